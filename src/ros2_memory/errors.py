@@ -1,0 +1,100 @@
+"""Everything that this program raises on purpose.
+
+    EpisodicError                 base; `code` is what reaches a client
+    |-- ConfigError               invalid_config     the program does not start (exit code 2)
+    |-- InvalidArgumentsError     invalid_arguments  a question that cannot be asked
+    |-- NoDataError               no_data            an answer: there is nothing, and why
+    |-- QueryTimeoutError         timeout            the question needs more than call_timeout_s
+    |-- BagError                  bag_unreadable     a file that cannot be read at all
+    |   `-- BagVanishedError      bag_unreadable     it is gone (retention, unmount)
+    |-- UndecodableError          undecodable        a message whose bytes mean nothing to us
+    `-- RecorderError             recorder           recording cannot start or go on
+
+Adapters translate every foreign exception into this tree; `tools.py` alone turns it into JSON.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import ClassVar
+
+
+class EpisodicError(Exception):
+    """Base of the tree. `str(error)` is a full sentence for the person or planner who asked."""
+
+    code: ClassVar[str] = "internal"
+
+
+class ConfigError(EpisodicError):
+    """The configuration is refused; the sentence names the key and what is allowed."""
+
+    code = "invalid_config"
+
+
+class InvalidArgumentsError(EpisodicError):
+    """A tool call whose arguments make no question; the sentence names the argument."""
+
+    code = "invalid_arguments"
+
+
+class NoDataReason(StrEnum):
+    """Why there is nothing to answer with."""
+
+    TOPIC_NOT_RECORDED = "topic_not_recorded"
+    OUTSIDE_RANGE = "outside_range"
+    GAP = "gap"
+    NOT_CLOSED_YET = "not_closed_yet"
+    UNDECODABLE = "undecodable"
+    FRAME_UNKNOWN = "frame_unknown"
+    FRAMES_NOT_CONNECTED = "frames_not_connected"
+    EMPTY_MEMORY = "empty_memory"
+
+
+class NoDataError(EpisodicError):
+    """There is no answer; `detail` says what there is instead and what to ask."""
+
+    code = "no_data"
+
+    def __init__(self, reason: NoDataReason, detail: str) -> None:
+        super().__init__(detail)
+        self.reason = reason
+        self.detail = detail
+
+
+class QueryTimeoutError(EpisodicError):
+    """The query passed its deadline."""
+
+    code = "timeout"
+
+
+class BagError(EpisodicError):
+    """A bag file that cannot be read; `path` is which, `reason` is why."""
+
+    code = "bag_unreadable"
+
+    def __init__(self, path: str, reason: str) -> None:
+        super().__init__(f"{path}: {reason}")
+        self.path = path
+        self.reason = reason
+
+
+class BagVanishedError(BagError):
+    """The bag file is not there any more."""
+
+
+class UndecodableError(EpisodicError):
+    """A message that cannot be decoded; `topic`, `type` and `reason` say which and why."""
+
+    code = "undecodable"
+
+    def __init__(self, topic: str, type_name: str, reason: str) -> None:
+        super().__init__(f"{topic} ({type_name}): {reason}")
+        self.topic = topic
+        self.type_name = type_name
+        self.reason = reason
+
+
+class RecorderError(EpisodicError):
+    """Recording cannot start or go on; the sentence says what to do."""
+
+    code = "recorder"

@@ -1,0 +1,222 @@
+"""The nouns that every room speaks: windows, bags, topics, samples, poses.
+
+Frozen and slotted. Times are `Ns` of `log_time`; lengths are metres, angles radians; vectors are
+(x, y, z) and quaternions (x, y, z, w), in the frames of REP-103 and REP-105.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, TypeAlias
+
+from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, Ns, ns_from_unix
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+JsonValue: TypeAlias = "bool | int | float | str | list[JsonValue] | dict[str, JsonValue] | None"
+"""What a reply is made of; NaN and infinities are not JSON and become null before they leave."""
+
+Vector3: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class TimeWindow:
+    """A half-open span of log time, `[start, stop)`."""
+
+    start: Ns
+    stop: Ns
+
+    @classmethod
+    def from_unix(cls, start_s: float, end_s: float) -> TimeWindow:
+        """The window of an inclusive question `[start_s, end_s]` in Unix seconds.
+
+        The end is granted the slack of a float of seconds (see `timebase`).
+
+        Raises:
+            InvalidArgumentsError: a bound is not finite, or the start is after the end.
+        """
+        try:
+            start, end = ns_from_unix(start_s), ns_from_unix(end_s)
+        except ValueError as error:
+            raise InvalidArgumentsError(
+                f"the window's bounds must be Unix seconds: {error}"
+            ) from error
+        if start > end:
+            raise InvalidArgumentsError(
+                f"start ({start_s}) is after end ({end_s}); give the earlier time first"
+            )
+        return cls(start, min(end + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS))
+
+    @classmethod
+    def everything(cls) -> TimeWindow:
+        """All of time."""
+        return cls(MIN_NS, MAX_NS)
+
+    @classmethod
+    def until(cls, end: Ns) -> TimeWindow:
+        """All of time up to and including `end`."""
+        return cls(MIN_NS, min(end + 1, MAX_NS))
+
+    def contains(self, moment: Ns) -> bool:
+        """Whether the moment lies inside."""
+        return self.start <= moment < self.stop
+
+    def overlaps(self, first: Ns, last: Ns) -> bool:
+        """Whether any moment of the inclusive span `[first, last]` lies inside."""
+        return first < self.stop and last >= self.start
+
+    def covers(self, first: Ns, last: Ns) -> bool:
+        """Whether all of the inclusive span `[first, last]` lies inside."""
+        return self.start <= first and last < self.stop
+
+    def intersect(self, other: TimeWindow) -> TimeWindow:
+        """The part that both share; empty (`start == stop`) where there is none."""
+        start = max(self.start, other.start)
+        return TimeWindow(start, max(start, min(self.stop, other.stop)))
+
+    @property
+    def empty(self) -> bool:
+        """Whether no moment lies inside."""
+        return self.stop <= self.start
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSummary:
+    """What one bag holds of one topic under one type; only where it holds at least one message.
+
+    `first` and `last` are the exact log times of its earliest and latest message (inclusive).
+    `latched`: some publisher offered it as transient local.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    count: int
+    first: Ns
+    last: Ns
+    latched: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class BagSummary:
+    """What one bag file holds.
+
+    `complete` is False where the file ends early and only what was readable is counted. `silent`
+    names the topics that are declared without a message. `notes` are sentences on what is odd.
+    """
+
+    topics: tuple[TopicSummary, ...]
+    silent: tuple[str, ...] = ()
+    complete: bool = True
+    notes: tuple[str, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Messages on all topics."""
+        return sum(topic.count for topic in self.topics)
+
+    @property
+    def empty(self) -> bool:
+        """Whether the bag holds no message: such a bag has no start and no end."""
+        return not self.topics
+
+    @property
+    def start(self) -> Ns:
+        """Log time of the earliest message. Only for a bag that is not empty."""
+        return min(topic.first for topic in self.topics)
+
+    @property
+    def end(self) -> Ns:
+        """Log time of the latest message (inclusive). Only for a bag that is not empty."""
+        return max(topic.last for topic in self.topics)
+
+
+class BagState(StrEnum):
+    """How a bag file stands."""
+
+    CLOSED = "closed"
+    ACTIVE = "active"  # still being written: marked, and excluded from queries
+    INCOMPLETE = "incomplete"  # left open by a crash: its readable messages are served
+    DAMAGED = "damaged"  # cannot be read at all: set aside with its reason
+
+
+@dataclass(frozen=True, slots=True)
+class BagFile:
+    """One bag file that answers questions (closed or incomplete, and not empty).
+
+    `start` and `end` are the log times of its first and last message, both inclusive.
+    """
+
+    path: Path
+    size: int
+    mtime_ns: Ns
+    state: BagState
+    summary: BagSummary
+    start: Ns
+    end: Ns
+
+    @property
+    def recording(self) -> Path:
+        """The rosbag2 recording that this file is a split of: its directory."""
+        return self.path.parent
+
+
+@dataclass(frozen=True, slots=True)
+class SetAside:
+    """A file that does not answer: active, damaged, or of a kind that the reader does not read."""
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One message as it leaves a query: its log time and its extracted value."""
+
+    time: Ns
+    value: JsonValue
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Position (m) and orientation in `frame_id`; a zero or NaN quaternion is no orientation.
+
+    `frame_id` is empty where the message names none.
+    """
+
+    position: Vector3
+    orientation: Quaternion | None
+    frame_id: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Twist:
+    """Linear (m/s) and angular (rad/s) velocity expressed in `frame_id` (empty: not said)."""
+
+    linear: Vector3
+    angular: Vector3
+    frame_id: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """The pose of a child frame in its parent: a point p of the child lies at R p + t there."""
+
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class StampedTransform:
+    """One edge of the frame graph as published: header stamp and log time both kept."""
+
+    parent: str
+    child: str
+    stamp: Ns
+    log_time: Ns
+    transform: Transform
+    static: bool

@@ -1,0 +1,1 @@
+"""Reading bag files: the port, and one adapter for each backend."""

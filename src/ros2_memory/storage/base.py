@@ -1,0 +1,155 @@
+"""The port for reading bag files. The docstrings are the contract; one suite holds every adapter.
+
+A reader takes single bag *files*; a rosbag2 directory is opened split by split, so that a deleted
+split or a wrong metadata.yaml costs nothing of the others. Adapters translate every foreign
+exception into `BagError`, `BagVanishedError` or `UndecodableError`, and never let another escape.
+A reader is safe to use from several threads at once.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.model import BagSummary, TimeWindow
+    from ros2_memory.timebase import Ns
+
+
+class Closing(StrEnum):
+    """Whether a file says of itself that its writer has finished."""
+
+    CLOSED = "closed"
+    OPEN = "open"
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A message definition as it stands in a bag. Equal by content: ids are local to one file.
+
+    `encoding` is `ros2msg`, `ros2idl`, `jsonschema`, ... or empty where the recorder found none.
+    """
+
+    name: str
+    encoding: str = ""
+    text: bytes = b""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One topic under one type in one bag. `encoding` is the message encoding (`cdr`, `json`)."""
+
+    topic: str
+    encoding: str
+    schema: Schema
+    latched: bool = False
+
+    @property
+    def type(self) -> str:
+        """The message type, `package/msg/Name` for ROS 2."""
+        return self.schema.name
+
+
+class Record(NamedTuple):
+    """One message, not yet decoded (a tuple: millions of them pass through a search).
+
+    Where a format keeps one time only, `publish_time` equals `log_time`.
+    """
+
+    channel: Channel
+    log_time: Ns
+    publish_time: Ns
+    payload: bytes
+
+
+class BagReader(ABC):
+    """Reads bag files of the kinds that `reads` accepts."""
+
+    @abstractmethod
+    def reads(self, path: Path) -> bool:
+        """Whether the file is of a kind this adapter reads, judged by its name alone."""
+
+    @abstractmethod
+    def closing(self, path: Path) -> Closing:
+        """Whether the writer has finished the file.
+
+        Closing magic for MCAP; no journal or WAL beside a sqlite file; a whole frame for `.zstd`.
+        A file that is not a bag at all counts as closed: `summarize` then says what is wrong.
+
+        Raises:
+            BagVanishedError: the file is not there.
+            BagError: it cannot be opened.
+        """
+
+    @abstractmethod
+    def summarize(self, path: Path) -> BagSummary:
+        """Topics with exact counts and exact first and last log times.
+
+        Costs the summary section where the file has one. A file that ends early is summarised by
+        what is readable, with `complete=False`.
+
+        Raises:
+            BagVanishedError: the file is not there.
+            BagError: nothing of it can be read.
+        """
+
+    @abstractmethod
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        """The undecoded messages of `topics` with log time inside the half-open window.
+
+        Ordered by log time whatever the order in the file, ties in file order; `newest_first`
+        gives exactly the reverse. Both channels of a topic that has two are read. Reads only
+        what overlaps the window; holds a chunk (and those that overlap it in time), never a file.
+        Payloads are plain serialized messages: message compression is already undone.
+        Lazy: nothing is opened before the first item is asked for.
+
+        Raises:
+            BagVanishedError: the file is not there.
+            BagError: the bytes from here on cannot be read. Where `summarize` gave
+                `complete=False` the early end is known, and simply ends the iteration.
+        """
+
+    @abstractmethod
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
+        """The log times that `records(path, [topic], window)` would give, without the payloads.
+
+        Raises:
+            BagVanishedError: the file is not there.
+            BagError: they cannot be read.
+        """
+
+    @abstractmethod
+    def undecodable(self, channel: Channel) -> str | None:
+        """Why no message of this channel can be decoded, or None where its type is understood."""
+
+    @abstractmethod
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """Every channel that is declared in the file, with or without messages.
+
+        Raises:
+            BagVanishedError: the file is not there.
+            BagError: they cannot be read.
+        """
+
+    @abstractmethod
+    def decode(self, record: Record) -> object:
+        """The message: an attribute object for a ROS type, a plain value for JSON.
+
+        The definition inside the bag counts first, then the configured `.msg` folders, then the
+        standard types.
+
+        Raises:
+            UndecodableError: no definition, a foreign encoding, or bytes that do not fit it.
+        """

@@ -1,0 +1,118 @@
+"""Time inside this program: nanosecond ints, and the only place that knows 1e9.
+
+Inside, a moment is an `Ns` (nanoseconds since the Unix epoch) and a window is half-open. Outside,
+a moment is a float of Unix seconds. A float64 near today's epoch resolves about 0.24 microseconds,
+so a moment that leaves is rounded *up* to whole microseconds (`unix_rounded_up`) and a moment that
+comes back is granted `AT_OR_BEFORE_SLACK_NS`: a timestamp fed back finds its own message.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Ns: TypeAlias = int
+"""Nanoseconds: since the Unix epoch for a moment, plain for a duration."""
+
+NS_PER_S: Final = 1_000_000_000
+NS_PER_MS: Final = 1_000_000
+NS_PER_US: Final = 1_000
+AT_OR_BEFORE_SLACK_NS: Final[Ns] = NS_PER_US
+"""What "at or before t" forgives, because t went through a float of seconds."""
+
+MIN_NS: Final[Ns] = -(2**63)
+MAX_NS: Final[Ns] = 2**63 - 1
+"""The range of a moment: what a signed 64-bit nanosecond clock (and SQLite) can hold."""
+
+
+def ns_from_unix(seconds: float) -> Ns:
+    """Nanoseconds for Unix (or plain) seconds, rounded to nearest, saturating at 64 bits.
+
+    Raises:
+        ValueError: `seconds` is NaN or infinite.
+    """
+    if not math.isfinite(seconds):
+        raise ValueError(f"{seconds} is not a finite number of seconds")
+    whole = math.floor(seconds)
+    ns = whole * NS_PER_S + round((seconds - whole) * NS_PER_S)
+    return min(max(ns, MIN_NS), MAX_NS)
+
+
+def unix_from_ns(ns: Ns) -> float:
+    """Unix (or plain) seconds nearest to `ns`."""
+    return ns / NS_PER_S
+
+
+def unix_rounded_up(ns: Ns) -> float:
+    """Unix seconds rounded up to whole microseconds: how a timestamp leaves the program."""
+    return -(-ns // NS_PER_US) / 1e6
+
+
+def ms_from_ns(ns: Ns) -> float:
+    """Milliseconds, for log events."""
+    return ns / NS_PER_MS
+
+
+def iso_local(ns: Ns) -> str | None:
+    """The moment as ISO 8601 local time with offset; None where the calendar does not reach."""
+    try:
+        return datetime.fromtimestamp(ns // NS_PER_S, tz=UTC).astimezone().isoformat()
+    except (OverflowError, ValueError, OSError):
+        return None
+
+
+class Clock(ABC):
+    """What "now" means. Read once for each call, so that one answer has one now."""
+
+    @abstractmethod
+    def now(self) -> Ns:
+        """The present moment."""
+
+
+class WallClock(Clock):
+    """The system's clock."""
+
+    def now(self) -> Ns:
+        """The present moment by the system's clock."""
+        return time.time_ns()
+
+
+@dataclass(frozen=True, slots=True)
+class FixedClock(Clock):
+    """A clock that stands still, for tests and for reproducing an answer."""
+
+    at: Ns
+
+    def now(self) -> Ns:
+        """Always the same moment."""
+        return self.at
+
+
+@dataclass(frozen=True, slots=True)
+class Deadline:
+    """A monotonic moment after which a query must give up; `Deadline.never()` has none."""
+
+    at_s: float
+    budget_s: float
+    _monotonic: Callable[[], float] = field(default=time.monotonic, repr=False)
+
+    @classmethod
+    def after(cls, budget_s: float, monotonic: Callable[[], float] = time.monotonic) -> Deadline:
+        """A deadline `budget_s` seconds from now."""
+        return cls(monotonic() + budget_s, budget_s, monotonic)
+
+    @classmethod
+    def never(cls) -> Deadline:
+        """A deadline that does not come."""
+        return cls(math.inf, math.inf)
+
+    def expired(self) -> bool:
+        """Whether the time is up."""
+        return self._monotonic() >= self.at_s

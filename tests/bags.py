@@ -1,0 +1,303 @@
+"""Bags written by the test that reads them: MCAP and sqlite3, as rosbag2 lays them out."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from dataclasses import dataclass, field
+from functools import cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable
+    from pathlib import Path
+
+    from rosbags.typesys.store import Typestore
+
+VISION_DEFINITIONS: Final = {
+    "ros2_vision_interfaces/msg/VisionDetection": (
+        "string label\nfloat32 score\ngeometry_msgs/Point point\nint32[4] bbox\n"
+    ),
+    "ros2_vision_interfaces/msg/VisionDetectionArray": (
+        "std_msgs/Header header\nstring skill\nVisionDetection[] detections\n"
+    ),
+    "ros2_vision_interfaces/msg/StampedString": "std_msgs/Header header\nstring data\n",
+}
+_QOS: Final = (
+    "- history: unknown\n  depth: 0\n  reliability: reliable\n  durability: {durability}\n"
+    "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  liveliness: automatic\n"
+    "  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
+    "  avoid_ros_namespace_conventions: false"
+)
+TRANSIENT_LOCAL: Final = _QOS.format(durability="transient_local")
+VOLATILE: Final = _QOS.format(durability="volatile")
+
+
+@cache
+def typestore() -> Typestore:
+    """Jazzy's standard types and `ros2_vision_interfaces`."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in VISION_DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+@dataclass(frozen=True)
+class Msg:
+    """One message to write. `body` is a message object of `type`, or raw payload bytes."""
+
+    topic: str
+    type: str
+    log_time: int
+    body: object
+    publish_time: int | None = None
+
+    @property
+    def published(self) -> int:
+        return self.log_time if self.publish_time is None else self.publish_time
+
+    @property
+    def payload(self) -> bytes:
+        if isinstance(self.body, bytes):
+            return self.body
+        return bytes(typestore().serialize_cdr(self.body, self.type))
+
+
+@dataclass(frozen=True)
+class McapLayout:
+    """The legal layouts of an MCAP file that differ for a reader."""
+
+    chunk_size: int | None = 768 * 1024  # None: no chunks (the fastwrite preset)
+    compression: CompressionType = CompressionType.NONE
+    index_types: IndexType = IndexType.ALL
+    repeat_channels: bool = True
+    use_summary_offsets: bool = True
+    use_statistics: bool = True
+    profile: str = "ros2"
+    finish: bool = True  # False: no footer, as a killed recorder leaves it
+    definitions: bool = True  # False: empty schemas, as when the recorder finds no definition
+    latched: frozenset[str] = field(default_factory=lambda: frozenset({"/tf_static"}))
+
+
+def write_mcap(
+    path: Path,
+    messages: Iterable[Msg],
+    layout: McapLayout | None = None,
+    *,
+    declared: Collection[tuple[str, str]] = (),
+) -> Path:
+    """Writes one MCAP split in the order given; `declared` adds (topic, type) without messages."""
+    how = layout or McapLayout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        writer = Writer(
+            stream,
+            chunk_size=how.chunk_size or 1024,
+            compression=how.compression,
+            index_types=how.index_types,
+            repeat_channels=how.repeat_channels,
+            use_chunking=how.chunk_size is not None,
+            use_statistics=how.use_statistics,
+            use_summary_offsets=how.use_summary_offsets,
+        )
+        writer.start(profile=how.profile, library="test")
+        channels: dict[tuple[str, str], int] = {}
+        schemas: dict[str, int] = {}
+
+        def channel(topic: str, type_name: str) -> int:
+            if (topic, type_name) not in channels:
+                if type_name not in schemas:
+                    text = definition(type_name) if how.definitions else ""
+                    encoding = "ros2msg" if text else ""
+                    schemas[type_name] = writer.register_schema(type_name, encoding, text.encode())
+                qos = TRANSIENT_LOCAL if topic in how.latched else VOLATILE
+                channels[topic, type_name] = writer.register_channel(
+                    topic, "cdr", schemas[type_name], {"offered_qos_profiles": qos}
+                )
+            return channels[topic, type_name]
+
+        for topic, type_name in declared:
+            channel(topic, type_name)
+        for sequence, message in enumerate(messages):
+            writer.add_message(
+                channel(message.topic, message.type),
+                message.log_time,
+                message.payload,
+                message.published,
+                sequence,
+            )
+        if how.finish:
+            writer.finish()
+    return path
+
+
+def write_db3(
+    path: Path,
+    messages: Iterable[Msg],
+    *,
+    definitions: bool = True,
+    latched: Collection[str] = ("/tf_static",),
+) -> Path:
+    """Writes one sqlite3 split with rosbag2's schema version 4."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    base = sqlite3.connect(path)
+    base.executescript(
+        "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY,ros_distro TEXT NOT NULL);"
+        "CREATE TABLE metadata(id INTEGER PRIMARY KEY,metadata_version INTEGER NOT NULL,"
+        "metadata TEXT NOT NULL);"
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL,"
+        "serialization_format TEXT NOT NULL,offered_qos_profiles TEXT NOT NULL,"
+        "type_description_hash TEXT NOT NULL);"
+        "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY,topic_type TEXT NOT NULL,"
+        "encoding TEXT NOT NULL,encoded_message_definition TEXT NOT NULL,"
+        "type_description_hash TEXT NOT NULL);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,"
+        "timestamp INTEGER NOT NULL, data BLOB NOT NULL);"
+        "CREATE INDEX timestamp_idx ON messages (timestamp ASC);"
+        "INSERT INTO schema VALUES (4, 'jazzy');"
+    )
+    topics: dict[tuple[str, str], int] = {}
+    types: set[str] = set()
+    for message in messages:
+        key = (message.topic, message.type)
+        if key not in topics:
+            topics[key] = len(topics) + 1
+            qos = TRANSIENT_LOCAL if message.topic in latched else VOLATILE
+            base.execute(
+                "INSERT INTO topics VALUES (?,?,?,?,?,?)", (topics[key], *key, "cdr", qos, "")
+            )
+            if definitions and message.type not in types:
+                types.add(message.type)
+                base.execute(
+                    "INSERT INTO message_definitions VALUES (?,?,?,?,?)",
+                    (len(types), message.type, "ros2msg", definition(message.type), ""),
+                )
+        base.execute(
+            "INSERT INTO messages(topic_id,timestamp,data) VALUES (?,?,?)",
+            (topics[key], message.log_time, message.payload),
+        )
+    base.commit()
+    base.close()
+    return path
+
+
+@cache
+def definition(type_name: str) -> str:
+    """The full ros2msg definition text, nested definitions included."""
+    return typestore().generate_msgdef(type_name, ros_version=2)[0]
+
+
+def make(type_name: str, **fields: object) -> object:
+    """A message object; every field must be given."""
+    build: Callable[..., object] = typestore().types[type_name]
+    return build(**fields)
+
+
+def stamp(ns: int) -> object:
+    return make("builtin_interfaces/msg/Time", sec=ns // 10**9, nanosec=ns % 10**9)
+
+
+def header(ns: int, frame_id: str) -> object:
+    return make("std_msgs/msg/Header", stamp=stamp(ns), frame_id=frame_id)
+
+
+def point(x: float, y: float, z: float = 0.0) -> object:
+    return make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+
+
+def vector3(x: float, y: float = 0.0, z: float = 0.0) -> object:
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def quaternion(yaw: float) -> object:
+    return make(
+        "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)
+    )
+
+
+def twist(vx: float, wz: float) -> object:
+    return make("geometry_msgs/msg/Twist", linear=vector3(vx), angular=vector3(0.0, 0.0, wz))
+
+
+def odom(
+    ns: int,
+    x: float,
+    y: float,
+    yaw: float = 0.0,
+    *,
+    vx: float = 0.0,
+    wz: float = 0.0,
+    topic: str = "/odom",
+    log_time: int | None = None,
+) -> Msg:
+    """An Odometry message (odom -> base_link) stamped and, unless said, logged at `ns`."""
+    covariance = np.zeros(36)
+    pose = make("geometry_msgs/msg/Pose", position=point(x, y), orientation=quaternion(yaw))
+    body = make(
+        "nav_msgs/msg/Odometry",
+        header=header(ns, "odom"),
+        child_frame_id="base_link",
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
+        twist=make(
+            "geometry_msgs/msg/TwistWithCovariance", twist=twist(vx, wz), covariance=covariance
+        ),
+    )
+    return Msg(topic, "nav_msgs/msg/Odometry", ns if log_time is None else log_time, body, ns)
+
+
+def transform(
+    ns: int, parent: str, child: str, xyz: tuple[float, float, float], yaw: float = 0.0
+) -> object:
+    return make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(ns, parent),
+        child_frame_id=child,
+        transform=make(
+            "geometry_msgs/msg/Transform", translation=vector3(*xyz), rotation=quaternion(yaw)
+        ),
+    )
+
+
+def tf(ns: int, *transforms: object, topic: str = "/tf", log_time: int | None = None) -> Msg:
+    body = make("tf2_msgs/msg/TFMessage", transforms=list(transforms))
+    return Msg(topic, "tf2_msgs/msg/TFMessage", ns if log_time is None else log_time, body, ns)
+
+
+def text(ns: int, data: str, topic: str = "/chatter") -> Msg:
+    return Msg(topic, "std_msgs/msg/String", ns, make("std_msgs/msg/String", data=data))
+
+
+def boolean(ns: int, data: bool, topic: str = "/bumper") -> Msg:
+    return Msg(topic, "std_msgs/msg/Bool", ns, make("std_msgs/msg/Bool", data=data))
+
+
+def detections(
+    ns: int,
+    labels: Iterable[str],
+    *,
+    topic: str = "/vision/scene/scene_objects",
+    at: tuple[float, float, float] = (1.0, 0.0, 0.0),
+) -> Msg:
+    """A VisionDetectionArray in base_link with one detection for each label."""
+    body = make(
+        "ros2_vision_interfaces/msg/VisionDetectionArray",
+        header=header(ns, "base_link"),
+        skill="scene",
+        detections=[
+            make(
+                "ros2_vision_interfaces/msg/VisionDetection",
+                label=label,
+                score=0.9,
+                point=point(*at),
+                bbox=np.array([10, 20, 100, 120], dtype=np.int32),
+            )
+            for label in labels
+        ],
+    )
+    return Msg(topic, "ros2_vision_interfaces/msg/VisionDetectionArray", ns, body)
