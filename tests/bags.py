@@ -146,6 +146,7 @@ def write_db3(
 ) -> Path:
     """Writes one sqlite3 split with rosbag2's schema version 4."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
     base = sqlite3.connect(path)
     base.executescript(
         "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY,ros_distro TEXT NOT NULL);"
