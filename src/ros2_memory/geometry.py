@@ -1,0 +1,223 @@
+"""Rotations, rigid transforms and paths in plain floats.
+
+Quaternions are (x, y, z, w), Hamilton's product, and taken to be of unit length unless a function
+says otherwise: `normalised` is the door. A `Transform` is the pose of a child in its parent.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.model import Quaternion, Transform, Vector3
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+IDENTITY: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+_GIMBAL_LOCK_SINE: Final = 1 - 1e-14
+"""Beyond this sine of pitch, roll and yaw turn about one axis to within 1.5e-7 rad."""
+
+_PARALLEL_COSINE: Final = 1 - 1e-10
+"""Beyond this, slerp divides two tiny sines, and a lerp differs from it by less than 1e-14."""
+
+_SCANS_PER_POINT: Final = 64
+"""How often, on average, path refinement may look at a point before it halves intervals."""
+
+
+def normalised(q: Quaternion) -> Quaternion | None:
+    """The unit quaternion of the same rotation; None for a zero, NaN or infinite one."""
+    largest = max(abs(part) for part in q)
+    if not all(math.isfinite(part) for part in q) or largest == 0:
+        return None
+    # Scaled first: the squares of very large and very small parts leave the range of a float.
+    x, y, z, w = (part / largest for part in q)
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    return (x / length, y / length, z / length, w / length)
+
+
+def rpy(q: Quaternion) -> tuple[float, float, float]:
+    """Roll, pitch and yaw (rad) about the fixed axes X, Y, Z in that order (REP-103).
+
+    At gimbal lock (pitch of plus or minus a right angle) only one sum of roll and yaw is
+    determined: it is given as yaw, and roll is 0.
+    """
+    x, y, z, w = q
+    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
+    pitch = math.asin(sine)
+    if abs(sine) > _GIMBAL_LOCK_SINE:
+        return 0.0, pitch, math.remainder(2 * math.atan2(z, w), math.tau)
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def yaw(q: Quaternion) -> float:
+    """The heading about Z (rad, in [-pi, pi]), as `rpy` gives it."""
+    return rpy(q)[2]
+
+
+def quaternion_from_yaw(angle: float) -> Quaternion:
+    """The rotation by `angle` (rad) about Z."""
+    return (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """The rotation `b` followed, about the fixed axes, by `a` (Hamilton's product a b)."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """The rotation backwards."""
+    x, y, z, w = q
+    return (-x, -y, -z, w)
+
+
+def rotate(q: Quaternion, v: Vector3) -> Vector3:
+    """`v` turned by `q`."""
+    x, y, z, w = q
+    vx, vy, vz = v
+    cx = 2 * (y * vz - z * vy)
+    cy = 2 * (z * vx - x * vz)
+    cz = 2 * (x * vy - y * vx)
+    return (
+        vx + w * cx + y * cz - z * cy,
+        vy + w * cy + z * cx - x * cz,
+        vz + w * cz + x * cy - y * cx,
+    )
+
+
+def compose(a: Transform, b: Transform) -> Transform:
+    """`a`, then `b` from there: the pose of b's child in a's parent."""
+    x, y, z = rotate(a.rotation, b.translation)
+    ax, ay, az = a.translation
+    return Transform((ax + x, ay + y, az + z), multiply(a.rotation, b.rotation))
+
+
+def invert(t: Transform) -> Transform:
+    """The pose of the parent in the child."""
+    back = conjugate(t.rotation)
+    x, y, z = rotate(back, t.translation)
+    return Transform((-x, -y, -z), back)
+
+
+def slerp(a: Quaternion, b: Quaternion, ratio: float) -> Quaternion:
+    """The rotation `ratio` (0 to 1) of the way from `a` to `b`, the shorter way, at even speed."""
+    cosine = sum(p * q for p, q in zip(a, b, strict=True))
+    sign = -1.0 if cosine < 0 else 1.0
+    cosine *= sign
+    if cosine > _PARALLEL_COSINE:
+        from_a, from_b = 1 - ratio, ratio * sign
+    else:
+        angle = math.acos(cosine)
+        from_a = math.sin((1 - ratio) * angle) / math.sin(angle)
+        from_b = math.sin(ratio * angle) / math.sin(angle) * sign
+    x, y, z, w = (from_a * p + from_b * q for p, q in zip(a, b, strict=True))
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    return (x / length, y / length, z / length, w / length)
+
+
+def interpolate(a: Transform, b: Transform, ratio: float) -> Transform:
+    """The transform `ratio` (0 to 1) of the way: translation linear, rotation by `slerp` (tf2)."""
+    x, y, z = (p + (q - p) * ratio for p, q in zip(a.translation, b.translation, strict=True))
+    return Transform((x, y, z), slerp(a.rotation, b.rotation, ratio))
+
+
+def distance(a: Vector3, b: Vector3) -> float:
+    """Metres between two points, in a straight line."""
+    return math.dist(a, b)
+
+
+def path_length(points: Iterable[Vector3]) -> float:
+    """Metres along the points in the order given; 0 for fewer than two."""
+    return math.fsum(math.dist(a, b) for a, b in pairwise(points))
+
+
+def simplify(points: Sequence[Vector3], tolerance_m: float) -> list[int]:
+    """Indices of the vertices that are enough to draw the path (Ramer, Douglas and Peucker).
+
+    Ascending; both ends are kept, and every point that is dropped lies within `tolerance_m` of
+    the kept segment that spans it. Points must be finite. Cost is bounded: where the splits stay
+    lopsided, intervals are halved instead, which keeps some vertices more than needed.
+    """
+    return _refine(points, tolerance_m, len(points))[0]
+
+
+def simplify_to(
+    points: Sequence[Vector3], tolerance_m: float, at_most: int
+) -> tuple[list[int], float]:
+    """As `simplify`, with the tolerance widened as far as it takes to keep at most `at_most`.
+
+    Returns:
+        The indices, and the largest distance (m) of a dropped point from the kept segment that
+        spans it.
+
+    Raises:
+        ValueError: `at_most` is below 2: both ends are always kept.
+    """
+    if at_most < 2:
+        raise ValueError(f"a path cannot be drawn with {at_most} vertices; allow 2 or more")
+    return _refine(points, tolerance_m, at_most)
+
+
+def _refine(points: Sequence[Vector3], tolerance_m: float, at_most: int) -> tuple[list[int], float]:
+    """Starts from the chord of the whole path and splits the worst interval again and again.
+
+    Splitting the worst first makes the limits on tolerance and on count one loop: with no limit
+    on count the kept set is that of the recursive algorithm, in another order.
+    """
+    last = len(points) - 1
+    if last < 2:
+        return list(range(last + 1)), 0.0
+    kept = [0, last]
+    worst = [_farthest(points, 0, last)]
+    scans_left = _SCANS_PER_POINT * len(points)
+    while worst and -worst[0][0] > tolerance_m and len(kept) < at_most:
+        _, split, start, end = heapq.heappop(worst)
+        if scans_left < 0:
+            split = (start + end) // 2
+        kept.append(split)
+        for low, high in ((start, split), (split, end)):
+            if high - low > 1:
+                scans_left -= high - low
+                heapq.heappush(worst, _farthest(points, low, high))
+    return sorted(kept), -worst[0][0] if worst else 0.0
+
+
+def _farthest(points: Sequence[Vector3], start: int, end: int) -> tuple[float, int, int, int]:
+    """The point between `start` and `end` that lies farthest from the segment between them.
+
+    Returns:
+        (minus its distance in metres, its index, start, end): ready for a heap.
+    """
+    ax, ay, az = points[start]
+    bx, by, bz = points[end]
+    dx, dy, dz = bx - ax, by - ay, bz - az
+    squared = dx * dx + dy * dy + dz * dz
+    # A chord too short to divide by is a point: a closed loop ends where it starts.
+    scale = 1 / squared if squared > 1e-300 else 0.0
+    most, where = -1.0, start + 1
+    for index in range(start + 1, end):
+        x, y, z = points[index]
+        x -= ax
+        y -= ay
+        z -= az
+        along = (x * dx + y * dy + z * dz) * scale
+        if along > 0:
+            along = min(along, 1.0)
+            x -= along * dx
+            y -= along * dy
+            z -= along * dz
+        off = x * x + y * y + z * z
+        if off > most:
+            most, where = off, index
+    return -math.sqrt(most), where, start, end

@@ -1,0 +1,51 @@
+"""Even downsampling, and the notes that say so.
+
+A reply that leaves something out says how much of how much; these are the only two wordings.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+T = TypeVar("T")
+
+
+def evenly(count: int, at_most: int) -> list[int]:
+    """Strictly increasing indices into `count` values, at most `at_most`, evenly spaced.
+
+    The first and the last are kept, and the distances between neighbours differ by at most one.
+    A single place goes to the last value: the newest.
+
+    Raises:
+        ValueError: `at_most` is below 1.
+    """
+    if at_most < 1:
+        raise ValueError(f"at most {at_most} values cannot be kept; at least 1 is")
+    if count <= at_most:
+        return list(range(count))
+    if at_most == 1:
+        return [count - 1]
+    return [place * (count - 1) // (at_most - 1) for place in range(at_most)]
+
+
+def thin(values: Sequence[T], at_most: int) -> tuple[list[T], str | None]:
+    """The samples that `evenly` keeps, and the note where any was left out.
+
+    Raises:
+        ValueError: `at_most` is below 1.
+    """
+    kept = [values[index] for index in evenly(len(values), at_most)]
+    return kept, samples_note(len(kept), len(values)) if len(kept) < len(values) else None
+
+
+def array_note(name: str, kept: int, total: int) -> str:
+    """What is said of an array inside a message that was thinned."""
+    return f"{name}: {kept} of {total} values, evenly spaced"
+
+
+def samples_note(kept: int, total: int) -> str:
+    """What is said of a window whose samples were thinned."""
+    return f"{kept} of {total} samples, evenly spaced over the window"
