@@ -1,0 +1,176 @@
+"""Why there is nothing to answer with, and what to ask instead."""
+
+from __future__ import annotations
+
+import math
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
+
+from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
+from ros2_memory.model import TimeWindow
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, Ns, unix_from_ns, unix_rounded_up
+
+if TYPE_CHECKING:
+    from ros2_memory.history import View
+
+
+def seconds(duration: Ns) -> str:
+    """A duration for a sentence."""
+    return f"{unix_from_ns(duration):.3g} s"
+
+
+def moment(at: Ns) -> str:
+    """A moment for a sentence: the Unix seconds that find it again."""
+    return f"{unix_rounded_up(at):.6f}"
+
+
+def resolve_topic(view: View, name: str) -> str:
+    """The recorded topic that a question means; a missing or extra leading slash is forgiven.
+
+    Raises:
+        NoDataError: `topic_not_recorded` with the nearest names, or `empty_memory`.
+    """
+    topics = view.snapshot.topics()
+    for candidate in (name, f"/{name}", name.removeprefix("/")):
+        if candidate in topics:
+            return candidate
+    raise not_recorded(view, name)
+
+
+def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
+    """The recorded topics that a name or glob (`/vision/*/scene_objects`) means.
+
+    Raises:
+        NoDataError: none does.
+    """
+    if not any(mark in pattern for mark in "*?["):
+        return (resolve_topic(view, pattern),)
+    matched = tuple(name for name in view.snapshot.topics() if fnmatchcase(name, pattern))
+    if not matched:
+        raise not_recorded(view, pattern)
+    return matched
+
+
+def require_bags(view: View) -> None:
+    """Refuses a question to a memory that holds nothing.
+
+    Raises:
+        NoDataError: `empty_memory`, or `not_closed_yet` where the first split is being written.
+    """
+    snapshot = view.snapshot
+    if snapshot.bags:
+        return
+    if snapshot.active:
+        raise NoDataError(
+            NoDataReason.NOT_CLOSED_YET,
+            "the first split is still being written; ask again when it closes, in "
+            f"{view.memory.limits.split_duration_s:g} s or less",
+        )
+    why = [snapshot.problem or "no bag with messages lies in the bag directory"]
+    if snapshot.damaged:
+        why.append(f"{len(snapshot.damaged)} damaged files were set aside")
+    if snapshot.unread:
+        why.append(f"{len(snapshot.unread)} files are of a kind that is not read here")
+    raise NoDataError(
+        NoDataReason.EMPTY_MEMORY, f"{'; '.join(why)}; data_time_range lists the files"
+    )
+
+
+def not_recorded(view: View, name: str) -> NoDataError:
+    """No message of such a topic lies in any closed bag."""
+    require_bags(view)
+    snapshot = view.snapshot
+    if name in snapshot.silent_topics or f"/{name}" in snapshot.silent_topics:
+        told = f"{name} is declared in the bags, but not one message of it was recorded"
+    else:
+        told = f"no topic {name} is recorded"
+    close = get_close_matches(name, snapshot.topics(), n=5, cutoff=0.5)
+    if not close:
+        stem = name.rstrip("/").rpartition("/")[2].strip("*")
+        close = [topic for topic in snapshot.topics() if stem and stem in topic][:5]
+    hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
+    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}")
+
+
+def nothing_at(view: View, topics: tuple[str, ...], at: Ns, tolerance: Ns | None) -> NoDataError:
+    """No message of these topics at or shortly before a moment.
+
+    The sentence names the nearest older and newer message with their distances, and what to do.
+    """
+    older = next(view.stream(topics, TimeWindow.until(at), newest_first=True), None)
+    newer = next(view.stream(topics, TimeWindow(at + 1, TimeWindow.everything().stop)), None)
+    names = " or ".join(topics)
+    within = "" if tolerance is None else f" within {seconds(tolerance)} before"
+    told = [f"no message of {names}{within} {moment(at)}"]
+    if older:
+        told.append(
+            f"the nearest older one is {seconds(at - older.time)} before it, at "
+            f"{moment(older.time)}"
+        )
+    if newer:
+        told.append(
+            f"the nearest newer one is {seconds(newer.time - at)} after it, at {moment(newer.time)}"
+        )
+    reason = NoDataReason.GAP if older and newer else beyond(view, at)
+    told.append(_advice(view, reason, at, older.time if older else None))
+    return NoDataError(reason, "; ".join(told))
+
+
+def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
+    """No message of these topics in a window."""
+    older = next(view.stream(topics, TimeWindow.until(window.start - 1), newest_first=True), None)
+    newer = next(view.stream(topics, TimeWindow(window.stop, TimeWindow.everything().stop)), None)
+    names = " or ".join(topics)
+    end = window.stop - 1 - AT_OR_BEFORE_SLACK_NS
+    told = [f"no message of {names} between {moment(window.start)} and {moment(end)}"]
+    if older:
+        told.append(f"the last one before is at {moment(older.time)}")
+    if newer:
+        told.append(f"the first one after is at {moment(newer.time)}")
+    reason = NoDataReason.GAP if older and newer else beyond(view, window.start)
+    told.append(_advice(view, reason, window.start, None))
+    return NoDataError(reason, "; ".join(told))
+
+
+def beyond(view: View, at: Ns) -> NoDataReason:
+    """Why a moment with nothing on one of its sides has no answer."""
+    latest = view.snapshot.latest
+    if latest is not None and at > latest and view.snapshot.active:
+        return NoDataReason.NOT_CLOSED_YET
+    return NoDataReason.OUTSIDE_RANGE
+
+
+def undecodable(topic: str, type_name: str, error: UndecodableError) -> NoDataError:
+    """Messages are there, but mean nothing to us."""
+    return NoDataError(
+        NoDataReason.UNDECODABLE,
+        f"messages of {topic} ({type_name}) are recorded but cannot be decoded: {error.reason}",
+    )
+
+
+def damaged_note(view: View) -> str | None:
+    """A sentence on the files that no search can look into, or None."""
+    damaged = view.snapshot.damaged
+    if not damaged:
+        return None
+    named = ", ".join(f"{each.path.name} ({each.reason})" for each in damaged[-3:])
+    more = f" and {len(damaged) - 3} more" if len(damaged) > 3 else ""
+    return f"could not be read and were not searched: {named}{more}"
+
+
+def _advice(view: View, reason: NoDataReason, at: Ns, older: Ns | None) -> str:
+    snapshot = view.snapshot
+    earliest, latest = snapshot.earliest, snapshot.latest
+    advice = []
+    if earliest is not None and latest is not None:
+        advice.append(f"the memory reaches from {moment(earliest)} to {moment(latest)}")
+    if reason is NoDataReason.NOT_CLOSED_YET:
+        advice.append(
+            "the split being written does not answer until it closes: ask about an earlier moment,"
+            f" or again in {view.memory.limits.split_duration_s:g} s"
+        )
+    if older is not None:
+        enough = math.ceil(unix_from_ns(at - older) * 1000) / 1000
+        advice.append(f"to accept the older one, ask with tolerance_s of at least {enough:g}")
+    return "; ".join(advice)

@@ -1,0 +1,175 @@
+"""The transforms that a question about frames needs, gathered from the history.
+
+Windows are in log time. A dynamic transform is looked for close to the moment first, then further
+away, up to tf2's cache length; a static one however far back it was recorded.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.absence import beyond, not_recorded, nothing_at
+from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
+from ros2_memory.model import StampedTransform, TimeWindow
+from ros2_memory.tf_tree import (
+    TF_CACHE_NS,
+    FrameEdge,
+    FrameGraph,
+    Lookup,
+    TfClock,
+    agreeing_clock,
+)
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, NS_PER_MS, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from ros2_memory.copies import Found
+    from ros2_memory.history import View
+
+_HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
+"""How far around the moment dynamic transforms are read; the last is as far as tf2 remembers."""
+
+
+class FoundTransform(NamedTuple):
+    """A transform, and the clock in which the moment was meant."""
+
+    lookup: Lookup
+    clock: TfClock
+
+
+def transform_at(view: View, parent: str, child: str, at: Ns) -> FoundTransform:
+    """The pose of `child` in `parent` at a moment, by tf2's rules.
+
+    Raises:
+        NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,
+            or nothing brackets the moment on one of the edges between them.
+    """
+    limits = view.memory.limits
+    recorded = _recorded(view, (*limits.tf_topics, *limits.tf_static_topics))
+    if not recorded:
+        raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
+    static = _static_at(view, at)
+    for half_width in _HALF_WIDTHS:
+        dynamic = list(_transforms(view, limits.tf_topics, _around(at, half_width), static=False))
+        try:
+            return _lookup(static, dynamic, limits.tf_clock, (parent, child), at)
+        except NoDataError as error:
+            failure = error
+    if limits.tf_clock == "stamp":
+        dynamic = list(_stamped_near(view, at))
+        return _lookup(static, dynamic, "stamp", (parent, child), at)
+    raise _explained(view, failure, at, nothing_near=not dynamic) from failure
+
+
+def edges(view: View) -> tuple[FrameEdge, ...]:
+    """Every parent and child pair that was recorded, sorted; `static` where it was so published.
+
+    A pair that was published both ways stands once, as dynamic.
+    """
+    limits = view.memory.limits
+    everything = TimeWindow.everything()
+    pairs: dict[tuple[str, str], bool] = {}
+    for each in _transforms(view, limits.tf_static_topics, everything, static=True):
+        pairs[each.parent, each.child] = True
+    for each in _transforms(view, limits.tf_topics, everything, static=False):
+        pairs[each.parent, each.child] = False
+    return tuple(
+        FrameEdge(parent, child, static) for (parent, child), static in sorted(pairs.items())
+    )
+
+
+def _lookup(
+    static: Sequence[StampedTransform],
+    dynamic: Sequence[StampedTransform],
+    mode: str,
+    frames: tuple[str, str],
+    at: Ns,
+) -> FoundTransform:
+    clock: TfClock = "log" if mode == "log" else "stamp"
+    if mode == "auto":
+        clock = agreeing_clock(dynamic)
+    graph = FrameGraph([*static, *dynamic], clock)
+    return FoundTransform(graph.lookup(*frames, at), clock)
+
+
+def _explained(view: View, failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:
+    """The failure of a lookup in its neighbourhood, said of the whole memory."""
+    topics = _recorded(view, view.memory.limits.tf_topics)
+    if topics and nothing_near:
+        return nothing_at(view, topics, at, None)
+    if failure.reason is not NoDataReason.OUTSIDE_RANGE:
+        return failure
+    after = TimeWindow(at + 1, MAX_NS)
+    later = next(view.stream(topics, after), None) if topics else None
+    reason = NoDataReason.GAP if later else beyond(view, at)
+    return NoDataError(reason, failure.detail)
+
+
+def _static_at(view: View, at: Ns) -> list[StampedTransform]:
+    """For each child frame its newest static transform at the moment.
+
+    A static transform holds at all times, so one that was only received later holds too.
+    """
+    holding: dict[str, StampedTransform] = {}
+    topics = view.memory.limits.tf_static_topics
+    for each in _transforms(view, topics, TimeWindow.everything(), static=True):
+        if each.child not in holding or each.log_time <= at + AT_OR_BEFORE_SLACK_NS:
+            holding[each.child] = each
+    return list(holding.values())
+
+
+def _stamped_near(view: View, at: Ns) -> Iterator[StampedTransform]:
+    """The dynamic transforms stamped around a moment, wherever in log time they were recorded.
+
+    A bag is read where the stamps of its first and last message reach as far as the moment.
+    """
+    topics = _recorded(view, view.memory.limits.tf_topics)
+    everything = TimeWindow.everything()
+    for held in view.holdings(topics, everything):
+        ends = [
+            transform.stamp
+            for newest_first in (False, True)
+            for found in _first(view.read(held.bag, topics, everything, newest_first=newest_first))
+            for transform in _decoded(view, found, static=False)
+        ]
+        if ends and min(ends) - TF_CACHE_NS <= at <= max(ends) + TF_CACHE_NS:
+            for found in view.read(held.bag, topics, everything):
+                yield from _decoded(view, found, static=False)
+
+
+def _first(found: Iterator[Found]) -> Iterable[Found]:
+    first = next(found, None)
+    return () if first is None else (first,)
+
+
+def _around(at: Ns, half_width: Ns) -> TimeWindow:
+    return TimeWindow(max(at - half_width, MIN_NS), min(at + half_width + 1, MAX_NS))
+
+
+def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
+    known = set(view.snapshot.topics())
+    return tuple(topic for topic in topics if topic in known)
+
+
+def _transforms(
+    view: View, topics: Iterable[str], window: TimeWindow, *, static: bool
+) -> Iterator[StampedTransform]:
+    recorded = _recorded(view, topics)
+    if recorded:
+        for found in view.stream(recorded, window):
+            yield from _decoded(view, found, static=static)
+
+
+def _decoded(view: View, found: Found, *, static: bool) -> tuple[StampedTransform, ...]:
+    begin = time.perf_counter_ns()
+    try:
+        message = view.memory.reader.decode(found.record)
+        return view.memory.extractor.transforms(message, found.time, static=static)
+    except UndecodableError as error:
+        view.complete = False
+        view.note(f"messages of {error.topic} could not be decoded: {error.reason}")
+        return ()
+    finally:
+        view.call.stages.add("extract", time.perf_counter_ns() - begin)

@@ -1,0 +1,81 @@
+"""What a question is asked of, and what one call carries with it."""
+
+from __future__ import annotations
+
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+from ros2_memory.timebase import Deadline, ms_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.recorder.index_manager import IndexManager
+    from ros2_memory.storage.base import BagReader
+    from ros2_memory.timebase import Clock, Ns
+
+ClockOfTransforms = Literal["auto", "stamp", "log"]
+NowOfMemory = Literal["wall", "latest"]
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The knobs of the configuration's `data` section that questions need."""
+
+    position_tolerance_m: float = 0.5
+    time_tolerance_s: float = 0.1
+    pose_topic: str = "/odom"
+    tf_topics: tuple[str, ...] = ("/tf",)
+    tf_static_topics: tuple[str, ...] = ("/tf_static",)
+    now: NowOfMemory = "wall"
+    tf_clock: ClockOfTransforms = "auto"
+    max_plausible_speed_mps: float = 10.0
+    split_duration_s: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """The robot's past, as far as it lies in closed bags."""
+
+    index: IndexManager
+    reader: BagReader
+    extractor: SchemaExtractor
+    clock: Clock
+    limits: Limits
+
+
+class Stages:
+    """How long one call spent where: `index`, `read`, `extract`."""
+
+    __slots__ = ("_spent",)
+
+    def __init__(self) -> None:
+        self._spent: dict[str, Ns] = {}
+
+    def add(self, stage: str, spent: Ns) -> None:
+        """Adds nanoseconds to a stage."""
+        self._spent[stage] = self._spent.get(stage, 0) + spent
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Adds what the block takes."""
+        begin = time.perf_counter_ns()
+        try:
+            yield
+        finally:
+            self.add(stage, time.perf_counter_ns() - begin)
+
+    def as_ms(self) -> dict[str, float]:
+        """Milliseconds by stage, for the log event of the call."""
+        return {stage: round(ms_from_ns(spent), 3) for stage, spent in self._spent.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One call: when it must be over, and where its time went."""
+
+    deadline: Deadline = field(default_factory=Deadline.never)
+    stages: Stages = field(default_factory=Stages)

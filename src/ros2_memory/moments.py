@@ -1,0 +1,103 @@
+"""What the times of a question mean: a moment or a window of the memory, and its now.
+
+Seconds come in as floats of Unix seconds or of a duration. "Ago" counts from the wall clock or,
+for replayed and simulated bags (`data.now: latest`), from the newest recorded moment. The clock
+is read once for each call.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ros2_memory.absence import require_bags
+from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.history import View
+from ros2_memory.model import TimeWindow
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, Ns, ns_from_unix
+
+if TYPE_CHECKING:
+    from ros2_memory.memory import Call, Memory
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A moment asked about: at Unix seconds, or so many seconds before now. Exactly one is set."""
+
+    at_s: float | None = None
+    ago_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """An inclusive window asked about: from `start_s` to `end_s`, or the last so many seconds."""
+
+    start_s: float | None = None
+    end_s: float | None = None
+    last_s: float | None = None
+
+
+def _now(memory: Memory, view: View) -> Ns:
+    """What "ago" counts from; asked once for each call."""
+    require_bags(view)
+    if memory.limits.now == "wall" or view.snapshot.latest is None:
+        return memory.clock.now()
+    return view.snapshot.latest
+
+
+def open_moment(memory: Memory, call: Call, moment: Moment) -> tuple[View, Ns, Ns | None]:
+    """The view for a moment, the moment itself, and now where the question was relative."""
+    if moment.at_s is not None:
+        at = ns_argument("timestamp", moment.at_s)
+        view = View(memory, call, at)
+        require_bags(view)
+        return view, at, None
+    ago = ns_argument("seconds_ago", moment.ago_s or 0.0)
+    if ago < 0:
+        raise InvalidArgumentsError("seconds_ago must be 0 or more: it counts back from now")
+    view, now = _relative(memory, call, ago)
+    return view, max(now - ago, MIN_NS), now
+
+
+def _relative(memory: Memory, call: Call, ago: Ns) -> tuple[View, Ns]:
+    if memory.limits.now == "latest":
+        view = View(memory, call)
+        return view, _now(memory, view)
+    now = memory.clock.now()
+    view = View(memory, call, now - ago)
+    require_bags(view)
+    return view, now
+
+
+def open_span(memory: Memory, call: Call, span: Span) -> tuple[View, TimeWindow]:
+    """The view for a window, and the window itself.
+
+    Raises:
+        InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length.
+        NoDataError: the memory holds nothing.
+    """
+    if span.last_s is not None:
+        length = ns_argument("seconds", span.last_s)
+        if length <= 0:
+            raise InvalidArgumentsError("seconds must be more than 0: the length of the window")
+        view, now = _relative(memory, call, 0)
+        stop = min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
+        return view, TimeWindow(max(now - length, MIN_NS), stop)
+    if span.start_s is None or span.end_s is None:
+        raise InvalidArgumentsError("start and end must both be given, as Unix seconds")
+    window = TimeWindow.from_unix(span.start_s, span.end_s)
+    view = View(memory, call, window.stop)
+    require_bags(view)
+    return view, window
+
+
+def ns_argument(name: str, value_s: float) -> Ns:
+    """Nanoseconds of an argument in seconds.
+
+    Raises:
+        InvalidArgumentsError: it is not finite; the sentence names the argument.
+    """
+    try:
+        return ns_from_unix(value_s)
+    except ValueError as error:
+        raise InvalidArgumentsError(f"{name}: {error}") from error

@@ -1,0 +1,404 @@
+"""One function for one question over a `Memory`: plain values in, a dataclass of `answers` out.
+
+Times that come in are Unix seconds (see `timebase`); "ago" counts from the memory's now, which is
+the wall clock or, for replayed and simulated bags, the newest recorded moment. Every function may
+raise `NoDataError`, `InvalidArgumentsError` and `QueryTimeoutError`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from ros2_memory import answers
+from ros2_memory import frames as frame_history
+from ros2_memory.absence import (
+    moment,
+    nothing_at,
+    nothing_between,
+    require_bags,
+    resolve_topic,
+    seconds,
+    undecodable,
+)
+from ros2_memory.conditions import parse_condition
+from ros2_memory.errors import (
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    UndecodableError,
+)
+from ros2_memory.history import View
+from ros2_memory.model import BagState, Sample, SetAside, TimeWindow
+from ros2_memory.moments import Moment, Span, ns_argument, open_moment, open_span
+from ros2_memory.sampling import samples_note
+from ros2_memory.search import last_match, unsearched
+from ros2_memory.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    MIN_NS,
+    Ns,
+    ns_from_unix,
+)
+from ros2_memory.trajectory import TrajectoryBuilder
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.copies import Found
+    from ros2_memory.memory import Call, Memory
+    from ros2_memory.model import JsonValue, Pose, Twist
+
+
+def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, ...]:
+    """Every topic that was heard, under each of its types; empty for an empty memory."""
+    view = View(memory, call)
+    rows = []
+    for topic in view.snapshot.topics():
+        reasons = _undecodable_types(view, topic)
+        for type_name, census in sorted(view.census(topic).items()):
+            rows.append(
+                answers.TopicRow(
+                    topic,
+                    type_name,
+                    census.first,
+                    census.last,
+                    census.count,
+                    reasons.get(type_name),
+                )
+            )
+    return tuple(rows)
+
+
+def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
+    """What the memory spans, where it has holes, and which files do not answer."""
+    view = View(memory, call, memory.clock.now() if memory.limits.now == "wall" else None)
+    snapshot = view.snapshot
+    now = memory.clock.now()
+    if memory.limits.now == "latest" and snapshot.latest is not None:
+        now = snapshot.latest
+    incomplete = tuple(
+        SetAside(bag.path, "; ".join(bag.summary.notes) or "left open by a crash")
+        for bag in snapshot.bags
+        if bag.state is BagState.INCOMPLETE
+    )
+    notes = (snapshot.problem,) if snapshot.problem else ()
+    return answers.TimeRange(
+        earliest=snapshot.earliest,
+        latest=snapshot.latest,
+        now=now,
+        bags=len(snapshot.bags),
+        gaps=_gaps(view),
+        incomplete=incomplete,
+        active=snapshot.active,
+        damaged=snapshot.damaged,
+        unread=snapshot.unread,
+        silent_topics=len(snapshot.silent_topics),
+        notes=notes,
+    )
+
+
+def topic_value(
+    memory: Memory,
+    call: Call,
+    topic: str,
+    moment: Moment,
+    *,
+    tolerance_s: float | None = None,
+    fields: Sequence[str] = (),
+) -> answers.TopicValue:
+    """The newest message of a topic at or before a moment, within the tolerance.
+
+    A latched topic has no tolerance unless one is given: its newest message holds.
+    """
+    view, at, now = open_moment(memory, call, moment)
+    found = _found_at(view, resolve_topic(view, topic), at, tolerance_s)
+    return _value(view, found, fields, now)
+
+
+def topic_range(
+    memory: Memory,
+    call: Call,
+    topic: str,
+    span: Span,
+    *,
+    max_samples: int = 100,
+    fields: Sequence[str] = (),
+) -> answers.TopicRange:
+    """Samples of a topic, evenly spaced over all its messages in a window."""
+    view, window = open_span(memory, call, span)
+    name = resolve_topic(view, topic)
+    total, chosen = view.pick(name, window, max_samples)
+    if not total:
+        raise nothing_between(view, (name,), window)
+    samples, types = _samples(view, chosen, fields)
+    if len(types) > 1:
+        view.note(f"the topic was recorded under several types: {', '.join(types)}")
+    if len(chosen) < total:
+        view.note(samples_note(len(chosen), total))
+    _note_edges(view, window)
+    return answers.TopicRange(name, types[-1], total, samples, view.notes)
+
+
+def position(
+    memory: Memory,
+    call: Call,
+    moment: Moment,
+    *,
+    topic: str | None = None,
+    tolerance_s: float | None = None,
+) -> answers.Position:
+    """Where the robot was: the newest pose at or before a moment, within the tolerance."""
+    view, at, now = open_moment(memory, call, moment)
+    name = resolve_topic(view, topic or memory.limits.pose_topic)
+    found = _found_at(view, name, at, tolerance_s)
+    pose = _pose(view, found)
+    if pose is None:
+        raise InvalidArgumentsError(_carries_no("position", found))
+    if not all(map(math.isfinite, pose.position)):
+        view.note("the recorded position is not a number")
+    if pose.orientation is None:
+        view.note("the recorded orientation is not a rotation")
+    return answers.Position(name, found.time, pose, view.notes, _age(found, now))
+
+
+def velocity(
+    memory: Memory,
+    call: Call,
+    moment: Moment,
+    *,
+    topic: str | None = None,
+    tolerance_s: float | None = None,
+) -> answers.Velocity:
+    """How fast the robot moved: the newest twist at or before a moment, within the tolerance."""
+    view, at, now = open_moment(memory, call, moment)
+    name = resolve_topic(view, topic or memory.limits.pose_topic)
+    found = _found_at(view, name, at, tolerance_s)
+    twist = _twist(view, found)
+    if twist is None:
+        raise InvalidArgumentsError(_carries_no("velocity", found))
+    return answers.Velocity(name, found.time, twist, view.notes, _age(found, now))
+
+
+def transform(
+    memory: Memory, call: Call, parent: str, child: str, moment: Moment
+) -> answers.TransformAt:
+    """The pose of `child` in `parent` at a moment, interpolated by tf2's rules."""
+    view, at, now = open_moment(memory, call, moment)
+    found = frame_history.transform_at(view, parent, child, at)
+    age = None if now is None else now - at
+    return answers.TransformAt(
+        parent, child, at, found.lookup.transform, found.clock, view.notes, age
+    )
+
+
+def frames(memory: Memory, call: Call) -> answers.Frames:
+    """Every frame and parent-child pair that was recorded."""
+    view = View(memory, call)
+    require_bags(view)
+    return answers.Frames(frame_history.edges(view), view.notes)
+
+
+def findlast_match(
+    memory: Memory,
+    call: Call,
+    topic: str,
+    condition_type: str,
+    value: JsonValue,
+    *,
+    field: str | None = None,
+    fields: Sequence[str] = (),
+) -> answers.Match:
+    """The newest message of a topic, or of all topics of a glob, that meets a condition."""
+    condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
+    view = View(memory, call, memory.clock.now())
+    found = last_match(view, topic, condition)
+    if found is None:
+        return answers.Match(None, unsearched(view))
+    now = memory.clock.now() if memory.limits.now == "wall" else view.snapshot.latest
+    return answers.Match(_value(view, found, fields, now), view.notes)
+
+
+def value_when(
+    memory: Memory,
+    call: Call,
+    value_topic: str,
+    condition_topic: str,
+    *,
+    condition_type: str,
+    value: JsonValue,
+    field: str | None = None,
+    fields: Sequence[str] = (),
+) -> answers.ValueWhen:
+    """What one topic held when another last met a condition: its value at or before the match."""
+    condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
+    view = View(memory, call, memory.clock.now())
+    name = resolve_topic(view, value_topic)
+    found = last_match(view, condition_topic, condition)
+    if found is None:
+        return answers.ValueWhen(None, notes=unsearched(view))
+    matched = _value(view, found, (), None)
+    held = view.newest(name, TimeWindow.until(found.time))
+    if held is None:
+        view.note(f"{name} held no message yet at {moment(found.time)}")
+        return answers.ValueWhen(matched, None, view.notes)
+    distance = found.time - held.time
+    if distance > ns_from_unix(memory.limits.time_tolerance_s) and not view.snapshot.is_latched(
+        name
+    ):
+        view.note(f"the value is {seconds(distance)} older than the match")
+    return answers.ValueWhen(matched, _value(view, held, fields, None), view.notes)
+
+
+def trajectory_summary(
+    memory: Memory, call: Call, span: Span, *, topic: str | None = None
+) -> answers.TrajectorySummary:
+    """The way driven in a window, from one pose topic in log-time order."""
+    view, window = open_span(memory, call, span)
+    name = resolve_topic(view, topic or memory.limits.pose_topic)
+    builder = TrajectoryBuilder(max_plausible_speed_mps=memory.limits.max_plausible_speed_mps)
+    first = last = None
+    frame_ids: dict[str, None] = {}
+    for found in view.stream([name], window):
+        pose, twist = _pose(view, found), _twist(view, found)
+        if pose is None:
+            raise InvalidArgumentsError(_carries_no("position", found))
+        frame_ids[pose.frame_id] = None
+        builder.add(found.time, pose, None if twist is None else math.hypot(*twist.linear))
+        first = found.time if first is None else first
+        last = found.time
+    if first is None or last is None:
+        raise nothing_between(view, (name,), window)
+    if len(frame_ids) > 1:
+        view.note(f"poses in several frames were joined: {', '.join(frame_ids)}")
+    _note_edges(view, window)
+    return answers.TrajectorySummary(
+        name, next(iter(frame_ids)), first, last, builder.result(), view.notes
+    )
+
+
+def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Found:
+    if tolerance_s is None and view.snapshot.is_latched(topic):
+        tolerance = None
+    else:
+        limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
+        tolerance = ns_argument("tolerance_s", limit)
+    start = MIN_NS if tolerance is None else max(at - tolerance, MIN_NS)
+    stop = min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
+    found = view.newest(topic, TimeWindow(start, stop))
+    if found is None:
+        raise nothing_at(view, (topic,), at, tolerance)
+    return found
+
+
+def _decode(view: View, found: Found) -> object:
+    try:
+        return view.memory.reader.decode(found.record)
+    except UndecodableError as error:
+        raise undecodable(error.topic, error.type_name, error) from error
+
+
+def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> answers.TopicValue:
+    """A message as a reply shows it, with the notes of the whole view so far."""
+    begin = time.perf_counter_ns()
+    channel = found.record.channel
+    shown = view.memory.extractor.shown(_decode(view, found), channel.type, fields)
+    view.call.stages.add("extract", time.perf_counter_ns() - begin)
+    return answers.TopicValue(
+        channel.topic,
+        channel.type,
+        Sample(found.time, shown.value),
+        (*view.notes, *shown.notes),
+        _age(found, now),
+    )
+
+
+def _samples(
+    view: View, chosen: Sequence[Found], fields: Sequence[str]
+) -> tuple[tuple[Sample, ...], list[str]]:
+    """The samples that can be decoded, and their types in order of appearance.
+
+    Raises:
+        NoDataError: none can.
+    """
+    samples: list[Sample] = []
+    types: dict[str, None] = {}
+    failures: Counter[str] = Counter()
+    for found in chosen:
+        try:
+            value = _value(view, found, fields, None)
+        except NoDataError as error:
+            failures[error.detail] += 1
+            continue
+        samples.append(value.sample)
+        types[value.type] = None
+        for sentence in value.notes:
+            view.note(sentence)
+    if failures and not samples:
+        raise NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
+    for detail, count in failures.items():
+        view.note(f"{count} samples left out: {detail}")
+    return tuple(samples), list(types)
+
+
+def _pose(view: View, found: Found) -> Pose | None:
+    return view.memory.extractor.pose(_decode(view, found), found.record.channel.type)
+
+
+def _twist(view: View, found: Found) -> Twist | None:
+    return view.memory.extractor.twist(_decode(view, found), found.record.channel.type)
+
+
+def _age(found: Found, now: Ns | None) -> Ns | None:
+    return None if now is None else now - found.time
+
+
+def _carries_no(what: str, found: Found) -> str:
+    channel = found.record.channel
+    return (
+        f"topic: {channel.topic} is a {channel.type}, which carries no {what}; "
+        "give a topic that does, such as one of type nav_msgs/msg/Odometry"
+    )
+
+
+def _undecodable_types(view: View, topic: str) -> dict[str, str]:
+    """Why messages of the topic cannot be decoded, by type; from one bag for each type."""
+    reasons: dict[str, str] = {}
+    seen: set[str] = set()
+    for bag, summary in view.snapshot.holding(topic):
+        if summary.type in seen:
+            continue
+        seen.add(summary.type)
+        for channel in view.channels(bag):
+            if channel.topic == topic and channel.type == summary.type:
+                reason = view.memory.reader.undecodable(channel)
+                if reason:
+                    reasons[summary.type] = reason
+    return reasons
+
+
+def _gaps(view: View) -> tuple[answers.Gap, ...]:
+    """Holes of more than two splits between one bag's end and the next one's start."""
+    longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
+    return tuple(_holes(view, longest))
+
+
+def _holes(view: View, longest: Ns) -> Iterator[answers.Gap]:
+    reach: Ns | None = None
+    for bag in view.snapshot.bags:
+        if reach is not None and bag.start - reach > longest:
+            yield answers.Gap(reach, bag.start)
+        reach = bag.end if reach is None else max(reach, bag.end)
+
+
+def _note_edges(view: View, window: TimeWindow) -> None:
+    """Says where a window was asked to reach past what the memory can answer."""
+    snapshot = view.snapshot
+    if snapshot.earliest is not None and window.start < snapshot.earliest:
+        view.note(f"the memory begins at {moment(snapshot.earliest)}")
+    if snapshot.latest is not None and window.stop - 1 > snapshot.latest and snapshot.active:
+        view.note(
+            f"the split being written is not included: nothing after {moment(snapshot.latest)}"
+        )
