@@ -1,0 +1,320 @@
+"""Conditions on one extracted value: `contains`, `equals` and `near_position`.
+
+They are tested on the whole value, before anything in it is downsampled or rounded. NaN and null
+match nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.geometry import distance
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.model import JsonValue, Vector3
+
+Scalar: TypeAlias = bool | int | float | str
+
+POSITION_KEYS: Final = ("position", "point", "translation")
+"""Keys under which a value holds a place; x and y under other keys may be a velocity or an axis."""
+
+# Bounded, since int() refuses texts of thousands of digits.
+_WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
+_DECIMAL: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
+_EXAMPLES: Final = {
+    "contains": 'condition_type "contains", value "scissors"',
+    "equals": 'condition_type "equals", value true',
+    "near_position": 'condition_type "near_position", value {"x": 1.5, "y": -0.2}',
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Contains:
+    """A text anywhere in the value, or an element of any list in it.
+
+    A text matches without regard to case, inside any string at any depth (not the keys); a number
+    or a boolean matches an equal element of a list, compared as `Equals` compares.
+    """
+
+    needle: Scalar
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether the value contains the needle."""
+        if isinstance(self.needle, str):
+            folded = self.needle.casefold()
+            return any(
+                isinstance(leaf, str) and folded in leaf.casefold() for leaf in _leaves(value)
+            )
+        equals = Equals(self.needle)
+        return any(equals.is_leaf(element) for element in _elements(value))
+
+
+@dataclass(frozen=True, slots=True)
+class Equals:
+    """A boolean, number or string that some leaf of the value is equal to.
+
+    A boolean is never a number. A number is equal to itself and to its float32 rounding, which is
+    what a float32 field holds of it. A string is compared to the letter; one that spells a
+    boolean or a number is equal to that, too, since planners put values in quotes.
+    """
+
+    value: Scalar
+    _boolean: bool | None = field(init=False, repr=False, compare=False)
+    _numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        meant = _spelled(self.value) if isinstance(self.value, str) else self.value
+        boolean = meant if isinstance(meant, bool) else None
+        numbers = () if meant is None or boolean is not None else (meant, _float32(meant))
+        object.__setattr__(self, "_boolean", boolean)
+        object.__setattr__(self, "_numbers", numbers)
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether any leaf at any depth is equal."""
+        return any(self.is_leaf(leaf) for leaf in _leaves(value))
+
+    def is_leaf(self, leaf: JsonValue) -> bool:
+        """Whether this leaf is equal."""
+        if isinstance(leaf, bool):
+            return leaf is self._boolean
+        if isinstance(leaf, int | float):
+            return any(leaf == number for number in self._numbers)
+        return isinstance(leaf, str) and leaf == self.value
+
+
+@dataclass(frozen=True, slots=True)
+class NearPosition:
+    """A place (m) within `tolerance_m`, inclusive; in the plane where `z` is None.
+
+    The frame is the value's own. A position without a finite x and y (and z, where one is asked)
+    is near nothing.
+    """
+
+    x: float
+    y: float
+    z: float | None
+    tolerance_m: float
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether any position in the value is near."""
+        return any(self.is_near(x, y, z) for x, y, z in positions(value))
+
+    def is_near(self, x: float, y: float, z: float) -> bool:
+        """Whether this position (m) is near; its z may be NaN where none is asked."""
+        here: Vector3 = (x, y, 0.0 if self.z is None else z)
+        return distance(here, (self.x, self.y, self.z or 0.0)) <= self.tolerance_m
+
+
+Test: TypeAlias = Contains | Equals | NearPosition
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """A test, and the dot-path of the part of the value that it is put to (None: all of it)."""
+
+    test: Test
+    field: str | None = None
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether the value, or any target of the field in it, meets the test."""
+        if self.field is None:
+            return self.test.matches(value)
+        return any(self.test.matches(target) for target in at_field(value, self.field))
+
+
+def parse_condition(
+    condition_type: str, value: JsonValue, tolerance_m: float, field: str | None = None
+) -> Condition:
+    """The condition that a planner's arguments mean.
+
+    Args:
+        condition_type: `contains`, `equals` or `near_position`.
+        value: a text, number or boolean; for `near_position` an object with x, y and perhaps z.
+        tolerance_m: how near `near_position` is.
+        field: dot-path in the value that narrows the test; None or blank for all of it.
+
+    Raises:
+        InvalidArgumentsError: the sentence says what is wrong and gives an example.
+    """
+    return Condition(_parse_test(condition_type, value, tolerance_m), (field or "").strip() or None)
+
+
+def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
+    """What stands at a dot-path in an extracted value; empty where there is nothing.
+
+    Over a list the path goes on in every element, unless the segment is a whole number: that one
+    element (negative: from the end). `detections.label` gives every label, `detections.0.label`
+    the first.
+    """
+    found: list[JsonValue] = [value]
+    for segment in dot_path.split("."):
+        found = [target for held in found for target in _step(held, segment)]
+    return found
+
+
+def positions(value: JsonValue) -> Iterator[Vector3]:
+    """The positions (m) in a value, with NaN for a coordinate that is missing or null.
+
+    The value itself where it is an object with x and y, or the elements of a list of those;
+    else the objects found at any depth under `position`, `point` or `translation`.
+    """
+    own = list(_own_positions(value))
+    if own:
+        yield from own
+        return
+    waiting: list[JsonValue] = [value]
+    while waiting:
+        held = waiting.pop()
+        if isinstance(held, list):
+            waiting.extend(reversed(held))
+        elif isinstance(held, dict):
+            for key in POSITION_KEYS:
+                yield from _own_positions(held.get(key))
+            waiting.extend(reversed(held.values()))
+
+
+def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Test:
+    if condition_type == "near_position":
+        return _parse_near(value, tolerance_m)
+    if condition_type not in _EXAMPLES:
+        raise InvalidArgumentsError(
+            f"condition_type '{condition_type}' is not one of {', '.join(_EXAMPLES)};"
+            f" for example {_EXAMPLES['contains']}"
+        )
+    example = f"for example {_EXAMPLES[condition_type]}"
+    if not isinstance(value, bool | int | float | str):
+        raise InvalidArgumentsError(
+            f"'{condition_type}' takes a text, a number or a boolean as value,"
+            f" not {_kind(value)}; {example}"
+        )
+    if isinstance(value, float) and math.isnan(value):
+        raise InvalidArgumentsError(f"the value is NaN, which nothing is equal to; {example}")
+    if condition_type == "equals":
+        return Equals(value)
+    if isinstance(value, str) and not value.strip():
+        raise InvalidArgumentsError(f"'contains' takes a text that is not blank; {example}")
+    return Contains(value)
+
+
+def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
+    example = f"for example {_EXAMPLES['near_position']}"
+    if not isinstance(value, dict):
+        raise InvalidArgumentsError(
+            f"'near_position' takes an object with x and y (and z) in metres as value,"
+            f" not {_kind(value)}; {example}"
+        )
+    if unknown := sorted(value.keys() - {"x", "y", "z"}):
+        raise InvalidArgumentsError(
+            f"'near_position' knows x, y and z only, not {', '.join(unknown)}; {example}"
+        )
+    for axis in ("x", "y", "z") if value.get("z") is not None else ("x", "y"):
+        if not math.isfinite(_coordinate(value.get(axis))):
+            raise InvalidArgumentsError(
+                f"'{axis}' of 'near_position' must be a finite number of metres,"
+                f" not {_kind(value.get(axis))}; {example}"
+            )
+    if not (math.isfinite(tolerance_m) and tolerance_m >= 0):
+        raise InvalidArgumentsError(
+            f"the tolerance must be a finite number of metres, 0 or more, not {tolerance_m}"
+        )
+    z = value.get("z")
+    return NearPosition(
+        _coordinate(value["x"]),
+        _coordinate(value["y"]),
+        None if z is None else _coordinate(z),
+        float(tolerance_m),
+    )
+
+
+def _kind(value: JsonValue) -> str:
+    """A value as it is named in a sentence."""
+    if isinstance(value, list):
+        return "a list"
+    return "an object" if isinstance(value, dict) else json.dumps(value)
+
+
+def _step(held: JsonValue, segment: str) -> Iterator[JsonValue]:
+    if isinstance(held, dict):
+        if segment in held:
+            yield held[segment]
+    elif isinstance(held, list):
+        if _INDEX.fullmatch(segment):
+            index = int(segment)
+            if -len(held) <= index < len(held):
+                yield held[index]
+        else:
+            for element in held:
+                yield from _step(element, segment)
+
+
+def _leaves(value: JsonValue) -> Iterator[JsonValue]:
+    """Everything at any depth that is neither a list nor an object."""
+    waiting = [value]
+    while waiting:
+        held = waiting.pop()
+        if isinstance(held, dict):
+            waiting.extend(held.values())
+        elif isinstance(held, list):
+            waiting.extend(held)
+        else:
+            yield held
+
+
+def _elements(value: JsonValue) -> Iterator[JsonValue]:
+    """Every element of every list at any depth."""
+    waiting = [value]
+    while waiting:
+        held = waiting.pop()
+        if isinstance(held, dict):
+            waiting.extend(held.values())
+        elif isinstance(held, list):
+            yield from held
+            waiting.extend(held)
+
+
+def _own_positions(value: JsonValue) -> Iterator[Vector3]:
+    for held in value if isinstance(value, list) else (value,):
+        # Null is a coordinate that was NaN; texts and lists are not coordinates at all.
+        if isinstance(held, dict) and all(
+            axis in held and isinstance(held[axis], int | float | None) for axis in ("x", "y")
+        ):
+            x, y = _coordinate(held["x"]), _coordinate(held["y"])
+            yield (x, y, _coordinate(held.get("z")))
+
+
+def _coordinate(value: JsonValue) -> float:
+    """The number as metres; NaN for anything else, so that it is near nothing."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _spelled(text: str) -> bool | int | float | None:
+    """The boolean or number that a text spells."""
+    word = text.strip().casefold()
+    if word in {"true", "false"}:
+        return word == "true"
+    if _WHOLE.fullmatch(word):
+        return int(word)
+    return float(word) if _DECIMAL.fullmatch(word) else None
+
+
+def _float32(number: float) -> float:
+    """The number rounded to a float32; itself where a float32 cannot hold it."""
+    try:
+        rounded: float = struct.unpack("<f", struct.pack("<f", number))[0]
+    except OverflowError:
+        return number
+    return rounded
