@@ -1,0 +1,258 @@
+"""One recording of the simulated robot, laid out as `ros2 bag record` lays it out.
+
+A directory with splits `<name>_<i>.mcap` (profile `ros2`, CDR, ros2msg definitions with all nested
+ones, the publishers' QoS on each channel, every channel in every split, zstd chunks small enough
+that data reaches the disk within seconds), and at a clean close `metadata.yaml` (version 9). A
+split ends when a message arrives more than the split duration after its first message, and gets
+its footer just after the next one was opened.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from typing import IO, TYPE_CHECKING, Final, Self
+
+import yaml
+from mcap.writer import CompressionType, Writer
+
+from ros2_memory.demo.messages import definition, payload
+from ros2_memory.demo.streams import STREAMS
+from ros2_memory.timebase import Ns, WallClock, ns_from_unix, unix_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from types import TracebackType
+
+    from ros2_memory.demo.streams import Message, Stream, Timeline
+    from ros2_memory.model import JsonValue
+    from ros2_memory.timebase import Clock
+
+_CHUNK_BYTES: Final = 16 * 1024
+_FOR_EVER: Final[dict[str, JsonValue]] = {"sec": 9223372036, "nsec": 854775807}
+_STOP_WITHIN_S: Final = 10.0
+
+
+class Split:
+    """One MCAP file while it is written; `first` and `last` are log times, None while empty."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.first: Ns | None = None
+        self.last: Ns | None = None
+        self.count = 0
+        self._file: IO[bytes] = path.open("xb")
+        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library="ros2-memory demo")
+        schemas = {
+            name: self._writer.register_schema(name, "ros2msg", definition(name).encode())
+            for name in dict.fromkeys(stream.type for stream in STREAMS)
+        }
+        self._channels = {
+            stream.topic: self._writer.register_channel(
+                stream.topic,
+                "cdr",
+                schemas[stream.type],
+                {"offered_qos_profiles": yaml.safe_dump([_qos(stream)], sort_keys=False)},
+            )
+            for stream in STREAMS
+        }
+
+    def full(self, log_time: Ns, duration: Ns) -> bool:
+        """Whether a message of this log time belongs into the next split."""
+        return self.first is not None and log_time - self.first > duration
+
+    def add(self, message: Message) -> None:
+        """Appends one message."""
+        self._writer.add_message(
+            self._channels[message.stream.topic],
+            message.log_time,
+            payload(message),
+            message.publish_time,
+            self.count,
+        )
+        self.first = message.log_time if self.first is None else self.first
+        self.last = message.log_time
+        self.count += 1
+
+    def flush(self) -> None:
+        """Hands every finished chunk to the operating system."""
+        self._file.flush()
+
+    def close(self) -> None:
+        """Writes the last chunk, the summary and the footer."""
+        try:
+            self._writer.finish()
+        finally:
+            self._file.close()
+
+    def as_metadata(self) -> dict[str, JsonValue]:
+        """How metadata.yaml tells of this file."""
+        first, last = self.first or 0, self.last or 0
+        return {
+            "path": self.path.name,
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "duration": {"nanoseconds": last - first},
+            "message_count": self.count,
+        }
+
+
+class DemoRecorder:
+    """Writes what a `Timeline` says into `directory`, first at once up to now, then as it happens.
+
+    The directory must not exist (as with `ros2 bag record`); its name is the recording's. As a
+    context manager it stops at the end of the block, and leaves a cleanly closed recording.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        timeline: Timeline,
+        *,
+        split_duration_s: float = 5.0,
+        clock: Clock | None = None,
+    ) -> None:
+        directory.mkdir(parents=True)
+        self.directory = directory
+        self.timeline = timeline
+        self._duration = ns_from_unix(split_duration_s)
+        self._clock = clock or WallClock()
+        self._due: Iterator[Message] = timeline.everything()
+        self._next = next(self._due)
+        self._splits: list[Split] = []
+        self._closed: list[tuple[Ns, Ns]] = []
+        self._counts: Counter[str] = Counter()
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: OSError | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    @property
+    def failure(self) -> OSError | None:
+        """What ended the live recording early (a full disk), if something did."""
+        return self._failure
+
+    @property
+    def splits(self) -> int:
+        """How many files there are; all but the last are closed until `stop` closes that too."""
+        return len(self._splits)
+
+    def closed_end(self, at: Ns) -> Ns:
+        """The log time of the last message in a split that was closed by `at`.
+
+        The recording's start while no split was closed.
+        """
+        ends = (end for closed, end in list(self._closed) if closed <= at)
+        return max(ends, default=self.timeline.start)
+
+    def write_until(self, now: Ns) -> None:
+        """Writes every message that the recorder has heard by `now`.
+
+        Raises:
+            OSError: the disk does not take it.
+        """
+        while self._next.log_time <= now:
+            self._write(self._next)
+            self._next = next(self._due)
+        if self._splits:
+            self._splits[-1].flush()
+
+    def start(self) -> None:
+        """Goes on as time passes, in a thread of its own, until `stop`."""
+        self._thread = threading.Thread(target=self._live, name="demo-recorder", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the recording as a clean shutdown does: a footer, and metadata.yaml.
+
+        Raises:
+            OSError: the disk does not take it.
+        """
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join(_STOP_WITHIN_S)
+            self._thread = None
+        still_open = self._splits[len(self._closed) :]
+        for split in still_open:
+            self._close(split)
+        if still_open:
+            text = yaml.safe_dump(self._metadata(), sort_keys=False)
+            (self.directory / "metadata.yaml").write_text(text)
+
+    def _live(self) -> None:
+        try:
+            while not self._ending.wait(unix_from_ns(self._next.log_time - self._clock.now())):
+                self.write_until(self._clock.now())
+        except OSError as error:
+            self._failure = error
+
+    def _write(self, message: Message) -> None:
+        if not self._splits or self._splits[-1].full(message.log_time, self._duration):
+            name = f"{self.directory.name}_{len(self._splits)}.mcap"
+            self._splits.append(Split(self.directory / name))
+            if len(self._splits) > 1:
+                self._close(self._splits[-2])
+        self._splits[-1].add(message)
+        self._counts[message.stream.topic] += 1
+
+    def _close(self, split: Split) -> None:
+        split.close()
+        self._closed.append((self._clock.now(), split.last or self.timeline.start))
+
+    def _metadata(self) -> dict[str, JsonValue]:
+        first = self._splits[0].first or 0
+        last = self._splits[-1].last or 0
+        return {
+            "rosbag2_bagfile_information": {
+                "version": 9,
+                "storage_identifier": "mcap",
+                "duration": {"nanoseconds": last - first},
+                "starting_time": {"nanoseconds_since_epoch": first},
+                "message_count": sum(self._counts.values()),
+                "topics_with_message_count": [
+                    {
+                        "topic_metadata": {
+                            "name": stream.topic,
+                            "type": stream.type,
+                            "serialization_format": "cdr",
+                            "offered_qos_profiles": [_qos(stream)],
+                            "type_description_hash": "",
+                        },
+                        "message_count": self._counts[stream.topic],
+                    }
+                    for stream in STREAMS
+                ],
+                "compression_format": "",
+                "compression_mode": "",
+                "relative_file_paths": [split.path.name for split in self._splits],
+                "files": [split.as_metadata() for split in self._splits],
+                "custom_data": None,
+                "ros_distro": "jazzy",
+            }
+        }
+
+
+def _qos(stream: Stream) -> dict[str, JsonValue]:
+    """What the publisher offers, in rosbag2's words."""
+    return {
+        "history": "unknown",
+        "depth": 0,
+        "reliability": "reliable" if stream.reliable else "best_effort",
+        "durability": "transient_local" if stream.latched else "volatile",
+        "deadline": dict(_FOR_EVER),
+        "lifespan": dict(_FOR_EVER),
+        "liveliness": "automatic",
+        "liveliness_lease_duration": dict(_FOR_EVER),
+        "avoid_ros_namespace_conventions": False,
+    }

@@ -1,0 +1,210 @@
+"""Where the simulated robot is and what it senses: closed forms of the time t (s) since its start.
+
+It drives one lap for ever: from its dock in the living room to the front door in the hall, on to
+the kitchen counter, and back. A lap is a chain of legs, each from rest to rest along a curve of
+constant curvature with the eased progress e(u) = u - sin(2 pi u) / (2 pi), u in [0, 1]: pose and
+velocity are continuous, and velocity, distance and pose are exact.
+
+Poses are in `odom`, whose origin is the dock and whose x axis points north; `MAP_TO_ODOM` says
+where that is in `map` (the frame of `flat`). Frames and axes follow REP-103 and REP-105.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.demo.flat import THINGS, room_at, wall_distances
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ros2_memory.model import Vector3
+
+
+def wrapped(angle: float) -> float:
+    """The same direction in (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
+
+
+class Planar(NamedTuple):
+    """A pose in the plane: metres, and `yaw` in radians from the x axis, in (-pi, pi]."""
+
+    x: float
+    y: float
+    yaw: float
+
+    def then(self, step: Planar) -> Planar:
+        """The pose that is `step` when seen from this one."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return Planar(
+            self.x + cos * step.x - sin * step.y,
+            self.y + sin * step.x + cos * step.y,
+            wrapped(self.yaw + step.yaw),
+        )
+
+    def inverse(self) -> Planar:
+        """The pose of the origin when seen from this one."""
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return Planar(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, wrapped(-self.yaw))
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A motion from rest to rest: `length` (m, negative: backwards) while turning by `turn` (rad).
+
+    Without a length it turns on the spot, without a turn it goes straight, without both it waits.
+    """
+
+    duration: float
+    length: float = 0.0
+    turn: float = 0.0
+
+    def after(self, progress: float) -> Planar:
+        """The pose, seen from the leg's start, when the fraction `progress` of it is done."""
+        length, turn = self.length * progress, self.turn * progress
+        if not self.turn:
+            return Planar(length, 0.0, 0.0)
+        radius = self.length / self.turn
+        return Planar(radius * math.sin(turn), radius * (1.0 - math.cos(turn)), turn)
+
+
+class Thing(NamedTuple):
+    """Something the camera sees; `point` (m) is where it is in `base_link`."""
+
+    label: str
+    score: float
+    point: Vector3
+
+
+_RIGHT: Final = math.pi / 2
+MAP_TO_ODOM: Final = Planar(1.0, 1.0, _RIGHT)
+CAMERA: Final[Vector3] = (0.15, 0.0, 0.30)
+LASER: Final[Vector3] = (0.10, 0.0, 0.20)
+"""Where the camera and the laser sit in `base_link`; both look straight ahead."""
+
+FRONT_DOOR: Final = Planar(6.0, 3.2, _RIGHT)
+KITCHEN_COUNTER: Final = Planar(10.0, 3.0, _RIGHT)
+"""Two of the places where the robot stops, in `map`."""
+
+LAP: Final = (
+    Leg(4.0, length=_RIGHT, turn=-_RIGHT),  # off the dock, towards the hall
+    Leg(8.0, length=4.0),
+    Leg(2.5, turn=_RIGHT),
+    Leg(3.5, length=1.2),
+    Leg(4.0),  # at the front door
+    Leg(3.5, length=-1.2),  # backs off, eyes on the door
+    Leg(2.5, turn=-_RIGHT),
+    Leg(6.0, length=3.0),
+    Leg(4.0, length=_RIGHT, turn=_RIGHT),
+    Leg(4.0),  # at the kitchen counter
+    Leg(5.0, turn=math.pi),
+    Leg(4.0, length=_RIGHT, turn=-_RIGHT),
+    Leg(12.0, length=7.0),  # through all rooms, home
+    Leg(4.0, length=_RIGHT, turn=_RIGHT),
+    Leg(5.0, turn=-math.pi),
+    Leg(8.0),  # on the dock, charging
+)
+LAP_S: Final = sum(leg.duration for leg in LAP)
+LAP_M: Final = sum(abs(leg.length) for leg in LAP)
+_CHARGING_S: Final = LAP[-1].duration
+_STARTS: Final = tuple(accumulate((leg.duration for leg in LAP), initial=0.0))
+_POSES: Final = tuple(
+    accumulate(LAP, lambda pose, leg: pose.then(leg.after(1.0)), initial=Planar(0.0, 0.0, 0.0))
+)
+_DRIVEN: Final = tuple(accumulate((abs(leg.length) for leg in LAP), initial=0.0))
+
+SCAN_BEAMS: Final = 360
+SCAN_START: Final = -math.pi
+SCAN_STEP: Final = 2.0 * math.pi / SCAN_BEAMS
+_BEAMS: Final = np.array([SCAN_START + beam * SCAN_STEP for beam in range(SCAN_BEAMS)])
+_AHEAD: Final = np.array([beam * SCAN_STEP for beam in range(-15, 16)])
+CLEAR_M: Final = 1.0
+SIGHT_M: Final = 3.0
+SIGHT_HALF_ANGLE: Final = math.radians(40.0)
+
+
+def pose(t: float) -> Planar:
+    """Where the robot is, in `odom`."""
+    index, share = _leg(t)
+    return _POSES[index].then(LAP[index].after(_eased(share)))
+
+
+def pose_in_map(t: float) -> Planar:
+    """Where the robot is, in `map`."""
+    return MAP_TO_ODOM.then(pose(t))
+
+
+def twist(t: float) -> tuple[float, float]:
+    """Forward speed (m/s) and turning rate (rad/s, left positive), in `base_link`."""
+    index, share = _leg(t)
+    leg = LAP[index]
+    rate = (1.0 - math.cos(2.0 * math.pi * share)) / leg.duration
+    return leg.length * rate, leg.turn * rate
+
+
+def driven(t: float) -> float:
+    """The length (m) of the way driven from 0 to t, backwards driving counted too."""
+    index, share = _leg(t)
+    return (t // LAP_S) * LAP_M + _DRIVEN[index] + abs(LAP[index].length) * _eased(share)
+
+
+def place(t: float) -> str:
+    """The name of the room the robot is in."""
+    return room_at(pose_in_map(t).x)
+
+
+def seen(t: float) -> tuple[Thing, ...]:
+    """What the camera sees, nearest first: near enough, in its field of view, no wall between."""
+    here = pose_in_map(t)
+    camera = here.then(Planar(CAMERA[0], CAMERA[1], 0.0))
+    to_base = here.inverse()
+    things: list[Thing] = []
+    for label, (x, y, z) in THINGS.items():
+        bearing = math.atan2(y - camera.y, x - camera.x)
+        distance = math.hypot(x - camera.x, y - camera.y)
+        if distance > SIGHT_M or abs(wrapped(bearing - camera.yaw)) > SIGHT_HALF_ANGLE:
+            continue
+        if wall_distances(camera.x, camera.y, np.array([bearing]))[0] < distance:
+            continue
+        there = to_base.then(Planar(x, y, 0.0))
+        things.append(Thing(label, round(0.97 - 0.1 * distance, 2), (there.x, there.y, z)))
+    return tuple(sorted(things, key=lambda thing: -thing.score))
+
+
+def scan(t: float) -> NDArray[np.float64]:
+    """Distance (m) from the laser to the walls for each beam, the first one looking backwards."""
+    return _ranges(t, _BEAMS)
+
+
+def path_clear(t: float) -> bool:
+    """Whether no wall is nearer than `CLEAR_M` to the laser within 15 degrees of straight ahead."""
+    return bool(_ranges(t, _AHEAD).min() > CLEAR_M)
+
+
+def battery(t: float) -> float:
+    """The charge, 0 to 1: it falls evenly on the way and is regained on the dock."""
+    phase = t % LAP_S
+    driving = LAP_S - _CHARGING_S
+    spent = phase / driving if phase < driving else (LAP_S - phase) / _CHARGING_S
+    return 0.90 - 0.08 * spent
+
+
+def _ranges(t: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    laser = pose_in_map(t).then(Planar(LASER[0], LASER[1], 0.0))
+    return wall_distances(laser.x, laser.y, laser.yaw + angles)
+
+
+def _leg(t: float) -> tuple[int, float]:
+    """The leg under way and which share of its duration has passed, in [0, 1]."""
+    phase = t % LAP_S
+    index = max(i for i, start in enumerate(_STARTS[:-1]) if start <= phase)
+    return index, (phase - _STARTS[index]) / LAP[index].duration
+
+
+def _eased(share: float) -> float:
+    return share - math.sin(2.0 * math.pi * share) / (2.0 * math.pi)
