@@ -1,0 +1,143 @@
+"""Log events: where they go and what they look like."""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import structlog
+
+from ros2_memory.logs import configure_logging, get_logger
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture(autouse=True)
+def restored_logging() -> Iterator[None]:
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    # pytest's own handlers stand on the root logger, and the set-up closes what it replaces.
+    root.handlers = []
+    yield
+    root.level, root.handlers = level, handlers
+    logging.captureWarnings(capture=False)
+    structlog.reset_defaults()
+
+
+def events(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    out, err = capsys.readouterr()
+    assert out == ""
+    return [json.loads(line) for line in err.splitlines()]
+
+
+def fail(reason: str) -> None:
+    secret = "hunter" + str(len("ab"))
+    assert secret
+    raise ValueError(reason)
+
+
+def log_failure(reason: str) -> None:
+    try:
+        fail(reason)
+    except ValueError:
+        get_logger("ours").exception("scan failed")
+
+
+def test_an_event_is_one_json_object_on_stderr_with_utc_time(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log = get_logger("ros2_memory.index")
+    configure_logging("info", "json")
+    log.info("indexed", bags=3, duration_ms=1.5)
+    (event,) = events(capsys)
+    stamp = datetime.fromisoformat(event.pop("timestamp"))
+    assert stamp.tzinfo == UTC
+    assert event == {
+        "event": "indexed",
+        "bags": 3,
+        "duration_ms": 1.5,
+        "logger": "ros2_memory.index",
+        "level": "info",
+    }
+
+
+def test_what_libraries_log_has_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("info", "json")
+    logging.getLogger("uvicorn.error").warning("port %d is busy", 9203)
+    (event,) = events(capsys)
+    assert datetime.fromisoformat(event.pop("timestamp")).tzinfo == UTC
+    assert event == {"event": "port 9203 is busy", "logger": "uvicorn.error", "level": "warning"}
+
+
+def test_warnings_have_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("info", "json")
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        logging.captureWarnings(capture=True)
+        warnings.warn("the disk is slow", UserWarning, stacklevel=1)
+    (event,) = events(capsys)
+    assert event["logger"] == "py.warnings"
+    assert "the disk is slow" in event["event"]
+
+
+def test_a_bound_correlation_id_joins_every_event(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("info", "json")
+    with structlog.contextvars.bound_contextvars(call_id="c1"):
+        get_logger("ours").info("read")
+        logging.getLogger("theirs").info("read")
+    get_logger("ours").info("idle")
+    assert [event.get("call_id") for event in events(capsys)] == ["c1", "c1", None]
+
+
+def test_events_below_the_level_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("warning", "json")
+    for log in (get_logger("ours"), logging.getLogger("theirs")):
+        log.info("small")
+        log.warning("large")
+    assert [event["event"] for event in events(capsys)] == ["large", "large"]
+
+
+def test_an_exception_is_one_line_of_json(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("info", "json")
+    log_failure("bad bag")
+    (event,) = events(capsys)
+    assert event["level"] == "error"
+    assert "ValueError: bad bag" in event["exception"]
+
+
+@pytest.mark.parametrize("layout", ["json", "pretty"])
+def test_an_exception_does_not_show_local_variables(
+    layout: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configure_logging("info", "json" if layout == "json" else "pretty")
+    log_failure("bad bag")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "ValueError: bad bag" in err
+    assert "hunter2" not in err
+
+
+def test_pretty_events_are_for_people_and_plain_without_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    configure_logging("debug", "pretty")
+    get_logger("ours").debug("read", bags=3)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "read" in err
+    assert "bags=3" in err
+    assert "\x1b" not in err
+
+
+def test_a_second_configuration_replaces_the_first(capsys: pytest.CaptureFixture[str]) -> None:
+    log = get_logger("ours")
+    configure_logging("error", "json")
+    log.info("early")
+    configure_logging("info", "json")
+    log.info("late")
+    assert [event["event"] for event in events(capsys)] == ["late"]
