@@ -46,6 +46,10 @@ class Contains:
     """
 
     needle: Scalar
+    _equals: Equals = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_equals", Equals(self.needle))
 
     def matches(self, value: JsonValue) -> bool:
         """Whether the value contains the needle."""
@@ -54,8 +58,7 @@ class Contains:
             return any(
                 isinstance(leaf, str) and folded in leaf.casefold() for leaf in _leaves(value)
             )
-        equals = Equals(self.needle)
-        return any(equals.is_leaf(element) for element in _elements(value))
+        return any(self._equals.is_leaf(element) for element in _elements(value))
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +71,9 @@ class Equals:
     """
 
     value: Scalar
-    _boolean: bool | None = field(init=False, repr=False, compare=False)
-    _numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
+    # Compared too: without them Equals(True) and Equals(1) would be one condition.
+    _boolean: bool | None = field(init=False, repr=False)
+    _numbers: tuple[int | float, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         meant = _spelled(self.value) if isinstance(self.value, str) else self.value
