@@ -1,0 +1,285 @@
+"""Messages into plain values, by a map of dot-paths for each message type.
+
+The schema map (`config/message_schemas.yaml`) names, for a type, the fields that a reply shows
+and the path at which each stands in the message. The names `position` and `orientation`,
+`linear_velocity` and `angular_velocity` also tell where a pose and a twist are. Types that are not
+in the map are shown with all their fields.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.errors import ConfigError, InvalidArgumentsError
+from ros2_memory.messages import ABSENT, Route, Segments, descend, names_of, parse_path
+from ros2_memory.model import JsonValue, Pose, StampedTransform, Transform, Twist
+from ros2_memory.rendering import MAX_SQUEEZE, Exact, Rendering, Shown
+from ros2_memory.views import Kind, kind_of, nanoseconds, rotation, view, xyz, xyzw
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from ros2_memory.model import Vector3
+    from ros2_memory.timebase import Ns
+
+MAX_SHOWN_CHARS: Final = 20_000
+"""A shown value longer than this would fill a reply alone, and is thinned harder."""
+
+_LISTED_NAMES: Final = 40
+_NOWHERE: Final = Route("")
+
+
+@dataclass(frozen=True, slots=True)
+class Extracted:
+    """A value as it leaves, and sentences on what was left out of it."""
+
+    value: JsonValue
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """What the schema map says of one type, compiled. Pairs of routes are tried in order."""
+
+    fields: tuple[tuple[str, Segments], ...]
+    poses: tuple[tuple[Route, Route], ...]
+    twists: tuple[tuple[Route, Route], ...]
+
+    def path(self, name: str) -> Segments | None:
+        """The path of a field."""
+        return next((path for field, path in self.fields if field == name), None)
+
+
+def _pair(*segments: str, of: tuple[str, str]) -> tuple[Route, Route]:
+    return Route(*segments, of[0]), Route(*segments, of[1])
+
+
+_UNMAPPED: Final = _Plan(
+    fields=(),
+    poses=tuple(
+        _pair(*prefix, of=("position", "orientation"))
+        for prefix in (("pose", "pose"), ("pose",), ())
+    ),
+    twists=tuple(
+        _pair(*prefix, of=("linear", "angular")) for prefix in (("twist", "twist"), ("twist",))
+    ),
+)
+_FRAME: Final = Route("header", "frame_id")
+_CHILD_FRAME: Final = Route("child_frame_id")
+_STAMP: Final = Route("header", "stamp")
+_TRANSFORMS: Final = Route("transforms")
+_TRANSLATION: Final = Route("transform", "translation")
+_ROTATION: Final = Route("transform", "rotation")
+
+
+class SchemaExtractor:
+    """Reads decoded messages: ROS messages by the schema map, JSON as what it says.
+
+    Args:
+        schemas: for each message type, the name of each field and its dot-path.
+        max_array_length: the most elements of any array, and bytes of any byte array, in a value
+            that is shown.
+        max_chars: how long one shown value may be, as JSON text, before it is thinned harder.
+
+    Raises:
+        ConfigError: a field's name or path is malformed, or a limit is below 1.
+    """
+
+    def __init__(
+        self,
+        schemas: Mapping[str, Mapping[str, str]],
+        max_array_length: int,
+        *,
+        max_chars: int = MAX_SHOWN_CHARS,
+    ) -> None:
+        if max_array_length < 1:
+            raise ConfigError(f"max_array_length is {max_array_length}; it must be at least 1")
+        self._limit = max_array_length
+        self._max_chars = max_chars
+        self._plans = {name: _compile(name, fields) for name, fields in schemas.items()}
+
+    def fields_of(self, type_name: str) -> tuple[str, ...]:
+        """The fields that the schema map names for a type, in its order; none if it has none."""
+        return tuple(name for name, _ in self._plan(type_name).fields)
+
+    def exact(self, message: object, type_name: str) -> JsonValue:
+        """The whole extracted value, neither thinned nor rounded: what conditions are tested on.
+
+        NaN and infinities stay; angles are in degrees, times in seconds. Byte arrays longer than
+        the limit, and the data of images, point clouds and maps, are summaries here too.
+        """
+        return self._whole(Exact(self._limit), message, type_name)
+
+    def shown(self, message: object, type_name: str, fields: Sequence[str] = ()) -> Extracted:
+        """The value as it leaves in a reply: strict JSON, thinned and rounded, with notes.
+
+        Args:
+            message: the decoded message.
+            type_name: its type.
+            fields: dot-paths that narrow the value; it is then an object keyed by them. A path
+                means the extracted value's own field, or else the full path in the message.
+
+        Raises:
+            InvalidArgumentsError: a path of `fields` leads nowhere; says what there is.
+        """
+        nodes = {path: self._find(message, type_name, path) for path in fields}
+        limit, squeeze = self._limit, 1
+        while True:
+            rendering = Shown(limit, squeeze)
+            value: JsonValue = (
+                {path: rendering.value(node, path) for path, node in nodes.items()}
+                if nodes
+                else self._whole(rendering, message, type_name)
+            )
+            fits = len(json.dumps(value, separators=(",", ":"))) <= self._max_chars
+            if fits or (limit == 1 and squeeze >= MAX_SQUEEZE):
+                return Extracted(value, rendering.notes)
+            limit, squeeze = max(limit // 2, 1), squeeze * 2
+
+    def pose(self, message: object, type_name: str) -> Pose | None:
+        """The pose that a message carries, in its header's frame; None where it carries none.
+
+        By the schema map's `position` and `orientation`; for a type that is not in the map, by a
+        point at `pose.pose.position`, `pose.position` or `position`. Coordinates are as they
+        stand, NaN included.
+        """
+        for position, orientation in self._plan(type_name).poses:
+            where = xyz(position.of(message))
+            if where is not None:
+                return Pose(where, rotation(orientation.of(message)), _text(_FRAME.of(message)))
+        return None
+
+    def twist(self, message: object, type_name: str) -> Twist | None:
+        """The velocity that a message carries; None where it carries none.
+
+        By the schema map's `linear_velocity` and `angular_velocity`; for a type that is not in the
+        map, by vectors at `twist.twist` or `twist`. It is expressed in the child frame where the
+        message names one (nav_msgs/Odometry), otherwise in the header's frame.
+        """
+        for linear, angular in self._plan(type_name).twists:
+            along, about = xyz(linear.of(message)), xyz(angular.of(message))
+            if along is not None and about is not None:
+                frame = _text(_CHILD_FRAME.of(message)) or _text(_FRAME.of(message))
+                return Twist(along, about, frame)
+        return None
+
+    def stamp(self, message: object) -> Ns | None:
+        """The time in a message's header; None where it has none."""
+        return nanoseconds(_STAMP.of(message))
+
+    def transforms(
+        self, message: object, log_time: Ns, *, static: bool
+    ) -> tuple[StampedTransform, ...]:
+        """The edges of a tf2_msgs/TFMessage, rotations normalised, frames without leading slash.
+
+        Left out, as tf2's buffer refuses them: an edge without a frame name or from a frame to
+        itself, and one whose numbers are not finite or whose quaternion is zero.
+        """
+        listed = _TRANSFORMS.of(message)
+        if not isinstance(listed, list):
+            return ()
+        edges = (_edge(one, log_time, static=static) for one in listed)
+        return tuple(edge for edge in edges if edge is not None)
+
+    def _plan(self, type_name: str) -> _Plan:
+        plan = self._plans.get(type_name)
+        if plan is None and type_name.count("/") == 1:  # as recorders before 2019 wrote it
+            plan = self._plans.get(type_name.replace("/", "/msg/"))
+        return _UNMAPPED if plan is None else plan
+
+    def _whole(self, rendering: Rendering, message: object, type_name: str) -> JsonValue:
+        plan = self._plan(type_name)
+        nodes = [(name, _at(message, path)) for name, path in plan.fields]
+        absent = [name for name, node in nodes if node is ABSENT]
+        for name in absent:
+            rendering.say("absent", name, f"{name}: this message has no such field")
+        if len(absent) == len(nodes):
+            return rendering.value(message, "")
+        return {name: rendering.value(node, name) for name, node in nodes}
+
+    def _find(self, message: object, type_name: str, path: str) -> object:
+        plan = self._plan(type_name)
+        segments = tuple(path.split("."))
+        mapped = plan.path(segments[0])
+        if mapped is not None:
+            found = descend(_at(message, mapped), segments[1:], view)
+        else:
+            found = ABSENT if plan.fields else descend(message, segments, view)
+        if found is ABSENT:
+            found = _plain(descend(message, segments))
+        if found is ABSENT:
+            raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
+        return found
+
+
+def _compile(type_name: str, fields: Mapping[str, str]) -> _Plan:
+    paths: dict[str, Segments] = {}
+    for name, path in fields.items():
+        segments = parse_path(path)
+        if segments is None or not name or "." in name:
+            raise ConfigError(
+                f"message schema {type_name}: {name}: {path!r} is not a dot-path of a message; "
+                "give field names joined by dots, such as pose.pose.position"
+            )
+        paths[name] = segments
+    return _Plan(
+        fields=tuple(paths.items()),
+        poses=_routes(paths, "position", "orientation", optional=True),
+        twists=_routes(paths, "linear_velocity", "angular_velocity", optional=False),
+    )
+
+
+def _routes(
+    paths: Mapping[str, Segments], first: str, second: str, *, optional: bool
+) -> tuple[tuple[Route, Route], ...]:
+    if first not in paths or (second not in paths and not optional):
+        return ()
+    return ((Route(*paths[first]), Route(*paths[second]) if second in paths else _NOWHERE),)
+
+
+def _at(message: object, path: Segments) -> object:
+    found = descend(message, path, view)
+    return descend(message, path) if found is ABSENT else found
+
+
+def _plain(node: object) -> object:
+    """A node that was named by its full path: a quaternion so named is wanted as x, y, z, w."""
+    if isinstance(node, list):
+        return [_plain(one) for one in node]
+    numbers = xyzw(node) if kind_of(node) is Kind.QUATERNION else None
+    return node if numbers is None else dict(zip("xyzw", numbers, strict=True))
+
+
+def _no_such_field(type_name: str, path: str, plan: _Plan, message: object) -> str:
+    standing = names_of(message)
+    listed = ", ".join(standing[:_LISTED_NAMES]) + (", ..." if standing[_LISTED_NAMES:] else "")
+    if not plan.fields:
+        there = f"its fields are: {listed}" if listed else "it has no fields"
+        return f"{type_name} has no field {path!r}; {there}"
+    shown = ", ".join(name for name, _ in plan.fields)
+    return (
+        f"{type_name} has no field {path!r}; its fields are: {shown}; "
+        f"or give a full path in the message, which begins with one of: {listed}"
+    )
+
+
+def _text(node: object) -> str:
+    return node if isinstance(node, str) else ""
+
+
+def _edge(node: object, log_time: Ns, *, static: bool) -> StampedTransform | None:
+    parent = _text(_FRAME.of(node)).removeprefix("/")
+    child = _text(_CHILD_FRAME.of(node)).removeprefix("/")
+    stamp = nanoseconds(_STAMP.of(node))
+    translation, turn = xyz(_TRANSLATION.of(node)), rotation(_ROTATION.of(node))
+    if not parent or not child or parent == child or stamp is None:
+        return None
+    if translation is None or turn is None or not _finite(translation):
+        return None
+    return StampedTransform(parent, child, stamp, log_time, Transform(translation, turn), static)
+
+
+def _finite(vector: Vector3) -> bool:
+    return all(part - part == 0 for part in vector)
