@@ -319,6 +319,6 @@ def _float32(number: float) -> float:
     """The number rounded to a float32; itself where a float32 cannot hold it."""
     try:
         rounded: float = struct.unpack("<f", struct.pack("<f", number))[0]
-    except OverflowError:
+    except (OverflowError, struct.error):
         return number
     return rounded
