@@ -129,6 +129,11 @@ class TrajectoryBuilder:
         self._motion.add(time, pose.position)
         self._path.add((time, pose.position, pose.orientation))
 
+    @property
+    def vertices(self) -> int:
+        """How many poses are held to draw the path: about 25,000 at most."""
+        return self._path.size
+
     def result(self) -> Trajectory:
         """The trajectory so far; more poses may be added after."""
         motion = self._motion
@@ -211,6 +216,10 @@ class _Path:
         self._merged: _Vertex | None = None
         self._merged_m = 0.0
         self._dropped_m = 0.0
+
+    @property
+    def size(self) -> int:
+        return len(self._kept) + len(self._block)
 
     def add(self, vertex: _Vertex) -> None:
         if self._block:
