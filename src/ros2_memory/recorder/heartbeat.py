@@ -1,0 +1,194 @@
+"""`recorder.json` in the bag directory: what the recorder says of itself every few seconds.
+
+The recorder writes it, the query server reads it. A reader must expect anything: another version's
+file, half a file, a file of the operator's. So reading never fails; it says why there is nothing.
+A recorder names a recording here before it creates its first file: with a live heartbeat, an open
+file of a recording that is not named counts as left behind by a crash.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.errors import RecorderError
+from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ns_from_unix
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HEARTBEAT_FILE: Final = "recorder.json"
+MAX_INTERVAL_S: Final = 3600.0
+"""A heartbeat that claims to come more rarely is not believed: it would count as live for days."""
+
+_PATIENCE_INTERVALS: Final = 3
+_PATIENCE_AT_LEAST_NS: Final[Ns] = 15 * NS_PER_S
+_MAX_BYTES: Final = 1 << 20
+
+
+class RecorderState(StrEnum):
+    """What the recorder is doing."""
+
+    STARTING = "starting"
+    RECORDING = "recording"
+    PAUSED = "paused"  # alive, and not recording on purpose: the disk is nearly full
+    STOPPING = "stopping"
+    STOPPED = "stopped"
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """One heartbeat.
+
+    `updated` and `since` (the start of this state) are wall clock time; it comes every
+    `interval_s` seconds. `recordings` are the recordings being written, as directories relative to
+    the bag directory with forward slashes; at a rotation there are two. `subscribed` are the
+    topics subscribed to, `silent` those among them that have brought no message; `bytes_written`
+    counts all recordings since the recorder started.
+    """
+
+    pid: int
+    updated: Ns
+    state: RecorderState
+    recordings: tuple[str, ...]
+    since: Ns
+    bytes_written: int
+    subscribed: tuple[str, ...]
+    silent: tuple[str, ...]
+    last_error: str | None
+    interval_s: float
+
+    def is_live(self, now: Ns) -> bool:
+        """Whether the recorder that wrote this is likely to be there still.
+
+        That is, it was updated within three intervals (at least 15 s) of `now`, on either side: a
+        heartbeat from the future comes from before the clock was set back.
+        """
+        patience = max(ns_from_unix(_PATIENCE_INTERVALS * self.interval_s), _PATIENCE_AT_LEAST_NS)
+        return abs(now - self.updated) <= patience
+
+
+class HeartbeatReading(NamedTuple):
+    """The heartbeat, or the reason why there is none."""
+
+    heartbeat: Heartbeat | None
+    reason: str | None
+
+
+def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
+    """What the recorder last wrote into `recorder.json`, live or not. Raises nothing."""
+    try:
+        text = _text(bag_dir / HEARTBEAT_FILE)
+        return HeartbeatReading(_parsed(text), None)
+    except FileNotFoundError:
+        return HeartbeatReading(None, f"there is no {HEARTBEAT_FILE}: no recorder has written here")
+    except OSError as error:
+        return HeartbeatReading(None, f"{HEARTBEAT_FILE} cannot be read: {error.strerror or error}")
+    # json raises RecursionError for a file of nothing but brackets.
+    except (ValueError, TypeError, RecursionError) as error:
+        return HeartbeatReading(None, f"{HEARTBEAT_FILE} is no heartbeat: {error}")
+
+
+def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
+    """Replaces `recorder.json` at once: a reader sees the old one or this one, never a part.
+
+    Raises:
+        RecorderError: it cannot be written, e.g. because the disk is full; the old one stands.
+    """
+    target = bag_dir / HEARTBEAT_FILE
+    beside = bag_dir / f".{HEARTBEAT_FILE}.tmp"
+    text = json.dumps(asdict(heartbeat), allow_nan=False, separators=(",", ":"))
+    try:
+        try:
+            with beside.open("w", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            beside.replace(target)
+        except OSError:
+            beside.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise RecorderError(
+            f"{target} cannot be written: {error.strerror or error}; "
+            "free disk space or correct the permissions of the bag directory"
+        ) from error
+
+
+def _text(path: Path) -> str:
+    """The text of a small regular file; never waits, as opening a FIFO would."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as stream:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ValueError("it is not a regular file")
+        data = stream.read(_MAX_BYTES + 1)
+    if len(data) > _MAX_BYTES:
+        raise ValueError(f"it is larger than {_MAX_BYTES} bytes")
+    return data.decode("utf-8")
+
+
+def _parsed(text: str) -> Heartbeat:
+    """The heartbeat in the text; a ValueError or TypeError names the key that is wrong."""
+    value: object = json.loads(text)
+    if not isinstance(value, dict):
+        raise TypeError("it is not a JSON object")
+    fields: dict[object, object] = value
+    return Heartbeat(
+        pid=_int(fields, "pid", least=1),
+        updated=_int(fields, "updated"),
+        state=_state(fields),
+        recordings=_strings(fields, "recordings"),
+        since=_int(fields, "since"),
+        bytes_written=_int(fields, "bytes_written", least=0),
+        subscribed=_strings(fields, "subscribed"),
+        silent=_strings(fields, "silent"),
+        last_error=_text_or_null(fields, "last_error"),
+        interval_s=_interval(fields),
+    )
+
+
+def _get(fields: dict[object, object], key: str) -> object:
+    if key not in fields:
+        raise ValueError(f"it has no {key}")
+    return fields[key]
+
+
+def _int(fields: dict[object, object], key: str, *, least: int = MIN_NS) -> int:
+    value = _get(fields, key)
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= MAX_NS:
+        raise ValueError(f"{key} must be an integer from {least} to {MAX_NS}")
+    return value
+
+
+def _strings(fields: dict[object, object], key: str) -> tuple[str, ...]:
+    value = _get(fields, key)
+    if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+        raise ValueError(f"{key} must be a list of strings")
+    return tuple(value)
+
+
+def _text_or_null(fields: dict[object, object], key: str) -> str | None:
+    value = _get(fields, key)
+    if value is not None and not isinstance(value, str):
+        raise ValueError(f"{key} must be a string or null")
+    return value
+
+
+def _state(fields: dict[object, object]) -> RecorderState:
+    value = _get(fields, "state")
+    if value not in list(RecorderState):
+        raise ValueError(f"state must be one of {', '.join(RecorderState)}")
+    return RecorderState(str(value))
+
+
+def _interval(fields: dict[object, object]) -> float:
+    value = _get(fields, "interval_s")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError("interval_s must be a number of seconds")
+    if not 0 < value <= MAX_INTERVAL_S:
+        raise ValueError(f"interval_s must be above 0 and at most {MAX_INTERVAL_S:g} s")
+    return float(value)

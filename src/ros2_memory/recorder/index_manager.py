@@ -1,0 +1,282 @@
+"""Keeps what is known of the bag directory: which bags answer, and what was set aside.
+
+A scan looks at what changed, judges each file (see `standing`), and swaps a whole new `Snapshot`
+in: a query that holds one sees one consistent index for as long as it likes. Nothing is written,
+and no thread is started: whoever asks a question, or calls `refresh` now and then, scans.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import structlog
+
+from ros2_memory.errors import BagVanishedError
+from ros2_memory.recorder.heartbeat import read_heartbeat
+from ros2_memory.recorder.scan import Tree, bag_kind
+from ros2_memory.recorder.snapshot import Snapshot, Timeline
+from ros2_memory.recorder.standing import FileNotes, Scene, Standing, judge
+from ros2_memory.timebase import ms_from_ns, ns_from_unix
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from structlog.typing import FilteringBoundLogger
+
+    from ros2_memory.model import BagFile, SetAside
+    from ros2_memory.recorder.heartbeat import Heartbeat
+    from ros2_memory.recorder.scan import Stamp, Walked
+    from ros2_memory.recorder.standing import Verdict
+    from ros2_memory.storage.base import BagReader
+    from ros2_memory.timebase import Clock, Ns
+
+__all__ = ["IndexManager", "Snapshot"]
+
+SPLITS_OF_PATIENCE: Final = 3
+"""A file that lay still for so many splits is not being written, unless a heartbeat says so."""
+PATROL: Final = 256
+"""Closed files looked at in each scan, in turn: one overwritten in place changes no directory."""
+
+_COMPRESSED: Final = ".zstd"
+
+
+class _Oddities(NamedTuple):
+    """What a walk finds besides files."""
+
+    damaged: tuple[SetAside, ...] = ()
+    links: tuple[SetAside, ...] = ()
+    problem: str | None = None
+
+
+class IndexManager:
+    """Keeps the snapshot of one bag directory. Safe for several threads at once.
+
+    `refresh_s` is how old a snapshot may become before a question has it renewed;
+    `split_duration_s` is how long the recorder writes one file.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        reader: BagReader,
+        clock: Clock,
+        *,
+        refresh_s: float,
+        split_duration_s: float,
+    ) -> None:
+        self._bag_dir = bag_dir
+        self._reader = reader
+        self._clock = clock
+        self._refresh: Ns = ns_from_unix(refresh_s)
+        self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
+        self._log: FilteringBoundLogger = structlog.get_logger()
+        self._lock = threading.Lock()
+        self._published: Snapshot | None = None
+        self._start_over()
+
+    def snapshot(self, reach: Ns | None = None) -> Snapshot:
+        """The current snapshot, scanned anew where it may not do.
+
+        That is: it is older than `refresh_s`, or `reach`, the latest log time that the question is
+        about, lies past the end of the newest bag. Callers that come while a scan runs wait for it
+        and share its result.
+        """
+        current = self._published
+        if current is not None and not self._is_stale(current, reach):
+            return current
+        with self._lock:
+            if self._published is not None and self._published is not current:
+                return self._published
+            return self._scan()
+
+    def refresh(self) -> Snapshot:
+        """Scans now, and gives the result."""
+        with self._lock:
+            return self._scan()
+
+    def heartbeat(self) -> Heartbeat | None:
+        """What the recorder last wrote of itself, live or not; None where that cannot be read."""
+        return read_heartbeat(self._bag_dir).heartbeat
+
+    def _is_stale(self, snapshot: Snapshot, reach: Ns | None) -> bool:
+        if not 0 <= self._clock.now() - snapshot.scanned_at < self._refresh:
+            return True
+        return reach is not None and (snapshot.latest is None or reach > snapshot.latest)
+
+    # What follows runs under the lock.
+
+    def _start_over(self) -> None:
+        self._tree = Tree(self._bag_dir)
+        self._files: dict[str, FileNotes] = {}
+        self._verdicts: dict[str, Verdict] = {}
+        self._counted: dict[str, Verdict] = {}  # of x.mcap and x.mcap.zstd only one
+        self._set_aside: dict[str, Verdict] = {}  # those of `_counted` that are no bags
+        self._watched: set[str] = set()
+        self._patrol: list[str] = []
+        self._odd = _Oddities()
+        self._timeline = Timeline()
+
+    def _scan(self) -> Snapshot:
+        begun = time.perf_counter_ns()
+        scene = self._scene()
+        try:
+            walked = self._tree.walk(scene.now, [*self._watched, *self._next_on_patrol()])
+            changed = self._forget(walked.gone) | self._examine(walked.looked_at, scene)
+            removed, added = self._recount(changed)
+            self._timeline = self._timeline.changed(removed, added)
+        except BaseException:
+            # The walk does not show a second time what it has shown once.
+            self._start_over()
+            raise
+        before, odd = self._published, _oddities(walked)
+        if before is not None and not changed and odd == self._odd:
+            self._published = replace(before, scanned_at=scene.now)
+            return self._published
+        self._odd = odd
+        self._published = self._compose(scene.now)
+        self._report(before, self._published, len(removed), len(added), begun)
+        return self._published
+
+    def _scene(self) -> Scene:
+        now = self._clock.now()
+        heartbeat = self.heartbeat()
+        if heartbeat is None or not heartbeat.is_live(now):
+            return Scene(self._bag_dir, now, self._three_splits)
+        return Scene(self._bag_dir, now, self._three_splits, frozenset(heartbeat.recordings))
+
+    def _next_on_patrol(self) -> list[str]:
+        if not self._patrol:
+            self._patrol = list(self._files)
+        following = self._patrol[-PATROL:]
+        del self._patrol[-PATROL:]
+        return [path for path in following if path in self._files]
+
+    def _forget(self, paths: Iterable[str]) -> set[str]:
+        """Drops what is known of these files; gives those that had a verdict."""
+        forgotten = set()
+        for path in paths:
+            self._watched.discard(path)
+            self._files.pop(path, None)
+            if self._verdicts.pop(path, None) is not None:
+                forgotten.add(path)
+        return forgotten
+
+    def _examine(self, stamps: dict[str, Stamp], scene: Scene) -> set[str]:
+        """Judges these files; gives those of which the verdict changed."""
+        changed = set()
+        for path, stamp in stamps.items():
+            notes = self._noted(path, stamp, scene.now)
+            try:
+                verdict = judge(notes, self._reader, scene)
+            except BagVanishedError:
+                self._tree.distrust(path)
+                changed |= self._forget([path])
+                continue
+            if notes.must_be_watched(verdict, scene):
+                self._watched.add(path)
+            else:
+                self._watched.discard(path)
+            if verdict != self._verdicts.get(path):
+                self._verdicts[path] = verdict
+                changed.add(path)
+        return changed
+
+    def _noted(self, path: str, stamp: Stamp, now: Ns) -> FileNotes:
+        notes = self._files.get(path)
+        if notes is None:
+            notes = FileNotes.first(Path(path), bag_kind(path) or "", stamp, now)
+            self._files[path] = notes
+        else:
+            notes.look(stamp, now)
+        return notes
+
+    def _recount(self, changed: Iterable[str]) -> tuple[list[BagFile], list[BagFile]]:
+        """Brings `_counted` up to date; gives the bags that left it and those that came."""
+        removed, added = [], []
+        for path in {form for each in changed for form in (each, _other_form(each))}:
+            before, after = self._counted.pop(path, None), self._verdict_that_counts(path)
+            self._set_aside.pop(path, None)
+            if after is not None:
+                self._counted[path] = after
+                if after.bag is None:
+                    self._set_aside[path] = after
+            if before == after:
+                continue
+            if before is not None and before.bag is not None:
+                removed.append(before.bag)
+            if after is not None and after.bag is not None:
+                added.append(after.bag)
+        return removed, added
+
+    def _verdict_that_counts(self, path: str) -> Verdict | None:
+        """The file's verdict; None where it is unknown, or its other form answers for it.
+
+        While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice.
+        """
+        own = self._verdicts.get(path)
+        other = self._verdicts.get(_other_form(path))
+        if own is None or other is None or own.standing > other.standing:
+            return own
+        plain = not path.endswith(_COMPRESSED)
+        return own if plain and own.standing == other.standing else None
+
+    def _compose(self, now: Ns) -> Snapshot:
+        timeline = self._timeline
+        aside: dict[Standing, list[SetAside]] = {}
+        silent = set(timeline.silent)
+        empty = 0
+        for verdict in self._set_aside.values():
+            if verdict.aside is not None:
+                aside.setdefault(verdict.standing, []).append(verdict.aside)
+            else:
+                empty += 1
+                silent.update(verdict.silent)
+        return Snapshot(
+            bags=timeline.bags,
+            active=_by_path(aside.get(Standing.ACTIVE, ())),
+            damaged=_by_path([*aside.get(Standing.DAMAGED, ()), *self._odd.damaged]),
+            unread=_by_path([*aside.get(Standing.UNREAD, ()), *self._odd.links]),
+            empty=empty,
+            silent_topics=frozenset(silent - timeline.types.keys()),
+            scanned_at=now,
+            problem=self._odd.problem,
+            timeline=timeline,
+        )
+
+    def _report(
+        self, before: Snapshot | None, after: Snapshot, removed: int, added: int, begun: Ns
+    ) -> None:
+        known = set() if before is None else set(before.damaged)
+        for each in after.damaged:
+            if each not in known:
+                self._log.warning("bag_damaged", path=str(each.path), reason=each.reason)
+        self._log.info(
+            "index_scanned",
+            bag_dir=str(self._bag_dir),
+            bags=len(after.bags),
+            added=added,
+            removed=removed,
+            active=len(after.active),
+            damaged=len(after.damaged),
+            unread=len(after.unread),
+            empty=after.empty,
+            problem=after.problem,
+            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+        )
+
+
+def _other_form(path: str) -> str:
+    """The name of the same bag compressed, or no longer so."""
+    return path.removesuffix(_COMPRESSED) if path.endswith(_COMPRESSED) else path + _COMPRESSED
+
+
+def _oddities(walked: Walked) -> _Oddities:
+    return _Oddities(_by_path(walked.damaged), _by_path(walked.links), walked.problem)
+
+
+def _by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
+    return tuple(sorted(asides, key=lambda each: each.path))

@@ -1,0 +1,211 @@
+"""Walking the bag directory: which bag files lie there, and which may have changed.
+
+A directory is listed again only when its mtime says that names came or went. That says nothing of
+what was written *into* a file, so the caller names the files that it wants looked at every time.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.model import SetAside
+from ros2_memory.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+BAG_KINDS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+"""How the names of bag files end, whichever reader reads them."""
+YOUNG_NS: Final[Ns] = 2 * NS_PER_S
+"""Two changes within one tick of the file system share an mtime: a younger one proves nothing."""
+
+_LINK = "a symbolic link, which is not followed: move or mount the bags into the bag directory"
+
+
+def bag_kind(name: str) -> str | None:
+    """The kind of bag that a file name claims, one of `BAG_KINDS`, or None."""
+    lowered = name.lower()
+    return next((kind for kind in BAG_KINDS if lowered.endswith(kind)), None)
+
+
+def settled(mtime_ns: Ns, now: Ns) -> bool:
+    """Whether a later change would have to show another mtime. One far in the future is settled."""
+    return abs(now - mtime_ns) >= YOUNG_NS
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """How a file looked from outside."""
+
+    size: int
+    mtime_ns: Ns
+    ctime_ns: Ns
+    inode: int
+
+    @classmethod
+    def of(cls, stat: os.stat_result) -> Stamp:
+        """The stamp in a stat result."""
+        return cls(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
+
+
+@dataclass(frozen=True, slots=True)
+class Walked:
+    """What one walk found. A file's path is the text that `os.scandir` gives: it is met so often.
+
+    `looked_at` has every bag file of the directories that were listed, and the watched ones; `gone`
+    the ones that are known no more. `damaged` are directories that cannot be listed and bag names
+    that are no files, `links` the symbolic links, neither in any order. With a `problem` the bag
+    directory itself is not there, and everything in it is gone.
+    """
+
+    looked_at: dict[str, Stamp]
+    gone: set[str]
+    damaged: list[SetAside]
+    links: list[SetAside]
+    problem: str | None = None
+
+
+@dataclass(slots=True)
+class _Folder:
+    mtime_ns: Ns
+    trusted: bool
+    folders: list[Path] = field(default_factory=list)
+    files: set[str] = field(default_factory=set)
+    links: list[Path] = field(default_factory=list)
+    odd: list[SetAside] = field(default_factory=list)
+
+
+class Tree:
+    """The directories under one root, as the last walk saw them.
+
+    The root itself may be a symbolic link; inside it none is followed. Folders whose name begins
+    with a dot are left out. Not for several threads at once.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._folders: dict[Path, _Folder] = {}
+
+    def walk(self, now: Ns, watched: Iterable[str]) -> Walked:
+        """Looks for what is new, changed or gone since the last walk, and at the `watched` files.
+
+        `now` tells which mtimes are too young to be trusted. Raises nothing: a directory that
+        cannot be listed is part of the result.
+        """
+        before, self._folders = self._folders, {}
+        walked = Walked({}, set(), [], [])
+        problem = self._descend(before, now, walked)
+        if problem is not None:
+            self._folders = {}
+            walked = Walked({}, set(), [], [], problem)
+        for path, folder in before.items():
+            after = self._folders.get(path)
+            if after is not folder:
+                walked.gone.update(folder.files - (after.files if after else set()))
+        for file in watched:
+            self._look(file, walked)
+        return walked
+
+    def distrust(self, path: str) -> None:
+        """Has the folder of a file listed again in the next walk, whatever its mtime says."""
+        folder = self._folders.get(Path(path).parent)
+        if folder is not None:
+            folder.trusted = False
+
+    def _descend(self, before: dict[Path, _Folder], now: Ns, walked: Walked) -> str | None:
+        """Visits every folder; says what is wrong where the root cannot be listed."""
+        waiting = [self._root]
+        while waiting:
+            path = waiting.pop()
+            try:
+                folder = _visit(path, before.get(path), now, walked.looked_at)
+            except OSError as error:
+                if path == self._root:
+                    return _problem(error)
+                # A folder that went since its parent was listed changes that parent's mtime.
+                if not isinstance(error, FileNotFoundError):
+                    reason = f"the directory cannot be listed: {error.strerror or error}"
+                    walked.damaged.append(SetAside(path, reason))
+                continue
+            self._folders[path] = folder
+            waiting.extend(folder.folders)
+            walked.damaged.extend(folder.odd)
+            walked.links.extend(
+                SetAside(link, _LINK)
+                for link in folder.links
+                if bag_kind(link.name) or _is_folder(link)
+            )
+        return None
+
+    def _look(self, path: str, walked: Walked) -> None:
+        if path in walked.looked_at or path in walked.gone:
+            return
+        try:
+            walked.looked_at[path] = Stamp.of(Path(path).lstat())
+        except OSError:
+            # Its folder looks as before, and may soon look the same with the file back in it.
+            walked.gone.add(path)
+            self.distrust(path)
+
+
+def _visit(path: Path, known: _Folder | None, now: Ns, looked_at: dict[str, Stamp]) -> _Folder:
+    """The folder as it is known where nothing came or went; otherwise as it is listed.
+
+    Its mtime is taken first: what changes during the listing is then found by the next walk.
+    """
+    mtime_ns = path.stat().st_mtime_ns
+    if known is not None and known.trusted and known.mtime_ns == mtime_ns:
+        return known
+    folder = _Folder(mtime_ns, trusted=settled(mtime_ns, now))
+    with os.scandir(path) as entries:
+        for entry in entries:
+            _enter(folder, entry, looked_at)
+    return folder
+
+
+def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]) -> None:
+    hidden = entry.name.startswith(".")
+    if entry.is_symlink():
+        if not hidden or bag_kind(entry.name):
+            folder.links.append(Path(entry.path))
+    elif entry.is_dir(follow_symlinks=False):
+        if not hidden:
+            folder.folders.append(Path(entry.path))
+    elif bag_kind(entry.name):
+        _enter_file(folder, entry, looked_at)
+
+
+def _enter_file(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]) -> None:
+    if not entry.is_file(follow_symlinks=False):
+        folder.odd.append(SetAside(Path(entry.path), "not a regular file"))
+        return
+    try:
+        looked_at[entry.path] = Stamp.of(entry.stat(follow_symlinks=False))
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        reason = f"cannot be looked at: {error.strerror or error}"
+        folder.odd.append(SetAside(Path(entry.path), reason))
+        folder.trusted = False
+        return
+    folder.files.add(entry.path)
+
+
+def _is_folder(link: Path) -> bool:
+    """Whether a link leads to a directory; where that cannot be told it is better named."""
+    try:
+        return link.is_dir()
+    except OSError:
+        return True
+
+
+def _problem(error: OSError) -> str:
+    """What to tell the operator of a bag directory that cannot be listed."""
+    if isinstance(error, FileNotFoundError):
+        return "the bag directory does not exist; it is looked for again with every scan"
+    if isinstance(error, NotADirectoryError):
+        return "the bag directory is a file, not a directory: correct recording.bag_dir"
+    return f"the bag directory cannot be read: {error.strerror or error}"

@@ -1,0 +1,256 @@
+"""How a bag file stands: closed, still being written, left open by a crash, or unreadable.
+
+The file says of itself whether its writer has finished. Where it does not say so, either a
+recorder still writes it or a crash left it:
+
+    open      live heartbeat  names the recording                -> active, however still it lies
+    open      live heartbeat  names others only                  -> left open by a crash
+    open      no heartbeat    grew within the last three splits  -> active
+    open      no heartbeat    lay still for longer               -> left open by a crash
+
+A file "grew" when its mtime says so, or when two scans saw it grow. An mtime in the future says
+nothing (the clock was set back), so there only what was seen counts.
+
+A `.db3` has no closing mark: between two transactions of its recorder it looks finished. One that
+grew within the last three splits is active unless the `metadata.yaml` beside it, which a recorder
+writes last, mentions it, or a live heartbeat names other recordings only. A `.zstd` is written
+after the bag in it was closed; it is open until its last frame is whole.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.errors import BagError, BagVanishedError
+from ros2_memory.model import BagFile, BagState, BagSummary, SetAside
+from ros2_memory.recorder.scan import YOUNG_NS, bag_kind, settled
+from ros2_memory.storage.base import Closing
+from ros2_memory.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from ros2_memory.recorder.scan import Stamp
+    from ros2_memory.storage.base import BagReader
+
+RETRY_NS: Final[Ns] = 600 * NS_PER_S
+"""After this long an unreadable file is tried again: the fault may have been the machine's."""
+
+_ACTIVE = "still being written"
+_NO_MESSAGE = (
+    "it ends before its first message: its recorder was killed before any reached the disk"
+)
+_METADATA_LIMIT: Final = 1 << 26
+
+
+class Standing(IntEnum):
+    """What a file is to the index. Of two forms of one bag the higher standing answers."""
+
+    UNREAD = 0
+    DAMAGED = 1
+    ACTIVE = 2
+    INCOMPLETE = 3
+    EMPTY = 4
+    CLOSED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How one file stands: as a bag, set aside with a reason, or without a message.
+
+    `silent` are the topics that a bag without a message declares.
+    """
+
+    standing: Standing
+    bag: BagFile | None = None
+    aside: SetAside | None = None
+    silent: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What one scan knows besides the files themselves.
+
+    `open_recordings` are those that a live heartbeat names; None without a live heartbeat.
+    """
+
+    root: Path
+    now: Ns
+    three_splits: Ns
+    open_recordings: frozenset[str] | None = None
+    _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
+
+    def may_be_recorded(self, path: Path) -> bool:
+        """Whether no live heartbeat says that this file's recording is over."""
+        return self.open_recordings is None or self.names(path)
+
+    def names(self, path: Path) -> bool:
+        """Whether a live heartbeat names this file's recording."""
+        recording = path.parent.relative_to(self.root).as_posix()
+        return self.open_recordings is not None and recording in self.open_recordings
+
+    def is_finished(self, path: Path) -> bool:
+        """Whether the metadata.yaml beside the file mentions it."""
+        folder = path.parent
+        if folder not in self._finished:
+            self._finished[folder] = files_in_metadata(folder / "metadata.yaml")
+        return path.name in self._finished[folder]
+
+
+@dataclass(slots=True)
+class FileNotes:
+    """What is known of one bag file, from outside and, as far as it was read, from inside."""
+
+    path: Path
+    kind: str
+    stamp: Stamp
+    seen_at: Ns
+    trusted: bool
+    grew_at: Ns | None = None
+    closing: Closing | None = None
+    summary: BagSummary | None = None
+    fault: str | None = None
+
+    @classmethod
+    def first(cls, path: Path, kind: str, stamp: Stamp, now: Ns) -> FileNotes:
+        """The notes of a file that was not known before."""
+        return cls(path, kind, stamp, now, settled(stamp.mtime_ns, now))
+
+    def look(self, stamp: Stamp, now: Ns) -> None:
+        """Takes in how the file looks at this scan, and forgets what may not hold any more."""
+        if stamp.inode != self.stamp.inode:
+            self.grew_at = None  # another file under the same name
+        elif stamp.size > self.stamp.size or (self.grew_at is not None and self.grew_at > now):
+            self.grew_at = now  # also anew after the clock was set back
+        if self._outdated(stamp, now):
+            self.closing, self.summary, self.fault = None, None, None
+            self.seen_at = now
+        self.stamp = stamp
+        self.trusted = settled(stamp.mtime_ns, now)
+
+    def grew_lately(self, scene: Scene) -> bool:
+        """Whether the file grew within the last three splits."""
+        age = scene.now - self.stamp.mtime_ns
+        seen = self.grew_at is not None and scene.now - self.grew_at <= scene.three_splits
+        return seen or -YOUNG_NS < age <= scene.three_splits
+
+    def must_be_watched(self, verdict: Verdict, scene: Scene) -> bool:
+        """Whether the next scan must look at the file though its directory did not change."""
+        if verdict.standing is Standing.UNREAD:
+            return False
+        return (
+            not self.trusted
+            or verdict.standing in {Standing.ACTIVE, Standing.DAMAGED}
+            or self.closing is Closing.OPEN
+            or (self.kind == ".db3" and scene.now - self.stamp.mtime_ns <= scene.three_splits)
+        )
+
+    def _outdated(self, stamp: Stamp, now: Ns) -> bool:
+        before = self.stamp
+        if not self.trusted or (stamp.size, stamp.mtime_ns) != (before.size, before.mtime_ns):
+            return True
+        # Permissions change only the ctime.
+        return self.fault is not None and (
+            stamp.ctime_ns != before.ctime_ns or abs(now - self.seen_at) >= RETRY_NS
+        )
+
+
+def judge(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
+    """How the file stands; reads of it only what the notes do not have.
+
+    Raises:
+        BagVanishedError: the file is not there any more.
+    """
+    if not reader.reads(notes.path):
+        return _aside(Standing.UNREAD, notes, _not_read(notes))
+    try:
+        if notes.closing is None and notes.fault is None:
+            # An open MCAP is 0 bytes until its first chunk is full.
+            empty = notes.stamp.size == 0
+            notes.closing = Closing.OPEN if empty else reader.closing(notes.path)
+        if _is_active(notes, scene):
+            return _aside(Standing.ACTIVE, notes, _ACTIVE)
+        if notes.summary is None and notes.fault is None:
+            notes.summary = _shared(reader.summarize(notes.path))
+    except BagVanishedError:
+        raise
+    except BagError as error:
+        notes.fault = error.reason
+    if notes.summary is None:
+        return _aside(Standing.DAMAGED, notes, notes.fault or "it cannot be read")
+    return _readable(notes, notes.summary)
+
+
+def files_in_metadata(path: Path) -> frozenset[str]:
+    """The bag files that a rosbag2 metadata.yaml mentions; none where it cannot be read.
+
+    Only the lines that name files are looked at (`relative_file_paths` and `files[].path`):
+    parsing the YAML of a long recording takes seconds.
+    """
+    try:
+        if not path.is_file():
+            return frozenset()
+        with path.open("rb") as stream:
+            text = stream.read(_METADATA_LIMIT).decode("utf-8", errors="replace")
+    except OSError:
+        return frozenset()
+    entries = (
+        line.strip().removeprefix("- ").removeprefix("path:").strip().strip("'\"")
+        for line in text.splitlines()
+    )
+    return frozenset(PurePosixPath(entry).name for entry in entries if bag_kind(entry))
+
+
+def _is_active(notes: FileNotes, scene: Scene) -> bool:
+    if notes.closing is Closing.OPEN:
+        if scene.open_recordings is not None:
+            return scene.names(notes.path)
+        return notes.grew_lately(scene)
+    return (
+        notes.closing is Closing.CLOSED
+        and notes.kind == ".db3"
+        and scene.may_be_recorded(notes.path)
+        and notes.grew_lately(scene)
+        and not scene.is_finished(notes.path)
+    )
+
+
+def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
+    closed = notes.closing is Closing.CLOSED and summary.complete
+    if summary.empty:
+        if closed:
+            return Verdict(Standing.EMPTY, silent=summary.silent)
+        return _aside(Standing.DAMAGED, notes, _NO_MESSAGE)
+    state = BagState.CLOSED if closed else BagState.INCOMPLETE
+    stamp = notes.stamp
+    bag = BagFile(
+        notes.path, stamp.size, stamp.mtime_ns, state, summary, summary.start, summary.end
+    )
+    return Verdict(Standing.CLOSED if closed else Standing.INCOMPLETE, bag=bag)
+
+
+def _aside(standing: Standing, notes: FileNotes, reason: str) -> Verdict:
+    return Verdict(standing, aside=SetAside(notes.path, reason))
+
+
+def _not_read(notes: FileNotes) -> str:
+    if not notes.path.name.endswith(notes.kind):
+        return f"the name of a bag file must end in {notes.kind}, in lower case: rename it"
+    return f"this storage does not read {notes.kind} files: choose storage=rosbag2, which does"
+
+
+def _shared(summary: BagSummary) -> BagSummary:
+    """The summary with one copy of each name: 60,000 bags repeat the same few."""
+    intern = sys.intern
+    topics = tuple(
+        replace(
+            each,
+            topic=intern(each.topic),
+            type=intern(each.type),
+            encoding=intern(each.encoding),
+        )
+        for each in summary.topics
+    )
+    return replace(summary, topics=topics, silent=tuple(intern(name) for name in summary.silent))

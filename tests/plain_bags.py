@@ -1,0 +1,121 @@
+"""Bag files of plain text, and a reader for them: for tests of what surrounds a bag's content.
+
+A file is `BAG`, a line `topic type log_time` for each message or `topic type -` for a topic without
+any, and `END` once it is closed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from ros2_memory.errors import BagError, BagVanishedError
+from ros2_memory.model import BagSummary, TopicSummary
+from ros2_memory.storage.base import BagReader, Channel, Closing, Record
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.model import TimeWindow
+
+
+def plain(
+    path: Path,
+    times: Iterable[int] = (),
+    *,
+    topic: str = "/odom",
+    type_name: str = "nav_msgs/msg/Odometry",
+    silent: Iterable[str] = (),
+    closed: bool = True,
+) -> Path:
+    """Writes one bag; without `closed` as a recorder leaves it that was killed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = ["BAG", *(f"{topic} {type_name} {time}" for time in times)]
+    lines += [f"{name} {type_name} -" for name in silent]
+    path.write_text("\n".join([*lines, "END" if closed else ""]), encoding="utf-8")
+    return path
+
+
+def grow(path: Path, *times: int, topic: str = "/odom") -> None:
+    """Appends messages to an open bag, as its recorder does."""
+    with path.open("a", encoding="utf-8") as stream:
+        stream.writelines(f"{topic} nav_msgs/msg/Odometry {time}\n" for time in times)
+
+
+def close(path: Path) -> None:
+    """Closes an open bag in place."""
+    with path.open("a", encoding="utf-8") as stream:
+        stream.write("END")
+
+
+class PlainReader(BagReader):
+    """Reads plain bags, and counts by file name what it was asked for."""
+
+    def __init__(self, *kinds: str) -> None:
+        self.kinds = kinds or (".mcap",)
+        self.closings: Counter[str] = Counter()
+        self.summaries: Counter[str] = Counter()
+        self.before_summary: Callable[[Path], object] = bool
+
+    def reads(self, path: Path) -> bool:
+        return path.name.endswith(self.kinds)
+
+    def closing(self, path: Path) -> Closing:
+        self.closings[path.name] += 1
+        text = _text(path)
+        bag = text.startswith("BAG") or not text
+        return Closing.OPEN if bag and not text.endswith("END") else Closing.CLOSED
+
+    def summarize(self, path: Path) -> BagSummary:
+        self.summaries[path.name] += 1
+        self.before_summary(path)
+        text = _text(path)
+        if not text.startswith("BAG"):
+            raise BagError(str(path), "the file is empty" if not text else "not a bag")
+        times: dict[tuple[str, str], list[int]] = {}
+        for line in text.splitlines()[1:]:
+            if line not in {"END", ""}:
+                topic, type_name, time = line.split()
+                heard = times.setdefault((topic, type_name), [])
+                heard.extend([] if time == "-" else [int(time)])
+        return BagSummary(
+            tuple(
+                TopicSummary(topic, kind, "cdr", len(at), min(at), max(at), topic == "/tf_static")
+                for (topic, kind), at in times.items()
+                if at
+            ),
+            silent=tuple(topic for (topic, _), at in times.items() if not at),
+            complete=text.endswith("END"),
+        )
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        raise NotImplementedError
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[int]:
+        raise NotImplementedError
+
+    def undecodable(self, channel: Channel) -> str | None:
+        raise NotImplementedError
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        raise NotImplementedError
+
+    def decode(self, record: Record) -> object:
+        raise NotImplementedError
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise BagVanishedError(str(path), "it is gone") from error
+    except OSError as error:
+        raise BagError(str(path), f"cannot be opened: {error.strerror}") from error
