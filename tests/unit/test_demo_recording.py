@@ -207,8 +207,10 @@ def test_the_recorder_knows_up_to_when_the_closed_splits_reach(tmp_path: Path) -
         summary = make_reader(stream).get_summary()
     assert summary is not None
     assert summary.statistics is not None
-    assert recorder.closed_end(now) == summary.statistics.message_end_time
-    assert recorder.closed_end(now - 1) == START
+    second = summary.statistics.message_end_time
+    assert recorder.closed_ends(now - 1, now)[1:] == (second,)
+    assert recorder.closed_ends(now, now) == (second,)
+    assert recorder.closed_ends(now - 2, now - 1) == ()
     recorder.stop()
 
 

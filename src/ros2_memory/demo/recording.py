@@ -148,13 +148,15 @@ class DemoRecorder:
         """How many files there are; all but the last are closed until `stop` closes that too."""
         return len(self._splits)
 
-    def closed_end(self, at: Ns) -> Ns:
-        """The log time of the last message in a split that was closed by `at`.
+    def closed_ends(self, since: Ns, until: Ns) -> tuple[Ns, ...]:
+        """Where the closed splits ended, as log times of their last messages.
 
-        The recording's start while no split was closed.
+        First the end of the newest split that was closed by the wall-clock time `since` (if there
+        was one), then that of each that was closed after it up to `until`.
         """
-        ends = (end for closed, end in list(self._closed) if closed <= at)
-        return max(ends, default=self.timeline.start)
+        closed = list(self._closed)
+        before = [end for at, end in closed if at <= since]
+        return (*before[-1:], *(end for at, end in closed if since < at <= until))
 
     def write_until(self, now: Ns) -> None:
         """Writes every message that the recorder has heard by `now`.
@@ -207,8 +209,9 @@ class DemoRecorder:
         self._counts[message.stream.topic] += 1
 
     def _close(self, split: Split) -> None:
-        split.close()
+        # Noted first: who sees the footer must find the split among the closed ones.
         self._closed.append((self._clock.now(), split.last or self.timeline.start))
+        split.close()
 
     def _metadata(self) -> dict[str, JsonValue]:
         first = self._splits[0].first or 0

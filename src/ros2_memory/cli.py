@@ -1,0 +1,99 @@
+"""`ros2-memory`: the program for people."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.demo.run import DemoOptions, run_demo
+from ros2_memory.errors import EpisodicError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from types import FrameType
+
+_CANNOT_START: Final = 2
+_INTERRUPTED: Final = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line (`sys.argv` unless given) and returns the exit code.
+
+    0: done and right; 1: an answer was wrong; 2: it could not run, and stderr says why;
+    130: interrupted before it was done.
+    """
+    arguments = _parser().parse_args(argv)
+    options = DemoOptions(
+        once=arguments.once,
+        port=arguments.port,
+        bag_dir=arguments.bag_dir,
+        duration_s=arguments.duration,
+        verbose=arguments.verbose,
+    )
+    try:
+        with _ended_like_ctrl_c(signal.SIGTERM, signal.SIGHUP):
+            return run_demo(options, _say)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except (EpisodicError, OSError) as error:
+        print(f"ros2-memory demo: {error}", file=sys.stderr)
+        return _CANNOT_START
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="ros2-memory", description="A robot's episodic memory: tools for people."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    demo = commands.add_parser(
+        "demo",
+        help="a simulated robot, its bags, the query server and a client that asks it questions",
+        description="Runs the query server on the bags of a simulated robot, asks it questions, "
+        "and holds every answer against what the robot did. Needs no ROS and no configuration.",
+    )
+    demo.add_argument(
+        "--once",
+        action="store_true",
+        help="leave after the answers; the exit code is 1 if one was wrong",
+    )
+    demo.add_argument(
+        "--port", type=int, default=9203, help="on 127.0.0.1; 0: any that is free (%(default)s)"
+    )
+    demo.add_argument(
+        "--bag-dir",
+        type=Path,
+        metavar="DIR",
+        help="a new or empty folder, kept (a temporary one, removed at the end)",
+    )
+    demo.add_argument(
+        "--duration",
+        type=float,
+        default=120.0,
+        metavar="S",
+        help="seconds of history that exist when the questions are asked (%(default)s)",
+    )
+    demo.add_argument("--verbose", action="store_true", help="show the server's log on stderr")
+    return parser
+
+
+@contextmanager
+def _ended_like_ctrl_c(*signals: signal.Signals) -> Iterator[None]:
+    """Within the block each of these signals is a KeyboardInterrupt, so that all is closed."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in signals}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

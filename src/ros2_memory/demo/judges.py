@@ -1,0 +1,337 @@
+"""The judge of each kind of answer.
+
+A judge compares a reply with the robot's closed form at the reply's own moment, checks that this
+moment is the right one, and returns the answer as a sentence; `WrongAnswerError` otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from ros2_memory.demo import robot, streams
+from ros2_memory.demo.checking import (
+    METRES,
+    Asked,
+    at,
+    items,
+    near,
+    near_angle,
+    number,
+    one_of,
+    same,
+    text,
+    told_of,
+    within,
+)
+from ros2_memory.demo.flat import room_at
+from ros2_memory.demo.messages import description
+from ros2_memory.demo.robot import Planar
+from ros2_memory.demo.streams import STREAMS
+from ros2_memory.timebase import NS_PER_MS, NS_PER_S, ns_from_unix
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from ros2_memory.demo.streams import Message
+    from ros2_memory.model import JsonValue
+
+Judge: TypeAlias = "Callable[[JsonValue, Asked], str]"
+
+NEAR_M: Final = 0.5
+"""What counts as being at a place: the server's default `data.position_tolerance_m`."""
+
+_MPS: Final = 1e-3
+_SHARE_OF_PATH: Final = 1e-3
+_INTERPOLATED_M: Final = 5e-3
+_BY_TOPIC: Final = {stream.topic: stream for stream in STREAMS}
+_ODOM: Final = _BY_TOPIC[streams.ODOM]
+
+
+def in_odom(place: Planar) -> Planar:
+    """A place of the flat in the frame of the robot's poses."""
+    return robot.MAP_TO_ODOM.inverse().then(place)
+
+
+def time_range(reply: JsonValue, asked: Asked) -> str:
+    """All of what was recorded, no holes, nothing damaged, and a file being written."""
+    first = next(asked.timeline.everything()).log_time
+    earliest, latest = number(reply, "earliest"), number(reply, "latest")
+    one_of("earliest", earliest, [first])
+    one_of("latest", latest, asked.known)
+    for kind in ("gaps", "damaged", "incomplete", "unread"):
+        same(kind, items(reply, kind), [])
+    if not items(reply, "active"):
+        same("active files", 0, 1)
+    return (
+        f"{latest - earliest:.0f} s, in {number(reply, 'bags'):.0f} closed bag files, up to "
+        f"{asked.age_s(latest):.1f} s ago. What is being written joins them as its file closes."
+    )
+
+
+def topics(reply: JsonValue, asked: Asked) -> str:
+    """Every topic with its type, its count and its newest message."""
+    counts: dict[str, int] = {}
+    rows = items(reply)
+    same("topics", sorted(text(row, "topic") for row in rows), sorted(_BY_TOPIC))
+    for row in rows:
+        stream = _BY_TOPIC[text(row, "topic")]
+        same(f"type of {stream.topic}", text(row, "type"), stream.type)
+        newest = told_of(number(row, "last_ts"), asked.newest_known(stream))
+        counts[stream.topic] = asked.timeline.count(stream, newest.log_time)
+        same(f"count of {stream.topic}", number(row, "count"), counts[stream.topic])
+    total = sum(counts.values())
+    return f"{total:,} messages on {len(counts)} topics, {counts[streams.ODOM]:,} on /odom."
+
+
+def position(seconds_ago: float) -> Judge:
+    """The pose of `/odom` so long ago."""
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        message = told_of(number(reply, "timestamp"), asked.ago(_ODOM, seconds_ago))
+        return f"{_at_place(reply, message)}, facing {_facing(reply, message.t)}."
+
+    return judge
+
+
+def velocity(seconds_ago: float) -> Judge:
+    """The twist of `/odom` so long ago."""
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        message = told_of(number(reply, "timestamp"), asked.ago(_ODOM, seconds_ago))
+        forward, turning = robot.twist(message.t)
+        near("forward speed", number(reply, "linear", "x"), forward, _MPS)
+        near("turning rate", number(reply, "angular", "z"), turning, _MPS)
+        return f"{abs(forward):.2f} m/s {_way(forward)}, {_turn(turning)}."
+
+    return judge
+
+
+def seen_near(place: Planar) -> Judge:
+    """What the camera saw when the robot last was at a place."""
+    spot = in_odom(place)
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        moment = number(reply, "timestamp")
+        match = told_of(moment, asked.last_where(_ODOM, _near(spot)))
+        then = _held(reply, asked, streams.SCENE_OBJECTS, match)
+        labels = [text(found, "label") for found in items(reply, "value", "detections")]
+        same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(then.t)))
+        return f"{_listed(labels).capitalize()}, at {asked.when(moment)}."
+
+    return judge
+
+
+def last_near(place: Planar) -> Judge:
+    """When the robot last was at a place."""
+    spot = in_odom(place)
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        moment = number(reply, "timestamp")
+        message = told_of(moment, asked.last_where(_ODOM, _near(spot)))
+        _at_place(at(reply, "value", "position"), message)
+        return f"At {asked.when(moment)}."
+
+    return judge
+
+
+def path_clear(reply: JsonValue, asked: Asked) -> str:
+    """When the path was last clear."""
+    moment = number(reply, "timestamp")
+    told_of(moment, asked.last_where(_BY_TOPIC[streams.PATH_CLEAR], robot.path_clear))
+    same("value", at(reply, "value", "value"), expected=True)
+    return f"At {asked.when(moment)}."
+
+
+def last_seen(label: str) -> Judge:
+    """When a thing was last seen."""
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        moment = number(reply, "timestamp")
+        sighting = asked.last_where(_BY_TOPIC[streams.SCENE_OBJECTS], _sees(label))
+        message = told_of(moment, sighting)
+        same("topic", text(reply, "topic"), streams.SCENE_OBJECTS)
+        labels = [text(found, "label") for found in items(reply, "value", "detections")]
+        same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(message.t)))
+        others = [name for name in labels if name != label]
+        return f"At {asked.when(moment)}, beside {_listed(others)}."
+
+    return judge
+
+
+def where_seen(label: str) -> Judge:
+    """Where the robot was when it last saw a thing."""
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        moment = number(reply, "timestamp")
+        sighting = asked.last_where(_BY_TOPIC[streams.SCENE_OBJECTS], _sees(label))
+        message = _held(reply, asked, streams.ODOM, told_of(moment, sighting))
+        return f"{_at_place(at(reply, 'value', 'position'), message)}, at {asked.when(moment)}."
+
+    return judge
+
+
+def driven(seconds: float) -> Judge:
+    """The way driven in the last so many seconds, as far as it is in closed files."""
+    window = ns_from_unix(seconds)
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        start, end = number(reply, "start"), number(reply, "end")
+        last = told_of(end, asked.newest_known(_ODOM))
+        begun = (asked.before - window, asked.after - window + _ODOM.period + NS_PER_MS)
+        within("start", start, begun)
+        newest = asked.timeline.newest(_ODOM, ns_from_unix(start) + NS_PER_MS)
+        first = told_of(start, [newest] if newest else [])
+        expected = robot.driven(last.t) - robot.driven(first.t)
+        near("distance", number(reply, "distance_m"), expected, METRES + _SHARE_OF_PATH * expected)
+        near("duration", number(reply, "duration_s"), end - start, 2e-3)
+        near("mean speed", number(reply, "avg_speed"), expected / (end - start), _MPS)
+        fastest = max(_speeds(asked, first, last))
+        near("top speed", number(reply, "max_speed"), fastest, _MPS)
+        return (
+            f"{expected:.2f} m, at up to {fastest:.2f} m/s, in the {end - start:.1f} s of it that "
+            "are in closed files."
+        )
+
+    return judge
+
+
+def camera_in_map(seconds_ago: float) -> Judge:
+    """The pose of the camera in the flat so long ago, through four frames."""
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        moment = number(reply, "timestamp")
+        back = ns_from_unix(seconds_ago)
+        within("time", moment, (asked.before - back, asked.after - back))
+        t = (ns_from_unix(moment) - asked.timeline.t0) / NS_PER_S
+        truth = robot.pose_in_map(t).then(Planar(robot.CAMERA[0], robot.CAMERA[1], 0.0))
+        x, y, z = (number(reply, "translation", axis) for axis in "xyz")
+        near("x", x, truth.x, _INTERPOLATED_M)
+        near("y", y, truth.y, _INTERPOLATED_M)
+        near("z", z, robot.CAMERA[2], _INTERPOLATED_M)
+        near_angle("yaw", number(reply, "yaw_deg"), truth.yaw, tolerance_deg=0.2)
+        return (
+            f"In the {room_at(x)}, {x:.2f} m east and {y:.2f} m north of the flat's corner, "
+            f"{z:.2f} m high."
+        )
+
+    return judge
+
+
+def frames(reply: JsonValue, _asked: Asked) -> str:
+    """The frames and which of them move."""
+    rows = items(reply, "transforms")
+    pairs = {(text(row, "parent"), text(row, "child")): at(row, "static") for row in rows}
+    expected: dict[tuple[str, str], JsonValue] = {
+        ("map", "odom"): True,
+        ("odom", "base_link"): False,
+        ("base_link", "camera"): True,
+        ("base_link", "laser"): True,
+    }
+    same("frames", pairs, expected)
+    return "map > odom > base_link > camera and laser; only base_link moves."
+
+
+def battery(seconds_ago: float) -> Judge:
+    """The charge so long ago."""
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        stream = _BY_TOPIC[streams.BATTERY]
+        message = told_of(number(reply, "timestamp"), asked.ago(stream, seconds_ago))
+        charge = number(reply, "value", "percentage")
+        near("charge", charge, robot.battery(message.t), 1e-6)
+        return f"{charge:.1%}."
+
+    return judge
+
+
+def told(seconds: float, at_most: int) -> Judge:
+    """What the robot said it saw in the last so many seconds, thinned to a few samples."""
+    window = ns_from_unix(seconds)
+
+    def judge(reply: JsonValue, asked: Asked) -> str:
+        stream = _BY_TOPIC[streams.SCENE_DESCRIPTION]
+        samples = items(reply, "samples")
+        total = int(number(reply, "total"))
+        same("samples", len(samples), min(total, at_most))
+        begun = (asked.before - window, asked.after - window + stream.period + NS_PER_MS)
+        within("start", number(samples, 0, "timestamp"), begun)
+        last = told_of(number(samples, -1, "timestamp"), asked.newest_known(stream))
+        first = asked.timeline.message(stream, last.k - total + 1)
+        told_of(number(samples, 0, "timestamp"), [first])
+        between = [asked.timeline.message(stream, k) for k in range(first.k, last.k + 1)]
+        for sample in samples:
+            message = told_of(number(sample, "timestamp"), between)
+            same("words", text(sample, "value", "value"), description(message.t))
+        return " ".join(text(sample, "value", "value") for sample in samples[-2:])
+
+    return judge
+
+
+def nothing_on(topic: str) -> Judge:
+    """That a topic was never recorded, which is an answer too."""
+
+    def judge(reply: JsonValue, _asked: Asked) -> str:
+        same("error", text(reply, "error"), "no_data")
+        same("reason", text(reply, "reason"), "topic_not_recorded")
+        return f"{topic} was never recorded, and the answer says so."
+
+    return judge
+
+
+def _near(spot: Planar) -> Callable[[float], bool]:
+    def holds(t: float) -> bool:
+        here = robot.pose(t)
+        return math.hypot(here.x - spot.x, here.y - spot.y) <= NEAR_M
+
+    return holds
+
+
+def _sees(label: str) -> Callable[[float], bool]:
+    return lambda t: any(thing.label == label for thing in robot.seen(t))
+
+
+def _held(reply: JsonValue, asked: Asked, topic: str, match: Message) -> Message:
+    """The message of a topic at or before the match, which the reply must tell of."""
+    newest = asked.timeline.newest(_BY_TOPIC[topic], match.log_time)
+    return told_of(number(reply, "value_timestamp"), [newest] if newest else [])
+
+
+def _at_place(point: JsonValue, message: Message) -> str:
+    """Checks a position in `odom`, and says where in the flat that is."""
+    truth = robot.pose(message.t)
+    x, y = number(point, "x"), number(point, "y")
+    near("x", x, truth.x, METRES)
+    near("y", y, truth.y, METRES)
+    near("z", number(point, "z"), 0.0, METRES)
+    there = robot.MAP_TO_ODOM.then(Planar(x, y, 0.0))
+    return f"In the {room_at(there.x)}, at x {x:.2f} m, y {y:.2f} m in odom"
+
+
+def _facing(reply: JsonValue, t: float) -> str:
+    same("frame", text(reply, "frame_id"), "odom")
+    yaw = number(reply, "yaw_deg")
+    near_angle("yaw", yaw, robot.pose(t).yaw)
+    return f"{yaw:.0f} degrees"
+
+
+def _way(forward: float) -> str:
+    return "backwards" if forward < 0 else "forwards"
+
+
+def _turn(turning: float) -> str:
+    rate = math.degrees(turning)
+    side = "left" if rate > 0 else "right"
+    return f"turning {side} at {abs(rate):.0f} degrees/s" if abs(rate) >= 1 else "straight on"
+
+
+def _speeds(asked: Asked, first: Message, last: Message) -> list[float]:
+    moments = (asked.timeline.message(_ODOM, k).t for k in range(first.k, last.k + 1))
+    return [abs(robot.twist(t)[0]) for t in moments]
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The names as a sentence has them."""
+    if not names:
+        return "nothing"
+    return " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)

@@ -1,0 +1,178 @@
+"""Recorder, query server and client together: what `ros2-memory demo` does."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Final
+
+import anyio
+from mcp import Client, MCPError
+from mcp.client.sse import sse_client
+from mcp.types import TextContent
+
+from ros2_memory.demo.checking import Asked
+from ros2_memory.demo.questions import QUESTIONS, Exchange, judged
+from ros2_memory.demo.recording import DemoRecorder
+from ros2_memory.demo.robot import LAP_S
+from ros2_memory.demo.serving import HOST, free_port, served
+from ros2_memory.demo.showing import invitation, shown
+from ros2_memory.demo.streams import Timeline
+from ros2_memory.errors import ConfigError, EpisodicError
+from ros2_memory.timebase import NS_PER_S, WallClock, ns_from_unix
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ros2_memory.demo.questions import Question
+
+SPLIT_DURATION_S: Final = 5.0
+SHORTEST_S: Final = LAP_S + 2 * SPLIT_DURATION_S
+LONGEST_S: Final = 86_400.0
+_UNDERWAY_S: Final = 22
+"""How long the robot has been driving when its recording begins (it leaves the front door)."""
+
+_KNOWN_WITHIN_NS: Final = 3 * NS_PER_S
+"""How soon after it was closed a split must be known: the index refresh, with room."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """What the command line says.
+
+    Attributes:
+        once: leave after the answers.
+        port: where the server listens; 0 for any that is free.
+        bag_dir: an empty or new folder for the bags, kept; None for a temporary one.
+        duration_s: length of the history that exists when the questions are asked.
+        verbose: the server's log goes to stderr.
+    """
+
+    once: bool = False
+    port: int = 9203
+    bag_dir: Path | None = None
+    duration_s: float = 120.0
+    verbose: bool = False
+
+
+def run_demo(options: DemoOptions, say: Callable[[str], None]) -> int:
+    """Records, serves, asks, and (unless `once`) goes on until it is interrupted.
+
+    Returns:
+        0 where every answer was right, otherwise 1.
+
+    Raises:
+        ConfigError: the options cannot be followed.
+        EpisodicError: the server or the recording did not last.
+        KeyboardInterrupt: it was interrupted before all answers were there.
+    """
+    _check(options)
+    port = free_port(options.port)
+    with ExitStack() as stack:
+        bag_dir = _bag_dir(options, stack)
+        recorder = stack.enter_context(_recorder(bag_dir, options.duration_s))
+        server = stack.enter_context(
+            served(bag_dir, port, split_duration_s=SPLIT_DURATION_S, verbose=options.verbose)
+        )
+        url = f"http://{HOST}:{port}"
+        say(_heading(recorder, options, url))
+        wrong = anyio.run(_ask_all, f"{url}/sse", recorder, say)
+        total = len(QUESTIONS)
+        say(f"{total - wrong} of {total} answers are right: each was held against the closed form.")
+        if not options.once:
+            say(f"\n{invitation(f'{url}/sse', f'{url}/mcp')}")
+            _stay(server, recorder)
+    return 1 if wrong else 0
+
+
+def _check(options: DemoOptions) -> None:
+    if not SHORTEST_S <= options.duration_s <= LONGEST_S:
+        raise ConfigError(
+            f"--duration {options.duration_s:g} is not between {SHORTEST_S:g} and {LONGEST_S:g} s; "
+            "the shortest is a lap of the robot and two bag files"
+        )
+    folder = options.bag_dir
+    if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(f"--bag-dir {folder} is not an empty folder; give a new or an empty one")
+
+
+def _bag_dir(options: DemoOptions, stack: ExitStack) -> Path:
+    if options.bag_dir is None:
+        temporary = TemporaryDirectory(prefix="ros2-memory-demo-", ignore_cleanup_errors=True)
+        return Path(stack.enter_context(temporary))
+    try:
+        options.bag_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--bag-dir {options.bag_dir} cannot be made: {error}") from error
+    return options.bag_dir.resolve()
+
+
+def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
+    """A recorder that has written its history and records on."""
+    now = WallClock().now()
+    start = now - ns_from_unix(duration_s)
+    timeline = Timeline(t0=start - _UNDERWAY_S * NS_PER_S, start=start)
+    name = time.strftime("flat_%Y_%m_%d-%H_%M_%S")
+    recorder = DemoRecorder(bag_dir / name, timeline, split_duration_s=SPLIT_DURATION_S)
+    recorder.write_until(now)
+    recorder.start()
+    return recorder
+
+
+def _heading(recorder: DemoRecorder, options: DemoOptions, url: str) -> str:
+    return (
+        "A simulated robot drives through a flat. Nothing here is ROS; the bags, the server and "
+        "the\nclient are what a robot would have.\n\n"
+        f"  bags     {recorder.directory}\n"
+        f"           {options.duration_s:g} s of history in {recorder.splits} files of "
+        f"{SPLIT_DURATION_S:g} s, the last one being written\n"
+        f"  server   {url}/sse\n"
+    )
+
+
+async def _ask_all(url: str, recorder: DemoRecorder, say: Callable[[str], None]) -> int:
+    """Asks every question over one connection; how many answers were wrong."""
+    wrong = 0
+    async with Client(sse_client(url)) as client:
+        for number, question in enumerate(QUESTIONS, start=1):
+            exchange = await _ask(client, question, recorder)
+            say(f"{shown(number, exchange)}\n")
+            wrong += not exchange.right
+    return wrong
+
+
+async def _ask(client: Client, question: Question, recorder: DemoRecorder) -> Exchange:
+    clock = WallClock()
+    before = clock.now()
+    try:
+        result = await client.call_tool(question.tool, dict(question.arguments))
+    except MCPError as error:
+        return Exchange(question, "", f"the call failed: {error}", right=False)
+    after = clock.now()
+    reply = "".join(part.text for part in result.content if isinstance(part, TextContent))
+    asked = Asked(
+        recorder.timeline, before, after, recorder.closed_ends(before - _KNOWN_WITHIN_NS, after)
+    )
+    return judged(question, reply, asked, is_error=result.is_error)
+
+
+def _stay(server: subprocess.Popen[bytes], recorder: DemoRecorder) -> None:
+    """Returns when it is interrupted.
+
+    Raises:
+        EpisodicError: the server or the recording ended by itself.
+    """
+    try:
+        while recorder.failure is None:
+            try:
+                code = server.wait(timeout=1.0)
+            except subprocess.TimeoutExpired:
+                continue
+            raise EpisodicError(f"the server ended by itself, with exit code {code}")
+    except KeyboardInterrupt:
+        return
+    raise EpisodicError(f"the recording ended: {recorder.failure}")

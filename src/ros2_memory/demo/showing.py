@@ -1,0 +1,74 @@
+"""What the demo prints, as text of at most 100 columns."""
+
+from __future__ import annotations
+
+import json
+import re
+import textwrap
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.demo.questions import Exchange, Question
+
+WIDTH: Final = 96
+_INDENT: Final = "    "
+_JSON_LINES: Final = 4
+
+
+def shown(number: int, exchange: Exchange) -> str:
+    """The question, the tool call, the answer in words, and the reply as it came."""
+    mark = "" if exchange.right else "WRONG: "
+    answer = textwrap.fill(
+        f"{mark}{exchange.sentence}",
+        WIDTH,
+        initial_indent=f"{_INDENT}=> ",
+        subsequent_indent=f"{_INDENT}   ",
+        break_on_hyphens=False,
+    )
+    lines = [f"{number:>2}. {exchange.question.words}", *_call(exchange.question), answer]
+    return "\n".join([*lines, *_reply(exchange.reply)])
+
+
+def invitation(sse_url: str, http_url: str) -> str:
+    """How another client asks, while the robot drives on."""
+    return "\n".join(
+        [
+            "The robot drives on, and the server stays up until Ctrl-C. Ask it yourself:",
+            "",
+            f"  over SSE               {sse_url}",
+            f"  over streamable HTTP   {http_url}",
+            "  from a brain           with this in its tools/mcp.yaml:",
+            "",
+            "    - name: episodic",
+            "      transport: sse",
+            f'      url: "{sse_url}"',
+        ]
+    )
+
+
+def _call(question: Question) -> list[str]:
+    arguments = ", ".join(
+        f"{name}={json.dumps(value)}" for name, value in question.arguments.items()
+    )
+    return textwrap.wrap(
+        f"{question.tool}({arguments})",
+        WIDTH,
+        initial_indent=_INDENT,
+        subsequent_indent=_INDENT * 2,
+        break_on_hyphens=False,
+    )
+
+
+def _reply(text: str) -> Iterator[str]:
+    """The JSON as it came, broken after commas; of a long one the beginning and its length."""
+    lines = [""]
+    for piece in re.findall(r"[^,]*,|[^,]+$", text):
+        if lines[-1] and len(_INDENT) + len(lines[-1]) + len(piece) > WIDTH:
+            lines.append("")
+        lines[-1] += piece
+    for line in lines[:_JSON_LINES]:
+        yield _INDENT + line
+    if len(lines) > _JSON_LINES:
+        yield f"{_INDENT}... ({len(text):,} characters in all)"
