@@ -108,7 +108,8 @@ class SchemaExtractor:
         """The whole extracted value, neither thinned nor rounded: what conditions are tested on.
 
         NaN and infinities stay; angles are in degrees, times in seconds. Byte arrays longer than
-        the limit, and the data of images, point clouds and maps, are summaries here too.
+        the limit, and the data of images, point clouds and maps, are summaries here too, and what
+        lies deeper than 24 levels (JSON alone can) is null.
         """
         return self._whole(Exact(self._limit), message, type_name)
 
@@ -208,7 +209,7 @@ class SchemaExtractor:
         else:
             found = ABSENT if plan.fields else descend(message, segments, view)
         if found is ABSENT:
-            found = _plain(descend(message, segments))
+            found = _plain(_at(message, segments))
         if found is ABSENT:
             raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
         return found

@@ -45,6 +45,7 @@ def real(number: float) -> JsonValue:
 
     A scalar that was a float32 no longer says so once it is decoded. Its value does: it is exactly
     a float32 and yet needs more digits than these, which befalls a measured float64 once in 2**29.
+    It leaves as `single` has it.
     """
     if not math.isfinite(number) or number == int(number):
         return short(number)
