@@ -1,0 +1,323 @@
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.errors import ConfigError, InvalidArgumentsError
+from ros2_memory.extract import SchemaExtractor
+from tests import bags
+from tests.schemas import shipped_extractor
+
+EXTRACTOR = shipped_extractor()
+ODOMETRY = "nav_msgs/msg/Odometry"
+DETECTIONS = "ros2_vision_interfaces/msg/VisionDetectionArray"
+NS = 1_752_500_000_123_456_789
+
+
+def decoded(message: bags.Msg) -> object:
+    """The message as a reader gives it: through its bytes."""
+    return bags.typestore().deserialize_cdr(message.payload, message.type)
+
+
+def odometry(yaw: float = 0.5) -> object:
+    return decoded(bags.odom(NS, 1.23456, -2.0, yaw, vx=0.3, wz=0.1))
+
+
+def detections(*labels: str) -> object:
+    return decoded(bags.detections(NS, labels, at=(1.23456, 2.0, 3.0)))
+
+
+def pose_stamped(orientation: object, position: object | None = None) -> object:
+    pose = bags.make(
+        "geometry_msgs/msg/Pose",
+        position=position or bags.point(1.0, 2.0, 3.0),
+        orientation=orientation,
+    )
+    return bags.make("geometry_msgs/msg/PoseStamped", header=bags.header(NS, "map"), pose=pose)
+
+
+def shown(message: object, type_name: str, *fields: str) -> Any:
+    return EXTRACTOR.shown(message, type_name, fields).value
+
+
+# What the specification asks of its types
+
+
+def test_odometry_is_shown_as_position_angles_and_velocities() -> None:
+    assert shown(odometry(), ODOMETRY) == {
+        "position": {"x": 1.2346, "y": -2, "z": 0},
+        "orientation": {"roll_deg": 0, "pitch_deg": 0, "yaw_deg": 28.65},
+        "linear_velocity": {"x": 0.3, "y": 0, "z": 0},
+        "angular_velocity": {"x": 0, "y": 0, "z": 0.1},
+    }
+
+
+def test_exactly_odometry_is_neither_rounded_nor_made_of_ints() -> None:
+    value = EXTRACTOR.exact(odometry(), ODOMETRY)
+    assert isinstance(value, dict)
+    assert value["position"] == {"x": 1.23456, "y": -2.0, "z": 0.0}
+    assert value["orientation"] == {
+        "roll_deg": 0.0,
+        "pitch_deg": 0.0,
+        "yaw_deg": pytest.approx(math.degrees(0.5), abs=1e-12),
+    }
+
+
+def test_a_twist_is_shown_as_velocities() -> None:
+    message = bags.Msg("/cmd_vel", "geometry_msgs/msg/Twist", NS, bags.twist(0.25, -0.5))
+    assert shown(decoded(message), message.type) == {
+        "linear_velocity": {"x": 0.25, "y": 0, "z": 0},
+        "angular_velocity": {"x": 0, "y": 0, "z": -0.5},
+    }
+
+
+def test_a_stamped_string_is_shown_as_its_value() -> None:
+    type_name = "ros2_vision_interfaces/msg/StampedString"
+    body = bags.make(type_name, header=bags.header(NS, ""), data="a red cup")
+    assert shown(decoded(bags.Msg("/scene", type_name, NS, body)), type_name) == {
+        "value": "a red cup"
+    }
+
+
+def test_detections_are_shown_with_label_score_point_and_box() -> None:
+    assert shown(detections("cup"), DETECTIONS) == {
+        "skill": "scene",
+        "detections": [
+            {
+                "label": "cup",
+                "score": 0.9,
+                "point": {"x": 1.2346, "y": 2, "z": 3},
+                "bbox": [10, 20, 100, 120],
+            }
+        ],
+    }
+
+
+def test_more_detections_than_the_limit_are_thinned_with_a_note_and_whole_for_conditions() -> None:
+    many = detections(*(f"thing {n}" for n in range(80)))
+    extracted = EXTRACTOR.shown(many, DETECTIONS)
+    assert extracted.notes == ("detections: 50 of 80 values, evenly spaced",)
+    exact = EXTRACTOR.exact(many, DETECTIONS)
+    assert isinstance(exact, dict)
+    assert isinstance(exact["detections"], list)
+    assert len(exact["detections"]) == 80
+
+
+def test_a_path_is_shown_by_its_poses() -> None:
+    path = bags.make(
+        "nav_msgs/msg/Path",
+        header=bags.header(NS, "map"),
+        poses=[pose_stamped(bags.quaternion(0.0), bags.point(n, 0)) for n in range(212)],
+    )
+    extracted = EXTRACTOR.shown(path, "nav_msgs/msg/Path")
+    assert extracted.notes == ("poses: 50 of 212 values, evenly spaced",)
+    assert isinstance(extracted.value, dict)
+    assert extracted.value["frame_id"] == "map"
+    assert isinstance(extracted.value["poses"], list)
+    assert extracted.value["poses"][-1] == {
+        "position": {"x": 211, "y": 0, "z": 0},
+        "orientation": {"roll_deg": 0, "pitch_deg": 0, "yaw_deg": 0},
+    }
+
+
+# Types without an entry, and JSON
+
+
+def test_a_type_without_an_entry_is_shown_with_all_its_fields() -> None:
+    body = bags.make(
+        "sensor_msgs/msg/Temperature",
+        header=bags.header(1_500_000_000, "engine"),
+        temperature=21.5,
+        variance=0.0,
+    )
+    assert shown(body, "sensor_msgs/msg/Temperature") == {
+        "header": {"stamp": 1.5, "frame_id": "engine"},
+        "temperature": 21.5,
+        "variance": 0,
+    }
+
+
+def test_a_type_named_as_before_2019_is_found_in_the_map() -> None:
+    assert shown(odometry(), "nav_msgs/Odometry") == shown(odometry(), ODOMETRY)
+    assert EXTRACTOR.fields_of("std_msgs/String") == ("value",)
+
+
+@pytest.mark.parametrize("message", [{"level": 2, "q": {"x": 0, "w": 1}}, [1, "a"], "text", None])
+def test_json_says_what_it_says(message: object) -> None:
+    assert shown(message, "foxglove.Log") == message
+    assert EXTRACTOR.exact(message, "foxglove.Log") == message
+
+
+def test_fields_that_a_message_lacks_are_null_with_a_note() -> None:
+    extracted = EXTRACTOR.shown({"status": "on", "skill": "scene"}, DETECTIONS)
+    assert extracted.value == {"skill": "scene", "detections": None}
+    assert extracted.notes == ("detections: this message has no such field",)
+
+
+def test_a_message_that_fits_nothing_of_its_entry_is_shown_whole() -> None:
+    assert shown({"other": 1}, DETECTIONS) == {"other": 1}
+
+
+# `fields`
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("position", {"x": 1.2346, "y": -2, "z": 0}),
+        ("position.x", 1.2346),
+        ("orientation.yaw_deg", 28.65),
+        ("child_frame_id", "base_link"),
+        ("header", {"stamp": 1752500000.123457, "frame_id": "odom"}),
+        ("header.stamp", 1752500000.123457),
+        ("header.stamp.sec", 1752500000),
+        ("pose.pose.position.x", 1.2346),
+        ("pose.pose.orientation", {"x": 0, "y": 0, "z": 0.24740395925, "w": 0.96891242171}),
+        ("pose.covariance.35", 0),
+        ("twist.twist.linear", {"x": 0.3, "y": 0, "z": 0}),
+    ],
+)
+def test_a_field_is_one_of_the_value_or_else_a_full_path_in_the_message(
+    path: str, value: object
+) -> None:
+    assert shown(odometry(), ODOMETRY, path) == {path: value}
+
+
+def test_fields_over_a_list_take_an_element_or_map_over_all() -> None:
+    seen = detections("cup", "mug")
+    paths = ("detections.label", "detections.1.label", "detections.2.label", "detections.point.x")
+    assert shown(seen, DETECTIONS, *paths) == {
+        "detections.label": ["cup", "mug"],
+        "detections.1.label": "mug",
+        "detections.2.label": None,
+        "detections.point.x": [1.2346, 1.2346],
+    }
+    assert shown(detections(), DETECTIONS, "detections.label") == {"detections.label": []}
+
+
+def test_a_mapped_field_is_thinned_under_its_own_path() -> None:
+    extracted = EXTRACTOR.shown(detections(*"a" * 60), DETECTIONS, ["detections.label"])
+    assert extracted.notes == ("detections.label: 50 of 60 values, evenly spaced",)
+
+
+def test_the_field_of_the_value_counts_before_that_of_the_message() -> None:
+    imu = {"orientation": bags.quaternion(0.5)}
+    type_name = "sensor_msgs/msg/Imu"
+    assert set(shown(imu, type_name, "orientation")["orientation"]) == {
+        "roll_deg",
+        "pitch_deg",
+        "yaw_deg",
+    }
+    assert shown(imu, type_name, "orientation.w") == {"orientation.w": pytest.approx(0.96891242)}
+
+
+def test_the_full_path_to_the_quaternions_of_a_list_gives_their_components() -> None:
+    path = bags.make(
+        "nav_msgs/msg/Path",
+        header=bags.header(NS, "map"),
+        poses=[pose_stamped(bags.quaternion(0.0))],
+    )
+    both = shown(path, "nav_msgs/msg/Path", "poses.orientation", "poses.pose.orientation")
+    assert both["poses.orientation"] == [{"roll_deg": 0, "pitch_deg": 0, "yaw_deg": 0}]
+    assert both["poses.pose.orientation"] == [{"x": 0, "y": 0, "z": 0, "w": 1}]
+
+
+def test_fields_of_json_are_its_keys() -> None:
+    message = {"pose": {"x": 1.5}, "tags": [{"id": 1}, {"id": 2}]}
+    assert shown(message, "json", "pose.x", "tags.id") == {"pose.x": 1.5, "tags.id": [1, 2]}
+
+
+def test_an_unknown_field_is_refused_with_the_path_the_type_and_what_there_is() -> None:
+    with pytest.raises(InvalidArgumentsError) as refused:
+        EXTRACTOR.shown(odometry(), ODOMETRY, ["position", "speed"])
+    assert str(refused.value) == (
+        "nav_msgs/msg/Odometry has no field 'speed'; its fields are: position, orientation, "
+        "linear_velocity, angular_velocity; or give a full path in the message, which begins with "
+        "one of: header, child_frame_id, pose, twist"
+    )
+
+
+def test_an_unknown_field_of_an_unmapped_type_is_refused_with_what_the_message_has() -> None:
+    with pytest.raises(InvalidArgumentsError, match="json has no field 'c'; its fields are: a, b"):
+        EXTRACTOR.shown({"a": 1, "b": 2}, "json", ["c"])
+    with pytest.raises(InvalidArgumentsError, match="it has no fields"):
+        EXTRACTOR.shown("text", "json", ["c"])
+    with pytest.raises(InvalidArgumentsError, match=r"k39, \.\.\.$"):
+        EXTRACTOR.shown({f"k{n}": n for n in range(50)}, "json", ["c"])
+
+
+@pytest.mark.parametrize("path", ["", ".", "position.", "position.w", "position.__class__"])
+def test_a_path_that_is_none_is_refused(path: str) -> None:
+    with pytest.raises(InvalidArgumentsError):
+        EXTRACTOR.shown(odometry(), ODOMETRY, [path])
+
+
+# What would fill a reply alone
+
+
+def test_a_message_that_would_fill_a_reply_is_thinned_harder() -> None:
+    values = [{"key": f"k{n}", "value": "x" * 60} for n in range(45)]
+    message = {"status": [{"name": f"n{n}", "values": values} for n in range(45)]}
+    extracted = SchemaExtractor({}, 50, max_chars=5000).shown(message, "json")
+    assert len(repr(extracted.value)) < 6000
+    assert any(note.startswith("status: ") and " of 45 values" in note for note in extracted.notes)
+
+
+@given(st.recursive(st.text(max_size=300), lambda inner: st.lists(inner, max_size=30)))
+def test_no_list_of_texts_is_too_long_to_be_shown(message: object) -> None:
+    extracted = SchemaExtractor({}, 50, max_chars=800).shown(message, "json")
+    assert len(repr(extracted.value)) <= 1600
+
+
+# The map itself
+
+
+def test_the_fields_of_a_type_are_those_of_the_map() -> None:
+    assert EXTRACTOR.fields_of(DETECTIONS) == ("skill", "detections")
+    assert EXTRACTOR.fields_of("custom_msgs/msg/Unknown") == ()
+
+
+@pytest.mark.parametrize("path", ["", "pose..x", "pose/x", ".pose", "pose.", "__dict__"])
+def test_a_malformed_path_is_refused_with_its_type_and_field(path: str) -> None:
+    with pytest.raises(ConfigError, match=r"message schema a_msgs/msg/A: where: .* is not a dot-"):
+        SchemaExtractor({"a_msgs/msg/A": {"where": path}}, 50)
+
+
+@pytest.mark.parametrize("name", ["", "a.b"])
+def test_a_field_name_that_no_path_could_address_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match="a_msgs/msg/A"):
+        SchemaExtractor({"a_msgs/msg/A": {name: "data"}}, 50)
+
+
+def test_a_limit_below_one_is_refused() -> None:
+    with pytest.raises(ConfigError, match="max_array_length is 0"):
+        SchemaExtractor({}, 0)
+
+
+def test_a_map_of_ones_own_may_reach_into_lists() -> None:
+    schemas = {"a_msgs/msg/A": {"labels": "seen.label", "first": "seen.0", "second": "stamp.sec"}}
+    extractor = SchemaExtractor(schemas, 50)
+    message = SimpleNamespace(
+        seen=[{"label": "cup"}, {"label": "mug"}], stamp=bags.stamp(2 * 10**9)
+    )
+    assert extractor.exact(message, "a_msgs/msg/A") == {
+        "labels": ["cup", "mug"],
+        "first": {"label": "cup"},
+        "second": 2,
+    }
+
+
+def test_a_scan_of_float32_is_shown_in_short_decimals() -> None:
+    ranges = np.linspace(0.1, 36.0, 360, dtype=np.float32)
+    message = SimpleNamespace(ranges=ranges)
+    extracted = EXTRACTOR.shown(message, "sensor_msgs/msg/LaserScan")
+    assert extracted.notes == ("ranges: 50 of 360 values, evenly spaced",)
+    assert isinstance(extracted.value, dict)
+    assert isinstance(extracted.value["ranges"], list)
+    assert extracted.value["ranges"][:2] == [0.1, 0.8]

@@ -1,0 +1,191 @@
+"""Where a message is, how fast, when, and what it says of frames."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from ros2_memory import geometry
+from ros2_memory.model import Pose, Twist
+from tests import bags
+from tests.schemas import shipped_extractor
+
+EXTRACTOR = shipped_extractor()
+ODOMETRY = "nav_msgs/msg/Odometry"
+NS = 1_752_500_000_123_456_789
+
+
+def odometry() -> object:
+    return decoded(bags.odom(NS, 1.23456, -2.0, 0.5, vx=0.3, wz=0.1))
+
+
+def decoded(message: bags.Msg) -> object:
+    """The message as a reader gives it: through its bytes."""
+    return bags.typestore().deserialize_cdr(message.payload, message.type)
+
+
+def quaternion(x: float, y: float, z: float, w: float) -> object:
+    return bags.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def pose_stamped(orientation: object, position: object) -> object:
+    pose = bags.make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+    return bags.make("geometry_msgs/msg/PoseStamped", header=bags.header(NS, "map"), pose=pose)
+
+
+def test_the_pose_of_odometry_is_in_its_headers_frame_and_its_twist_in_the_childs() -> None:
+    assert EXTRACTOR.pose(odometry(), ODOMETRY) == Pose(
+        (1.23456, -2.0, 0.0), (0.0, 0.0, math.sin(0.25), math.cos(0.25)), "odom"
+    )
+    assert EXTRACTOR.twist(odometry(), ODOMETRY) == Twist(
+        (0.3, 0.0, 0.0), (0.0, 0.0, 0.1), "base_link"
+    )
+
+
+def test_a_twist_is_in_its_headers_frame_or_in_none() -> None:
+    twist = bags.twist(1.0, 0.0)
+    assert EXTRACTOR.twist(twist, "geometry_msgs/msg/Twist") == Twist(
+        (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), ""
+    )
+    stamped = bags.make(
+        "geometry_msgs/msg/TwistStamped", header=bags.header(NS, "base_link"), twist=twist
+    )
+    found = EXTRACTOR.twist(stamped, "geometry_msgs/msg/TwistStamped")
+    assert found is not None
+    assert found.frame_id == "base_link"
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        SimpleNamespace(pose=SimpleNamespace(pose=SimpleNamespace(position=bags.point(1, 2, 3)))),
+        SimpleNamespace(pose=SimpleNamespace(position=bags.point(1, 2, 3))),
+        SimpleNamespace(position=bags.point(1, 2, 3)),
+        {"pose": {"pose": {"position": {"x": 1, "y": 2, "z": 3}}}},
+        {"position": {"x": 1, "y": 2, "z": 3}},
+    ],
+)
+def test_a_type_without_an_entry_has_a_pose_where_a_point_stands_in_one_of_three_places(
+    message: object,
+) -> None:
+    assert EXTRACTOR.pose(message, "custom_msgs/msg/Place") == Pose((1.0, 2.0, 3.0), None, "")
+
+
+def test_json_in_the_likeness_of_a_message_has_its_pose_twist_and_stamp() -> None:
+    vector = {"x": 1, "y": 0, "z": 0}
+    message = {
+        "header": {"frame_id": "odom", "stamp": {"sec": 1, "nanosec": 2}},
+        "child_frame_id": "base_link",
+        "pose": {"pose": {"position": vector, "orientation": {"x": 0, "y": 0, "z": 0, "w": 2}}},
+        "twist": {"twist": {"linear": vector, "angular": vector}},
+    }
+    for type_name in (ODOMETRY, "json"):
+        assert EXTRACTOR.pose(message, type_name) == Pose(
+            (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "odom"
+        )
+        assert EXTRACTOR.twist(message, type_name) == Twist(
+            (1.0, 0.0, 0.0), (1.0, 0.0, 0.0), "base_link"
+        )
+    assert EXTRACTOR.stamp(message) == 1_000_000_002
+
+
+@pytest.mark.parametrize(
+    ("message", "type_name"),
+    [
+        (bags.make("std_msgs/msg/String", data="x"), "std_msgs/msg/String"),
+        (bags.twist(1.0, 0.0), "geometry_msgs/msg/Twist"),
+        (SimpleNamespace(position=[1.0, 2.0]), "custom_msgs/msg/Joints"),
+        ({"position": {"x": "1", "y": 2, "z": 3}}, "json"),
+        ([1, 2], "json"),
+        (None, "json"),
+    ],
+)
+def test_what_carries_no_pose_has_none(message: object, type_name: str) -> None:
+    assert EXTRACTOR.pose(message, type_name) is None
+
+
+def test_an_acceleration_is_no_twist() -> None:
+    accel = bags.make(
+        "geometry_msgs/msg/Accel", linear=bags.vector3(1.0), angular=bags.vector3(0.0)
+    )
+    assert EXTRACTOR.twist(accel, "geometry_msgs/msg/Accel") is None
+    assert EXTRACTOR.twist({"angular_velocity": {"x": 0}}, "sensor_msgs/msg/Imu") is None
+
+
+def test_positions_that_are_nan_are_given_as_they_stand() -> None:
+    message = pose_stamped(quaternion(0.0, 0.0, 0.0, 0.0), bags.point(math.nan, 1.0, 2.0))
+    pose = EXTRACTOR.pose(message, "geometry_msgs/msg/PoseStamped")
+    assert pose is not None
+    assert math.isnan(pose.position[0])
+    assert pose.orientation is None
+    assert pose.frame_id == "map"
+
+
+def test_orientations_are_normalised() -> None:
+    pose = EXTRACTOR.pose(
+        pose_stamped(quaternion(5.0, 6.0, 7.0, 8.0), bags.point(1.0, 2.0)),
+        "geometry_msgs/msg/PoseStamped",
+    )
+    assert pose is not None
+    assert pose.orientation == geometry.normalised((5.0, 6.0, 7.0, 8.0))
+
+
+def test_a_point_is_a_pose_without_orientation() -> None:
+    point = bags.make(
+        "geometry_msgs/msg/PointStamped", header=bags.header(NS, "map"), point=bags.point(1.0, 2.0)
+    )
+    assert EXTRACTOR.pose(point, "geometry_msgs/msg/PointStamped") == Pose(
+        (1.0, 2.0, 0.0), None, "map"
+    )
+
+
+def test_the_stamp_is_that_of_the_header() -> None:
+    assert EXTRACTOR.stamp(odometry()) == NS
+    assert EXTRACTOR.stamp(bags.twist(0.0, 0.0)) is None
+
+
+def tf_message(*transforms: object) -> object:
+    return decoded(bags.tf(NS, *transforms))
+
+
+def test_the_transforms_of_a_message_keep_stamp_and_log_time() -> None:
+    message = tf_message(
+        bags.transform(NS, "odom", "base_link", (1.0, 2.0, 0.0), 0.5),
+        bags.transform(NS + 5, "/base_link", "/laser", (0.1, 0.0, 0.2)),
+    )
+    first, second = EXTRACTOR.transforms(message, NS + 9, static=True)
+    assert (first.parent, first.child, first.stamp, first.log_time, first.static) == (
+        "odom",
+        "base_link",
+        NS,
+        NS + 9,
+        True,
+    )
+    assert first.transform.translation == (1.0, 2.0, 0.0)
+    assert first.transform.rotation == (0.0, 0.0, math.sin(0.25), math.cos(0.25))
+    assert (second.parent, second.child, second.stamp) == ("base_link", "laser", NS + 5)
+
+
+def test_transforms_that_tf_refuses_are_left_out() -> None:
+    good = bags.transform(NS, "odom", "base_link", (0.0, 0.0, 0.0))
+    bad: list[Any] = [bags.transform(NS, "a", "b", (0.0, 0.0, 0.0)) for _ in range(2)]
+    bad[0].transform.rotation = quaternion(0.0, 0.0, 0.0, 0.0)
+    bad[1].transform.rotation = quaternion(math.nan, 0.0, 0.0, 1.0)
+    message = tf_message(
+        *bad,
+        bags.transform(NS, "a", "b", (math.nan, 0.0, 0.0)),
+        bags.transform(NS, "a", "b", (0.0, math.inf, 0.0)),
+        bags.transform(NS, "same", "/same", (0.0, 0.0, 0.0)),
+        bags.transform(NS, "", "b", (0.0, 0.0, 0.0)),
+        bags.transform(NS, "a", "", (0.0, 0.0, 0.0)),
+        good,
+    )
+    assert [edge.child for edge in EXTRACTOR.transforms(message, NS, static=False)] == ["base_link"]
+
+
+@pytest.mark.parametrize("message", [None, {"transforms": 3}, {"transforms": [1, None]}, "x"])
+def test_what_is_no_tf_message_has_no_transforms(message: object) -> None:
+    assert EXTRACTOR.transforms(message, NS, static=False) == ()

@@ -1,0 +1,132 @@
+"""Every message of public robots' bags, decoded with plain rosbags and mcap."""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ros2_memory.messages import names_of
+from tests.schemas import shipped_extractor
+from tests.shared_bags import REAL, needs_real
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from rosbags.typesys.store import Typestore
+
+EXTRACTOR = shipped_extractor()
+MAX_REPLY_CHARS = 24_000
+SETS = {
+    "rosbags_rs_94types_mcap": 188,
+    "rosbags_rs_94types_db3": 188,
+    "cougars_auv_mcap": 2671,
+    "rerun_sensors_mcap": 194,
+}
+
+
+def store_of(name: str, text: str) -> Typestore:
+    if not text:
+        return get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, name))
+    return store
+
+
+def messages(folder: Path) -> Iterator[tuple[str, str, object]]:
+    """Topic, type and message of everything in a folder's bags."""
+    stores: dict[tuple[str, str], Typestore] = {}
+    for topic, name, text, payload in (*mcap_rows(folder), *sqlite_rows(folder)):
+        if (name, text) not in stores:
+            stores[name, text] = store_of(name, text)
+        yield topic, name, stores[name, text].deserialize_cdr(payload, name)
+
+
+def mcap_rows(folder: Path) -> Iterator[tuple[str, str, str, bytes]]:
+    for path in sorted(folder.glob("*.mcap")):
+        with path.open("rb") as stream:
+            for schema, channel, message in make_reader(stream).iter_messages():
+                assert schema is not None
+                yield channel.topic, schema.name, schema.data.decode(), message.data
+
+
+def sqlite_rows(folder: Path) -> Iterator[tuple[str, str, str, bytes]]:
+    for path in sorted(folder.glob("*.db3")):
+        base = sqlite3.connect(f"file:{path}?immutable=1", uri=True)
+        yield from base.execute(
+            "SELECT t.name, t.type, d.encoded_message_definition, m.data FROM messages m "
+            "JOIN topics t ON t.id = m.topic_id "
+            "JOIN message_definitions d ON d.topic_type = t.type ORDER BY m.timestamp"
+        )
+        base.close()
+
+
+@needs_real
+@pytest.mark.parametrize("name", SETS)
+def test_every_message_is_shown_as_strict_json_that_fits_a_reply(name: str) -> None:
+    shown = 0
+    for _, type_name, message in messages(REAL / name):
+        value = EXTRACTOR.shown(message, type_name).value
+        text = json.dumps(value, allow_nan=False)
+        assert len(text) < MAX_REPLY_CHARS
+        assert "__msgtype__" not in text
+        assert isinstance(EXTRACTOR.exact(message, type_name), dict)
+        EXTRACTOR.transforms(message, 0, static=False)
+        shown += 1
+    assert shown == SETS[name]
+
+
+@needs_real
+def test_each_field_of_each_type_can_be_asked_for_alone() -> None:
+    for _, type_name, message in messages(REAL / "rosbags_rs_94types_mcap"):
+        for path in (*names_of(message), *EXTRACTOR.fields_of(type_name)):
+            value = EXTRACTOR.shown(message, type_name, [path]).value
+            assert isinstance(value, dict)
+            assert list(value) == [path]
+
+
+@needs_real
+def test_constants_of_definitions_are_not_shown() -> None:
+    for _, type_name, message in messages(REAL / "rosbags_rs_94types_mcap"):
+        assert all(not name.isupper() for name in names_of(message)), type_name
+
+
+@needs_real
+def test_the_nan_positions_of_the_auv_are_poses_and_leave_as_null() -> None:
+    odometry = [m for m in messages(REAL / "cougars_auv_mcap") if m[0] == "/coug2/odom"]
+    assert len(odometry) == 3
+    for _, type_name, message in odometry:
+        pose = EXTRACTOR.pose(message, type_name)
+        assert pose is not None
+        assert any(math.isnan(part) for part in pose.position)
+        value = EXTRACTOR.shown(message, type_name, ["position"]).value
+        assert isinstance(value, dict)
+        assert isinstance(value["position"], dict)
+        assert None in value["position"].values()
+
+
+@needs_real
+def test_pictures_and_clouds_are_shown_as_summaries() -> None:
+    found = {t: (n, m) for t, n, m in messages(REAL / "rerun_sensors_mcap")}
+    data = {}
+    for type_name, message in found.values():
+        if type_name.rpartition("/")[2] in {"Image", "CompressedImage", "PointCloud2"}:
+            value = EXTRACTOR.exact(message, type_name)
+            assert isinstance(value, dict)
+            data[type_name] = value["data"]
+    assert data["sensor_msgs/msg/Image"] == {
+        "bytes": 921600,
+        "encoding": "rgb8",
+        "shape": [480, 640, 3],
+    }
+    compressed, cloud = data["sensor_msgs/msg/CompressedImage"], data["sensor_msgs/msg/PointCloud2"]
+    assert isinstance(compressed, dict)
+    assert compressed["encoding"] == "jpeg"
+    assert isinstance(cloud, dict)
+    assert (cloud["points"], cloud["shape"]) == (200, [1, 200])

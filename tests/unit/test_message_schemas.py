@@ -1,0 +1,125 @@
+"""The shipped schema map, held against the real definitions of its types."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import pytest
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_msg
+
+from tests import bags
+from tests.schemas import shipped_schemas
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import FieldDesc, Typesdict
+
+VISION_MSGS = {
+    "vision_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
+    "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta\n",
+    "vision_msgs/msg/BoundingBox2D": (
+        "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n"
+    ),
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
+    ),
+    "vision_msgs/msg/Detection2D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox2D bbox\n"
+        "string id\n"
+    ),
+    "vision_msgs/msg/Detection3D": (
+        "std_msgs/Header header\nObjectHypothesisWithPose[] results\nBoundingBox3D bbox\n"
+        "string id\n"
+    ),
+    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nDetection2D[] detections\n",
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nDetection3D[] detections\n",
+}
+
+SPEC = {
+    "nav_msgs/msg/Odometry": {
+        "position": "pose.pose.position",
+        "orientation": "pose.pose.orientation",
+        "linear_velocity": "twist.twist.linear",
+        "angular_velocity": "twist.twist.angular",
+    },
+    "sensor_msgs/msg/LaserScan": {"ranges": "ranges"},
+    "ros2_vision_interfaces/msg/VisionDetectionArray": {
+        "skill": "skill",
+        "detections": "detections",
+    },
+    "ros2_vision_interfaces/msg/StampedString": {"value": "data"},
+}
+
+PROMISED = (
+    *SPEC,
+    *(f"std_msgs/msg/{name}" for name in ("String", "Bool", "Byte", "Char", "Float32", "Float64")),
+    *(f"std_msgs/msg/{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)),
+    "geometry_msgs/msg/Twist",
+    "geometry_msgs/msg/TwistStamped",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Path",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/BatteryState",
+    "sensor_msgs/msg/NavSatFix",
+    "sensor_msgs/msg/Range",
+    "sensor_msgs/msg/JointState",
+    "tf2_msgs/msg/TFMessage",
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "rcl_interfaces/msg/Log",
+    "vision_msgs/msg/Detection2DArray",
+    "vision_msgs/msg/Detection3DArray",
+)
+
+
+@cache
+def definitions() -> Typesdict:
+    known = dict(bags.typestore().fielddefs)
+    for name, text in VISION_MSGS.items():
+        known.update(get_types_from_msg(text, name))
+    return known
+
+
+def leads_somewhere(type_name: str, path: str) -> bool:
+    """Whether each segment names a field of the definition before it."""
+    for segment in path.split("."):
+        fields = dict(definitions()[type_name][1]) if type_name in definitions() else {}
+        if segment not in fields:
+            return False
+        type_name = element_type(fields[segment])
+    return True
+
+
+def element_type(description: FieldDesc) -> str:
+    """The message type of a field or of its elements; empty for numbers and strings."""
+    if description[0] in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+        description = description[1][0]
+    return description[1] if isinstance(description[1], str) else ""
+
+
+@pytest.mark.parametrize("type_name", shipped_schemas())
+def test_every_path_leads_to_a_field_of_the_real_definition(type_name: str) -> None:
+    assert type_name in definitions()
+    wrong = {
+        name: path
+        for name, path in shipped_schemas()[type_name].items()
+        if not leads_somewhere(type_name, path)
+    }
+    assert wrong == {}
+
+
+def test_a_path_that_leads_nowhere_would_be_seen() -> None:
+    assert not leads_somewhere("nav_msgs/msg/Odometry", "pose.position")
+    assert not leads_somewhere("nav_msgs/msg/Odometry", "pose.pose.position.x.y")
+
+
+def test_the_types_of_the_specification_stand_exactly_so() -> None:
+    assert {name: shipped_schemas()[name] for name in SPEC} == SPEC
+
+
+@pytest.mark.parametrize("type_name", PROMISED)
+def test_a_promised_type_is_mapped(type_name: str) -> None:
+    assert shipped_schemas()[type_name]
