@@ -246,7 +246,9 @@ def test_a_path_goes_on_in_every_element_of_a_list() -> None:
     assert at_field(SCENE, "detections.point.z") == [0.3]
 
 
-@pytest.mark.parametrize(("path", "label"), [("0", "Red Scissors"), ("-1", "mug")])
+@pytest.mark.parametrize(
+    ("path", "label"), [("0", "Red Scissors"), ("-1", "mug"), ("-2", "Red Scissors")]
+)
 def test_a_whole_number_picks_one_element(path: str, label: str) -> None:
     assert at_field(SCENE, f"detections.{path}.label") == [label]
 
@@ -294,6 +296,7 @@ def test_a_field_that_holds_places_deeper_down_is_searched() -> None:
         ("equals", True, Condition(Equals(True))),
         ("equals", "", Condition(Equals(""))),
         ("near_position", {"x": 1, "y": 2}, Condition(NearPosition(1.0, 2.0, None, 0.5))),
+        ("near_position", {"x": -0.5, "y": 0}, Condition(NearPosition(-0.5, 0.0, None, 0.5))),
         ("near_position", {"x": 1, "y": 2, "z": 3}, Condition(NearPosition(1.0, 2.0, 3.0, 0.5))),
         (
             "near_position",
@@ -337,6 +340,12 @@ def test_arguments_that_mean_nothing_are_refused_with_an_example(
     with pytest.raises(InvalidArgumentsError, match="for example condition_type") as refused:
         parse_condition(kind, value, 0.5)
     assert complaint in str(refused.value)
+
+
+def test_no_tolerance_means_the_very_place() -> None:
+    exact = parse_condition("near_position", {"x": 1, "y": 2}, 0.0)
+    assert exact.matches({"x": 1.0, "y": 2.0})
+    assert not exact.matches({"x": 1.0, "y": 2.001})
 
 
 @pytest.mark.parametrize("tolerance_m", [-0.1, math.nan, math.inf])
