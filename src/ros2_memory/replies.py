@@ -1,0 +1,82 @@
+"""Answers and errors as the one JSON text that leaves: which is what, and never too long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.errors import (
+    BagError,
+    EpisodicError,
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    QueryTimeoutError,
+    UndecodableError,
+)
+from ros2_memory.fitting import compact, fit
+from ros2_memory.shapes import Answer, file_name, shown
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.fitting import JsonObject
+
+_HOW_TO_NARROW: Final = "narrow the list with pattern, a glob such as /vision/*"
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What a client receives: one text, and whether it is an error for the protocol."""
+
+    text: str
+    is_error: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Replies:
+    """Renders answers and errors. File names are shown relative to `bag_dir`, never absolute."""
+
+    bag_dir: Path
+    max_chars: int
+
+    def answer(self, answer: Answer) -> Reply:
+        """An answer in the shape that the tool's description promises."""
+        value = shown(answer, self.bag_dir)
+        if isinstance(value, dict):
+            return Reply(fit(value, self.max_chars))
+        text = compact(value)
+        if isinstance(value, list) and len(text) > self.max_chars:
+            # A list has no place for the note that something is missing from it.
+            return Reply(fit({"topics": value, "notes": [_HOW_TO_NARROW]}, self.max_chars))
+        return Reply(text)
+
+    def error(self, error: EpisodicError) -> Reply:
+        """An error of the tree. Having no data is an answer; the others are errors."""
+        match error:
+            case NoDataError():
+                return self._no_data(error.reason, error.detail)
+            case UndecodableError():
+                return self._no_data(NoDataReason.UNDECODABLE, str(error))
+            case InvalidArgumentsError() | QueryTimeoutError():
+                return self._failure(error.code, str(error))
+            case BagError():
+                name = file_name(error.path, self.bag_dir)
+                return self._failure(error.code, f"{name}: {error.reason}; ask again")
+            case _:
+                return self._failure(error.code, str(error))
+
+    def internal(self, correlation_id: str) -> Reply:
+        """A fault of this program: nothing of its inside leaves but the id that finds the log."""
+        return self._failure(
+            "internal",
+            "the question failed through a fault in this server, not in the arguments; "
+            f"its log has the cause under correlation_id {correlation_id}",
+        )
+
+    def _no_data(self, reason: NoDataReason, detail: str) -> Reply:
+        shown: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
+        return Reply(fit(shown, self.max_chars))
+
+    def _failure(self, code: str, detail: str) -> Reply:
+        return Reply(fit({"error": code, "detail": detail}, self.max_chars), is_error=True)

@@ -1,0 +1,330 @@
+"""Answers as JSON values: field names, units, rounding.
+
+Timestamps are Unix seconds, rounded up to whole microseconds so that one fed back finds its own
+message; metres and metres per second to 1e-4, degrees to 1e-2, quaternions to 1e-6. What is not a
+finite number is null. `notes` is there only where there is something to say.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import singledispatch
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from ros2_memory import answers
+from ros2_memory.fitting import compact, without_constant_zeros
+from ros2_memory.geometry import normalised, yaw
+from ros2_memory.timebase import Ns, iso_local, unix_from_ns, unix_rounded_up
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.fitting import JsonObject
+    from ros2_memory.model import JsonValue, SetAside, Vector3
+
+Answer: TypeAlias = (
+    tuple[answers.TopicRow, ...]
+    | answers.TimeRange
+    | answers.TopicValue
+    | answers.TopicRange
+    | answers.Position
+    | answers.Velocity
+    | answers.TransformAt
+    | answers.Frames
+    | answers.Match
+    | answers.ValueWhen
+    | answers.TrajectorySummary
+)
+
+ZEROS_SHOWN_BELOW_CHARS: Final = 4000
+"""A range shorter than this keeps its constant zeros: there is room, and whole values read best."""
+
+FINE_PATH_M: Final = 0.05 + 1e-9
+"""The deviation that a drawn path is expected to have; a coarser one is worth a note."""
+
+_NEWEST_LISTED: Final = 20
+_MOST_ZEROS_NAMED: Final = 20
+
+
+@singledispatch
+def shown(answer: object, _bag_dir: Path) -> JsonValue:
+    """What a reply shows of an answer; files are named relative to the bag directory.
+
+    Raises:
+        TypeError: the value is none of `Answer`.
+    """
+    raise TypeError(f"{type(answer).__name__} is not an answer")
+
+
+@shown.register(tuple)
+def _topics(answer: tuple[answers.TopicRow, ...], _bag_dir: Path) -> JsonValue:
+    return [_topic_row(row) for row in answer]
+
+
+@shown.register(answers.TimeRange)
+def _time_range(answer: answers.TimeRange, bag_dir: Path) -> JsonObject:
+    notes = list(answer.notes)
+    gaps: list[JsonValue] = [
+        {
+            "start": unix_rounded_up(gap.start),
+            "end": unix_rounded_up(gap.end),
+            "duration_s": _seconds(gap.end - gap.start),
+        }
+        for gap in answer.gaps
+    ]
+    lists: dict[str, list[JsonValue]] = {
+        "gaps": gaps,
+        "active": _files(answer.active, bag_dir),
+        "damaged": _files(answer.damaged, bag_dir),
+        "incomplete": _files(answer.incomplete, bag_dir),
+        "unread": _files(answer.unread, bag_dir),
+    }
+    for name, rows in lists.items():
+        if len(rows) > _NEWEST_LISTED:
+            notes.append(f"{name}: the last {_NEWEST_LISTED} of {len(rows)} are listed")
+    reply: JsonObject = {
+        "earliest": _moment(answer.earliest),
+        "latest": _moment(answer.latest),
+        "earliest_local": _local(answer.earliest),
+        "latest_local": _local(answer.latest),
+        "now": _moment(answer.now),
+        "now_local": _local(answer.now),
+        "bags": answer.bags,
+    }
+    for name, rows in lists.items():
+        reply[name] = rows[-_NEWEST_LISTED:]
+        if len(rows) > _NEWEST_LISTED:
+            reply[f"{name}_count"] = len(rows)
+    reply["silent_topics"] = answer.silent_topics
+    return _with_notes(reply, notes)
+
+
+def _files(files: Sequence[SetAside], bag_dir: Path) -> list[JsonValue]:
+    return [{"file": file_name(file.path, bag_dir), "reason": file.reason} for file in files]
+
+
+def file_name(path: Path | str, bag_dir: Path) -> str:
+    """A bag as the operator finds it below the bag directory; never a path of the machine."""
+    bag = Path(path)
+    return str(bag.relative_to(bag_dir)) if bag.is_relative_to(bag_dir) else bag.name
+
+
+def _topic_row(row: answers.TopicRow) -> JsonObject:
+    reply: JsonObject = {
+        "topic": row.topic,
+        "type": row.type,
+        "first_ts": unix_rounded_up(row.first),
+        "last_ts": unix_rounded_up(row.last),
+        "count": row.count,
+    }
+    return reply if row.undecodable is None else {**reply, "undecodable": row.undecodable}
+
+
+@shown.register(answers.TopicValue)
+def _topic_value(answer: answers.TopicValue, _bag_dir: Path) -> JsonObject:
+    reply: JsonObject = {
+        "topic": answer.topic,
+        "type": answer.type,
+        "timestamp": unix_rounded_up(answer.sample.time),
+        "value": answer.sample.value,
+    }
+    return _finished(reply, answer.age, answer.notes)
+
+
+@shown.register(answers.TopicRange)
+def _topic_range(answer: answers.TopicRange, _bag_dir: Path) -> JsonObject:
+    reply = _range_of(answer, [sample.value for sample in answer.samples], answer.notes)
+    if len(compact(reply)) <= ZEROS_SHOWN_BELOW_CHARS:
+        return reply
+    values, zeros = without_constant_zeros([sample.value for sample in answer.samples])
+    if not zeros:
+        return reply
+    more = len(zeros) - _MOST_ZEROS_NAMED
+    named = ", ".join(zeros[:_MOST_ZEROS_NAMED]) + (f" and {more} more" if more > 0 else "")
+    note = f"0 in every sample and left out: {named}"
+    return _range_of(answer, values, (*answer.notes, note))
+
+
+def _range_of(
+    answer: answers.TopicRange, values: Sequence[JsonValue], notes: Sequence[str]
+) -> JsonObject:
+    samples: list[JsonValue] = [
+        {"timestamp": unix_rounded_up(sample.time), "value": value}
+        for sample, value in zip(answer.samples, values, strict=True)
+    ]
+    reply: JsonObject = {
+        "topic": answer.topic,
+        "type": answer.type,
+        "total": answer.total,
+        "samples": samples,
+    }
+    return _with_notes(reply, notes)
+
+
+@shown.register(answers.Position)
+def _position(answer: answers.Position, _bag_dir: Path) -> JsonObject:
+    pose = answer.pose
+    unit = None if pose.orientation is None else normalised(pose.orientation)
+    reply: JsonObject = {
+        **_xyz(pose.position),
+        "yaw_deg": _degrees(None if unit is None else yaw(unit)),
+        "timestamp": unix_rounded_up(answer.time),
+        "topic": answer.topic,
+        "frame_id": pose.frame_id or None,
+    }
+    return _finished(reply, answer.age, answer.notes)
+
+
+@shown.register(answers.Velocity)
+def _velocity(answer: answers.Velocity, _bag_dir: Path) -> JsonObject:
+    reply: JsonObject = {
+        "linear": _xyz(answer.twist.linear),
+        "angular": _xyz(answer.twist.angular),
+        "timestamp": unix_rounded_up(answer.time),
+        "topic": answer.topic,
+        "frame_id": answer.twist.frame_id or None,
+    }
+    return _finished(reply, answer.age, answer.notes)
+
+
+@shown.register(answers.TransformAt)
+def _transform(answer: answers.TransformAt, _bag_dir: Path) -> JsonObject:
+    rotation = answer.transform.rotation
+    reply: JsonObject = {
+        "translation": _xyz(answer.transform.translation),
+        "rotation": {name: _rounded(part, 6) for name, part in zip("xyzw", rotation, strict=True)},
+        "yaw_deg": _degrees(yaw(rotation)),
+        "timestamp": unix_rounded_up(answer.time),
+        "parent": answer.parent,
+        "child": answer.child,
+        "clock": answer.clock,
+    }
+    return _finished(reply, answer.age, answer.notes)
+
+
+@shown.register(answers.Frames)
+def _frames(answer: answers.Frames, _bag_dir: Path) -> JsonObject:
+    edges = sorted(answer.edges, key=lambda edge: (edge.parent, edge.child))
+    names: list[JsonValue] = [
+        *sorted({name for edge in edges for name in (edge.parent, edge.child)})
+    ]
+    reply: JsonObject = {
+        "frames": names,
+        "transforms": [
+            {"parent": edge.parent, "child": edge.child, "static": edge.static} for edge in edges
+        ],
+    }
+    return _with_notes(reply, answer.notes)
+
+
+@shown.register(answers.Match)
+def _match(answer: answers.Match, _bag_dir: Path) -> JsonObject | None:
+    if answer.found is None:
+        return _no_match(answer.notes)
+    found = answer.found
+    reply: JsonObject = {
+        "timestamp": unix_rounded_up(found.sample.time),
+        "value": found.sample.value,
+        "topic": found.topic,
+        "type": found.type,
+    }
+    return _finished(reply, found.age, _once(found.notes, answer.notes))
+
+
+@shown.register(answers.ValueWhen)
+def _value_when(answer: answers.ValueWhen, _bag_dir: Path) -> JsonObject | None:
+    matched, held = answer.matched, answer.value
+    if matched is None:
+        return _no_match(answer.notes)
+    reply: JsonObject = {
+        "timestamp": unix_rounded_up(matched.sample.time),
+        "matched": matched.sample.value,
+        "value": None if held is None else held.sample.value,
+        "value_timestamp": None if held is None else unix_rounded_up(held.sample.time),
+        "condition_topic": matched.topic,
+        "value_topic": None if held is None else held.topic,
+    }
+    notes = _once(matched.notes, () if held is None else held.notes, answer.notes)
+    return _finished(reply, matched.age, notes)
+
+
+def _no_match(notes: Sequence[str]) -> JsonObject | None:
+    """`null` after a complete search; a search that could not look everywhere says so instead."""
+    return _with_notes({"match": None}, notes) if notes else None
+
+
+@shown.register(answers.TrajectorySummary)
+def _trajectory(answer: answers.TrajectorySummary, _bag_dir: Path) -> JsonObject:
+    way = answer.trajectory
+    reply: JsonObject = {
+        "distance_m": _rounded(way.distance_m, 4),
+        "avg_speed": _rounded(way.avg_speed, 4),
+        "max_speed": _rounded(way.max_speed, 4),
+        "duration_s": _rounded(way.duration_s, 3),
+        "waypoints": [
+            {
+                "timestamp": unix_rounded_up(point.time),
+                **_xyz(point.position),
+                "yaw_deg": _degrees(point.yaw_rad),
+            }
+            for point in way.waypoints
+        ],
+        "topic": answer.topic,
+        "frame_id": answer.frame_id or None,
+        "start": unix_rounded_up(answer.start),
+        "end": unix_rounded_up(answer.end),
+        "poses": way.poses,
+    }
+    notes = [*answer.notes]
+    if way.invalid:
+        notes.append(
+            f"{way.invalid} poses left out: their coordinates are no place (NaN or beyond)"
+        )
+    if way.jumps:
+        notes.append(
+            f"{way.jumps} jumps of {way.jumped_m:.2f} m in all, faster than is plausible, "
+            "left out of distance and speed"
+        )
+    if way.max_speed_from == "positions":
+        notes.append("max_speed is measured from positions: the messages state no speed")
+    if way.waypoint_error_m > FINE_PATH_M:
+        notes.append(f"the path lies within {way.waypoint_error_m:.2f} m of the waypoints' line")
+    return _with_notes(reply, notes)
+
+
+def _finished(reply: JsonObject, age: Ns | None, notes: Sequence[str]) -> JsonObject:
+    aged = reply if age is None else {**reply, "age_s": _seconds(age)}
+    return _with_notes(aged, notes)
+
+
+def _with_notes(reply: JsonObject, notes: Sequence[str]) -> JsonObject:
+    return {**reply, "notes": [*notes]} if notes else reply
+
+
+def _once(*notes: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(note for some in notes for note in some))
+
+
+def _moment(at: Ns | None) -> float | None:
+    return None if at is None else unix_rounded_up(at)
+
+
+def _local(at: Ns | None) -> str | None:
+    return None if at is None else iso_local(at)
+
+
+def _seconds(duration: Ns) -> float:
+    return round(unix_from_ns(duration), 3)
+
+
+def _xyz(vector: Vector3) -> JsonObject:
+    return {name: _rounded(part, 4) for name, part in zip("xyz", vector, strict=True)}
+
+
+def _degrees(angle: float | None) -> float | None:
+    return None if angle is None else _rounded(math.degrees(angle), 2)
+
+
+def _rounded(number: float, places: int) -> float | None:
+    return round(number, places) if math.isfinite(number) else None
