@@ -1,0 +1,266 @@
+"""The arguments of the tools: their types, their bounds, and what the planner reads of them.
+
+A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) shares one declaration, in
+which a `moment` or a `span` stands for the arguments that differ; a `When` unfolds it. Types are
+strict: `true` is no number and `"10"` no duration.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Annotated, ClassVar, Final, Literal, TypeAlias
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+    WithJsonSchema,
+)
+
+from ros2_memory.moments import Moment, Span
+
+LATEST_MOMENT_S: Final = 9_223_372_036.0
+"""The last second that a 64-bit clock of nanoseconds can tell; more is another unit."""
+
+
+def _as_list(value: object) -> object:
+    """A list as planners send it: as such, as JSON text, or as one bare name."""
+    if isinstance(value, str):
+        parsed = from_json(value)
+        return parsed if isinstance(parsed, list) else [value]
+    return value
+
+
+def from_json(text: str) -> object:
+    """What a JSON text says; None where it is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _whole(value: object) -> object:
+    """JSON knows no integers: 100.0 is one."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _not_blank(value: str) -> str:
+    if not value.strip():
+        raise ValueError("is empty")
+    return value
+
+
+def _reachable(seconds: float) -> float:
+    if seconds > LATEST_MOMENT_S:
+        raise ValueError("is too large for Unix seconds; is it in milliseconds or nanoseconds?")
+    return seconds
+
+
+def _finite(value: JsonValue) -> JsonValue:
+    if value is None:
+        raise ValueError("is null")
+    for part in (value, *(value.values() if isinstance(value, dict) else ())):
+        if isinstance(part, float) and not math.isfinite(part):
+            raise ValueError("is not a finite number")
+    return value
+
+
+_Text: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_not_blank)]
+_Duration: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+_Unix: TypeAlias = Annotated[_Duration, AfterValidator(_reachable)]
+
+Timestamp: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023200.5])]
+SecondsAgo: TypeAlias = Annotated[
+    _Duration, Field(description="Seconds before now.", examples=[10])
+]
+Start: TypeAlias = Annotated[
+    _Unix, Field(description="Unix seconds, inclusive.", examples=[1784023200])
+]
+End: TypeAlias = Annotated[
+    _Unix, Field(description="Unix seconds, inclusive.", examples=[1784023260])
+]
+Seconds: TypeAlias = Annotated[
+    float,
+    Field(strict=True, gt=0, allow_inf_nan=False),
+    Field(description="Length of the window that ends now, in s.", examples=[60]),
+]
+Tolerance: TypeAlias = Annotated[
+    _Duration, Field(description="How old the message may be then, in s.")
+]
+Topic: TypeAlias = Annotated[_Text, Field(description="Topic name.", examples=["/odom"])]
+PoseTopic: TypeAlias = Annotated[_Text, Field(description="Instead of the default topic.")]
+ValueTopic: TypeAlias = Annotated[
+    _Text, Field(description="Topic to read at the match.", examples=["/odom"])
+]
+SearchTopic: TypeAlias = Annotated[
+    _Text,
+    Field(description="Topic, or glob over topics.", examples=["/vision/*/scene_objects"]),
+]
+Pattern: TypeAlias = Annotated[
+    _Text, Field(description="Only topics that match this glob, e.g. /vision/*.")
+]
+Parent: TypeAlias = Annotated[_Text, Field(description="Reference frame.", examples=["odom"])]
+Child: TypeAlias = Annotated[
+    _Text, Field(description="Frame whose pose is asked.", examples=["laser"])
+]
+Fields: TypeAlias = Annotated[
+    tuple[_Text, ...],
+    BeforeValidator(_as_list),
+    Field(description='Dot-paths that narrow value, e.g. ["position.x"].'),
+]
+MaxSamples: TypeAlias = Annotated[
+    Annotated[int, Field(strict=True, ge=1, le=10_000)], BeforeValidator(_whole)
+]
+ConditionType: TypeAlias = Annotated[
+    Literal["contains", "equals", "near_position"], Field(examples=["contains"])
+]
+ConditionValue: TypeAlias = Annotated[
+    JsonValue,
+    AfterValidator(_finite),
+    WithJsonSchema(
+        {
+            "anyOf": [{"type": kind} for kind in ("string", "number", "boolean", "object")],
+            "examples": ["scissors"],
+        }
+    ),
+]
+SearchField: TypeAlias = Annotated[
+    _Text, Field(description="Dot-path in the message that alone is tested.")
+]
+
+
+class Arguments(BaseModel):
+    """The arguments of one question. Unknown ones are refused before a model sees them."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class When(Arguments):
+    """Arguments that unfold a `moment` or a `span`; `stands_for` names which."""
+
+    stands_for: ClassVar[str]
+
+    def folded(self) -> Moment | Span:
+        """The moment or span that they mean."""
+        raise NotImplementedError
+
+
+class At(When):
+    """A moment in Unix seconds."""
+
+    stands_for = "moment"
+    timestamp: Timestamp
+
+    def folded(self) -> Moment:
+        """The moment itself."""
+        return Moment(at_s=self.timestamp)
+
+
+class Ago(When):
+    """A moment counted back from now."""
+
+    stands_for = "moment"
+    seconds_ago: SecondsAgo
+
+    def folded(self) -> Moment:
+        """The moment, relative to now."""
+        return Moment(ago_s=self.seconds_ago)
+
+
+class Between(When):
+    """A window in Unix seconds."""
+
+    stands_for = "span"
+    start: Start
+    end: End
+
+    def folded(self) -> Span:
+        """The window itself."""
+        return Span(start_s=self.start, end_s=self.end)
+
+
+class Last(When):
+    """A window that ends now."""
+
+    stands_for = "span"
+    seconds: Seconds
+
+    def folded(self) -> Span:
+        """The window, relative to now."""
+        return Span(last_s=self.seconds)
+
+
+class Nothing(Arguments):
+    """No arguments."""
+
+
+class Listing(Arguments):
+    """Which topics are listed."""
+
+    pattern: Pattern | None = None
+
+
+class TopicAt(Arguments):
+    """One message of a topic."""
+
+    topic: Topic
+    moment: Moment
+    tolerance_s: Tolerance | None = None
+    fields: Fields = ()
+
+
+class TopicOver(Arguments):
+    """Messages of a topic over a window."""
+
+    topic: Topic
+    span: Span
+    max_samples: MaxSamples = 100
+    fields: Fields = ()
+
+
+class MotionAt(Arguments):
+    """Pose or twist at a moment."""
+
+    moment: Moment
+    topic: PoseTopic | None = None
+    tolerance_s: Tolerance | None = None
+
+
+class TransformAt(Arguments):
+    """A pair of frames at a moment."""
+
+    parent: Parent
+    child: Child
+    moment: Moment
+
+
+class Search(Arguments):
+    """A condition on a topic."""
+
+    topic: SearchTopic
+    condition_type: ConditionType
+    value: ConditionValue
+    field: SearchField | None = None
+    fields: Fields = ()
+
+
+class Correlation(Arguments):
+    """A condition on one topic, and another to read then."""
+
+    value_topic: ValueTopic
+    condition_topic: SearchTopic
+    condition_type: ConditionType
+    value: ConditionValue
+    field: SearchField | None = None
+    fields: Fields = ()
+
+
+class WayOver(Arguments):
+    """The way driven over a window."""
+
+    span: Span
+    topic: PoseTopic | None = None
