@@ -1,0 +1,87 @@
+"""The decoding room: from the payload of a record to a message."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+from ros2_memory.errors import UndecodableError
+from ros2_memory.storage.zstd import FRAME_MAGIC
+from ros2_memory.typestore import Typestores
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from ros2_memory.storage.base import Channel, Record
+
+_MAX_KNOWN = 10_000
+
+
+class Decoding:
+    """Decodes CDR by message definition, and JSON. Safe to use from several threads at once.
+
+    Args:
+        custom_msg_paths: see `Typestores`.
+
+    Raises:
+        ConfigError: one of the paths cannot be used.
+    """
+
+    def __init__(self, custom_msg_paths: Sequence[Path | str] = ()) -> None:
+        self._typestores = Typestores(custom_msg_paths)
+        # By identity, since hashing a channel hashes its definition; the channel is kept, so that
+        # its identity is not given to another.
+        self._known: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
+
+    def undecodable(self, channel: Channel) -> str | None:
+        """Why no message of this channel can be decoded, or None."""
+        decoder = self._decoder(channel)
+        return decoder if isinstance(decoder, str) else None
+
+    def decode(self, record: Record) -> object:
+        """The message of a record: an attribute object for CDR, a plain value for JSON.
+
+        Raises:
+            UndecodableError: the channel cannot be decoded, or the bytes do not fit its type.
+        """
+        channel = record.channel
+        decoder = self._decoder(channel)
+        if isinstance(decoder, str):
+            raise UndecodableError(channel.topic, channel.type, decoder)
+        try:
+            return decoder(record.payload)
+        # rosbags raises whatever the generated code runs into; a payload may hold anything.
+        except Exception as error:
+            reason = _why(record, error)
+            raise UndecodableError(channel.topic, channel.type, reason) from error
+
+    def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
+        known = self._known.get(id(channel))
+        if known is not None:
+            return known[1]
+        decoder = self._find(channel)
+        if len(self._known) >= _MAX_KNOWN:
+            self._known.clear()
+        self._known[id(channel)] = (channel, decoder)
+        return decoder
+
+    def _find(self, channel: Channel) -> Callable[[bytes], object] | str:
+        if channel.encoding == "json":
+            return json.loads
+        if channel.encoding != "cdr":
+            return f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
+        schema = channel.schema
+        found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
+        if found.deserialize is None:
+            return found.reason or "its definition cannot be used"
+        return found.deserialize
+
+
+def _why(record: Record, error: Exception) -> str:
+    if record.payload[:4] == FRAME_MAGIC and record.channel.encoding == "cdr":
+        return "its compressed payload is damaged or too large"
+    words = " ".join(str(error).split())[:160] or type(error).__name__
+    if record.channel.encoding == "json":
+        return f"the payload is not JSON: {words}"
+    return f"the payload does not fit the definition: {words}"

@@ -1,0 +1,83 @@
+"""Where everything foreign becomes the error tree.
+
+Reading bytes that anybody may have written raises whatever the libraries and the interpreter make
+of them: struct.error, ZstdError, sqlite3.Error, lz4's RuntimeError, MemoryError, UnicodeDecodeError
+and more. The rooms below the adapters let all of it pass, and say `UnreadableError` for what they
+find wrong themselves; `reading` names the file.
+"""
+
+from __future__ import annotations
+
+import errno
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from ros2_memory.errors import BagError, BagVanishedError, EpisodicError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from types import TracebackType
+
+_GONE = {errno.ENOENT, errno.ENOTDIR, errno.ESTALE, errno.ENODEV}
+
+
+class UnreadableError(Exception):
+    """Bytes of a bag that cannot be read; the text is the reason, without the file's name."""
+
+
+class reading:  # noqa: N801 - reads as a statement: `with reading(path):`
+    """Raises only `EpisodicError`, about `path`, whatever is raised inside the block.
+
+    A class and not a generator: it is entered for every query of every bag.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> None:
+        """Nothing is opened."""
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Translates.
+
+        Raises:
+            BagVanishedError: the file or a folder above it is gone.
+            BagError: anything else; it ends on the reason.
+        """
+        if not isinstance(error, Exception) or isinstance(error, EpisodicError):
+            return
+        if isinstance(error, OSError) and error.errno in _GONE:
+            raise BagVanishedError(str(self._path), "the file is not there any more") from error
+        raise BagError(str(self._path), reason_of(error)) from error
+
+
+@contextmanager
+def damage() -> Iterator[None]:
+    """Raises `UnreadableError` for whatever damaged bytes raise, where others may be whole.
+
+    What the disk itself raises (OSError) passes.
+    """
+    try:
+        yield
+    except (UnreadableError, OSError):
+        raise
+    except Exception as error:
+        raise UnreadableError(reason_of(error)) from error
+
+
+def reason_of(error: Exception) -> str:
+    """One line that says why the bytes cannot be read."""
+    if isinstance(error, UnreadableError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"it cannot be opened or read: {error.strerror or error}"
+    if isinstance(error, MemoryError):
+        return "damaged: it asks for more memory than there is"
+    words = " ".join(str(error).split())[:160]
+    return f"damaged: {words} ({type(error).__name__})" if words else type(error).__name__

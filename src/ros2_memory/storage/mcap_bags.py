@@ -1,0 +1,275 @@
+"""The MCAP room: summaries, messages and log times of `.mcap` files.
+
+Fast because it decompresses a chunk only for a message that is wanted, and takes log times and
+places from the message indexes; whole because it falls back to the messages themselves wherever a
+file's own indexes are missing or wrong (see `mcap_index`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ros2_memory.model import BagSummary, TopicSummary
+from ros2_memory.storage.base import Channel, Closing, Record
+from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.lru import ByteLru
+from ros2_memory.storage.mcap_chunk import Column, joined, walk
+from ros2_memory.storage.mcap_file import McapFile
+from ros2_memory.storage.mcap_index import (
+    Chunk,
+    DoubtError,
+    McapIndex,
+    chunk_columns,
+    chunk_data,
+    index_from_summary,
+)
+from ros2_memory.storage.mcap_records import MESSAGE, RECORD, Opcode
+from ros2_memory.storage.mcap_scan import index_by_scan
+from ros2_memory.storage.merge import Rows, Run, merged
+from ros2_memory.storage.zstd import plain_payload
+from ros2_memory.timebase import MAX_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.model import TimeWindow
+    from ros2_memory.timebase import Ns
+
+_MAX_INTERNED = 10_000
+
+
+class McapBags:
+    """Reads MCAP files. Safe to use from several threads at once.
+
+    What goes wrong is raised as it comes; the adapters translate it (`faults.reading`).
+
+    Args:
+        cache_mb: what indexes and decompressed chunks may take of memory between calls.
+        max_chunk_mb: what one chunk may hold, decompressed.
+    """
+
+    def __init__(self, cache_mb: int = 64, max_chunk_mb: int = 256) -> None:
+        self._max_chunk_bytes = max_chunk_mb << 20
+        self._indexes: ByteLru[McapIndex] = ByteLru((cache_mb << 20) // 8)
+        self._columns: ByteLru[Column] = ByteLru((cache_mb << 20) * 3 // 8)
+        self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
+        self._interned: dict[Channel, Channel] = {}
+
+    def closing(self, path: Path) -> Closing:
+        """Whether the writer has finished the file."""
+        with McapFile(path) as file:
+            return file.closing()
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Topics with exact counts and first and last log times."""
+        with McapFile(path) as file:
+            return _summary(self._index(file))
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """The channels declared in the file."""
+        with McapFile(path) as file:
+            return list(self._index(file).channels.values())
+
+    def records(
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
+    ) -> Iterator[Record]:
+        """The messages of `topics` inside the window, in order."""
+        if window.empty:
+            return
+        with McapFile(path) as file:
+            runs = self._runs(file, topics, window, newest_first=newest_first)
+            yield from merged(runs, newest_first=newest_first)
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
+        """The log times of a topic's messages inside the window, ascending."""
+        with McapFile(path) as file:
+            index = self._index(file)
+            wanted = _wanted(index, {topic})
+            columns = [index.loose[channel] for channel in wanted if channel in index.loose]
+            for chunk in _overlapping(index, wanted, window):
+                columns += self._chunk_columns(file, chunk, wanted)
+        parts = [column.between(window.start, window.stop).times for column in columns]
+        if window.empty or not parts:
+            return []
+        times = np.sort(np.concatenate(parts))
+        return [int(time) for time in times.tolist()]
+
+    def _runs(
+        self, file: McapFile, topics: Collection[str], window: TimeWindow, *, newest_first: bool
+    ) -> Iterator[Run[Record]]:
+        index = self._index(file)
+        wanted = _wanted(index, topics)
+
+        def chunk_run(chunk: Chunk) -> Run[Record]:
+            def rows() -> Rows[Record]:
+                columns = self._chunk_columns(file, chunk, wanted)
+                column = joined([part.between(window.start, window.stop) for part in columns])
+                if not column.times.size:
+                    return Rows([], [], _nothing)
+                data = self._chunk_data(file, chunk)
+                return _rows(column, _from_bytes(data, wanted), newest_first=newest_first)
+
+            return Run(chunk.start, chunk.end, chunk.offset, rows)
+
+        for chunk in _overlapping(index, wanted, window):
+            yield chunk_run(chunk)
+        loose = [column for channel, column in index.loose.items() if channel in wanted]
+        column = joined([part.between(window.start, window.stop) for part in loose])
+        if column.times.size:
+            rows = _rows(column, _from_file(file, wanted), newest_first=newest_first)
+            yield Run(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
+
+    def _index(self, file: McapFile) -> McapIndex:
+        index = self._indexes.get(file.key)
+        if index is None:
+            index = self._with_shared_channels(_index_of(file, self._max_chunk_bytes))
+            self._indexes.put(file.key, index, index.bytes_held)
+        return index
+
+    def _with_shared_channels(self, index: McapIndex) -> McapIndex:
+        """The same with one object for equal channels of different bags: they repeat a lot."""
+        if len(self._interned) > _MAX_INTERNED:
+            self._interned.clear()
+        channels = {
+            number: self._interned.setdefault(channel, channel)
+            for number, channel in index.channels.items()
+        }
+        return McapIndex(
+            channels, index.chunks, index.totals, index.loose, index.complete, index.notes
+        )
+
+    def _chunk_columns(self, file: McapFile, chunk: Chunk, wanted: Collection[int]) -> list[Column]:
+        columns: list[Column] = []
+        missing: list[int] = []
+        for channel in chunk.channels.intersection(wanted):
+            column = self._columns.get((file.key, chunk.offset, channel))
+            if column is None:
+                missing.append(channel)
+            else:
+                columns.append(column)
+        if missing:
+            if chunk.index_offsets is not None:
+                read = chunk_columns(file, chunk, missing)
+            else:
+                read = walk(self._chunk_data(file, chunk)).columns
+            for channel, column in read.items():
+                self._columns.put((file.key, chunk.offset, channel), column, column.bytes_held)
+            columns += [read[channel] for channel in missing]
+        return columns
+
+    def _chunk_data(self, file: McapFile, chunk: Chunk) -> bytes:
+        key = (file.key, chunk.offset)
+        data = self._data.get(key)
+        if data is None:
+            data = chunk_data(file, chunk, self._max_chunk_bytes)
+            self._data.put(key, data, len(data))
+        return data
+
+
+def _index_of(file: McapFile, max_chunk_bytes: int) -> McapIndex:
+    if file.closing() is Closing.OPEN or not file.begins_as_mcap():
+        return index_by_scan(file, max_chunk_bytes)
+    try:
+        return index_from_summary(file)
+    except DoubtError as doubt:
+        return index_by_scan(file, max_chunk_bytes, str(doubt))
+
+
+def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:
+    """The channels of the topics that hold messages."""
+    return {
+        number: channel
+        for number, channel in index.channels.items()
+        if channel.topic in topics and number in index.totals
+    }
+
+
+def _overlapping(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:
+    for chunk in index.chunks:
+        if window.overlaps(chunk.start, chunk.end) and not chunk.channels.isdisjoint(wanted):
+            yield chunk
+
+
+def _rows(
+    column: Column, fetch: Callable[[int, Ns], Record], *, newest_first: bool
+) -> Rows[Record]:
+    times, places = column
+    if newest_first:
+        times, places = times[::-1], places[::-1]
+    return Rows(times.tolist(), places.tolist(), fetch)
+
+
+def _nothing(_place: int, _time: Ns) -> Record:
+    raise UnreadableError("damaged: a message is not where its index says")
+
+
+def _from_bytes(data: bytes, channels: dict[int, Channel]) -> Callable[[int, Ns], Record]:
+    """Fetches messages from a decompressed chunk."""
+    unpack = MESSAGE.unpack_from
+
+    def fetch(place: int, time: Ns) -> Record:
+        opcode, length, number, _, log_time, publish_time = unpack(data, place)
+        end = place + RECORD.size + length
+        if opcode != Opcode.MESSAGE or log_time != time or end > len(data):
+            raise UnreadableError("damaged: a message is not where its index says")
+        return _record(channels, number, log_time, publish_time, data[place + MESSAGE.size : end])
+
+    return fetch
+
+
+def _from_file(file: McapFile, channels: dict[int, Channel]) -> Callable[[int, Ns], Record]:
+    """Fetches messages that stand outside chunks."""
+
+    def fetch(place: int, time: Ns) -> Record:
+        head = MESSAGE.unpack(file.read(place, MESSAGE.size))
+        payload = file.read(place + MESSAGE.size, head[1] + RECORD.size - MESSAGE.size)
+        return _record(channels, head[2], time, head[5], payload)
+
+    return fetch
+
+
+def _record(
+    channels: dict[int, Channel], number: int, log_time: Ns, publish_time: Ns, payload: bytes
+) -> Record:
+    channel = channels.get(number)
+    if channel is None:
+        raise UnreadableError("damaged: a message is not of the channel that its index says")
+    if channel.encoding == "cdr":
+        payload = plain_payload(payload)
+    return Record(channel, log_time, publish_time if publish_time < MAX_NS else log_time, payload)
+
+
+def _summary(index: McapIndex) -> BagSummary:
+    merged_topics: dict[tuple[str, str], TopicSummary] = {}
+    for number, total in index.totals.items():
+        channel = index.channels[number]
+        key = (channel.topic, channel.type)
+        summary = TopicSummary(
+            *key, channel.encoding, total.count, total.first, total.last, channel.latched
+        )
+        other = merged_topics.get(key)
+        merged_topics[key] = summary if other is None else both(other, summary)
+    heard = {topic for topic, _ in merged_topics}
+    declared = {channel.topic for channel in index.channels.values()}
+    return BagSummary(
+        tuple(merged_topics[key] for key in sorted(merged_topics)),
+        tuple(sorted(declared - heard)),
+        index.complete,
+        index.notes,
+    )
+
+
+def both(one: TopicSummary, other: TopicSummary) -> TopicSummary:
+    """Two channels of one topic and type as one."""
+    return TopicSummary(
+        one.topic,
+        one.type,
+        one.encoding,
+        one.count + other.count,
+        min(one.first, other.first),
+        max(one.last, other.last),
+        one.latched or other.latched,
+    )

@@ -1,0 +1,206 @@
+"""What is inside a chunk: decompression, and where the messages of each channel lie."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import zstandard
+
+from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.mcap_records import (
+    CHUNK_TIMES,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    RECORD,
+    Opcode,
+)
+from ros2_memory.storage.zstd import unpacked_zstd
+from ros2_memory.timebase import MAX_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
+
+_INDEX_HEAD: Final = RECORD.size + 2 + 4
+_EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
+
+
+class Column(NamedTuple):
+    """The messages of one channel in one stretch of a file, by log time, ties in file order.
+
+    `places` are the offsets of the message records.
+    """
+
+    times: Ints
+    places: Ints
+
+    @property
+    def bytes_held(self) -> int:
+        """About how much memory it takes."""
+        return 2 * self.times.nbytes + 300
+
+    @classmethod
+    def of(cls, times: Ints, places: Ints) -> Column:
+        """Sorts; leaves out the messages whose log time is none (past what 64 bits signed hold)."""
+        if times.size > 1 and not bool((times[1:] > times[:-1]).all()):
+            order = np.lexsort((places, times))
+            times, places = times[order], places[order]
+        # An unsigned time past the signed range has wrapped to below zero.
+        first = int(np.searchsorted(times, 0))
+        stop = int(np.searchsorted(times, MAX_NS))
+        return cls(times[first:stop], places[first:stop])
+
+    def between(self, start: int, stop: int) -> Column:
+        """The part with log time in `[start, stop)`."""
+        first, last = (int(at) for at in np.searchsorted(self.times, (start, stop)))
+        return Column(self.times[first:last], self.places[first:last])
+
+
+def joined(columns: list[Column]) -> Column:
+    """Several channels' messages as one column."""
+    if len(columns) == 1:
+        return columns[0]
+    if not columns:
+        return Column(_EMPTY, _EMPTY)
+    times = np.concatenate([column.times for column in columns])
+    places = np.concatenate([column.places for column in columns])
+    order = np.lexsort((places, times))
+    return Column(times[order], places[order])
+
+
+def columns_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> dict[int, Column]:
+    """The columns that the message index records of one chunk hold.
+
+    Args:
+        region: the bytes behind the chunk in which they lie.
+        offsets: where each channel's record begins in the file.
+        base: where the region begins in the file.
+    """
+    columns: dict[int, Column] = {}
+    for channel, offset in offsets.items():
+        at = offset - base
+        if at < 0 or at + _INDEX_HEAD > len(region) or region[at] != Opcode.MESSAGE_INDEX:
+            raise UnreadableError("damaged: a message index is not where its chunk index says")
+        size = int.from_bytes(region[at + _INDEX_HEAD - 4 : at + _INDEX_HEAD], "little")
+        pairs = np.frombuffer(region, "<i8", size // 8, at + _INDEX_HEAD).reshape(-1, 2)
+        columns[channel] = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
+    return columns
+
+
+@dataclass(slots=True)
+class Walked:
+    """What walking the records of a chunk found.
+
+    `usable` is how many bytes of whole records there are.
+    """
+
+    columns: dict[int, Column]
+    usable: int
+    messages: int
+    declarations: list[tuple[int, bytes]] = field(default_factory=list)
+
+
+def walk(data: bytes) -> Walked:
+    """The messages of a decompressed chunk, as far as whole records reach."""
+    found: dict[int, tuple[list[int], list[int]]] = {}
+    declarations: list[tuple[int, bytes]] = []
+    position, end = 0, len(data)
+    record, message = RECORD.unpack_from, MESSAGE.unpack_from
+    while position + RECORD.size <= end:
+        opcode, length = record(data, position)
+        following = position + RECORD.size + length
+        if following > end or opcode == 0:
+            break
+        if opcode == Opcode.MESSAGE:
+            if length < MESSAGE_FIELDS:
+                break
+            _, _, channel, _, log_time, _ = message(data, position)
+            entry = found.get(channel)
+            if entry is None:
+                entry = found[channel] = ([], [])
+            entry[0].append(log_time)
+            entry[1].append(position)
+        elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+            declarations.append((opcode, data[position + RECORD.size : following]))
+        position = following
+    columns = {channel: column_of(*lists) for channel, lists in found.items()}
+    messages = sum(len(times) for times, _ in found.values())
+    return Walked(columns, position, messages, declarations)
+
+
+def column_of(times: Sequence[int], places: Sequence[int]) -> Column:
+    """A column from log times (unsigned, in file order) and places."""
+    return Column.of(
+        np.array(times, dtype=np.uint64).astype(np.int64), np.array(places, dtype=np.int64)
+    )
+
+
+class ChunkHead(NamedTuple):
+    """The fields of a chunk record before its data, which begins at `data_at` in the body."""
+
+    crc: int
+    compression: str
+    data_size: int
+    data_at: int
+
+
+CHUNK_HEAD_BYTES: Final = 96
+"""As much of a chunk record's body as holds its fields, whatever its compression is called."""
+
+
+def chunk_head(body: bytes) -> ChunkHead:
+    """The fields of a chunk record, from the beginning of its body.
+
+    Raises:
+        UnreadableError: that is not enough of it.
+    """
+    if len(body) < CHUNK_TIMES.size + 12:
+        raise UnreadableError("damaged: a chunk ends inside its own header")
+    crc: int = CHUNK_TIMES.unpack_from(body)[3]
+    at = CHUNK_TIMES.size + 4
+    name_size = int.from_bytes(body[at - 4 : at], "little")
+    name = body[at : at + name_size]
+    at += name_size + 8
+    if at > len(body):
+        raise UnreadableError("damaged: a chunk ends inside its own header")
+    return ChunkHead(crc, name.decode(), int.from_bytes(body[at - 8 : at], "little"), at)
+
+
+def unpacked(head: ChunkHead, packed: bytes, max_bytes: int) -> bytes:
+    """The records of a whole chunk, its checksum verified where it has one.
+
+    The size that the chunk states is not relied on for any allocation.
+
+    Raises:
+        UnreadableError: it is damaged, larger than `max_bytes`, or in a compression not known.
+    """
+    data = _decompressed(head.compression, packed, max_bytes)
+    if len(data) > max_bytes:
+        raise UnreadableError(f"a chunk is larger than the {max_bytes >> 20} MiB allowed")
+    if head.crc and zlib.crc32(data) != head.crc:
+        raise UnreadableError("damaged: a chunk does not match its checksum")
+    return data
+
+
+def unpacked_in_part(head: ChunkHead, packed: bytes, max_bytes: int) -> bytes:
+    """As much of a chunk as a file that ends inside it holds."""
+    if head.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
+            return stream.read(max_bytes)
+    return _decompressed(head.compression, packed, max_bytes)[:max_bytes]
+
+
+def _decompressed(compression: str, packed: bytes, max_bytes: int) -> bytes:
+    """At most a byte more than allowed, so that the excess shows."""
+    if not compression:
+        return packed
+    if compression == "zstd":
+        return unpacked_zstd(packed, max_bytes)
+    if compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_bytes + 1))
+    raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")

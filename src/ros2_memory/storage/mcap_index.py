@@ -1,0 +1,298 @@
+"""Where the messages of an MCAP file lie: from its summary section, or by scanning it once.
+
+The summary section is believed where its checksum holds and it agrees with itself and with the
+message indexes looked into. Everything else (no summary, no statistics, channels not repeated, no
+message index, no chunks, cut short) is answered by one scan, which finds the same from the
+messages themselves.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from ros2_memory.storage.faults import UnreadableError, damage
+from ros2_memory.storage.mcap_chunk import (
+    CHUNK_HEAD_BYTES,
+    Column,
+    chunk_head,
+    columns_from_index,
+    unpacked,
+    unpacked_in_part,
+)
+from ros2_memory.storage.mcap_records import (
+    FOOTER,
+    MAGIC_SIZE,
+    RECORD,
+    ChunkIndex,
+    Declarations,
+    Opcode,
+    Statistics,
+    chunk_index,
+    framed,
+    statistics,
+)
+from ros2_memory.timebase import MAX_NS, unix_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Mapping
+
+    from ros2_memory.storage.base import Channel
+    from ros2_memory.storage.mcap_file import McapFile
+    from ros2_memory.timebase import Ns
+
+MAX_SECTION_BYTES = 256 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """One chunk of a file. `start` and `end` are log times, inclusive.
+
+    `index_offsets` says where each channel's message index lies, None where there is none to
+    rely on. `usable` is how many of its decompressed bytes count where the file ends inside it.
+    """
+
+    offset: int
+    length: int
+    start: Ns
+    end: Ns
+    channels: frozenset[int]
+    index_offsets: Mapping[int, int] | None = None
+    index_length: int = 0
+    usable: int | None = None
+
+
+@dataclass(slots=True)
+class Total:
+    """Messages of one channel: how many, and the log times of the earliest and the latest."""
+
+    count: int
+    first: Ns
+    last: Ns
+
+
+@dataclass(frozen=True, slots=True)
+class McapIndex:
+    """What is known of a file without its payloads.
+
+    `loose` are the messages outside chunks, by channel, at their places in the file.
+    """
+
+    channels: Mapping[int, Channel]
+    chunks: tuple[Chunk, ...]
+    totals: Mapping[int, Total]
+    loose: Mapping[int, Column] = field(default_factory=dict)
+    complete: bool = True
+    notes: tuple[str, ...] = ()
+
+    @property
+    def bytes_held(self) -> int:
+        """About how much memory it takes."""
+        places = sum(len(chunk.index_offsets or ()) for chunk in self.chunks)
+        loose = sum(column.times.nbytes * 2 for column in self.loose.values())
+        return 1000 + 300 * (len(self.channels) + len(self.chunks)) + 100 * places + loose
+
+
+class DoubtError(UnreadableError):
+    """The summary section cannot be relied on; the text is a note on it, or empty."""
+
+
+def chunk_columns(
+    file: McapFile, chunk: Chunk, wanted: Collection[int] | None = None
+) -> dict[int, Column]:
+    """The messages of a chunk by its message indexes. Only where it has `index_offsets`.
+
+    Args:
+        file: the open file.
+        chunk: one of its chunks.
+        wanted: the channels to read, or all.
+
+    Raises:
+        UnreadableError: the indexes are damaged, or disagree with the chunk's stated span.
+    """
+    offsets = chunk.index_offsets or {}
+    if wanted is not None:
+        offsets = {channel: offset for channel, offset in offsets.items() if channel in wanted}
+    base = chunk.offset + chunk.length
+    if chunk.index_length > MAX_SECTION_BYTES:
+        raise UnreadableError("damaged: a message index is larger than any chunk")
+    columns = columns_from_index(file.read(base, chunk.index_length), offsets, base)
+    for column in columns.values():
+        if column.times.size and not (
+            chunk.start <= int(column.times[0]) and int(column.times[-1]) <= chunk.end
+        ):
+            raise UnreadableError("damaged: a chunk holds messages outside its stated times")
+    return columns
+
+
+def chunk_data(file: McapFile, chunk: Chunk, max_bytes: int) -> bytes:
+    """The decompressed records of a chunk.
+
+    Raises:
+        UnreadableError: the chunk is damaged or larger than `max_bytes`.
+    """
+    body_at, body_size = chunk.offset + RECORD.size, chunk.length - RECORD.size
+    head = chunk_head(file.read(body_at, min(body_size, CHUNK_HEAD_BYTES)))
+    held = body_size - head.data_at
+    if chunk.usable is not None:
+        packed = file.read(body_at + head.data_at, min(held, head.data_size))
+        return unpacked_in_part(head, packed, max_bytes)[: chunk.usable]
+    if head.data_size > held:
+        raise UnreadableError("damaged: a chunk is shorter than it states")
+    return unpacked(head, file.read(body_at + head.data_at, head.data_size), max_bytes)
+
+
+def index_from_summary(file: McapFile) -> McapIndex:
+    """The index that the summary section gives.
+
+    Raises:
+        DoubtError: there is none to rely on; scan the file.
+    """
+    try:
+        with damage():
+            return _index_from_summary(file)
+    except DoubtError:
+        raise
+    except UnreadableError as error:
+        raise DoubtError(f"its summary section is not used ({error})") from error
+
+
+def _index_from_summary(file: McapFile) -> McapIndex:
+    declarations, indexes, stated = _summary(file)
+    channels = declarations.channels()
+    chunks = tuple(_chunk(index) for index in indexes)
+    if stated is None or not declarations.resolved or not stated.counts.keys() <= channels.keys():
+        raise DoubtError
+    if stated.counts and not all(chunk.index_offsets for chunk in chunks):
+        raise DoubtError
+    exact = _agrees(stated, chunks)
+    totals = totals_of(file, chunks, stated.counts if exact else None)
+    if {channel: total.count for channel, total in totals.items()} != stated.counts:
+        raise DoubtError
+    notes = () if exact else (disagreement(stated, totals.values()),)
+    held = tuple(chunk for chunk in chunks if chunk.channels)
+    return McapIndex(channels, held, totals, notes=notes)
+
+
+def _summary(file: McapFile) -> tuple[Declarations, list[ChunkIndex], Statistics | None]:
+    footer_at = file.size - MAGIC_SIZE - FOOTER.size
+    footer = file.read(footer_at, FOOTER.size)
+    opcode, _, summary_at, _, crc = FOOTER.unpack(footer)
+    if opcode != Opcode.FOOTER or not summary_at:
+        raise DoubtError
+    if footer_at - summary_at > MAX_SECTION_BYTES:
+        raise DoubtError("its summary section is too large to be one")
+    section = file.read(summary_at, footer_at - summary_at)
+    if crc and zlib.crc32(footer[:-4], zlib.crc32(section)) != crc:
+        raise DoubtError("its summary section does not match its checksum")
+    declarations = Declarations()
+    indexes: list[ChunkIndex] = []
+    stated: Statistics | None = None
+    for opcode, body in framed(section):
+        if opcode == Opcode.CHUNK_INDEX:
+            indexes.append(chunk_index(body))
+        elif opcode == Opcode.STATISTICS:
+            stated = statistics(body)
+        else:
+            declarations.add(opcode, body)
+    return declarations, indexes, stated
+
+
+def _chunk(index: ChunkIndex) -> Chunk:
+    offsets = index.index_offsets
+    return Chunk(
+        index.offset,
+        index.length,
+        index.start,
+        index.end,
+        frozenset(offsets),
+        offsets or None,
+        index.index_length,
+    )
+
+
+def _agrees(stated: Statistics, chunks: tuple[Chunk, ...]) -> bool:
+    """Whether the statistics agree with themselves and with the chunk indexes."""
+    held = [chunk for chunk in chunks if chunk.channels]
+    if sum(stated.counts.values()) != stated.messages or stated.chunks != len(chunks):
+        return False
+    if not held:
+        return not stated.messages
+    start, end = min(chunk.start for chunk in held), max(chunk.end for chunk in held)
+    return (start, end) == (stated.start, stated.end) and end < MAX_NS
+
+
+def totals_of(
+    file: McapFile, chunks: Iterable[Chunk], counts: Mapping[int, int] | None
+) -> dict[int, Total]:
+    """Exact totals by channel, from message indexes.
+
+    Args:
+        file: the open file.
+        chunks: its chunks; those that hold messages have message indexes.
+        counts: messages by channel where that is known; only those indexes are then read that can
+            hold a channel's earliest or latest message.
+    """
+    totals: dict[int, Total] = {}
+    unread = {chunk.offset: chunk for chunk in chunks if chunk.channels}
+
+    def read(chunk: Chunk) -> None:
+        del unread[chunk.offset]
+        for channel, column in chunk_columns(file, chunk).items():
+            add_column(totals, channel, column)
+
+    for chunk in sorted(unread.values(), key=lambda chunk: chunk.start):
+        if counts is None or _may_extend(chunk, counts, totals, before=True):
+            read(chunk)
+    for chunk in sorted(unread.values(), key=lambda chunk: -chunk.end):
+        if _may_extend(chunk, counts or {}, totals, before=False):
+            read(chunk)
+    if counts is not None:
+        for channel, total in totals.items():
+            total.count = counts.get(channel, 0)
+    return totals
+
+
+def _may_extend(
+    chunk: Chunk, counts: Mapping[int, int], totals: Mapping[int, Total], *, before: bool
+) -> bool:
+    """Whether a chunk can hold an earlier (or later) message of a channel than those seen."""
+    for channel in chunk.channels:
+        if channel not in counts:
+            continue
+        total = totals.get(channel)
+        if total is None or (chunk.start < total.first if before else chunk.end > total.last):
+            return True
+    return False
+
+
+def add_column(totals: dict[int, Total], channel: int, column: Column) -> None:
+    """Counts a stretch's messages of one channel in."""
+    if not column.times.size:
+        return
+    first, last = int(column.times[0]), int(column.times[-1])
+    total = totals.get(channel)
+    if total is None:
+        totals[channel] = Total(column.times.size, first, last)
+        return
+    total.count += column.times.size
+    total.first = min(total.first, first)
+    total.last = max(total.last, last)
+
+
+def disagreement(stated: Statistics, totals: Iterable[Total]) -> str:
+    """The note on statistics that the messages contradict."""
+    found = list(totals)
+    span = "none"
+    if found:
+        first, last = min(total.first for total in found), max(total.last for total in found)
+        span = f"{sum(t.count for t in found)} from {_seconds(first)} to {_seconds(last)}"
+    return (
+        f"its own statistics are wrong: they state {stated.messages} messages from"
+        f" {_seconds(stated.start)} to {_seconds(stated.end)}; it holds {span}"
+    )
+
+
+def _seconds(moment: Ns) -> str:
+    return f"{unix_from_ns(moment):.6f} s"

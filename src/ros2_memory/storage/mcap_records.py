@@ -1,0 +1,157 @@
+"""The records of an MCAP file, from bytes (https://mcap.dev/spec).
+
+A file is magic, records, magic; a record is an opcode (1 byte), a length (8 bytes, little endian)
+and a body. Messages and chunk indexes are read with `struct`, since there are many of them; what
+stands once in a file is read by the `mcap` package.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from mcap import records as mcap_records
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.stream_reader import MAGIC_SIZE
+from mcap.writer import MCAP0_MAGIC
+
+from ros2_memory.storage.base import Channel, Schema
+from ros2_memory.storage.faults import UnreadableError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.timebase import Ns
+
+__all__ = ["MAGIC", "MAGIC_SIZE", "Declarations", "Opcode", "framed"]
+
+MAGIC: Final = MCAP0_MAGIC
+RECORD: Final = struct.Struct("<BQ")
+"""Opcode and length of the body."""
+MESSAGE: Final = struct.Struct("<BQHIQQ")
+"""A message record up to its payload: opcode, length, channel, sequence, log and publish time."""
+MESSAGE_FIELDS: Final = MESSAGE.size - RECORD.size
+CHUNK_TIMES: Final = struct.Struct("<QQQI")
+"""A chunk's first and last log time, uncompressed size and CRC; compression and data follow."""
+FOOTER: Final = struct.Struct("<BQQQI")
+"""Opcode, length, start of the summary section, start of the summary offsets, summary CRC."""
+_CHUNK_INDEX: Final = struct.Struct("<QQQQI")
+_INDEX_OFFSET: Final = struct.Struct("<HQ")
+_SIZE: Final = struct.Struct("<Q")
+
+# QoS stands in a channel's metadata as YAML; parsing it costs fifty times this search. Newer
+# distros write the durability's name, older ones rmw's number for it.
+_TRANSIENT_LOCAL: Final = re.compile(r"durability:\s*(?:transient_local|1)\b")
+
+
+def offered_as_latched(qos_profiles: str) -> bool:
+    """Whether some publisher offered the topic as transient local, by rosbag2's QoS text."""
+    return _TRANSIENT_LOCAL.search(qos_profiles) is not None
+
+
+def framed(section: bytes) -> Iterator[tuple[int, bytes]]:
+    """The records of a section as (opcode, body).
+
+    Raises:
+        UnreadableError: the section does not end where a record does.
+    """
+    position, end = 0, len(section)
+    while position < end:
+        if position + RECORD.size > end:
+            raise UnreadableError("damaged: a section ends inside a record")
+        opcode, length = RECORD.unpack_from(section, position)
+        position += RECORD.size
+        if position + length > end:
+            raise UnreadableError("damaged: a record is longer than its section")
+        yield opcode, section[position : position + length]
+        position += length
+
+
+class ChunkIndex(NamedTuple):
+    """Where a chunk lies, what time it spans (inclusive), and where its message indexes lie."""
+
+    start: Ns
+    end: Ns
+    offset: int
+    length: int
+    index_offsets: dict[int, int]
+    index_length: int
+
+
+def chunk_index(body: bytes) -> ChunkIndex:
+    """A chunk index record."""
+    start, end, offset, length, offsets_size = _CHUNK_INDEX.unpack_from(body)
+    position = _CHUNK_INDEX.size
+    stop = position + offsets_size
+    (index_length,) = _SIZE.unpack_from(body, stop)
+    offsets = dict(_INDEX_OFFSET.iter_unpack(body[position:stop]))
+    return ChunkIndex(start, end, offset, length, offsets, index_length)
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """What a file says of itself: messages by channel, and its first and last log time."""
+
+    counts: dict[int, int]
+    messages: int
+    start: Ns
+    end: Ns
+    chunks: int
+
+
+def statistics(body: bytes) -> Statistics:
+    """A statistics record."""
+    found: mcap_records.Statistics = mcap_records.Statistics.read(_stream(body))
+    counts = {channel: count for channel, count in found.channel_message_counts.items() if count}
+    return Statistics(
+        counts,
+        found.message_count,
+        found.message_start_time,
+        found.message_end_time,
+        found.chunk_count,
+    )
+
+
+@dataclass(slots=True)
+class Declarations:
+    """The schemas and channels met so far; ids are local to one file."""
+
+    _schemas: dict[int, Schema] = field(default_factory=dict)
+    _channels: dict[int, mcap_records.Channel] = field(default_factory=dict)
+
+    def add(self, opcode: int, body: bytes) -> None:
+        """Takes note of a schema or channel record; others are ignored."""
+        if opcode == Opcode.SCHEMA:
+            schema: mcap_records.Schema = mcap_records.Schema.read(_stream(body))
+            self._schemas[schema.id] = Schema(schema.name, schema.encoding, schema.data)
+        elif opcode == Opcode.CHANNEL:
+            channel: mcap_records.Channel = mcap_records.Channel.read(_stream(body))
+            self._channels[channel.id] = channel
+
+    @property
+    def resolved(self) -> bool:
+        """Whether every channel's schema is known. Id 0 means a channel without one."""
+        return all(
+            channel.schema_id == 0 or channel.schema_id in self._schemas
+            for channel in self._channels.values()
+        )
+
+    def channels(self) -> dict[int, Channel]:
+        """The channels by id; one whose schema is nowhere in the file has an empty schema."""
+        return {
+            number: Channel(
+                channel.topic,
+                channel.message_encoding,
+                self._schemas.get(channel.schema_id, Schema("")),
+                offered_as_latched(channel.metadata.get("offered_qos_profiles", "")),
+            )
+            for number, channel in self._channels.items()
+        }
+
+
+def _stream(body: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(body))

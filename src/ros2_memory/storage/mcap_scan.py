@@ -1,0 +1,253 @@
+"""The index of an MCAP file by reading it once from front to back.
+
+For files without a summary to rely on, and for files that end early: every whole record counts,
+and the messages of a last, partial chunk as far as they reach.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.storage.faults import UnreadableError, damage
+from ros2_memory.storage.mcap_chunk import (
+    CHUNK_HEAD_BYTES,
+    Walked,
+    chunk_head,
+    column_of,
+    unpacked,
+    unpacked_in_part,
+    walk,
+)
+from ros2_memory.storage.mcap_file import EMPTY_FILE
+from ros2_memory.storage.mcap_index import (
+    MAX_SECTION_BYTES,
+    Chunk,
+    McapIndex,
+    Total,
+    add_column,
+    disagreement,
+)
+from ros2_memory.storage.mcap_records import (
+    MAGIC_SIZE,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    RECORD,
+    Declarations,
+    Opcode,
+    Statistics,
+    statistics,
+)
+
+if TYPE_CHECKING:
+    from ros2_memory.storage.mcap_chunk import Column
+    from ros2_memory.storage.mcap_file import McapFile
+
+_BLOCK: Final = 256 * 1024
+
+
+def index_by_scan(file: McapFile, max_chunk_bytes: int, note: str = "") -> McapIndex:
+    """The index of the messages that can be read.
+
+    Args:
+        file: the open file.
+        max_chunk_bytes: what a chunk may hold, decompressed; larger ones are left out and noted.
+        note: why the summary section was not used, where that is worth telling.
+
+    Raises:
+        UnreadableError: it is no MCAP file, or is empty.
+    """
+    if not file.size:
+        raise UnreadableError(EMPTY_FILE)
+    if not file.begins_as_mcap():
+        raise UnreadableError("not an MCAP file: it does not begin as one")
+    scan = _Scan(file, max_chunk_bytes)
+    scan.run()
+    return scan.index(note)
+
+
+@dataclass(slots=True)
+class _Scan:
+    file: McapFile
+    max_chunk_bytes: int
+    position: int = MAGIC_SIZE
+    finished: bool = False
+    declarations: Declarations = field(default_factory=Declarations)
+    chunks: list[Chunk] = field(default_factory=list)
+    totals: dict[int, Total] = field(default_factory=dict)
+    loose: dict[int, tuple[array[int], array[int]]] = field(default_factory=dict)
+    stated: Statistics | None = None
+    messages: int = 0
+    damaged: list[str] = field(default_factory=list)
+    partial: int = 0  # bytes of a last, compressed chunk that was read in part
+    _block: bytes = b""
+    _block_at: int = 0
+
+    def run(self) -> None:
+        """Reads on until the footer, or until what follows is no whole record."""
+        size = self.file.size
+        while not self.finished and self.position + RECORD.size <= size:
+            opcode, length = RECORD.unpack(self._peek(self.position, RECORD.size))
+            end = self.position + RECORD.size + length
+            if opcode == 0:
+                return
+            if end > size:
+                if opcode == Opcode.CHUNK:
+                    self._cut_chunk(size)
+                return
+            if opcode == Opcode.MESSAGE and length < MESSAGE_FIELDS:
+                return
+            self._record(opcode, end)
+            self.position = end
+
+    def _record(self, opcode: int, end: int) -> None:
+        if opcode == Opcode.MESSAGE:
+            head = MESSAGE.unpack(self._peek(self.position, MESSAGE.size))
+            times, places = self.loose.setdefault(head[2], (array("Q"), array("q")))
+            times.append(head[4])
+            places.append(self.position)
+            self.messages += 1
+            return
+        self.finished = opcode == Opcode.FOOTER
+        try:
+            if opcode == Opcode.CHUNK:
+                self._whole_chunk(end)
+            elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS}:
+                self._declare(opcode, self._body(end))
+        except UnreadableError as error:
+            # Those behind it may be whole.
+            self.damaged.append(str(error))
+
+    def _declare(self, opcode: int, body: bytes) -> None:
+        with damage():
+            if opcode == Opcode.STATISTICS:
+                self.stated = statistics(body)
+            else:
+                self.declarations.add(opcode, body)
+
+    def _body(self, end: int) -> bytes:
+        start = self.position + RECORD.size
+        if end - start > MAX_SECTION_BYTES:
+            raise UnreadableError("damaged: a record is larger than any can be")
+        return self.file.read(start, end - start)
+
+    def _whole_chunk(self, end: int) -> None:
+        body_at = self.position + RECORD.size
+        head = chunk_head(self.file.read(body_at, min(CHUNK_HEAD_BYTES, end - body_at)))
+        if body_at + head.data_at + head.data_size > end:
+            raise UnreadableError("damaged: a chunk is shorter than it states")
+        packed = self.file.read(body_at + head.data_at, head.data_size)
+        with damage():
+            data = unpacked(head, packed, self.max_chunk_bytes)
+        walked = walk(data)
+        if walked.usable < len(data):
+            self.damaged.append("damaged: a chunk holds something that is no record")
+        self._take(walked, end, None)
+
+    def _cut_chunk(self, size: int) -> None:
+        """The chunk inside which the file ends."""
+        body_at = self.position + RECORD.size
+        try:
+            head = chunk_head(self.file.read(body_at, min(CHUNK_HEAD_BYTES, size - body_at)))
+            held = size - body_at - head.data_at
+            packed = self.file.read(body_at + head.data_at, min(held, head.data_size))
+            with damage():
+                walked = walk(unpacked_in_part(head, packed, self.max_chunk_bytes))
+        except UnreadableError:
+            return
+        if not walked.usable:
+            return
+        self._take(walked, size, walked.usable)
+        if head.compression:
+            self.partial = size - self.position
+            self.position = size
+        else:
+            self.position = body_at + head.data_at + walked.usable
+
+    def _take(self, walked: Walked, end: int, usable: int | None) -> None:
+        for opcode, body in walked.declarations:
+            try:
+                self._declare(opcode, body)
+            except UnreadableError as error:
+                self.damaged.append(str(error))
+        self.messages += walked.messages
+        held = {channel: column for channel, column in walked.columns.items() if column.times.size}
+        for channel, column in held.items():
+            add_column(self.totals, channel, column)
+        if held:
+            self.chunks.append(
+                Chunk(
+                    self.position,
+                    end - self.position,
+                    min(int(column.times[0]) for column in held.values()),
+                    max(int(column.times[-1]) for column in held.values()),
+                    frozenset(held),
+                    usable=usable,
+                )
+            )
+
+    def _peek(self, offset: int, length: int) -> bytes:
+        """A few bytes, by way of a block: small records lie close together."""
+        at = offset - self._block_at
+        if at < 0 or at + length > len(self._block):
+            self._block = self.file.read(offset, min(_BLOCK, self.file.size - offset))
+            self._block_at, at = offset, 0
+        return self._block[at : at + length]
+
+    def index(self, note: str) -> McapIndex:
+        """What was found."""
+        columns = {channel: column_of(*lists) for channel, lists in self.loose.items()}
+        for channel, column in columns.items():
+            add_column(self.totals, channel, column)
+        channels = self.declarations.channels()
+        known = {channel: total for channel, total in self.totals.items() if channel in channels}
+        notes = [note, *self._notes(known)] if note else self._notes(known)
+        return McapIndex(
+            channels,
+            tuple(self.chunks),
+            known,
+            _held(columns),
+            complete=self.finished,
+            notes=tuple(notes),
+        )
+
+    def _notes(self, known: dict[int, Total]) -> list[str]:
+        notes = []
+        if not self.finished:
+            notes.append(self._end_note())
+        if self.damaged:
+            notes.append(f"{len(self.damaged)} damaged records were left out ({self.damaged[0]})")
+        counted = sum(total.count for total in self.totals.values())
+        orphans = counted - sum(total.count for total in known.values())
+        if orphans:
+            notes.append(f"{orphans} messages belong to no declared channel and were left out")
+        if self.messages > counted:
+            notes.append(f"{self.messages - counted} messages bear no possible log time")
+        if self.stated is not None and not _agree(self.stated, known):
+            notes.append(disagreement(self.stated, known.values()))
+        return notes
+
+    def _end_note(self) -> str:
+        if self.partial:
+            return (
+                f"the file ends early: of its last chunk, {self.partial} compressed bytes, only a"
+                " part could be read"
+            )
+        unread = self.file.size - self.position
+        if unread:
+            return f"the file ends early: the last {unread} bytes could not be read"
+        return "the file ends early: its writer did not finish it"
+
+
+def _held(columns: dict[int, Column]) -> dict[int, Column]:
+    return {channel: column for channel, column in columns.items() if column.times.size}
+
+
+def _agree(stated: Statistics, totals: dict[int, Total]) -> bool:
+    if stated.counts != {channel: total.count for channel, total in totals.items()}:
+        return False
+    if not totals:
+        return True
+    first = min(total.first for total in totals.values())
+    return (stated.start, stated.end) == (first, max(t.last for t in totals.values()))

@@ -1,0 +1,310 @@
+"""Message definitions: which bytes a type is made of, and a deserializer for each.
+
+A definition is looked for in this order: inside the bag (the schema text, nested types included),
+in the configured `.msg` folders, among the standard types. Every distinct schema text gets a
+typestore of its own, so two bags that define one type differently are each read with their own.
+
+Definitions are read from files that anybody may have written. Their size, nesting and arrays are
+bounded before the parser and the code generator of rosbags see them: both take exponential time
+or memory on some inputs.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from ros2_memory.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from rosbags.interfaces.typing import FieldDesc, Typesdict
+
+MAX_TEXT_BYTES: Final = 1 << 20
+MAX_STATEMENTS: Final = {"ros2msg": 10_000, "ros2idl": 2_000}
+MAX_NESTING: Final = 40
+MAX_UNROLLED: Final = 5_000
+"""Elements of fixed arrays of strings or messages: rosbags writes a line of code for each."""
+_CACHED_TYPES: Final = 4_096
+
+_SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
+_SERVICE: Final = re.compile(r"^---[ \t]*$", re.MULTILINE)
+_MSG_NOISE: Final = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
+_IDL_PIECE: Final = re.compile(
+    r'"(?:\\.|[^"\\])*"|/\*.*?\*/|//[^\n]*|@[A-Za-z_]\w*(?:[ \t]*\()?|[()]|[^"/@()]+|.', re.DOTALL
+)
+_IDL_DIRECTIVE: Final = re.compile(r"^[ \t]*#[^\n]*", re.MULTILINE)
+_IDL_NESTED_SEQUENCE: Final = re.compile(r"sequence\s*<\s*sequence")
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """How one schema is deserialized, or the reason why it cannot be (one of both is None).
+
+    `fieldless`: the definition has no field, so any payload of more than a byte contradicts it.
+    """
+
+    name: str
+    deserialize: Callable[[bytes], object] | None
+    reason: str | None
+    fieldless: bool = False
+
+
+class _UnusableError(Exception):
+    """A definition that no deserializer can be made of; the text says why."""
+
+
+class _Section(NamedTuple):
+    encoding: str
+    text: str
+
+
+class Typestores:
+    """Deserializers by schema content. Safe to use from several threads at once.
+
+    Args:
+        custom_msg_paths: folders in which `<package>/msg/*.msg` lie, at any depth, or a package.
+            A type that stands in several is taken from the first.
+
+    Raises:
+        ConfigError: a path is not a folder, holds no `.msg` file, or cannot be read.
+    """
+
+    def __init__(self, custom_msg_paths: Sequence[Path | str] = ()) -> None:
+        self._folders: dict[str, _Section] = {}
+        for path in custom_msg_paths:
+            for name, text in _definitions_below(Path(path)):
+                self._folders.setdefault(name, _Section("ros2msg", text))
+        self._standard = get_typestore(Stores.LATEST).fielddefs
+        self._types: dict[tuple[str, str, bytes], MessageType] = {}
+        self._lock = threading.Lock()
+
+    def lookup(self, name: str, encoding: str, text: bytes) -> MessageType:
+        """The type that a schema of a bag stands for.
+
+        Args:
+            name: the type, `package/msg/Name`.
+            encoding: `ros2msg`, `ros2idl`, or empty where the bag holds no definition.
+            text: the definition with the nested ones behind it, as rosbag2 concatenates them.
+        """
+        key = (name, encoding, text)
+        known = self._types.get(key)
+        if known is not None:
+            return known
+        with self._lock:
+            if len(self._types) >= _CACHED_TYPES:
+                self._types.clear()
+            return self._types.setdefault(key, self._build(name, encoding, text))
+
+    def _build(self, name: str, encoding: str, text: bytes) -> MessageType:
+        root = _full_name(name)
+        try:
+            definitions = self._closure(root, _sections(root, encoding, text))
+            store = _compiled(definitions, root)
+        except _UnusableError as error:
+            return MessageType(name, None, str(error))
+
+        def deserialize(payload: bytes) -> object:
+            return store.deserialize_cdr(payload, root)
+
+        return MessageType(name, deserialize, None, fieldless=not definitions[root][1])
+
+    def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
+        """The definitions of `root` and of all that it is made of, checked to be bounded."""
+        found: Typesdict = {}
+        finished: set[str] = set()
+        unrolled = 0
+
+        def add(name: str, trail: tuple[str, ...]) -> None:
+            nonlocal unrolled
+            if name in trail:
+                raise _UnusableError(f"its definition contains itself: {' > '.join(trail)}")
+            if len(trail) > MAX_NESTING:
+                raise _UnusableError(f"its definition nests more than {MAX_NESTING} levels deep")
+            if name not in found:
+                found.update(self._definition(name, in_bag, trail))
+            for _, field in found[name][1]:
+                unrolled += _unrolled(field)
+                if unrolled > MAX_UNROLLED:
+                    raise _UnusableError(
+                        f"its fixed arrays of strings and messages hold more than {MAX_UNROLLED}"
+                        " elements"
+                    )
+                nested = _nested_type(field)
+                if nested is not None and nested not in finished:
+                    add(nested, (*trail, name))
+            finished.add(name)
+
+        add(root, ())
+        return {name: found[name] for name in finished}
+
+    def _definition(
+        self, name: str, in_bag: Mapping[str, _Section], trail: tuple[str, ...]
+    ) -> Typesdict:
+        section = in_bag.get(name)
+        if section is None or not section.text:
+            section = self._folders.get(name, section)
+        if name in self._standard and (section is None or not section.text):
+            return {name: self._standard[name]}
+        if section is not None:
+            parsed = _parse(name, section)
+            if name in parsed:
+                return parsed
+            raise _UnusableError(f"its definition defines {', '.join(parsed)}, not {name}")
+        missing = f"its part {name} (in {trail[-1]})" if trail else "it"
+        raise _UnusableError(
+            f"{missing} has no definition in the bag, in the configured folders or among the"
+            " standard types; put the package's .msg folder into reader.custom_msg_paths"
+        )
+
+
+def _sections(name: str, encoding: str, text: bytes) -> dict[str, _Section]:
+    """The definitions in one schema text, by type name."""
+    if encoding not in {"", "ros2msg", "ros2idl", "omgidl"}:
+        raise _UnusableError(f"its schema encoding {encoding!r} is not read")
+    if len(text) > MAX_TEXT_BYTES:
+        raise _UnusableError(f"its definition is larger than {MAX_TEXT_BYTES} bytes")
+    plain = text.decode("utf-8", errors="replace").replace("\r\n", "\n").lstrip("\ufeff")
+    if not plain.strip():
+        # A type without fields has an empty text, and so has one whose text was not found.
+        return {name: _Section(encoding, "")} if encoding else {}
+    if encoding != "ros2idl" and _SERVICE.search(plain):
+        kind = "an action" if plain.count("\n---") > 1 else "a service"
+        raise _UnusableError(f"{kind} definition; service events are not decoded")
+    pieces = _SEPARATOR.split(plain if plain.endswith("\n") else plain + "\n")
+    root = "ros2msg" if encoding in {"", "ros2msg"} else "ros2idl"
+    sections: dict[str, _Section] = {}
+    if pieces[0].strip():
+        sections[name] = _Section(root, pieces[0])
+    for kind, named, body in zip(pieces[1::3], pieces[2::3], pieces[3::3], strict=True):
+        section = _Section("ros2idl" if kind == "IDL" else "ros2msg", body)
+        sections.setdefault(_full_name(named), section)
+    return sections
+
+
+def _full_name(name: str) -> str:
+    """`package/Name` as `package/msg/Name`."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+
+
+def _parse(name: str, section: _Section) -> Typesdict:
+    text = _plain_idl(section.text) if section.encoding == "ros2idl" else section.text + "\n"
+    if section.encoding == "ros2msg":
+        text = _MSG_NOISE.sub("", text)
+    statements = text.count(";" if section.encoding == "ros2idl" else "\n")
+    if statements > MAX_STATEMENTS[section.encoding]:
+        raise _UnusableError(f"its definition of {name} has {statements} statements, too many")
+    parse = get_types_from_idl if section.encoding == "ros2idl" else _types_from_msg(name)
+    try:
+        return parse(text)
+    # The parser raises its own error, or whatever Python does with what it took for a number.
+    except Exception as error:
+        reason = f"its definition of {name} cannot be parsed: {_brief(error)}"
+        raise _UnusableError(reason) from error
+
+
+def _compiled(definitions: Typesdict, root: str) -> Typestore:
+    store = Typestore()
+    try:
+        store.register(definitions)
+        store.get_msgdef(root)
+    # rosbags turns definitions into Python and runs it: its failures have no common base.
+    except Exception as error:
+        raise _UnusableError(f"its definition cannot be used: {_brief(error)}") from error
+    return store
+
+
+def _types_from_msg(name: str) -> Callable[[str], Typesdict]:
+    return lambda text: get_types_from_msg(text, name)
+
+
+def _plain_idl(text: str) -> str:
+    """IDL without comments and annotations, refused where the parser would not come to an end.
+
+    rosbags parses an expression 128 times for each parenthesis around it, and a sequence twice
+    for each sequence around it; message definitions need neither.
+    """
+    kept: list[str] = []
+    depth = 0
+    for piece in _IDL_PIECE.findall(text):
+        if depth:
+            depth += (piece[-1] == "(") - (piece == ")")
+        elif piece[0] == "@":
+            depth = int(piece[-1] == "(")
+        elif piece.startswith(("//", "/*")):
+            kept.append(" ")
+        elif piece == "(":
+            raise _UnusableError("its IDL holds an expression in parentheses, which is not read")
+        else:
+            kept.append(piece)
+    plain = _IDL_DIRECTIVE.sub("", "".join(kept))
+    if "<<" in plain or _IDL_NESTED_SEQUENCE.search(plain):
+        raise _UnusableError("its IDL holds a shift or a sequence of sequences, which is not read")
+    return plain
+
+
+def _nested_type(field: FieldDesc) -> str | None:
+    """The message type that a field holds, alone or in an array; None for a primitive."""
+    if field[0] == Nodetype.NAME:
+        return str(field[1])
+    if field[0] == Nodetype.ARRAY or field[0] == Nodetype.SEQUENCE:
+        element = field[1][0]
+        return str(element[1]) if element[0] == Nodetype.NAME else None
+    return None
+
+
+def _unrolled(field: FieldDesc) -> int:
+    """Elements that generated code spells out one by one."""
+    if field[0] != Nodetype.ARRAY:
+        return 0
+    element, count = field[1]
+    primitive = element[0] == Nodetype.BASE and element[1][0] != "string"
+    return 0 if primitive else count
+
+
+def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
+    """(type name, text) of every `<package>/msg/<Name>.msg` below or of the folder."""
+    if not folder.is_dir():
+        raise ConfigError(
+            f"reader.custom_msg_paths: {folder} is not a folder; give a folder of packages, or one"
+            " package, with msg/*.msg in it"
+        )
+    try:
+        files = sorted(file for file in folder.resolve().rglob("*.msg") if file.is_file())
+        files = [file for file in files if file.parent.name == "msg"]
+        if not files:
+            raise ConfigError(f"reader.custom_msg_paths: {folder} holds no msg/*.msg file")
+        packages = {file.parent.parent: "" for file in files}
+        for package in packages:
+            packages[package] = _package_name(package)
+        for file in files:
+            text = file.read_text(encoding="utf-8", errors="replace")
+            yield f"{packages[file.parent.parent]}/msg/{file.stem}", text
+    except OSError as error:
+        raise ConfigError(f"reader.custom_msg_paths: {folder} cannot be read: {error}") from error
+
+
+def _package_name(package: Path) -> str:
+    """The name in package.xml, else the folder's."""
+    manifest = package / "package.xml"
+    if manifest.is_file():
+        text = manifest.read_text(encoding="utf-8", errors="replace")
+        named = re.search(r"<name>\s*([A-Za-z][A-Za-z0-9_]*)\s*</name>", text)
+        if named:
+            return named[1]
+    return package.name
+
+
+def _brief(error: Exception) -> str:
+    """One line of an error whose text may hold the whole definition."""
+    words = " ".join(f"{error}".split()) or "no reason given"
+    return f"{type(error).__name__}: {words[:160]}"
