@@ -275,7 +275,7 @@ def _edge(node: object, log_time: Ns, *, static: bool) -> StampedTransform | Non
     child = _text(_CHILD_FRAME.of(node)).removeprefix("/")
     stamp = nanoseconds(_STAMP.of(node))
     translation, turn = xyz(_TRANSLATION.of(node)), rotation(_ROTATION.of(node))
-    if not parent or not child or parent == child or stamp is None:
+    if not child or parent == child or stamp is None:
         return None
     if translation is None or turn is None or not _finite(translation):
         return None

@@ -201,7 +201,7 @@ def frames(memory: Memory, call: Call) -> answers.Frames:
     return answers.Frames(frame_history.edges(view), view.notes)
 
 
-def findlast_match(
+def find_last_match(
     memory: Memory,
     call: Call,
     topic: str,
@@ -285,7 +285,9 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Foun
     else:
         limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
         tolerance = ns_argument("tolerance_s", limit)
-    start = MIN_NS if tolerance is None else max(at - tolerance, MIN_NS)
+    # A timestamp that was fed back lies up to a microsecond, and a float's error, past its message.
+    oldest = MIN_NS if tolerance is None else at - tolerance - 2 * AT_OR_BEFORE_SLACK_NS
+    start = max(oldest, MIN_NS)
     stop = min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
     found = view.newest(topic, TimeWindow(start, stop))
     if found is None:

@@ -1,0 +1,55 @@
+"""A whole memory over a folder of bags, as the composition root would build it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import yaml
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+
+from ros2_memory.extract import SchemaExtractor
+from ros2_memory.memory import Limits, Memory
+from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.timebase import Clock, WallClock
+
+if TYPE_CHECKING:
+    from ros2_memory.storage.base import BagReader
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@cache
+def extractor() -> SchemaExtractor:
+    """The extractor of the shipped schema map."""
+    text = (ROOT / "config" / "message_schemas.yaml").read_text(encoding="utf-8")
+    return SchemaExtractor(yaml.safe_load(text)["schemas"], max_array_length=50)
+
+
+@dataclass
+class SettableClock(Clock):
+    """A clock that a test moves."""
+
+    at: int
+
+    def now(self) -> int:
+        return self.at
+
+
+def memory_of(
+    bag_dir: Path,
+    *,
+    storage: str = "mcap",
+    clock: Clock | None = None,
+    reader: BagReader | None = None,
+    limits: Limits | None = None,
+) -> Memory:
+    """The memory over `bag_dir`, rescanned at every question."""
+    if reader is None:
+        reader = McapReader() if storage == "mcap" else Rosbag2Reader()
+    timed = clock or WallClock()
+    index = IndexManager(bag_dir, reader, timed, refresh_s=0.0, split_duration_s=10.0)
+    return Memory(index, reader, extractor(), timed, limits or Limits())

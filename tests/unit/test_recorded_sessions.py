@@ -1,0 +1,295 @@
+"""Answers against the closed form, over bags that the real `ros2 bag record` wrote."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from typing import TYPE_CHECKING
+
+import pytest
+from rosbags.rosbag2 import Reader
+
+from ros2_memory import queries
+from ros2_memory.memory import Call, Limits
+from ros2_memory.moments import Moment, Span
+from ros2_memory.timebase import unix_from_ns, unix_rounded_up
+from tests.bags import typestore
+from tests.closed_form import (
+    CAMERA,
+    LASER,
+    SESSIONS,
+    SMALL,
+    SPEED,
+    Session,
+    degrees_apart,
+    mounted,
+    position,
+    yaw_deg,
+)
+from tests.memories import memory_of
+from tests.shared_bags import RECORDED, needs_recorded
+
+if TYPE_CHECKING:
+    from ros2_memory.memory import Memory
+
+sessions = pytest.mark.parametrize(
+    "session",
+    [
+        pytest.param(SMALL, id="small"),
+        *(pytest.param(each, id=name, marks=needs_recorded) for name, each in SESSIONS.items()),
+    ],
+)
+
+
+@pytest.fixture
+def memory(session: Session) -> Memory:
+    return memory_of(session.folder, storage=session.storage)
+
+
+def spanned(memory: Memory, session: Session) -> tuple[float, float]:
+    """First and last moment of the odometry, in seconds after T0."""
+    rows = {row.topic: row for row in queries.list_recorded_topics(memory, Call())}
+    first, last = rows["/odom"].first, rows["/odom"].last
+    return session.since(unix_from_ns(first)), session.since(unix_from_ns(last))
+
+
+def log_times(session: Session, topic: str) -> list[int]:
+    """By plain rosbags, over all files of the session."""
+    times = []
+    paths = [session.folder] if (session.folder / "metadata.yaml").exists() else []
+    for path in paths:
+        with Reader(path) as reader:
+            wanted = [each for each in reader.connections if each.topic == topic]
+            times.extend(stamp for _, stamp, _ in reader.messages(wanted))
+    return sorted(times)
+
+
+@sessions
+def test_the_position_is_the_closed_form_at_the_replys_own_timestamp(
+    memory: Memory, session: Session
+) -> None:
+    begin, end = spanned(memory, session)
+    known = log_times(session, "/odom")
+    rng = random.Random(50)
+    for _ in range(50):
+        asked = session.at(rng.uniform(begin + 0.2, end))
+        answer = queries.position(memory, Call(), Moment(at_s=asked))
+        t = session.since(unix_from_ns(answer.time))
+        x, y = position(t)
+        assert math.dist(answer.pose.position[:2], (x, y)) < 0.005
+        assert answer.time == max(each for each in known if each <= asked * 1e9 + 1000)
+
+
+@sessions
+def test_the_heading_is_the_closed_form(memory: Memory, session: Session) -> None:
+    begin, end = spanned(memory, session)
+    for step in range(20):
+        asked = session.at(begin + 0.2 + (end - begin - 0.4) * step / 19)
+        answer = queries.topic_value(memory, Call(), "/odom", Moment(at_s=asked))
+        value = answer.sample.value
+        assert isinstance(value, dict)
+        orientation = value["orientation"]
+        assert isinstance(orientation, dict)
+        shown = orientation["yaw_deg"]
+        assert isinstance(shown, (int, float))
+        t = session.since(unix_from_ns(answer.sample.time))
+        # 5 ms between stamp and log time are 0.07 degrees
+        assert degrees_apart(shown, yaw_deg(t)) < 0.1
+
+
+@sessions
+@pytest.mark.parametrize(("sensor", "mount"), [("laser", LASER), ("camera", CAMERA)])
+def test_a_transform_is_interpolated_to_the_asked_moment(
+    memory: Memory, session: Session, sensor: str, mount: tuple[float, float, float]
+) -> None:
+    begin, end = spanned(memory, session)
+    rng = random.Random(7)
+    for _ in range(25):
+        t = rng.uniform(begin + 0.1, end - 0.1)
+        answer = queries.transform(memory, Call(), "odom", sensor, Moment(at_s=session.at(t)))
+        assert math.dist(answer.transform.translation, mounted(t, mount)) < 0.005
+        x, y, z, w = answer.transform.rotation
+        yaw = math.degrees(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+        assert degrees_apart(yaw, yaw_deg(t)) < 0.2
+        assert answer.clock == "stamp"
+
+
+@sessions
+def test_a_transform_and_its_inverse_agree(memory: Memory, session: Session) -> None:
+    begin, end = spanned(memory, session)
+    t = (begin + end) / 2
+    there = queries.transform(memory, Call(), "odom", "laser", Moment(at_s=session.at(t)))
+    back = queries.transform(memory, Call(), "laser", "odom", Moment(at_s=session.at(t)))
+    x, y, _ = mounted(t, LASER)
+    angle = math.radians(yaw_deg(t))
+    expected = (
+        -(x * math.cos(angle) + y * math.sin(angle)),
+        x * math.sin(angle) - y * math.cos(angle),
+        -LASER[2],
+    )
+    assert math.dist(back.transform.translation, expected) < 0.005
+    assert there.transform.rotation[2] == pytest.approx(-back.transform.rotation[2], abs=1e-9)
+
+
+@sessions
+def test_the_path_length_is_speed_times_time(memory: Memory, session: Session) -> None:
+    begin, end = spanned(memory, session)
+    span = Span(start_s=session.at(begin - 1), end_s=session.at(end + 1))
+    answer = queries.trajectory_summary(memory, Call(), span)
+    steps = round((end - begin) * 20)
+    assert answer.trajectory.distance_m == pytest.approx(SPEED * steps / 20, rel=1e-3)
+    assert answer.trajectory.max_speed == pytest.approx(SPEED, abs=1e-6)
+    assert answer.trajectory.avg_speed == pytest.approx(SPEED, rel=0.01)
+    for waypoint in answer.trajectory.waypoints:
+        x, y = position(session.since(unix_from_ns(waypoint.time)))
+        assert math.dist(waypoint.position[:2], (x, y)) < 0.005
+
+
+@sessions
+def test_the_last_scissors_are_found_to_the_second(memory: Memory, session: Session) -> None:
+    _, end = spanned(memory, session)
+    answer = queries.find_last_match(
+        memory, Call(), "/vision/*/scene_objects", "contains", "Scissors"
+    )
+    assert answer.found is not None
+    assert answer.found.topic == "/vision/scene/scene_objects"
+    seen = [t for t in range(int(end) + 1) if 12 <= t < 18 or 40 <= t < 46]
+    assert session.since(unix_from_ns(answer.found.sample.time)) == pytest.approx(
+        seen[-1], abs=0.05
+    )
+
+
+@sessions
+def test_a_thing_never_seen_is_a_complete_search_without_a_match(
+    memory: Memory, session: Session
+) -> None:
+    answer = queries.find_last_match(
+        memory, Call(), "/vision/scene/scene_objects", "contains", "unicorn"
+    )
+    assert answer.found is None
+    assert answer.notes == ()
+
+
+@sessions
+def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Session) -> None:
+    begin, end = spanned(memory, session)
+    span = Span(start_s=session.at(begin), end_s=session.at(end))
+    for sample in queries.topic_range(memory, Call(), "/odom", span, max_samples=60).samples:
+        again = queries.topic_value(
+            memory, Call(), "/odom", Moment(at_s=unix_rounded_up(sample.time)), tolerance_s=0.0
+        )
+        assert again.sample.time == sample.time
+
+
+@sessions
+def test_every_topic_is_counted_exactly(memory: Memory, session: Session) -> None:
+    rows = {row.topic: row for row in queries.list_recorded_topics(memory, Call())}
+    with Reader(session.folder) as reader:
+        expected = {topic: info.msgcount for topic, info in reader.topics.items()}
+    assert {topic: row.count for topic, row in rows.items()} == {
+        topic: count for topic, count in expected.items() if count
+    }
+    for topic, row in rows.items():
+        times = log_times(session, topic)
+        assert (row.first, row.last) == (times[0], times[-1])
+
+
+@sessions
+def test_samples_decode_as_plain_rosbags_decodes_them(memory: Memory, session: Session) -> None:
+    begin, end = spanned(memory, session)
+    span = Span(start_s=session.at(begin), end_s=session.at(end))
+    answer = queries.topic_range(memory, Call(), "/odom", span, max_samples=1000)
+    wanted = {sample.time: sample.value for sample in answer.samples}
+    compared = 0
+    with Reader(session.folder) as reader:
+        odom = [each for each in reader.connections if each.topic == "/odom"]
+        for connection, stamp, payload in reader.messages(odom):
+            if stamp in wanted:
+                message = typestore().deserialize_cdr(payload, connection.msgtype)
+                value = wanted[stamp]
+                assert isinstance(value, dict)
+                assert value["position"] == {
+                    "x": pytest.approx(message.pose.pose.position.x, abs=5.1e-5),
+                    "y": pytest.approx(message.pose.pose.position.y, abs=5.1e-5),
+                    "z": 0,
+                }
+                compared += 1
+    assert compared == len(wanted) > 100
+
+
+@needs_recorded
+def test_the_bumper_was_last_pressed_half_a_second_before_it_was_released() -> None:
+    session = SESSIONS["session_mcap"]
+    memory = memory_of(session.folder)
+    answer = queries.find_last_match(memory, Call(), "/bumper", "equals", value=True)
+    assert answer.found is not None
+    assert session.since(unix_from_ns(answer.found.sample.time)) == pytest.approx(25.5, abs=0.05)
+    for t, pressed in ((24.9, False), (25.2, True), (25.9, True), (26.2, False)):
+        moment = Moment(at_s=session.at(t))
+        value = queries.topic_value(memory, Call(), "/bumper", moment, tolerance_s=0.6)
+        assert value.sample.value == {"value": pressed}
+
+
+@needs_recorded
+def test_the_battery_when_the_bumper_was_pressed() -> None:
+    session = SESSIONS["session_mcap"]
+    answer = queries.value_when(
+        memory_of(session.folder),
+        Call(),
+        "/battery_state",
+        "/bumper",
+        condition_type="equals",
+        value=True,
+        fields=["percentage"],
+    )
+    assert answer.value is not None
+    assert answer.value.sample.value == {"percentage": pytest.approx(0.775, abs=1e-4)}
+
+
+@needs_recorded
+@pytest.mark.parametrize("name", ["session_killed", "session_killed_chunk64k"])
+def test_a_killed_session_is_read_as_far_as_it_can_be(name: str) -> None:
+    memory = memory_of(RECORDED / name)
+    # what the kill left was written long before this test
+    memory_range = queries.data_time_range(memory, Call())
+    rows = {row.topic: row.count for row in queries.list_recorded_topics(memory, Call())}
+    t0 = json.loads((RECORDED / f"{name}.truth.json").read_text())["t0_ns"]
+    assert memory_range.latest is not None
+    reached = (memory_range.latest - t0) / 1e9
+    if name == "session_killed":
+        assert 19.9 < reached < 20.5
+        assert [each.path.name for each in memory_range.damaged] == ["session_killed_2.mcap"]
+    else:
+        assert 24.0 < reached < 25.0
+        assert [each.path.name for each in memory_range.incomplete] == [
+            "session_killed_chunk64k_2.mcap"
+        ]
+        assert rows["/odom"] > 480
+
+
+@needs_recorded
+def test_a_search_over_a_damaged_bag_says_that_it_was_not_complete() -> None:
+    memory = memory_of(RECORDED / "session_killed")
+    answer = queries.find_last_match(memory, Call(), "/bumper", "equals", value=True)
+    assert answer.found is None
+    assert "session_killed_2.mcap" in answer.notes[0]
+
+
+@needs_recorded
+def test_static_frames_of_three_broadcasters_are_all_known() -> None:
+    memory = memory_of(RECORDED / "extra" / "tfs")
+    edges = queries.frames(memory, Call()).edges
+    assert {edge.child for edge in edges if edge.static} == {"c1", "c2", "c3"}
+
+
+@needs_recorded
+def test_now_can_be_the_newest_recorded_moment() -> None:
+    session = SESSIONS["session_mcap"]
+    memory = memory_of(session.folder, limits=Limits(now="latest"))
+    answer = queries.position(memory, Call(), Moment(ago_s=10.0))
+    newest = memory.index.snapshot().latest
+    assert newest is not None
+    assert answer.age is not None
+    assert newest - answer.time == answer.age
+    assert 10.0 <= unix_from_ns(answer.age) < 10.1
