@@ -1,0 +1,293 @@
+"""The 17 tools: names, what the planner reads of them, arguments, and the query behind each.
+
+A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declared once; only the
+`Variant`s differ. The order here is the order in which clients see them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import partial
+from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+
+from ros2_memory import answers, queries
+from ros2_memory.arguments import (
+    Ago,
+    Arguments,
+    At,
+    Between,
+    Correlation,
+    Last,
+    Listing,
+    MotionAt,
+    Nothing,
+    Search,
+    TopicAt,
+    TopicOver,
+    TransformAt,
+    WayOver,
+    from_json,
+)
+from ros2_memory.errors import NoDataError, NoDataReason
+from ros2_memory.fitting import compact
+from ros2_memory.signatures import Signature
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from ros2_memory.arguments import When
+    from ros2_memory.fitting import JsonObject
+    from ros2_memory.memory import Call, Limits, Memory
+    from ros2_memory.model import JsonValue
+    from ros2_memory.shapes import Answer
+
+Question: TypeAlias = "Callable[[Memory, Call], Answer]"
+
+A = TypeVar("A", bound=Arguments)
+
+
+@dataclass(frozen=True, slots=True)
+class Tool:
+    """One tool as clients see it; `question` checks what is given and binds it to its query."""
+
+    name: str
+    title: str
+    description: str
+    schema: JsonObject
+    blocking: bool
+    question: Callable[[Mapping[str, object]], Question]
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One name of a question. `said` takes the place of {when} in the description."""
+
+    name: str
+    title: str
+    when: type[When] | None = None
+    said: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry(Generic[A]):
+    """A question and all its names."""
+
+    variants: tuple[Variant, ...]
+    description: str
+    arguments: type[A]
+    ask: Callable[[Memory, Call, A], Answer]
+    blocking: bool = False
+
+    def tools(self, facts: Mapping[str, object]) -> Iterator[Tool]:
+        """The tools; `facts` fill the description's placeholders."""
+        for variant in self.variants:
+            signature = Signature(self.arguments, variant.when)
+            what = self.description.format(when=variant.said, **facts)
+            text = f"{what} Example: {compact(signature.example)}"
+            if self.blocking:
+                text = f"Blocking: may take up to {facts['timeout']} s. {text}"
+            yield Tool(
+                variant.name,
+                variant.title,
+                text,
+                signature.json_schema(),
+                self.blocking,
+                partial(self._question, signature),
+            )
+
+    def _question(self, signature: Signature[A], given: Mapping[str, object]) -> Question:
+        arguments = signature.read(given)
+        return lambda memory, call: self.ask(memory, call, arguments)
+
+
+def build_tools(limits: Limits, call_timeout_s: float) -> tuple[Tool, ...]:
+    """All tools, in order. The descriptions tell this deployment's defaults."""
+    facts = {
+        "timeout": f"{call_timeout_s:g}",
+        "pose_topic": limits.pose_topic,
+        "tolerance": f"{limits.time_tolerance_s:g}",
+        "near": f"{limits.position_tolerance_m:g}",
+    }
+    return (
+        *_LIST.tools(facts),
+        *_RANGE.tools(facts),
+        *_TOPIC_AT.tools(facts),
+        *_TOPIC_OVER.tools(facts),
+        *_POSITION.tools(facts),
+        *_VELOCITY.tools(facts),
+        *_TRANSFORM.tools(facts),
+        *_FRAMES.tools(facts),
+        *_LAST_MATCH.tools(facts),
+        *_VALUE_WHEN.tools(facts),
+        *_TRAJECTORY.tools(facts),
+    )
+
+
+def _list_topics(memory: Memory, call: Call, given: Listing) -> tuple[answers.TopicRow, ...]:
+    rows = queries.list_recorded_topics(memory, call)
+    if given.pattern is None or not rows:
+        return rows
+    named = tuple(row for row in rows if fnmatchcase(row.topic, given.pattern))
+    if not named:
+        raise NoDataError(
+            NoDataReason.TOPIC_NOT_RECORDED,
+            f"none of the {len(rows)} recorded topics matches {given.pattern}; "
+            "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
+        )
+    return named
+
+
+def _condition_value(given: Search | Correlation) -> JsonValue:
+    """Planners tend to send an object as JSON text."""
+    if given.condition_type == "near_position" and isinstance(given.value, str):
+        parsed = from_json(given.value)
+        return parsed if isinstance(parsed, dict) else given.value
+    return given.value
+
+
+def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[Variant, ...]:
+    return (
+        Variant(f"get_{name}_{at}", f"{title} at a time", At, "at a Unix time"),
+        Variant(f"get_{name}_seconds_ago", f"{title} some seconds ago", Ago, "some seconds ago"),
+    )
+
+
+_LIST = Entry(
+    (Variant("list_recorded_topics", "Recorded topics"),),
+    "Every recorded topic. Ask this first when a topic's name is not known. "
+    "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s.",
+    Listing,
+    _list_topics,
+)
+_RANGE = Entry(
+    (Variant("data_time_range", "Span of the memory"),),
+    "What time span the memory covers, with its holes, and what time it is now. "
+    "Reply: {{earliest, latest, now, bags, gaps, ...}}, times in Unix s and local ISO; "
+    "earliest and latest are null while the memory is empty.",
+    Nothing,
+    lambda memory, call, _: queries.data_time_range(memory, call),
+)
+_TOPIC_AT = Entry(
+    _at_and_ago("topic", "A topic's value", at="at_time"),
+    "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
+    "(default {tolerance}; latched topics: any age). Reply: {{topic, type, timestamp, value}}.",
+    TopicAt,
+    lambda memory, call, given: queries.topic_value(
+        memory,
+        call,
+        given.topic,
+        given.moment,
+        tolerance_s=given.tolerance_s,
+        fields=given.fields,
+    ),
+)
+_TOPIC_OVER = Entry(
+    (
+        Variant("get_topic_in_range", "A topic over a window", Between, "between two Unix times"),
+        Variant("get_topic_in_last", "A topic over the last seconds", Last, "in the last seconds"),
+    ),
+    "What a topic said {when}: up to max_samples messages, evenly spaced over the window, first "
+    "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}.",
+    TopicOver,
+    lambda memory, call, given: queries.topic_range(
+        memory,
+        call,
+        given.topic,
+        given.span,
+        max_samples=given.max_samples,
+        fields=given.fields,
+    ),
+)
+_POSITION = Entry(
+    _at_and_ago("position", "Robot position"),
+    "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
+    "(counter-clockwise from x), timestamp, topic, frame_id}}.",
+    MotionAt,
+    lambda memory, call, given: queries.position(
+        memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
+    ),
+)
+_VELOCITY = Entry(
+    _at_and_ago("velocity", "Robot velocity"),
+    "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
+    "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame x is "
+    "ahead and angular z turns left.",
+    MotionAt,
+    lambda memory, call, given: queries.velocity(
+        memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
+    ),
+)
+_TRANSFORM = Entry(
+    _at_and_ago("transform", "Transform"),
+    "The pose of frame child in frame parent {when}, through any chain of frames, interpolated. "
+    "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock}}.",
+    TransformAt,
+    lambda memory, call, given: queries.transform(
+        memory, call, given.parent, given.child, given.moment
+    ),
+)
+_FRAMES = Entry(
+    (Variant("list_frames", "Frames (blocking)"),),
+    "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, static}}]}}.",
+    Nothing,
+    lambda memory, call, _: queries.frames(memory, call),
+    blocking=True,
+)
+_CONDITIONS = (
+    "contains (text anywhere in the message, or list element), equals (boolean, number or text), "
+    'near_position ({{"x": m, "y": m}} within {near} m)'
+)
+_LAST_MATCH = Entry(
+    (Variant("find_last_match", "Last time something held (blocking)"),),
+    "When a condition last held, e.g. when scissors were last seen: searches all history, newest "
+    f"first. Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type}}}}, or null if "
+    "it never held.",
+    Search,
+    lambda memory, call, given: queries.find_last_match(
+        memory,
+        call,
+        given.topic,
+        given.condition_type,
+        _condition_value(given),
+        field=given.field,
+        fields=given.fields,
+    ),
+    blocking=True,
+)
+_VALUE_WHEN = Entry(
+    (Variant("get_value_when", "A topic when another matched (blocking)"),),
+    "What value_topic held when condition_topic last met a condition (as in find_last_match), "
+    "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
+    "value_timestamp, condition_topic, value_topic}}, or null if it never held.",
+    Correlation,
+    lambda memory, call, given: queries.value_when(
+        memory,
+        call,
+        given.value_topic,
+        given.condition_topic,
+        condition_type=given.condition_type,
+        value=_condition_value(given),
+        field=given.field,
+        fields=given.fields,
+    ),
+    blocking=True,
+)
+_TRAJECTORY = Entry(
+    (
+        Variant("trajectory_summary", "Way driven (blocking)", Between, "between two Unix times"),
+        Variant(
+            "recent_trajectory_summary",
+            "Way driven lately (blocking)",
+            Last,
+            "in the last seconds",
+        ),
+    ),
+    "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, avg_speed, "
+    "max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], ...}}.",
+    WayOver,
+    lambda memory, call, given: queries.trajectory_summary(
+        memory, call, given.span, topic=given.topic
+    ),
+    blocking=True,
+)
