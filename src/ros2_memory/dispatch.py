@@ -1,0 +1,177 @@
+"""One tool call from arguments to reply: a worker thread, a deadline, one log event.
+
+Nothing escapes: what a query raises becomes a reply, and what it should not have raised is logged
+with its traceback under the call's correlation id, which is all that the client learns of it.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+import uuid
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Final
+
+import anyio
+import anyio.to_thread
+import structlog
+from mcp.server.mcpserver import MCPServer
+from mcp.types import CallToolResult, TextContent, ToolAnnotations
+from mcp.types import Tool as ListedTool
+
+from ros2_memory.errors import EpisodicError, InvalidArgumentsError, NoDataError, QueryTimeoutError
+from ros2_memory.logs import get_logger
+from ros2_memory.memory import Call
+from ros2_memory.timebase import Deadline, ms_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from ros2_memory.memory import Memory
+    from ros2_memory.replies import Replies, Reply
+    from ros2_memory.tools import Question, Tool
+
+QUERIES_AT_ONCE: Final = 4
+"""Queries are mostly Python, which runs one at a time: more threads would only slow each other."""
+
+_SOONER_S: Final = 0.5
+"""How much before the call a query gives up, so that its own sentence is what the client reads."""
+
+_LOGGED_CHARS: Final = 300
+
+log = get_logger(__name__)
+
+
+class Dispatcher:
+    """Answers tool calls from one memory, `QUERIES_AT_ONCE` at a time."""
+
+    def __init__(
+        self, memory: Memory, tools: Sequence[Tool], replies: Replies, *, call_timeout_s: float
+    ) -> None:
+        self._memory = memory
+        self._tools = {tool.name: tool for tool in tools}
+        self._replies = replies
+        self._call_timeout_s = call_timeout_s
+        self._limiter = anyio.CapacityLimiter(QUERIES_AT_ONCE)
+        self._stopping = threading.Event()
+
+    def stop(self) -> None:
+        """Has every query that still runs give up, so that the program can end."""
+        self._stopping.set()
+
+    async def answer(self, name: str, given: Mapping[str, object]) -> Reply:
+        """The reply to one call, within `call_timeout_s`. Raises nothing but cancellation."""
+        begun = time.perf_counter_ns()
+        patience_s = max(self._call_timeout_s - _SOONER_S, self._call_timeout_s * 0.9)
+        call = Call(Deadline.after(patience_s, self._monotonic))
+        outcome, chars = "cancelled", 0
+        with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
+            try:
+                outcome, reply = await self._outcome(name, given, call)
+                chars = len(reply.text)
+            finally:
+                log.info(
+                    "tool_call",
+                    tool=name[:_LOGGED_CHARS],
+                    arguments=repr(given)[:_LOGGED_CHARS],
+                    outcome=outcome,
+                    duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+                    stages_ms=call.stages.as_ms(),
+                    chars=chars,
+                )
+        return reply
+
+    def _monotonic(self) -> float:
+        return math.inf if self._stopping.is_set() else time.monotonic()
+
+    async def _outcome(
+        self, name: str, given: Mapping[str, object], call: Call
+    ) -> tuple[str, Reply]:
+        try:
+            question = self._tool(name).question(given)
+        except InvalidArgumentsError as error:
+            return error.code, self._replies.error(error)
+        with anyio.move_on_after(self._call_timeout_s):
+            return await anyio.to_thread.run_sync(
+                self._ask, question, call, abandon_on_cancel=True, limiter=self._limiter
+            )
+        late = QueryTimeoutError(
+            f"{name} needs more than {self._call_timeout_s:g} s; "
+            "ask about a shorter window or a single topic"
+        )
+        return late.code, self._replies.error(late)
+
+    def _tool(self, name: str) -> Tool:
+        if name in self._tools:
+            return self._tools[name]
+        near = get_close_matches(name, self._tools, n=3)
+        hint = (
+            f"do you mean {' or '.join(near)}?" if near else f"there are: {', '.join(self._tools)}"
+        )
+        raise InvalidArgumentsError(f'there is no tool "{name[:_LOGGED_CHARS]}"; {hint}')
+
+    def _ask(self, question: Question, call: Call) -> tuple[str, Reply]:
+        """Runs in a worker thread: the query, and the rendering of what it gives."""
+        try:
+            return "ok", self._replies.answer(question(self._memory, call))
+        except NoDataError as error:
+            return f"{error.code}: {error.reason}", self._replies.error(error)
+        except EpisodicError as error:
+            return error.code, self._replies.error(error)
+        except Exception:
+            log.exception("tool_failed")
+            context = structlog.contextvars.get_contextvars()
+            return "internal", self._replies.internal(str(context.get("correlation_id")))
+
+
+class EpisodicServer(MCPServer[object]):
+    """The MCP server over a dispatcher: lists the tools as declared, and answers with one text.
+
+    Text alone, without structured content: some clients forward only the latter where both exist,
+    and a JSON string is what the tools promise.
+    """
+
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        tools: Sequence[Tool],
+        *,
+        name: str,
+        version: str,
+        instructions: str,
+    ) -> None:
+        super().__init__(name, version=version, instructions=instructions)
+        self.dispatcher = dispatcher
+        self._listed = [_listed(tool) for tool in tools]
+
+    async def list_tools(self) -> list[ListedTool]:
+        """The tools, in the order of their declaration."""
+        return self._listed
+
+    async def call_tool(
+        self, name: str, arguments: Mapping[str, object], context: object | None = None
+    ) -> CallToolResult:
+        """One call's reply as one text block. Raises nothing but cancellation."""
+        del context
+        reply = await self.dispatcher.answer(name, arguments)
+        return CallToolResult(
+            content=[TextContent(type="text", text=reply.text)], is_error=reply.is_error
+        )
+
+
+def _listed(tool: Tool) -> ListedTool:
+    return ListedTool(
+        name=tool.name,
+        title=tool.title,
+        description=tool.description,
+        input_schema=dict(tool.schema),
+        annotations=ToolAnnotations(
+            title=tool.title,
+            read_only_hint=True,
+            destructive_hint=False,
+            idempotent_hint=True,
+            open_world_hint=False,
+        ),
+        _meta={"blocking": True} if tool.blocking else None,
+    )

@@ -1,0 +1,249 @@
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import anyio
+import pytest
+import structlog
+from mcp import Client
+from mcp.types import TextContent
+from structlog.testing import LogCapture
+
+from ros2_memory import answers
+from ros2_memory.dispatch import QUERIES_AT_ONCE, Dispatcher, EpisodicServer
+from ros2_memory.errors import InvalidArgumentsError, NoDataError, NoDataReason, QueryTimeoutError
+from ros2_memory.memory import Memory
+from ros2_memory.model import Sample
+from ros2_memory.replies import Replies
+from ros2_memory.tools import Tool
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from mcp.types import CallToolResult
+
+    from ros2_memory.memory import Call
+    from ros2_memory.shapes import Answer
+
+NOBODY = cast("Memory", None)
+"""The tools of these tests ask nothing of a memory."""
+
+
+def tool(name: str, ask: Callable[[Call], Answer], *, blocking: bool = False) -> Tool:
+    def question(given: Mapping[str, object]) -> Callable[[Memory, Call], Answer]:
+        if "bad" in given:
+            raise InvalidArgumentsError("bad was given")
+        return lambda _memory, call: ask(call)
+
+    schema: dict[str, Any] = {"type": "object", "properties": {}}
+    return Tool(name, name.title(), f"What {name} does.", schema, blocking, question)
+
+
+def value(shown: Any) -> answers.TopicValue:
+    return answers.TopicValue("/a", "a/msg/A", Sample(0, shown))
+
+
+def served(*tools: Tool, timeout_s: float = 25.0, max_chars: int = 24_000) -> EpisodicServer:
+    dispatcher = Dispatcher(
+        NOBODY, tools, Replies(Path("bags"), max_chars), call_timeout_s=timeout_s
+    )
+    return EpisodicServer(
+        dispatcher, tools, name="episodic", version="1.2.3", instructions="Ask away."
+    )
+
+
+def told(result: CallToolResult) -> Any:
+    """The reply, held to be one text block and nothing else."""
+    [block] = result.content
+    assert isinstance(block, TextContent)
+    assert result.structured_content is None
+    return json.loads(block.text)
+
+
+def raising(error: BaseException) -> Callable[[Call], Answer]:
+    def ask(_call: Call) -> Answer:
+        raise error
+
+    return ask
+
+
+def until_given_up(call: Call) -> Answer:
+    """A query as the rooms below write it: it looks at its deadline between two bags."""
+    while not call.deadline.expired():
+        threading.Event().wait(0.001)
+    raise QueryTimeoutError(f"the question needs more than {call.deadline.budget_s:g} s")
+
+
+@pytest.fixture
+def log() -> Iterator[LogCapture]:
+    capture = LogCapture()
+    structlog.configure(processors=[structlog.contextvars.merge_contextvars, capture])
+    yield capture
+    structlog.reset_defaults()
+
+
+async def test_a_reply_is_one_text_block_without_structured_content() -> None:
+    async with Client(served(tool("ask", lambda _call: value({"x": 1})))) as client:
+        result = await client.call_tool("ask", {})
+        assert told(result)["value"] == {"x": 1}
+        assert not result.is_error
+        [listed] = (await client.list_tools()).tools
+        assert listed.output_schema is None
+
+
+async def test_tools_are_listed_as_read_only_and_the_blocking_ones_marked() -> None:
+    quick, slow = tool("quick", raising(ValueError())), tool("slow", until_given_up, blocking=True)
+    async with Client(served(quick, slow)) as client:
+        listed = (await client.list_tools()).tools
+    assert [each.name for each in listed] == ["quick", "slow"]
+    for each in listed:
+        assert each.annotations is not None
+        assert each.annotations.read_only_hint is True
+        assert each.annotations.idempotent_hint is True
+        assert each.annotations.destructive_hint is False
+        assert each.annotations.open_world_hint is False
+    assert [each.meta for each in listed] == [None, {"blocking": True}]
+
+
+async def test_the_server_says_its_name_its_version_and_how_to_ask() -> None:
+    async with Client(served()) as client:
+        info = client.server_info
+        assert info is not None
+        assert (info.name, info.version) == ("episodic", "1.2.3")
+        assert client.instructions == "Ask away."
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "error", "is_error"),
+    [
+        ("none", {}, {"error": "no_data", "reason": "gap", "detail": "a hole"}, False),
+        ("none", {"bad": 1}, {"error": "invalid_arguments", "detail": "bad was given"}, True),
+        ("late", {}, {"error": "timeout", "detail": "too long"}, True),
+    ],
+)
+async def test_every_error_is_json(
+    name: str, given: dict[str, Any], error: dict[str, str], is_error: bool
+) -> None:
+    none = tool("none", raising(NoDataError(NoDataReason.GAP, "a hole")))
+    late = tool("late", raising(QueryTimeoutError("too long")))
+    async with Client(served(none, late)) as client:
+        result = await client.call_tool(name, given)
+        assert told(result) == error
+        assert result.is_error == is_error
+
+
+async def test_an_unknown_tool_is_answered_with_the_nearest_names() -> None:
+    async with Client(served(tool("get_position_at", raising(ValueError())))) as client:
+        result = await client.call_tool("get_positon", {})
+        assert result.is_error
+        assert told(result)["error"] == "invalid_arguments"
+        assert told(result)["detail"].endswith("do you mean get_position_at?")
+        assert "there are: get_position_at" in told(await client.call_tool("qqq", {}))["detail"]
+
+
+@pytest.mark.parametrize("error", [KeyError("secret"), RecursionError(), MemoryError()])
+async def test_a_fault_is_logged_and_told_without_its_inside(
+    error: Exception, log: LogCapture
+) -> None:
+    async with Client(served(tool("ask", raising(error)))) as client:
+        result = await client.call_tool("ask", {})
+        again = await client.call_tool("ask", {"bad": 1})
+    assert result.is_error
+    assert told(result)["error"] == "internal"
+    assert "secret" not in told(result)["detail"]
+    assert told(again)["error"] == "invalid_arguments"
+    failed, called, _ = log.entries
+    assert failed["event"] == "tool_failed"
+    assert failed["exc_info"] is True
+    assert failed["correlation_id"] == called["correlation_id"]
+    assert failed["correlation_id"] in told(result)["detail"]
+
+
+async def test_each_call_is_logged_once_with_its_outcome_and_times(log: LogCapture) -> None:
+    def ask(call: Call) -> Answer:
+        call.stages.add("read", 2_500_000)
+        return value(1)
+
+    tools = (tool("ask", ask), tool("none", raising(NoDataError(NoDataReason.GAP, "a hole"))))
+    async with Client(served(*tools)) as client:
+        await client.call_tool("ask", {"topic": "/a" * 1000})
+        await client.call_tool("none", {})
+        await client.call_tool("ask", {"bad": 1})
+    asked, none, bad = log.entries
+    assert asked["event"] == "tool_call"
+    assert asked["tool"] == "ask"
+    assert asked["outcome"] == "ok"
+    assert asked["stages_ms"] == {"read": 2.5}
+    assert asked["duration_ms"] > 0
+    assert len(asked["arguments"]) == 300
+    assert none["outcome"] == "no_data: gap"
+    assert bad["outcome"] == "invalid_arguments"
+    assert len({entry["correlation_id"] for entry in log.entries}) == 3
+
+
+async def test_a_query_that_takes_too_long_gives_up_by_itself() -> None:
+    async with Client(served(tool("slow", until_given_up), timeout_s=1.0)) as client:
+        result = await client.call_tool("slow", {})
+        assert result.is_error
+        assert told(result) == {"error": "timeout", "detail": "the question needs more than 0.9 s"}
+
+
+async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> None:
+    released = threading.Event()
+
+    def stuck(_call: Call) -> Answer:
+        released.wait(10)
+        return value(1)
+
+    async with Client(served(tool("stuck", stuck), timeout_s=0.05)) as client:
+        result = await client.call_tool("stuck", {})
+        released.set()
+    assert result.is_error
+    assert told(result)["error"] == "timeout"
+    assert told(result)["detail"].startswith("stuck needs more than 0.05 s")
+
+
+async def test_tools_are_listed_while_queries_run_and_wait() -> None:
+    released = threading.Event()
+
+    def stuck(_call: Call) -> Answer:
+        released.wait(10)
+        return value(1)
+
+    async with Client(served(tool("stuck", stuck))) as client, anyio.create_task_group() as tasks:
+        for _ in range(2 * QUERIES_AT_ONCE):
+            tasks.start_soon(client.call_tool, "stuck", {})
+        await anyio.wait_all_tasks_blocked()
+        assert len((await client.list_tools()).tools) == 1
+        released.set()
+
+
+async def test_stopping_has_running_queries_give_up() -> None:
+    started = threading.Event()
+
+    def ask(call: Call) -> Answer:
+        started.set()
+        return until_given_up(call)
+
+    server = served(tool("slow", ask))
+    results: list[CallToolResult] = []
+
+    async def call(client: Client) -> None:
+        results.append(await client.call_tool("slow", {}))
+
+    async with Client(server) as client, anyio.create_task_group() as tasks:
+        tasks.start_soon(call, client)
+        await anyio.to_thread.run_sync(started.wait)
+        server.dispatcher.stop()
+    assert told(results[0])["error"] == "timeout"
+
+
+async def test_a_reply_stays_below_the_cap() -> None:
+    server = served(tool("ask", lambda _call: value(["x" * 100] * 1000)), max_chars=1500)
+    async with Client(server) as client:
+        result = await client.call_tool("ask", {})
+    assert len(cast("TextContent", result.content[0]).text) <= 1500
+    assert told(result)["notes"]
