@@ -1,0 +1,203 @@
+"""The one web application: `/sse` with `/messages/`, `/mcp`, and `/health`, on one port."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Final, TypeAlias
+from urllib.parse import urlsplit
+
+import anyio
+from mcp.server.transport_security import TransportSecuritySettings
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.responses import JSONResponse, PlainTextResponse
+from starlette.routing import Route
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+
+    from mcp.server.mcpserver import MCPServer
+    from starlette.requests import Request
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+    from ros2_memory.fitting import JsonObject
+
+Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
+
+STREAM_PATH: Final = "/sse"
+GRACE_S: Final = 0.4
+"""How long requests under way may still take when the server stops; event streams end at once."""
+
+_LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+_ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104
+
+
+def web_app(
+    server: MCPServer[object],
+    *,
+    host: str,
+    health: Callable[[], Awaitable[JsonObject]],
+    background: Background,
+) -> WebApp:
+    """The application that listens on `host`.
+
+    `background` runs from start to end of the application, and is cancelled then.
+    """
+    # `Guard` stands before all routes, and knows the addresses of a host such as 0.0.0.0.
+    guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
+    streams = server.sse_app(sse_path=STREAM_PATH, transport_security=guarded)
+    requests = server.streamable_http_app(
+        stateless_http=True, json_response=True, transport_security=guarded
+    )
+
+    async def show_health(_request: Request) -> JSONResponse:
+        return JSONResponse(await health())
+
+    @asynccontextmanager
+    async def lifespan(_app: Starlette) -> AsyncIterator[None]:
+        async with server.session_manager.run(), anyio.create_task_group() as tasks:
+            tasks.start_soon(background)
+            yield
+            tasks.cancel_scope.cancel()
+
+    routes = [*streams.routes, *requests.routes, Route("/health", show_health, methods=["GET"])]
+    return WebApp(Guard(Starlette(routes=routes, lifespan=lifespan), host))
+
+
+class WebApp:
+    """Ends what is under way when the server stops, which an event stream never does by itself."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._under_way: set[_Exchange] = set()
+
+    def stop(self) -> None:
+        """Ends the event streams now, and other requests after `GRACE_S`."""
+        for exchange in self._under_way:
+            exchange.stop()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        exchange = _Exchange(scope, receive, send)
+        self._under_way.add(exchange)
+        try:
+            await exchange.run(self._app)
+        finally:
+            self._under_way.discard(exchange)
+
+
+class _Exchange:
+    """One request and its response.
+
+    An event stream is ended by telling the application that the client has left, which is the end
+    that it knows how to come to; whatever it sends after that goes nowhere.
+    """
+
+    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self._scope = scope
+        self._receive = receive
+        self._send = send
+        self._is_stream = scope["path"] == STREAM_PATH
+        self._begun = False
+        self._left = anyio.Event()
+        self._limit = anyio.CancelScope()
+
+    def stop(self) -> None:
+        """Ends it: a stream at once, what else there is within `GRACE_S`."""
+        if self._is_stream:
+            self._left.set()
+        self._limit.deadline = anyio.current_time() + GRACE_S
+
+    async def run(self, app: ASGIApp) -> None:
+        """Runs it; a response that was stopped on its way is brought to an end."""
+        with self._limit:
+            await app(self._scope, self.receive, self.send)
+        if not self._limit.cancelled_caught and not self._left.is_set():
+            return
+        if self._begun:
+            await self._send({"type": "http.response.body", "body": b"", "more_body": False})
+        else:
+            stopping = PlainTextResponse("The server is stopping.\n", status_code=503)
+            await stopping(self._scope, self._receive, self._send)
+
+    async def receive(self) -> Message:
+        """The client's next message, or its leaving where the stream is to end."""
+        if not self._is_stream:
+            return await self._receive()
+        message: Message = {"type": "http.disconnect"}
+
+        async def hear() -> None:
+            nonlocal message
+            message = await self._receive()
+            tasks.cancel_scope.cancel()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(hear)
+            await self._left.wait()
+            tasks.cancel_scope.cancel()
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Passes a message to the client."""
+        if not self._left.is_set():
+            self._begun = True
+            await self._send(message)
+
+
+class Guard:
+    """Refuses requests that a web page could have forged, by their Host and Origin headers.
+
+    A page of another site reaches a server on this machine or network by having its own name
+    resolve to the server's address (DNS rebinding): then Host carries that name. So Host must be a
+    name that is known to be this server's, or a bare address, which cannot be rebound. Origin,
+    which only browsers send, must be the same as Host, or a page on the loopback address.
+    """
+
+    def __init__(self, app: ASGIApp, host: str) -> None:
+        self._app = app
+        self._names = _LOOPBACK | {host.lower()} - _ANY_ADDRESS
+        self._reachable = host.lower() not in _LOOPBACK
+        if self._reachable:
+            name = socket.gethostname().lower()
+            self._names |= {name, f"{name}.local", socket.getfqdn().lower()}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI."""
+        if scope["type"] == "http":
+            headers = Headers(scope=scope)
+            refusal = self._refusal(headers.get("host", ""), headers.get("origin"))
+            if refusal is not None:
+                await refusal(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+    def _refusal(self, host: str, origin: str | None) -> PlainTextResponse | None:
+        name = _host_name(f"//{host}")
+        if name not in self._names and not (self._reachable and _is_address(name)):
+            return PlainTextResponse(
+                "Host is not a name of this server; use its address instead.\n", status_code=421
+            )
+        same = (f"http://{host}".lower(), f"https://{host}".lower())
+        if origin is None or origin.lower() in same or _host_name(origin) in _LOOPBACK:
+            return None
+        return PlainTextResponse("Origin is another site.\n", status_code=403)
+
+
+def _host_name(url: str) -> str:
+    try:
+        return (urlsplit(url).hostname or "").lower()
+    except ValueError:
+        return ""
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
