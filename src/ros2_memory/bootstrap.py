@@ -1,0 +1,106 @@
+"""The composition root: the only place that sees the configuration and the adapters together."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Final
+
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+
+from ros2_memory.config import load_message_schemas
+from ros2_memory.dispatch import Dispatcher, EpisodicServer
+from ros2_memory.errors import ConfigError
+from ros2_memory.extract import SchemaExtractor
+from ros2_memory.instructions import instructions
+from ros2_memory.memory import Limits, Memory
+from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.replies import Replies
+from ros2_memory.storage.base import BagReader
+from ros2_memory.timebase import WallClock
+from ros2_memory.tools import build_tools
+
+if TYPE_CHECKING:
+    from ros2_memory.settings import Settings
+
+_PACKAGE: Final = "ros2-memory"
+
+
+def build_reader(settings: Settings) -> BagReader:
+    """The bag reader that the configuration chooses.
+
+    Raises:
+        ConfigError: it cannot be built.
+    """
+    node = settings.storage
+    try:
+        # `all`: the adapter receives plain lists, not the configuration library's.
+        reader: object = instantiate(
+            {"_target_": node.target, "_convert_": "all"}, **node.arguments
+        )
+    except HydraException as error:
+        raise ConfigError(f"storage: {node.target} cannot be built: {error}") from error
+    if not isinstance(reader, BagReader):
+        raise ConfigError(f"storage: {node.target} is not a bag reader")
+    return reader
+
+
+def build_memory(settings: Settings) -> Memory:
+    """The memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
+
+    Raises:
+        ConfigError: the reader cannot be built, or the schema map is refused.
+    """
+    reader, clock = build_reader(settings), WallClock()
+    extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
+    index = IndexManager(
+        settings.recording.bag_dir,
+        reader,
+        clock,
+        refresh_s=settings.reader.index_refresh_s,
+        split_duration_s=settings.recording.split_duration_s,
+    )
+    return Memory(index, reader, extractor, clock, limits_of(settings))
+
+
+def limits_of(settings: Settings) -> Limits:
+    """What questions need of the configuration."""
+    data = settings.data
+    return Limits(
+        position_tolerance_m=data.position_tolerance_m,
+        time_tolerance_s=data.time_tolerance_s,
+        pose_topic=data.pose_topic,
+        tf_topics=data.tf_topics,
+        tf_static_topics=data.tf_static_topics,
+        now=data.now,
+        tf_clock=data.tf_clock,
+        max_plausible_speed_mps=data.max_plausible_speed_mps,
+        split_duration_s=settings.recording.split_duration_s,
+    )
+
+
+def build_server(settings: Settings, memory: Memory) -> EpisodicServer:
+    """The MCP server that answers from a memory."""
+    served = settings.server
+    tools = build_tools(memory.limits, served.call_timeout_s)
+    dispatcher = Dispatcher(
+        memory,
+        tools,
+        Replies(settings.recording.bag_dir, served.max_reply_chars),
+        call_timeout_s=served.call_timeout_s,
+    )
+    return EpisodicServer(
+        dispatcher,
+        tools,
+        name=served.name,
+        version=package_version(),
+        instructions=instructions(memory.limits),
+    )
+
+
+def package_version() -> str:
+    """The installed version of this package; `0` where it is run without being installed."""
+    try:
+        return version(_PACKAGE)
+    except PackageNotFoundError:
+        return "0"

@@ -1,0 +1,371 @@
+"""The query server as its own process, asked by the SDK's real client over each transport."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import anyio
+import pytest
+from mcp import Client
+from mcp.client.sse import sse_client
+from mcp.client.stdio import StdioServerParameters, stdio_client
+from mcp.types import TextContent
+
+from ros2_memory.timebase import NS_PER_S
+from tests.bags import boolean, detections, odom, tf, transform, write_mcap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+T0_S = 1_784_023_200
+T0 = T0_S * NS_PER_S
+LENGTH_S = 12
+ATTEMPTS = 600
+BETWEEN_ATTEMPTS_S = 0.05
+ENDS_WITHIN_S = 5.0
+"""Far above the second that it should take, so that a busy machine does not fail the test."""
+
+ANSWERED: list[tuple[str, dict[str, Any], str]] = [
+    ("list_recorded_topics", {}, "topic"),
+    ("data_time_range", {}, "earliest"),
+    ("get_topic_at_time", {"topic": "/odom", "timestamp": T0_S + 5}, "value"),
+    ("get_topic_seconds_ago", {"topic": "/odom", "seconds_ago": 5}, "age_s"),
+    ("get_topic_in_range", {"topic": "/odom", "start": T0_S, "end": T0_S + 9}, "samples"),
+    ("get_topic_in_last", {"topic": "/odom", "seconds": 5, "fields": "position"}, "samples"),
+    ("get_position_at", {"timestamp": T0_S + 3}, "yaw_deg"),
+    ("get_position_seconds_ago", {"seconds_ago": 1}, "age_s"),
+    ("get_velocity_at", {"timestamp": T0_S + 3}, "linear"),
+    ("get_velocity_seconds_ago", {"seconds_ago": 1, "topic": "/odom"}, "angular"),
+    ("get_transform_at", {"parent": "odom", "child": "laser", "timestamp": T0_S + 3}, "rotation"),
+    ("get_transform_seconds_ago", {"parent": "laser", "child": "odom", "seconds_ago": 1}, "clock"),
+    ("list_frames", {}, "transforms"),
+    (
+        "find_last_match",
+        {
+            "topic": "/vision/*/scene_objects",
+            "condition_type": "contains",
+            "value": "scissors",
+        },
+        "timestamp",
+    ),
+    (
+        "find_last_match",
+        {"topic": "/odom", "condition_type": "near_position", "value": '{"x": 0, "y": 0}'},
+        "value",
+    ),
+    (
+        "get_value_when",
+        {
+            "value_topic": "/odom",
+            "condition_topic": "/bumper",
+            "condition_type": "equals",
+            "value": True,
+        },
+        "matched",
+    ),
+    ("trajectory_summary", {"start": T0_S, "end": T0_S + LENGTH_S}, "waypoints"),
+    ("recent_trajectory_summary", {"seconds": 5}, "distance_m"),
+]
+REFUSED: list[tuple[str, dict[str, Any], str, bool]] = [
+    ("get_position_at", {"timestamp": 5}, "no_data", False),
+    ("get_topic_at_time", {"topic": "/nope", "timestamp": T0_S}, "no_data", False),
+    ("get_position_at", {"timestamp": "yesterday"}, "invalid_arguments", True),
+    ("get_position_at", {"timestamp": T0_S, "when": 1}, "invalid_arguments", True),
+    ("get_position_at", {}, "invalid_arguments", True),
+    ("get_topic_in_range", {"topic": "/odom", "start": 9, "end": 1}, "invalid_arguments", True),
+    (
+        "find_last_match",
+        {"topic": "/odom", "condition_type": "near_position", "value": "here"},
+        "invalid_arguments",
+        True,
+    ),
+    ("no_such_tool", {}, "invalid_arguments", True),
+]
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    messages = []
+    for n in range(LENGTH_S * 50):
+        at = T0 + n * NS_PER_S // 50
+        messages.append(odom(at, math.sin(n / 50), n / 100, 0.3, vx=0.5, wz=0.1))
+        moved = transform(at, "odom", "base_link", (n / 100, 0.0, 0.0), 0.1)
+        messages.append(tf(at, moved))
+    fixed = transform(T0, "base_link", "laser", (0.2, 0.0, 0.1))
+    messages.append(tf(T0, fixed, topic="/tf_static"))
+    messages.append(detections(T0 + 5 * NS_PER_S, ["scissors", "cup"]))
+    messages.append(boolean(T0 + 6 * NS_PER_S, data=True))
+    write_mcap(tmp_path / "bags" / "run" / "run_0.mcap", messages)
+    return tmp_path / "bags"
+
+
+def command(*overrides: str) -> list[str]:
+    return [sys.executable, "-m", "ros2_memory.server", "data.now=latest", *overrides]
+
+
+def environment(bag_dir: Path, **more: str) -> dict[str, str]:
+    """This test's environment, without settings of whoever runs it."""
+    ours = ("MEMORY_", "MCP_", "ROS_")
+    kept = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
+    return kept | {"MEMORY_BAG_DIR": str(bag_dir)} | more
+
+
+@dataclass
+class Served:
+    process: subprocess.Popen[bytes]
+    port: int
+    log: Path
+
+    def url(self, path: str) -> str:
+        return f"http://127.0.0.1:{self.port}{path}"
+
+    def get(self, path: str) -> tuple[int, bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        try:
+            connection.request("GET", path)
+            response = connection.getresponse()
+            return response.status, response.read()
+        finally:
+            connection.close()
+
+    def events(self) -> list[dict[str, Any]]:
+        """What was logged so far; the last line may be on its way."""
+        whole, _, _ = self.log.read_text(encoding="utf-8").rpartition("\n")
+        return [json.loads(line) for line in whole.splitlines()]
+
+
+@contextmanager
+def serving(bag_dir: Path, log: Path, *overrides: str) -> Iterator[Served]:
+    """The server over HTTP on a free port, from when it answers `/health`."""
+    env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT="0")
+    with log.open("wb") as stderr:
+        process = subprocess.Popen(
+            command(*overrides), env=env, stdout=subprocess.PIPE, stderr=stderr
+        )
+    try:
+        served = Served(process, 0, log)
+        for _ in range(ATTEMPTS):
+            assert process.poll() is None, log.read_text(encoding="utf-8")
+            ports = [each["port"] for each in served.events() if each["event"] == "listening"]
+            if ports:
+                served.port = ports[0]
+                break
+            time.sleep(BETWEEN_ATTEMPTS_S)
+        assert served.get("/health")[0] == 200
+        yield served
+    finally:
+        process.kill()
+        process.communicate()
+
+
+async def ask(client: Client, name: str, given: dict[str, Any]) -> tuple[Any, bool]:
+    result = await client.call_tool(name, given)
+    [block] = result.content
+    assert isinstance(block, TextContent)
+    assert result.structured_content is None
+    return json.loads(block.text), bool(result.is_error)
+
+
+async def ask_everything(client: Client) -> None:
+    """Every tool and every kind of error that a sound server has."""
+    tools = (await client.list_tools()).tools
+    assert {tool.name for tool in tools} == {name for name, _, _ in ANSWERED}
+    for name, given, key in ANSWERED:
+        told, is_error = await ask(client, name, given)
+        assert key in (told[0] if isinstance(told, list) else told), (name, told)
+        assert not is_error
+    for name, given, code, expected in REFUSED:
+        told, is_error = await ask(client, name, given)
+        assert told["error"] == code, (name, told)
+        assert told["detail"]
+        assert is_error == expected
+
+
+async def test_everything_is_answered_over_stdio(bag_dir: Path, tmp_path: Path) -> None:
+    program, *arguments = command("logging.level=debug")
+    server = StdioServerParameters(command=program, args=arguments, env=environment(bag_dir))
+    with (tmp_path / "log").open("w", encoding="utf-8") as log:
+        async with Client(stdio_client(server, errlog=log)) as client:
+            await ask_everything(client)
+
+
+async def test_everything_is_answered_over_sse_and_streamable_http(
+    bag_dir: Path, tmp_path: Path
+) -> None:
+    with serving(bag_dir, tmp_path / "log") as served:
+        async with Client(sse_client(served.url("/sse"))) as client:
+            await ask_everything(client)
+        async with Client(served.url("/mcp")) as client:
+            await ask_everything(client)
+        called = [each for each in served.events() if each["event"] == "tool_call"]
+        assert len(called) == 2 * (len(ANSWERED) + len(REFUSED))
+        assert all(each["correlation_id"] and each["duration_ms"] > 0 for each in called)
+
+
+async def test_several_clients_are_served_at_once(bag_dir: Path, tmp_path: Path) -> None:
+    async def one(transport: Any) -> None:
+        async with Client(transport) as client:
+            for _ in range(5):
+                told, _ = await ask(client, "get_position_seconds_ago", {"seconds_ago": 1})
+                assert told["topic"] == "/odom"
+
+    with serving(bag_dir, tmp_path / "log") as served:
+        async with anyio.create_task_group() as tasks:
+            for _ in range(4):
+                tasks.start_soon(one, sse_client(served.url("/sse")))
+                tasks.start_soon(one, served.url("/mcp"))
+
+
+async def test_an_empty_memory_answers_and_a_directory_that_comes_later_is_found(
+    bag_dir: Path, tmp_path: Path
+) -> None:
+    later = tmp_path / "later"
+    with serving(later, tmp_path / "log", "reader.index_refresh_s=0.05") as served:
+        async with Client(served.url("/mcp")) as client:
+            told, is_error = await ask(client, "get_position_seconds_ago", {"seconds_ago": 1})
+            assert (told["error"], told["reason"], is_error) == ("no_data", "empty_memory", False)
+            span, _ = await ask(client, "data_time_range", {})
+            assert span["earliest"] is None
+            bag_dir.rename(later)
+            for _ in range(ATTEMPTS):
+                span, _ = await ask(client, "data_time_range", {})
+                if span["bags"]:
+                    break
+                await anyio.sleep(BETWEEN_ATTEMPTS_S)
+            assert span["earliest"] == T0_S
+
+
+def test_health_tells_what_there_is(bag_dir: Path, tmp_path: Path) -> None:
+    with serving(bag_dir, tmp_path / "log") as served:
+        status, body = served.get("/health")
+        told = json.loads(body)
+        assert (status, told["status"], told["bags"]) == (200, "ok", 1)
+        assert told["earliest"] == T0_S
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+async def test_a_signal_ends_it_with_clients_connected(
+    bag_dir: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    with serving(bag_dir, tmp_path / "log") as served:
+        connected = anyio.Event()
+
+        async def stay() -> None:
+            async with Client(sse_client(served.url("/sse"))) as client:
+                await ask(client, "data_time_range", {})
+                connected.set()
+                await anyio.sleep_forever()
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(stay)
+            await connected.wait()
+            served.process.send_signal(number)
+            stdout, _ = await anyio.to_thread.run_sync(
+                lambda: served.process.communicate(timeout=ENDS_WITHIN_S)
+            )
+            tasks.cancel_scope.cancel()
+        assert served.process.returncode == 0
+        assert stdout == b""
+        assert served.events()[-1]["event"] == "stopped"
+        assert not [each for each in served.events() if each["level"] == "error"]
+
+
+def test_a_port_in_use_is_told_in_one_line(bag_dir: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT=str(port))
+        ended = subprocess.run(
+            command("logging.level=error"), env=env, capture_output=True, text=True, check=False
+        )
+    assert ended.returncode == 1
+    assert ended.stdout == ""
+    assert ended.stderr == (
+        f"ros2-memory-server: port {port} on 127.0.0.1 is in use by another program; "
+        "stop that one, or choose another port with MCP_PORT\n"
+    )
+
+
+def test_an_address_of_another_machine_is_told_in_one_line(bag_dir: Path) -> None:
+    env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_HOST="192.0.2.1")
+    ended = subprocess.run(
+        command("logging.level=error"), env=env, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1
+    assert "give an address of this machine with MCP_HOST" in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+
+
+def test_a_refused_configuration_is_told_on_stderr(bag_dir: Path) -> None:
+    ended = subprocess.run(
+        command("server.prot=1"),
+        env=environment(bag_dir),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    assert "server.prot" in ended.stderr
+
+
+@pytest.mark.parametrize(("option", "told"), [("--version", "0.1"), ("--help", "key=value")])
+def test_version_and_help_are_printed(bag_dir: Path, option: str, told: str) -> None:
+    ended = subprocess.run(
+        command(option), env=environment(bag_dir), capture_output=True, text=True, check=True
+    )
+    assert told in ended.stdout
+
+
+def stdio_process(bag_dir: Path) -> subprocess.Popen[bytes]:
+    """The server over stdio, with its handshake done."""
+    process = subprocess.Popen(
+        command("logging.level=debug"),
+        env=environment(bag_dir),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    hello = {
+        "jsonrpc": "2.0",
+        "id": 1,
+        "method": "initialize",
+        "params": {
+            "protocolVersion": "2025-06-18",
+            "capabilities": {},
+            "clientInfo": {"name": "test", "version": "1"},
+        },
+    }
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write(json.dumps(hello).encode() + b"\n")
+    process.stdin.flush()
+    assert json.loads(process.stdout.readline())["result"]["serverInfo"]["name"] == "episodic"
+    return process
+
+
+def test_the_end_of_stdin_ends_it_and_nothing_but_the_wire_was_on_stdout(bag_dir: Path) -> None:
+    process = stdio_process(bag_dir)
+    rest, _ = process.communicate(timeout=ENDS_WITHIN_S)
+    assert process.returncode == 0
+    assert rest == b""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_while_it_waits_for_stdin(bag_dir: Path, number: signal.Signals) -> None:
+    process = stdio_process(bag_dir)
+    process.send_signal(number)
+    assert process.wait(timeout=ENDS_WITHIN_S) == 0
+    rest, _ = process.communicate()
+    assert rest == b""
