@@ -1,4 +1,4 @@
-"""A cache that is bounded in bytes."""
+"""What is kept between calls: a cache bounded in bytes, and one object for equal ones."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from collections.abc import Hashable
 
 T = TypeVar("T")
+
+_MAX_SHARED = 10_000
 
 
 class ByteLru(Generic[T]):
@@ -52,3 +54,16 @@ class ByteLru(Generic[T]):
         """The sum of the sizes of what is kept."""
         with self._lock:
             return self._bytes
+
+
+class Shared(Generic[T]):
+    """One object for all that are equal: bags of one robot declare the same channels."""
+
+    def __init__(self) -> None:
+        self._known: dict[T, T] = {}
+
+    def of(self, value: T) -> T:
+        """The first object met that equals `value`."""
+        if len(self._known) >= _MAX_SHARED:
+            self._known.clear()
+        return self._known.setdefault(value, value)

@@ -7,16 +7,16 @@ file's own indexes are missing or wrong (see `mcap_index`).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ros2_memory.model import BagSummary, TopicSummary
 from ros2_memory.storage.base import Channel, Closing, Record
 from ros2_memory.storage.faults import UnreadableError
-from ros2_memory.storage.lru import ByteLru
+from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_chunk import Column, joined, walk
-from ros2_memory.storage.mcap_file import McapFile
+from ros2_memory.storage.mcap_file import begins_as_mcap, closing_of
 from ros2_memory.storage.mcap_index import (
     Chunk,
     DoubtError,
@@ -28,6 +28,8 @@ from ros2_memory.storage.mcap_index import (
 from ros2_memory.storage.mcap_records import MESSAGE, RECORD, Opcode
 from ros2_memory.storage.mcap_scan import index_by_scan
 from ros2_memory.storage.merge import Rows, Run, merged
+from ros2_memory.storage.open_file import OpenFile
+from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
 from ros2_memory.timebase import MAX_NS
 
@@ -35,10 +37,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import TimeWindow
+    from ros2_memory.model import BagSummary, TimeWindow
     from ros2_memory.timebase import Ns
-
-_MAX_INTERNED = 10_000
 
 
 class McapBags:
@@ -56,21 +56,27 @@ class McapBags:
         self._indexes: ByteLru[McapIndex] = ByteLru((cache_mb << 20) // 8)
         self._columns: ByteLru[Column] = ByteLru((cache_mb << 20) * 3 // 8)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
-        self._interned: dict[Channel, Channel] = {}
+        self._shared: Shared[Channel] = Shared()
 
     def closing(self, path: Path) -> Closing:
         """Whether the writer has finished the file."""
-        with McapFile(path) as file:
-            return file.closing()
+        with OpenFile(path) as file:
+            return closing_of(file)
 
     def summarize(self, path: Path) -> BagSummary:
         """Topics with exact counts and first and last log times."""
-        with McapFile(path) as file:
-            return _summary(self._index(file))
+        with OpenFile(path) as file:
+            index = self._index(file)
+        held = [
+            Held(index.channels[number], total.count, total.first, total.last)
+            for number, total in index.totals.items()
+        ]
+        declared = index.channels.values()
+        return bag_summary(held, declared, complete=index.complete, notes=index.notes)
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """The channels declared in the file."""
-        with McapFile(path) as file:
+        with OpenFile(path) as file:
             return list(self._index(file).channels.values())
 
     def records(
@@ -79,13 +85,13 @@ class McapBags:
         """The messages of `topics` inside the window, in order."""
         if window.empty:
             return
-        with McapFile(path) as file:
+        with OpenFile(path) as file:
             runs = self._runs(file, topics, window, newest_first=newest_first)
             yield from merged(runs, newest_first=newest_first)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
         """The log times of a topic's messages inside the window, ascending."""
-        with McapFile(path) as file:
+        with OpenFile(path) as file:
             index = self._index(file)
             wanted = _wanted(index, {topic})
             columns = [index.loose[channel] for channel in wanted if channel in index.loose]
@@ -98,7 +104,7 @@ class McapBags:
         return [int(time) for time in times.tolist()]
 
     def _runs(
-        self, file: McapFile, topics: Collection[str], window: TimeWindow, *, newest_first: bool
+        self, file: OpenFile, topics: Collection[str], window: TimeWindow, *, newest_first: bool
     ) -> Iterator[Run[Record]]:
         index = self._index(file)
         wanted = _wanted(index, topics)
@@ -122,26 +128,16 @@ class McapBags:
             rows = _rows(column, _from_file(file, wanted), newest_first=newest_first)
             yield Run(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
 
-    def _index(self, file: McapFile) -> McapIndex:
+    def _index(self, file: OpenFile) -> McapIndex:
         index = self._indexes.get(file.key)
         if index is None:
-            index = self._with_shared_channels(_index_of(file, self._max_chunk_bytes))
+            index = _index_of(file, self._max_chunk_bytes)
+            shared = {number: self._shared.of(each) for number, each in index.channels.items()}
+            index = replace(index, channels=shared)
             self._indexes.put(file.key, index, index.bytes_held)
         return index
 
-    def _with_shared_channels(self, index: McapIndex) -> McapIndex:
-        """The same with one object for equal channels of different bags: they repeat a lot."""
-        if len(self._interned) > _MAX_INTERNED:
-            self._interned.clear()
-        channels = {
-            number: self._interned.setdefault(channel, channel)
-            for number, channel in index.channels.items()
-        }
-        return McapIndex(
-            channels, index.chunks, index.totals, index.loose, index.complete, index.notes
-        )
-
-    def _chunk_columns(self, file: McapFile, chunk: Chunk, wanted: Collection[int]) -> list[Column]:
+    def _chunk_columns(self, file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> list[Column]:
         columns: list[Column] = []
         missing: list[int] = []
         for channel in chunk.channels.intersection(wanted):
@@ -160,7 +156,7 @@ class McapBags:
             columns += [read[channel] for channel in missing]
         return columns
 
-    def _chunk_data(self, file: McapFile, chunk: Chunk) -> bytes:
+    def _chunk_data(self, file: OpenFile, chunk: Chunk) -> bytes:
         key = (file.key, chunk.offset)
         data = self._data.get(key)
         if data is None:
@@ -169,8 +165,8 @@ class McapBags:
         return data
 
 
-def _index_of(file: McapFile, max_chunk_bytes: int) -> McapIndex:
-    if file.closing() is Closing.OPEN or not file.begins_as_mcap():
+def _index_of(file: OpenFile, max_chunk_bytes: int) -> McapIndex:
+    if closing_of(file) is Closing.OPEN or not begins_as_mcap(file):
         return index_by_scan(file, max_chunk_bytes)
     try:
         return index_from_summary(file)
@@ -220,7 +216,7 @@ def _from_bytes(data: bytes, channels: dict[int, Channel]) -> Callable[[int, Ns]
     return fetch
 
 
-def _from_file(file: McapFile, channels: dict[int, Channel]) -> Callable[[int, Ns], Record]:
+def _from_file(file: OpenFile, channels: dict[int, Channel]) -> Callable[[int, Ns], Record]:
     """Fetches messages that stand outside chunks."""
 
     def fetch(place: int, time: Ns) -> Record:
@@ -240,36 +236,3 @@ def _record(
     if channel.encoding == "cdr":
         payload = plain_payload(payload)
     return Record(channel, log_time, publish_time if publish_time < MAX_NS else log_time, payload)
-
-
-def _summary(index: McapIndex) -> BagSummary:
-    merged_topics: dict[tuple[str, str], TopicSummary] = {}
-    for number, total in index.totals.items():
-        channel = index.channels[number]
-        key = (channel.topic, channel.type)
-        summary = TopicSummary(
-            *key, channel.encoding, total.count, total.first, total.last, channel.latched
-        )
-        other = merged_topics.get(key)
-        merged_topics[key] = summary if other is None else both(other, summary)
-    heard = {topic for topic, _ in merged_topics}
-    declared = {channel.topic for channel in index.channels.values()}
-    return BagSummary(
-        tuple(merged_topics[key] for key in sorted(merged_topics)),
-        tuple(sorted(declared - heard)),
-        index.complete,
-        index.notes,
-    )
-
-
-def both(one: TopicSummary, other: TopicSummary) -> TopicSummary:
-    """Two channels of one topic and type as one."""
-    return TopicSummary(
-        one.topic,
-        one.type,
-        one.encoding,
-        one.count + other.count,
-        min(one.first, other.first),
-        max(one.last, other.last),
-        one.latched or other.latched,
-    )

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
 
     from ros2_memory.storage.base import Channel
-    from ros2_memory.storage.mcap_file import McapFile
+    from ros2_memory.storage.open_file import OpenFile
     from ros2_memory.timebase import Ns
 
 MAX_SECTION_BYTES = 256 << 20
@@ -99,7 +99,7 @@ class DoubtError(UnreadableError):
 
 
 def chunk_columns(
-    file: McapFile, chunk: Chunk, wanted: Collection[int] | None = None
+    file: OpenFile, chunk: Chunk, wanted: Collection[int] | None = None
 ) -> dict[int, Column]:
     """The messages of a chunk by its message indexes. Only where it has `index_offsets`.
 
@@ -126,7 +126,7 @@ def chunk_columns(
     return columns
 
 
-def chunk_data(file: McapFile, chunk: Chunk, max_bytes: int) -> bytes:
+def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
     """The decompressed records of a chunk.
 
     Raises:
@@ -143,7 +143,7 @@ def chunk_data(file: McapFile, chunk: Chunk, max_bytes: int) -> bytes:
     return unpacked(head, file.read(body_at + head.data_at, head.data_size), max_bytes)
 
 
-def index_from_summary(file: McapFile) -> McapIndex:
+def index_from_summary(file: OpenFile) -> McapIndex:
     """The index that the summary section gives.
 
     Raises:
@@ -158,7 +158,7 @@ def index_from_summary(file: McapFile) -> McapIndex:
         raise DoubtError(f"its summary section is not used ({error})") from error
 
 
-def _index_from_summary(file: McapFile) -> McapIndex:
+def _index_from_summary(file: OpenFile) -> McapIndex:
     declarations, indexes, stated = _summary(file)
     channels = declarations.channels()
     chunks = tuple(_chunk(index) for index in indexes)
@@ -175,7 +175,7 @@ def _index_from_summary(file: McapFile) -> McapIndex:
     return McapIndex(channels, held, totals, notes=notes)
 
 
-def _summary(file: McapFile) -> tuple[Declarations, list[ChunkIndex], Statistics | None]:
+def _summary(file: OpenFile) -> tuple[Declarations, list[ChunkIndex], Statistics | None]:
     footer_at = file.size - MAGIC_SIZE - FOOTER.size
     footer = file.read(footer_at, FOOTER.size)
     opcode, _, summary_at, _, crc = FOOTER.unpack(footer)
@@ -224,7 +224,7 @@ def _agrees(stated: Statistics, chunks: tuple[Chunk, ...]) -> bool:
 
 
 def totals_of(
-    file: McapFile, chunks: Iterable[Chunk], counts: Mapping[int, int] | None
+    file: OpenFile, chunks: Iterable[Chunk], counts: Mapping[int, int] | None
 ) -> dict[int, Total]:
     """Exact totals by channel, from message indexes.
 

@@ -20,7 +20,7 @@ from ros2_memory.storage.mcap_chunk import (
     unpacked_in_part,
     walk,
 )
-from ros2_memory.storage.mcap_file import EMPTY_FILE
+from ros2_memory.storage.mcap_file import begins_as_mcap
 from ros2_memory.storage.mcap_index import (
     MAX_SECTION_BYTES,
     Chunk,
@@ -39,15 +39,16 @@ from ros2_memory.storage.mcap_records import (
     Statistics,
     statistics,
 )
+from ros2_memory.storage.open_file import EMPTY_FILE
 
 if TYPE_CHECKING:
     from ros2_memory.storage.mcap_chunk import Column
-    from ros2_memory.storage.mcap_file import McapFile
+    from ros2_memory.storage.open_file import OpenFile
 
 _BLOCK: Final = 256 * 1024
 
 
-def index_by_scan(file: McapFile, max_chunk_bytes: int, note: str = "") -> McapIndex:
+def index_by_scan(file: OpenFile, max_chunk_bytes: int, note: str = "") -> McapIndex:
     """The index of the messages that can be read.
 
     Args:
@@ -60,7 +61,7 @@ def index_by_scan(file: McapFile, max_chunk_bytes: int, note: str = "") -> McapI
     """
     if not file.size:
         raise UnreadableError(EMPTY_FILE)
-    if not file.begins_as_mcap():
+    if not begins_as_mcap(file):
         raise UnreadableError("not an MCAP file: it does not begin as one")
     scan = _Scan(file, max_chunk_bytes)
     scan.run()
@@ -69,7 +70,7 @@ def index_by_scan(file: McapFile, max_chunk_bytes: int, note: str = "") -> McapI
 
 @dataclass(slots=True)
 class _Scan:
-    file: McapFile
+    file: OpenFile
     max_chunk_bytes: int
     position: int = MAGIC_SIZE
     finished: bool = False

@@ -1,15 +1,21 @@
-"""Zstandard data in memory: one frame, and messages that rosbag2 compressed one by one."""
+"""Zstandard data: one frame in memory, messages compressed one by one, the frames of a file."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import zstandard
 
 from ros2_memory.storage.faults import UnreadableError
 
+if TYPE_CHECKING:
+    from ros2_memory.storage.open_file import OpenFile
+
 FRAME_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_MESSAGE_BYTES: Final = 256 << 20
+_SKIPPABLE: Final = b"\x2a\x4d\x18"
+_HEADER_BYTES: Final = 18
+_RLE_BLOCK: Final = 1
 
 
 def unpacked_zstd(packed: bytes, max_bytes: int) -> bytes:
@@ -44,3 +50,45 @@ def plain_payload(payload: bytes) -> bytes:
         return unpacked_zstd(payload, MAX_MESSAGE_BYTES)
     except (UnreadableError, zstandard.ZstdError, MemoryError):
         return payload
+
+
+def begins_as_zstd(file: OpenFile) -> bool:
+    """Whether it begins with a frame's magic, or with as much of it as the file has bytes."""
+    head = file.read(0, min(file.size, 4))
+    return FRAME_MAGIC.startswith(head) or _is_skippable(head)
+
+
+def ends_whole(file: OpenFile) -> bool:
+    """Whether the file is made of whole frames, by their block headers alone (RFC 8878, 3.1)."""
+    position = 0
+    while position < file.size:
+        end = _frame_end(file, position)
+        if end is None or end > file.size:
+            return False
+        position = end
+    return position > 0
+
+
+def _is_skippable(head: bytes) -> bool:
+    return len(head) == 4 and head[0] & 0xF0 == 0x50 and head[1:] == _SKIPPABLE
+
+
+def _frame_end(file: OpenFile, start: int) -> int | None:
+    """Where the frame at `start` ends, None where the file ends before that shows."""
+    head = file.read(start, min(_HEADER_BYTES, file.size - start))
+    if _is_skippable(head[:4]):
+        if len(head) < 8:
+            return None
+        return start + 8 + int.from_bytes(head[4:8], "little")
+    try:
+        position = start + zstandard.frame_header_size(head)
+        checksum = 4 if zstandard.get_frame_parameters(head).has_checksum else 0
+    except zstandard.ZstdError:
+        return None
+    while position + 3 <= file.size:
+        header = int.from_bytes(file.read(position, 3), "little")
+        last, kind, size = header & 1, header >> 1 & 3, header >> 3
+        position += 3 + (1 if kind == _RLE_BLOCK else size)
+        if last:
+            return position + checksum
+    return None

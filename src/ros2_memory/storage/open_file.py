@@ -1,0 +1,80 @@
+"""A file on disk: bounded reads at any place, and what tells one content from another."""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
+
+from ros2_memory.storage.faults import UnreadableError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from types import TracebackType
+
+EMPTY_FILE: Final = "empty file: nothing had reached the disk"
+
+
+class FileKey(NamedTuple):
+    """Which content a file had: another size, time or inode is another content."""
+
+    path: str
+    size: int
+    mtime_ns: int
+    inode: int
+
+
+class OpenFile:
+    """A file opened for reading at any place; a context manager.
+
+    What was read of it stays readable after the file is deleted, until it is closed. Safe to use
+    from several threads at once.
+
+    Raises:
+        OSError: it cannot be opened.
+        UnreadableError: it is not a regular file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        # Without blocking: opening a pipe would wait for somebody to write into it.
+        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        status = os.fstat(self._descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            os.close(self._descriptor)
+            raise UnreadableError("not a regular file")
+        self.size = status.st_size
+        self.key = FileKey(str(path), status.st_size, status.st_mtime_ns, status.st_ino)
+
+    def __enter__(self) -> Self:
+        """The open file."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Closes it."""
+        os.close(self._descriptor)
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Exactly `length` bytes from `offset`.
+
+        Raises:
+            UnreadableError: the file has fewer; nothing is allocated for them then.
+        """
+        if offset < 0 or length < 0 or offset + length > self.size:
+            raise UnreadableError("damaged: it refers to bytes past its end")
+        pieces: list[bytes] = []
+        missing = length
+        while missing:
+            piece = os.pread(self._descriptor, missing, offset)
+            if not piece:
+                raise UnreadableError("it became shorter while it was being read")
+            if len(piece) == length:
+                return piece
+            pieces.append(piece)
+            offset += len(piece)
+            missing -= len(piece)
+        return b"".join(pieces)

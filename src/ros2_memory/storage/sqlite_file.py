@@ -1,0 +1,215 @@
+"""The sqlite3 room: summaries, messages and log times of rosbag2's `.db3` files.
+
+Every schema version since 2018 has the tables `topics` and `messages`; which columns there are
+beyond the oldest ones, and whether definitions lie in the file, is looked up in the file.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.storage.base import Channel, Closing, Record, Schema
+from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.lru import ByteLru, Shared
+from ros2_memory.storage.mcap_records import offered_as_latched
+from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile
+from ros2_memory.storage.summary import Held, bag_summary
+from ros2_memory.storage.zstd import plain_payload
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.model import BagSummary, TimeWindow
+    from ros2_memory.timebase import Ns
+
+JOURNALS: Final = ("-wal", "-journal")
+_KEPT_BYTES: Final = 16 << 20
+_TOTALS: Final = """
+    SELECT topic_id, count(*), min(timestamp), max(timestamp),
+           sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob')
+    FROM messages GROUP BY topic_id
+"""
+# Without the payload, so that sorting holds none of them; it follows row by row.
+_ASCENDING: Final = """
+    SELECT timestamp, rowid, topic_id FROM messages
+    WHERE timestamp >= ? AND timestamp < ? AND topic_id IN (SELECT value FROM json_each(?))
+    ORDER BY timestamp, rowid
+"""
+_DESCENDING: Final = _ASCENDING.replace("timestamp, rowid\n", "timestamp DESC, rowid DESC\n")
+_PAYLOAD: Final = "SELECT data FROM messages WHERE rowid = ?"
+
+
+@dataclass(frozen=True, slots=True)
+class _Topics:
+    """The channels of a file by topic id."""
+
+    channels: Mapping[int, Channel]
+
+    def named(self, topics: Collection[str]) -> dict[int, Channel]:
+        return {
+            number: channel for number, channel in self.channels.items() if channel.topic in topics
+        }
+
+
+class SqliteBags:
+    """Reads sqlite3 bag files that are settled: no journal or WAL beside them.
+
+    Nothing is written or locked; a connection is opened for each call. Safe to use from several
+    threads at once. What goes wrong is raised as it comes (`faults.reading` translates it).
+    """
+
+    def __init__(self) -> None:
+        self._known: ByteLru[_Topics] = ByteLru(_KEPT_BYTES)
+        self._shared: Shared[Channel] = Shared()
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Topics with exact counts and first and last log times."""
+        with self._opened(path) as (base, topics):
+            rows: list[tuple[int, int, int, int, int]] = base.execute(_TOTALS).fetchall()
+        if any(wrong for *_, wrong in rows):
+            raise UnreadableError(
+                "damaged: messages without an integer timestamp or a binary payload"
+            )
+        held = [
+            Held(topics.channels[number], count, first, last)
+            for number, count, first, last, _ in rows
+            if number in topics.channels
+        ]
+        orphans = sum(row[1] for row in rows) - sum(each.messages for each in held)
+        notes = (f"{orphans} messages belong to no topic and were left out",) if orphans else ()
+        return bag_summary(held, topics.channels.values(), notes=notes)
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """The topics declared in the file."""
+        with self._opened(path) as (_, topics):
+            return list(topics.channels.values())
+
+    def records(
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
+    ) -> Iterator[Record]:
+        """The messages of `topics` inside the window, in order."""
+        with self._opened(path) as (base, known):
+            wanted = known.named(topics)
+            order = _DESCENDING if newest_first else _ASCENDING
+            arguments = (window.start, window.stop, json.dumps(list(wanted)))
+            for time, row, number in base.execute(order, arguments):
+                found = base.execute(_PAYLOAD, (row,)).fetchone()
+                if found is None or not isinstance(found[0], bytes) or not isinstance(time, int):
+                    raise UnreadableError("damaged: a message without a binary payload")
+                channel = wanted[number]
+                payload = plain_payload(found[0]) if channel.encoding == "cdr" else found[0]
+                yield Record(channel, time, time, payload)
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
+        """The log times of a topic's messages inside the window, ascending."""
+        with self._opened(path) as (base, known):
+            arguments = (window.start, window.stop, json.dumps(list(known.named({topic}))))
+            return [int(time) for time, _, _ in base.execute(_ASCENDING, arguments)]
+
+    @contextmanager
+    def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
+        with OpenFile(path) as file:
+            if not file.size:
+                raise UnreadableError(EMPTY_FILE)
+            key = file.key
+        # Immutable: nothing is locked, and no file appears beside the bag.
+        address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+        # A generator of records may be resumed on another thread.
+        with closing(sqlite3.connect(address, uri=True, check_same_thread=False)) as base:
+            topics = self._known.get(key)
+            if topics is None:
+                topics = self._topics(base)
+                size = 1000 + sum(300 + len(c.schema.text) for c in topics.channels.values())
+                self._known.put(key, topics, size)
+            yield base, topics
+
+    def _topics(self, base: sqlite3.Connection) -> _Topics:
+        have = _columns(base, "topics")
+        if not {"id", "name", "type"} <= have or not _columns(base, "messages"):
+            raise UnreadableError("not a rosbag2 file: it lacks the tables topics and messages")
+        definitions = _definitions(base)
+        rows = base.execute("SELECT * FROM topics ORDER BY id")
+        names = [column[0] for column in rows.description]
+        channels: dict[int, Channel] = {}
+        for row in rows:
+            value = dict(zip(names, row, strict=True))
+            raw_type = str(value["type"])
+            schema = definitions.get(raw_type, Schema(_full_type(raw_type)))
+            channels[int(value["id"])] = self._shared.of(
+                Channel(
+                    str(value["name"]),
+                    # Before the column existed there was one format.
+                    str(value.get("serialization_format", "cdr")),
+                    schema,
+                    offered_as_latched(str(value.get("offered_qos_profiles", ""))),
+                )
+            )
+        return _Topics(channels)
+
+
+def _columns(base: sqlite3.Connection, table: str) -> set[str]:
+    rows = base.execute("SELECT name FROM pragma_table_info(?)", (table,))
+    return {str(name) for (name,) in rows}
+
+
+def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
+    """The definitions in the file, by type name; none before schema version 4."""
+    needed = {"topic_type", "encoding", "encoded_message_definition"}
+    if not needed <= _columns(base, "message_definitions"):
+        return {}
+    rows = base.execute(
+        "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    )
+    return {
+        str(name): Schema(_full_type(str(name)), str(encoding), str(text).encode())
+        for name, encoding, text in rows
+        if encoding in {"ros2msg", "ros2idl"}
+    }
+
+
+def _full_type(name: str) -> str:
+    """The type as it is written since 2019: `package/Name` is `package/msg/Name`."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+
+
+def journals_beside(path: Path) -> list[Path]:
+    """The journal and WAL that hold what the file itself does not, or not yet."""
+    beside = [path.with_name(path.name + suffix) for suffix in JOURNALS]
+    return [journal for journal in beside if journal.is_file() and journal.stat().st_size]
+
+
+def closing_of_db3(path: Path) -> Closing:
+    """Open while a journal or WAL lies beside it, or nothing is in it."""
+    with OpenFile(path) as file:
+        unfinished = not file.size or journals_beside(path)
+    return Closing.OPEN if unfinished else Closing.CLOSED
+
+
+def settled_copy(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Path, str]:
+    """A copy in which the journal or WAL beside the file has been played back by sqlite.
+
+    Playing it back in place would write into the folder of bags.
+
+    Args:
+        path: the file.
+        folder: where the copy is made.
+        reserve: called with a number of bytes before as many are written.
+
+    Returns:
+        The copy, and a note.
+    """
+    for source in (path, *journals_beside(path)):
+        reserve(2 * source.stat().st_size)
+        shutil.copyfile(source, folder / source.name)
+    copy = folder / path.name
+    with closing(sqlite3.connect(copy)) as base:
+        base.execute("PRAGMA journal_mode=DELETE").fetchall()
+        base.execute("SELECT count(*) FROM sqlite_master").fetchall()
+    return copy, "its writer did not finish it: a journal lay beside it and was played back"

@@ -1,0 +1,68 @@
+"""Bag files that rosbag2 compressed as a whole: `.mcap.zstd`, `.db3.zstd`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import zstandard
+
+from ros2_memory.storage.base import Closing
+from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile
+from ros2_memory.storage.zstd import begins_as_zstd, ends_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+_PIECE: Final = 1 << 20
+
+
+def closing_of_zstd(path: Path) -> Closing:
+    """Closed when the file is made of whole frames; what is not zstd at all counts as closed."""
+    with OpenFile(path) as file:
+        if file.size and not begins_as_zstd(file):
+            return Closing.CLOSED
+        return Closing.CLOSED if ends_whole(file) else Closing.OPEN
+
+
+def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Path, str]:
+    """Decompresses a bag file into the folder, as far as it can be read.
+
+    Args:
+        path: the compressed file.
+        folder: where the bag is written, under its name without `.zstd`.
+        reserve: called with a number of bytes before as many are written.
+
+    Returns:
+        The bag, and a note on where the compressed file ends early (empty where it does not).
+
+    Raises:
+        UnreadableError: nothing of it can be decompressed, or there is no room for it.
+    """
+    with OpenFile(path) as file:
+        if not file.size:
+            raise UnreadableError(EMPTY_FILE)
+        if not begins_as_zstd(file):
+            raise UnreadableError("not a zstd file: it does not begin as one")
+        whole = ends_whole(file)
+    target = folder / path.stem
+    damage = _unpack(path, target, reserve)
+    if damage:
+        return target, f"its compressed file is damaged ({damage}); what comes after is lost"
+    return target, "" if whole else "its compressed file ends early"
+
+
+def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
+    """Writes what can be decompressed; what is wrong with the rest, or nothing."""
+    with path.open("rb") as packed, target.open("wb") as out:
+        reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+        while True:
+            try:
+                piece = reader.read(_PIECE)
+            except zstandard.ZstdError as error:
+                return str(error)
+            if not piece:
+                return ""
+            reserve(len(piece))
+            out.write(piece)
