@@ -34,7 +34,8 @@ class TimeWindow:
     def from_unix(cls, start_s: float, end_s: float) -> TimeWindow:
         """The window of an inclusive question `[start_s, end_s]` in Unix seconds.
 
-        The end is granted the slack of a float of seconds (see `timebase`).
+        The end is granted the slack of a float of seconds (see `timebase`), the start twice
+        that: a timestamp fed back as the start was also rounded up past its own message.
 
         Raises:
             InvalidArgumentsError: a bound is not finite, or the start is after the end.
@@ -49,7 +50,8 @@ class TimeWindow:
             raise InvalidArgumentsError(
                 f"start ({start_s}) is after end ({end_s}); give the earlier time first"
             )
-        return cls(start, min(end + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS))
+        slack = AT_OR_BEFORE_SLACK_NS
+        return cls(max(start - 2 * slack, MIN_NS), min(end + slack + 1, MAX_NS))
 
     @classmethod
     def everything(cls) -> TimeWindow:

@@ -26,19 +26,28 @@ windows = st.builds(TimeWindow, small, small)
 @given(moments, st.integers(0, 10**15))
 def test_a_window_of_two_timestamps_holds_both_of_their_messages(first: int, span: int) -> None:
     last = first + span
-    window = TimeWindow.from_unix(unix_from_ns(first), unix_rounded_up(last))
+    window = TimeWindow.from_unix(unix_rounded_up(first), unix_rounded_up(last))
+    assert window.contains(first)
     assert window.contains(last)
-    assert window.contains(ns_from_unix(unix_from_ns(first)))
+
+
+def test_a_timestamp_that_was_rounded_up_by_almost_a_microsecond_is_still_a_start() -> None:
+    message = 1_784_023_200_123_001_001
+    assert unix_rounded_up(message) == 1784023200.123002
+    assert ns_from_unix(unix_rounded_up(message)) > message + AT_OR_BEFORE_SLACK_NS
+    assert TimeWindow.from_unix(unix_rounded_up(message), 2e9).contains(message)
 
 
 @given(moments, st.integers(0, 10**15))
-def test_the_end_of_a_question_is_inclusive_with_the_slack_of_a_float(
+def test_both_ends_of_a_question_are_inclusive_with_the_slack_of_a_float(
     first: int, span: int
 ) -> None:
     start_s, end_s = unix_from_ns(first), unix_from_ns(first + span)
     window = TimeWindow.from_unix(start_s, end_s)
-    end = ns_from_unix(end_s)
+    start, end = ns_from_unix(start_s), ns_from_unix(end_s)
     assert window.contains(end)
+    assert window.contains(start - 2 * AT_OR_BEFORE_SLACK_NS)
+    assert not window.contains(start - 2 * AT_OR_BEFORE_SLACK_NS - 1)
     assert window.contains(end + AT_OR_BEFORE_SLACK_NS)
     assert not window.contains(end + AT_OR_BEFORE_SLACK_NS + 1)
     assert not window.contains(window.start - 1)
