@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from mcp import Client
+
+from ros2_memory.bootstrap import build_memory, build_reader, build_server, package_version
+from ros2_memory.config import load_settings
+from ros2_memory.fitting import compact
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.questions import ANSWERED, ask, ask_everything, write_run
+
+if TYPE_CHECKING:
+    from ros2_memory.settings import Settings
+
+
+def settings(bag_dir: Path, *overrides: str) -> Settings:
+    return load_settings(overrides, {"MEMORY_BAG_DIR": str(bag_dir)})
+
+
+def test_the_storage_of_the_configuration_is_what_reads(tmp_path: Path) -> None:
+    assert isinstance(build_reader(settings(tmp_path)), McapReader)
+    assert isinstance(build_reader(settings(tmp_path, "storage=rosbag2")), Rosbag2Reader)
+
+
+def test_the_limits_of_the_configuration_reach_the_questions(tmp_path: Path) -> None:
+    memory = build_memory(
+        settings(
+            tmp_path,
+            "data.pose_topic=/amcl_pose",
+            "data.time_tolerance_s=0.3",
+            "data.position_tolerance_m=1.5",
+            "data.now=latest",
+            "data.tf_clock=log",
+            "data.tf_topics=[/a,/b]",
+            "data.max_plausible_speed_mps=3",
+            "recording.split_duration_s=20",
+        )
+    )
+    limits = memory.limits
+    assert limits.pose_topic == "/amcl_pose"
+    assert limits.time_tolerance_s == 0.3
+    assert limits.position_tolerance_m == 1.5
+    assert (limits.now, limits.tf_clock) == ("latest", "log")
+    assert limits.tf_topics == ("/a", "/b")
+    assert limits.tf_static_topics == ("/tf_static",)
+    assert limits.max_plausible_speed_mps == 3
+    assert limits.split_duration_s == 20
+
+
+def test_a_memory_is_built_before_its_directory_exists(tmp_path: Path) -> None:
+    memory = build_memory(settings(tmp_path / "later"))
+    assert memory.index.snapshot().bags == ()
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "expected"),
+    [
+        ("server.name=memory_two", "name", "memory_two"),
+        ("server.call_timeout_s=7", "timeout", "up to 7 s"),
+    ],
+)
+async def test_the_server_is_built_as_configured(
+    tmp_path: Path, override: str, key: str, expected: str
+) -> None:
+    chosen = settings(tmp_path, override)
+    async with Client(build_server(chosen, build_memory(chosen))) as client:
+        info = client.server_info
+        assert info is not None
+        texts = {
+            "name": info.name,
+            "timeout": str([tool.description for tool in (await client.list_tools()).tools]),
+        }
+        assert info.version == version("ros2-memory") == package_version()
+    assert expected in texts[key]
+
+
+async def test_the_whole_house_answers_every_question_from_a_bag(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    chosen = settings(tmp_path, "data.now=latest")
+    async with Client(build_server(chosen, build_memory(chosen))) as client:
+        await ask_everything(client)
+
+
+async def test_an_empty_memory_answers_every_question(tmp_path: Path) -> None:
+    chosen = settings(tmp_path)
+    async with Client(build_server(chosen, build_memory(chosen))) as client:
+        for name, given, _ in ANSWERED:
+            told, is_error = await ask(client, name, given)
+            assert not is_error
+            if name == "list_recorded_topics":
+                assert told == []
+            elif name != "data_time_range":
+                assert told["reason"] == "empty_memory", (name, told)
+
+
+@pytest.mark.parametrize(("pattern", "count"), [("/vision/*", 1), ("/*", 5), ("/odom", 1)])
+async def test_recorded_topics_are_narrowed_by_a_glob(
+    tmp_path: Path, pattern: str, count: int
+) -> None:
+    write_run(tmp_path)
+    chosen = settings(tmp_path)
+    async with Client(build_server(chosen, build_memory(chosen))) as client:
+        told, _ = await ask(client, "list_recorded_topics", {"pattern": pattern})
+        assert len(told) == count
+        none, is_error = await ask(client, "list_recorded_topics", {"pattern": "/visoin/*"})
+    assert (none["reason"], is_error) == ("topic_not_recorded", False)
+
+
+async def test_the_size_of_replies_is_as_configured(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    chosen = settings(tmp_path, "server.max_reply_chars=1000")
+    async with Client(build_server(chosen, build_memory(chosen))) as client:
+        for name, given, _ in ANSWERED:
+            told, _ = await ask(client, name, given)
+            assert len(compact(told)) <= 1000

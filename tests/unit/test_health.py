@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import anyio
+import anyio.from_thread
+import anyio.lowlevel
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory.health import health, keep_fresh
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.timebase import NS_PER_S
+from tests.bags import text, write_mcap
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from ros2_memory.memory import Memory
+    from ros2_memory.recorder.snapshot import Snapshot
+
+T0 = 1_784_023_200 * NS_PER_S
+
+
+def beat(state: RecorderState, *, updated: int = T0, last_error: str | None = None) -> Heartbeat:
+    return Heartbeat(
+        pid=1,
+        updated=updated,
+        state=state,
+        recordings=(),
+        since=T0,
+        bytes_written=0,
+        subscribed=("/a", "/b"),
+        silent=("/b",),
+        last_error=last_error,
+        interval_s=2.0,
+    )
+
+
+def memory_at(bag_dir: Path, *, seconds: int = 0) -> Memory:
+    return memory_of(bag_dir, clock=SettableClock(T0 + seconds * NS_PER_S))
+
+
+async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
+    assert await health(memory_at(tmp_path), "1.2.3") == {
+        "status": "ok",
+        "version": "1.2.3",
+        "bags": 0,
+        "earliest": None,
+        "latest": None,
+        "active": 0,
+        "damaged": 0,
+        "index_age_s": 0.0,
+    }
+
+
+async def test_the_span_of_the_memory_is_told(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a"), text(T0 + NS_PER_S, "b")])
+    told = await health(memory_at(tmp_path), "1")
+    assert (told["bags"], told["earliest"], told["latest"]) == (1, 1784023200.0, 1784023201.0)
+
+
+async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
+    (tmp_path / "torn.mcap").write_bytes(b"no bag at all, but not empty")
+    told = await health(memory_at(tmp_path, seconds=3600), "1")
+    assert told["status"] == "degraded"
+    assert told["damaged"] == 1
+    assert told["problems"] == ["1 damaged bag files; data_time_range lists them"]
+
+
+async def test_a_missing_bag_directory_is_told(tmp_path: Path) -> None:
+    told = await health(memory_at(tmp_path / "later"), "1")
+    assert told["bags"] == 0
+    assert told["status"] == "degraded"
+
+
+async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, beat(RecorderState.RECORDING))
+    told = await health(memory_at(tmp_path, seconds=3), "1")
+    assert told["status"] == "ok"
+    assert told["recorder"] == {
+        "state": "recording",
+        "live": True,
+        "heartbeat_age_s": 3.0,
+        "silent_topics": ["/b"],
+        "last_error": None,
+    }
+
+
+@pytest.mark.parametrize(
+    ("heartbeat", "seconds", "problem"),
+    [
+        (beat(RecorderState.RECORDING), 600, "the recorder has stopped without saying so"),
+        (
+            beat(RecorderState.PAUSED, last_error="disk full"),
+            1,
+            "the recorder is paused: disk full",
+        ),
+    ],
+)
+async def test_a_recorder_that_does_not_record_degrades_it(
+    tmp_path: Path, heartbeat: Heartbeat, seconds: int, problem: str
+) -> None:
+    write_heartbeat(tmp_path, heartbeat)
+    told = await health(memory_at(tmp_path, seconds=seconds), "1")
+    assert told["status"] == "degraded"
+    assert told["problems"] == [problem]
+
+
+async def test_a_recorder_that_was_stopped_is_no_problem(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, beat(RecorderState.STOPPED))
+    assert (await health(memory_at(tmp_path, seconds=600), "1"))["status"] == "ok"
+
+
+async def test_health_answers_while_the_first_scan_runs(tmp_path: Path) -> None:
+    released, ended = threading.Event(), threading.Event()
+
+    class Slow(IndexManager):
+        def snapshot(self, reach: int | None = None) -> Snapshot:
+            released.wait(10)
+            try:
+                return super().snapshot(reach)
+            finally:
+                ended.set()
+
+    memory = memory_at(tmp_path)
+    slow = Slow(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
+    told = await health(replace(memory, index=slow), "1", patience_s=0.01)
+    released.set()
+    assert ended.wait(10)
+    assert told["status"] == "degraded"
+    assert told["problems"] == ["the bag directory is being looked through"]
+
+
+async def test_a_bag_that_closes_is_found_without_a_question(tmp_path: Path) -> None:
+    memory = memory_at(tmp_path)
+    patient = IndexManager(
+        tmp_path, memory.reader, memory.clock, refresh_s=3600.0, split_duration_s=10.0
+    )
+    assert patient.snapshot().bags == ()
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    assert patient.snapshot().bags == ()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(keep_fresh, replace(memory, index=patient), 0.001)
+        with anyio.fail_after(10):
+            while not patient.snapshot().bags:
+                await anyio.lowlevel.checkpoint()
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_scan_that_fails_is_logged_and_tried_again(tmp_path: Path) -> None:
+    calls: list[int] = []
+    again = anyio.Event()
+
+    class Failing(IndexManager):
+        def refresh(self) -> Snapshot:
+            calls.append(1)
+            if len(calls) == 2:
+                anyio.from_thread.run_sync(again.set)
+            raise RuntimeError("no such disk")
+
+    memory = memory_at(tmp_path)
+    failing = Failing(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
+    with capture_logs() as logs:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keep_fresh, replace(memory, index=failing), 0.001)
+            await again.wait()
+            tasks.cancel_scope.cancel()
+    assert logs[0]["event"] == "index_refresh_failed"
