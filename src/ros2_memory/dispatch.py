@@ -11,6 +11,7 @@ import threading
 import time
 import uuid
 from difflib import get_close_matches
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import anyio
@@ -32,8 +33,12 @@ if TYPE_CHECKING:
     from ros2_memory.replies import Replies, Reply
     from ros2_memory.tools import Question, Tool
 
-QUERIES_AT_ONCE: Final = 4
-"""Queries are mostly Python, which runs one at a time: more threads would only slow each other."""
+QUICK_AT_ONCE: Final = 4
+BLOCKING_AT_ONCE: Final = 2
+"""Queries are mostly Python, which runs one at a time: more threads would only slow each other.
+
+Those that may take long have places of their own, so that a quick one never waits for them.
+"""
 
 _SOONER_S: Final = 0.5
 """How much before the call a query gives up, so that its own sentence is what the client reads."""
@@ -44,7 +49,7 @@ log = get_logger(__name__)
 
 
 class Dispatcher:
-    """Answers tool calls from one memory, `QUERIES_AT_ONCE` at a time."""
+    """Answers tool calls from one memory, a bounded number at a time."""
 
     def __init__(
         self, memory: Memory, tools: Sequence[Tool], replies: Replies, *, call_timeout_s: float
@@ -53,7 +58,8 @@ class Dispatcher:
         self._tools = {tool.name: tool for tool in tools}
         self._replies = replies
         self._call_timeout_s = call_timeout_s
-        self._limiter = anyio.CapacityLimiter(QUERIES_AT_ONCE)
+        self._quick = anyio.CapacityLimiter(QUICK_AT_ONCE)
+        self._blocking = anyio.CapacityLimiter(BLOCKING_AT_ONCE)
         self._stopping = threading.Event()
 
     def stop(self) -> None:
@@ -64,13 +70,15 @@ class Dispatcher:
         """The reply to one call, within `call_timeout_s`. Raises nothing but cancellation."""
         begun = time.perf_counter_ns()
         patience_s = max(self._call_timeout_s - _SOONER_S, self._call_timeout_s * 0.9)
-        call = Call(Deadline.after(patience_s, self._monotonic))
+        over = threading.Event()
+        call = Call(Deadline.after(patience_s, partial(self._monotonic, over)))
         outcome, chars = "cancelled", 0
         with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
             try:
                 outcome, reply = await self._outcome(name, given, call)
                 chars = len(reply.text)
             finally:
+                over.set()
                 log.info(
                     "tool_call",
                     tool=name[:_LOGGED_CHARS],
@@ -82,19 +90,22 @@ class Dispatcher:
                 )
         return reply
 
-    def _monotonic(self) -> float:
-        return math.inf if self._stopping.is_set() else time.monotonic()
+    def _monotonic(self, over: threading.Event) -> float:
+        """The clock of one call's deadline: its time is up when nobody waits for it any more."""
+        return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
 
     async def _outcome(
         self, name: str, given: Mapping[str, object], call: Call
     ) -> tuple[str, Reply]:
         try:
-            question = self._tool(name).question(given)
+            tool = self._tool(name)
+            question = tool.question(given)
         except InvalidArgumentsError as error:
             return error.code, self._replies.error(error)
+        places = self._blocking if tool.blocking else self._quick
         with anyio.move_on_after(self._call_timeout_s):
             return await anyio.to_thread.run_sync(
-                self._ask, question, call, abandon_on_cancel=True, limiter=self._limiter
+                self._ask, question, call, abandon_on_cancel=True, limiter=places
             )
         late = QueryTimeoutError(
             f"{name} needs more than {self._call_timeout_s:g} s; "

@@ -13,7 +13,7 @@ from mcp.types import TextContent
 from structlog.testing import LogCapture
 
 from ros2_memory import answers
-from ros2_memory.dispatch import QUERIES_AT_ONCE, Dispatcher, EpisodicServer
+from ros2_memory.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher, EpisodicServer
 from ros2_memory.errors import InvalidArgumentsError, NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.memory import Memory
 from ros2_memory.model import Sample
@@ -214,11 +214,47 @@ async def test_tools_are_listed_while_queries_run_and_wait() -> None:
         return value(1)
 
     async with Client(served(tool("stuck", stuck))) as client, anyio.create_task_group() as tasks:
-        for _ in range(2 * QUERIES_AT_ONCE):
+        for _ in range(2 * QUICK_AT_ONCE):
             tasks.start_soon(client.call_tool, "stuck", {})
         await anyio.wait_all_tasks_blocked()
         assert len((await client.list_tools()).tools) == 1
         released.set()
+
+
+async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
+    released = threading.Event()
+
+    def stuck(_call: Call) -> Answer:
+        released.wait(10)
+        return value(1)
+
+    slow, quick = tool("slow", stuck, blocking=True), tool("quick", lambda _call: value(2))
+    async with Client(served(slow, quick)) as client, anyio.create_task_group() as tasks:
+        for _ in range(BLOCKING_AT_ONCE + QUICK_AT_ONCE):
+            tasks.start_soon(client.call_tool, "slow", {})
+        await anyio.wait_all_tasks_blocked()
+        assert told(await client.call_tool("quick", {}))["value"] == 2
+        assert not released.is_set()
+        released.set()
+
+
+async def test_a_query_gives_up_when_its_client_no_longer_waits(log: LogCapture) -> None:
+    started, ended = threading.Event(), threading.Event()
+
+    def ask(call: Call) -> Answer:
+        started.set()
+        try:
+            return until_given_up(call)
+        finally:
+            ended.set()
+
+    dispatcher = served(tool("slow", ask)).dispatcher
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(dispatcher.answer, "slow", {})
+        await anyio.to_thread.run_sync(started.wait)
+        tasks.cancel_scope.cancel()
+    assert ended.wait(10)
+    assert [entry["outcome"] for entry in log.entries] == ["cancelled"]
 
 
 async def test_stopping_has_running_queries_give_up() -> None:
