@@ -162,7 +162,9 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     declarations, indexes, stated = _summary(file)
     channels = declarations.channels()
     chunks = tuple(_chunk(index) for index in indexes)
-    if stated is None or not declarations.resolved or not stated.counts.keys() <= channels.keys():
+    if stated is None or not declarations.resolved or stated.channels > len(channels):
+        raise DoubtError
+    if not stated.counts.keys() <= channels.keys():
         raise DoubtError
     if stated.counts and not all(chunk.index_offsets for chunk in chunks):
         raise DoubtError

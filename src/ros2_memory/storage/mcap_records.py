@@ -94,13 +94,14 @@ def chunk_index(body: bytes) -> ChunkIndex:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """What a file says of itself: messages by channel, and its first and last log time."""
+    """What a file says of itself: how much it holds, and its first and last log time."""
 
     counts: dict[int, int]
     messages: int
     start: Ns
     end: Ns
     chunks: int
+    channels: int
 
 
 def statistics(body: bytes) -> Statistics:
@@ -113,6 +114,7 @@ def statistics(body: bytes) -> Statistics:
         found.message_start_time,
         found.message_end_time,
         found.chunk_count,
+        found.channel_count,
     )
 
 

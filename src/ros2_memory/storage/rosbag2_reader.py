@@ -78,7 +78,7 @@ class Rosbag2Reader(BagReader):
 
     def reads(self, path: Path) -> bool:
         """Whether its name ends on one of the four kinds."""
-        return path.name.endswith(_KINDS)
+        return path.name.endswith(_KINDS) and path.name not in _KINDS
 
     def closing(self, path: Path) -> Closing:
         """Closing magic for MCAP; no journal beside a `.db3`; whole frames for `.zstd`."""
