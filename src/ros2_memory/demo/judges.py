@@ -153,8 +153,7 @@ def last_seen(label: str) -> Judge:
         same("topic", text(reply, "topic"), streams.SCENE_OBJECTS)
         labels = [text(found, "label") for found in items(reply, "value", "detections")]
         same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(message.t)))
-        others = [name for name in labels if name != label]
-        return f"At {asked.when(moment)}, beside {_listed(others)}."
+        return f"At {asked.when(moment)}; in view: {_listed(labels)}."
 
     return judge
 

@@ -43,6 +43,7 @@ class _Build(Protocol):
 
 
 _FOCAL_PX: Final = 320.0
+_PICTURE_PX: Final = (640, 480)
 _CENTRE_PX: Final = (320.0, 240.0)
 _THING_M: Final = 0.15
 _UNKNOWN: Final = math.nan
@@ -199,12 +200,17 @@ def _battery(message: Message) -> object:
 
 
 def _bounding_box(thing: Thing) -> list[int]:
-    """Pixels (left, top, right, bottom) of a pinhole camera of 640 x 480."""
+    """Pixels (left, top, right, bottom) of a pinhole camera, cut off at the picture's edges."""
     depth = max(thing.point[0] - robot.CAMERA[0], _THING_M)
     across = _CENTRE_PX[0] - _FOCAL_PX * thing.point[1] / depth
     down = _CENTRE_PX[1] - _FOCAL_PX * (thing.point[2] - robot.CAMERA[2]) / depth
     half = _FOCAL_PX * _THING_M / depth
-    return [round(edge) for edge in (across - half, down - half, across + half, down + half)]
+    corners = ((across - half, down - half), (across + half, down + half))
+    return [
+        min(max(round(edge), 0), size)
+        for corner in corners
+        for edge, size in zip(corner, _PICTURE_PX, strict=True)
+    ]
 
 
 def _detections(message: Message, skill: str, things: Sequence[Thing]) -> object:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ros2_memory.demo.robot import Planar
     from ros2_memory.model import JsonValue
 
-LOOK_BACK_S: Final = 60.0
+LOOK_BACK_S: Final = 60
 """The longest of the windows that are asked about."""
 
 

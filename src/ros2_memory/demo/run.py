@@ -82,7 +82,7 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> int:
         say(_heading(recorder, options, url))
         wrong = anyio.run(_ask_all, f"{url}/sse", recorder, say)
         total = len(QUESTIONS)
-        say(f"{total - wrong} of {total} answers are right: each was held against the closed form.")
+        say(f"{total - wrong} of {total} answers are right.")
         if not options.once:
             say(f"\n{invitation(f'{url}/sse', f'{url}/mcp')}")
             _stay(server, recorder)
@@ -125,8 +125,8 @@ def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
 
 def _heading(recorder: DemoRecorder, options: DemoOptions, url: str) -> str:
     return (
-        "A simulated robot drives through a flat. Nothing here is ROS; the bags, the server and "
-        "the\nclient are what a robot would have.\n\n"
+        "A simulated robot drives through a flat and records what it does. A client asks the real\n"
+        "query server about it, and each answer is held against the robot's closed form.\n\n"
         f"  bags     {recorder.directory}\n"
         f"           {options.duration_s:g} s of history in {recorder.splits} files of "
         f"{SPLIT_DURATION_S:g} s, the last one being written\n"

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 HOST: Final = "127.0.0.1"
 LOG_NAME: Final = "server.log"
-_PROGRAM: Final = "from ros2_memory.server import main; raise SystemExit(main())"
 _OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION_INTERFACES_PATH")
 _UP_WITHIN_S: Final = 30.0
 _DOWN_WITHIN_S: Final = 5.0
@@ -78,8 +77,8 @@ def served(
     log_path = bag_dir / LOG_NAME
     environment = server_environment(os.environ, bag_dir, port, split_duration_s)
     with log_path.open("wb") as log:
-        process = subprocess.Popen(  # noqa: S603 - our own interpreter, no outside input
-            [sys.executable, "-c", _PROGRAM],
+        process = subprocess.Popen(
+            [sys.executable, "-m", "ros2_memory.server"],
             stdin=subprocess.DEVNULL,
             stdout=None if verbose else log,
             stderr=None if verbose else log,

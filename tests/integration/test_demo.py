@@ -1,0 +1,115 @@
+"""`ros2-memory demo` as a user runs it: the whole program, its server and its client."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcp import Client
+from mcp.client.sse import sse_client
+from mcp.types import TextContent
+from rosbags.rosbag2 import Reader
+
+from ros2_memory.demo.questions import QUESTIONS
+
+PROGRAM = [str(Path(sys.executable).with_name("ros2-memory")), "demo"]
+TIMEOUT_S = 120
+
+
+def environment(scratch: Path) -> dict[str, str]:
+    """Ours, with temporary folders where the test sees them, and settings that must not count."""
+    return {**os.environ, "TMPDIR": str(scratch), "MEMORY_DEPLOYMENT": "no-such-deployment"}
+
+
+@pytest.fixture
+def scratch(tmp_path: Path) -> Path:
+    folder = tmp_path / "tmp"
+    folder.mkdir()
+    return folder
+
+
+def test_once_it_answers_every_question_rightly_and_leaves_nothing_behind(scratch: Path) -> None:
+    done = subprocess.run(
+        [*PROGRAM, "--once", "--port", "0"],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+        env=environment(scratch),
+    )
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
+    for question in QUESTIONS:
+        assert f". {question.words}\n" in done.stdout
+    assert done.stdout.count("\n    => ") == len(QUESTIONS)
+    assert "WRONG" not in done.stdout
+    assert f"{len(QUESTIONS)} of {len(QUESTIONS)} answers are right" in done.stdout
+    assert list(scratch.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+async def test_it_stays_for_other_clients_and_leaves_a_closed_recording(
+    tmp_path: Path, scratch: Path, ending: signal.Signals
+) -> None:
+    bag_dir = tmp_path / "bags"
+    with subprocess.Popen(
+        [*PROGRAM, "--port", "0", "--bag-dir", str(bag_dir), "--duration", "95"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment(scratch),
+    ) as demo:
+        try:
+            url = _invited(demo)
+            async with Client(sse_client(url)) as client:
+                tools = (await client.list_tools()).tools
+                result = await client.call_tool("get_position_seconds_ago", {"seconds_ago": 10})
+            demo.send_signal(ending)
+            assert demo.wait(timeout=30) == 0
+        finally:
+            demo.kill()
+    assert len(tools) == 17
+    (content,) = result.content
+    assert isinstance(content, TextContent)
+    assert '"frame_id":"odom"' in content.text
+    (recording,) = bag_dir.glob("*/")
+    with Reader(recording) as reader:
+        assert {connection.topic for connection in reader.connections} >= {"/odom", "/tf_static"}
+    _assert_nobody_listens(url)
+
+
+def test_a_port_in_use_is_named_and_nothing_is_started(scratch: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        refused = subprocess.run(
+            [*PROGRAM, "--once", "--port", str(port)],
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
+            env=environment(scratch),
+        )
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert f"port {port} on 127.0.0.1 is in use" in refused.stderr
+    assert "--port" in refused.stderr
+    assert list(scratch.iterdir()) == []
+
+
+def _invited(demo: subprocess.Popen[str]) -> str:
+    """Reads until the demo says how to connect; the address it gives."""
+    assert demo.stdout is not None
+    for line in demo.stdout:
+        found = re.search(r'url: "(http://127\.0\.0\.1:\d+/sse)"', line)
+        if found:
+            return found[1]
+    raise AssertionError("the demo ended without an invitation")
+
+
+def _assert_nobody_listens(url: str) -> None:
+    port = int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
+    with socket.create_server(("127.0.0.1", port)):
+        pass
