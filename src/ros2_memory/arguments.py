@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from abc import ABC, abstractmethod
 from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import (
@@ -139,14 +140,14 @@ class Arguments(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
-class When(Arguments):
+class When(Arguments, ABC):
     """Arguments that unfold a `moment` or a `span`; `stands_for` names which."""
 
     stands_for: ClassVar[str]
 
+    @abstractmethod
     def folded(self) -> Moment | Span:
         """The moment or span that they mean."""
-        raise NotImplementedError
 
 
 class At(When):

@@ -39,6 +39,9 @@ def build_reader(settings: Settings) -> BagReader:
             {"_target_": node.target, "_convert_": "all"}, **node.arguments
         )
     except HydraException as error:
+        # What the adapter refuses, it says itself; Hydra only wraps it.
+        if isinstance(error.__cause__, ConfigError):
+            raise error.__cause__ from None
         raise ConfigError(f"storage: {node.target} cannot be built: {error}") from error
     if not isinstance(reader, BagReader):
         raise ConfigError(f"storage: {node.target} is not a bag reader")

@@ -58,7 +58,7 @@ def fit(reply: JsonObject, max_chars: int) -> str:
         text = compact(bounded)
         if len(text) <= max_chars:
             return text
-    return compact({"notes": [f"the answer does not fit into {max_chars} characters"]})
+    return compact(_outline(reply, max_chars))
 
 
 def without_constant_zeros(samples: Sequence[JsonValue]) -> tuple[list[JsonValue], list[str]]:
@@ -145,6 +145,20 @@ def _with_few_notes(reply: JsonObject) -> JsonObject:
     if len(notes) > _MOST_NOTES:
         kept.append(f"and {len(notes) - _MOST_NOTES} more notes")
     return {**reply, "notes": kept}
+
+
+def _outline(reply: JsonObject, max_chars: int) -> JsonObject:
+    """The few words and numbers of the reply's first level, for what defies being shortened."""
+    sentence = (
+        f"the answer does not fit into {max_chars} characters; name parts of it in fields, or ask "
+        "more narrowly"
+    )
+    kept: JsonObject = {}
+    for key, item in reply.items():
+        is_short = key != "notes" and not isinstance(item, list | dict) and len(compact(item)) < 80
+        if is_short and len(compact({**kept, key: item})) < max_chars // 2:
+            kept[key] = item
+    return {**kept, "notes": [sentence]}
 
 
 def _fewer_rows(reply: JsonObject, max_chars: int) -> JsonObject:

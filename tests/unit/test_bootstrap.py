@@ -9,6 +9,7 @@ from mcp import Client
 
 from ros2_memory.bootstrap import build_memory, build_reader, build_server, package_version
 from ros2_memory.config import load_settings
+from ros2_memory.errors import ConfigError
 from ros2_memory.fitting import compact
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -25,6 +26,12 @@ def settings(bag_dir: Path, *overrides: str) -> Settings:
 def test_the_storage_of_the_configuration_is_what_reads(tmp_path: Path) -> None:
     assert isinstance(build_reader(settings(tmp_path)), McapReader)
     assert isinstance(build_reader(settings(tmp_path, "storage=rosbag2")), Rosbag2Reader)
+
+
+def test_what_a_reader_refuses_is_told_in_its_own_words(tmp_path: Path) -> None:
+    refused = settings(tmp_path, f"reader.custom_msg_paths=[{tmp_path}]")
+    with pytest.raises(ConfigError, match=r"^reader\.custom_msg_paths: .* holds no"):
+        build_reader(refused)
 
 
 def test_the_limits_of_the_configuration_reach_the_questions(tmp_path: Path) -> None:

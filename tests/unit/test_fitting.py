@@ -128,6 +128,16 @@ def test_a_wide_object_loses_keys_with_a_note() -> None:
     assert "value (keys left out)" in shown["notes"][0]
 
 
+def test_what_cannot_be_shortened_leaves_what_it_is_about() -> None:
+    tree: Any = 1
+    for _ in range(7):
+        tree = {f"branch_{n}": tree for n in range(5)}
+    shown = strict(fit({"topic": "/tree", "timestamp": 1.5, "value": tree}, 1000))
+    assert (shown["topic"], shown["timestamp"]) == ("/tree", 1.5)
+    assert "value" not in shown
+    assert "does not fit into 1000 characters" in shown["notes"][0]
+
+
 def test_a_long_note_does_not_drive_out_the_answer() -> None:
     shown = strict(fit({"value": 1, "notes": ["n" * 3000] * 50}, 24_000))
     assert shown["value"] == 1
