@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import yaml
-from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.memory import Limits, Memory
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.timebase import Clock, WallClock
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.timebase import NS_PER_S, Clock
 
 if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
@@ -47,9 +48,12 @@ def memory_of(
     reader: BagReader | None = None,
     limits: Limits | None = None,
 ) -> Memory:
-    """The memory over `bag_dir`, rescanned at every question."""
+    """The memory over `bag_dir`, rescanned at every question.
+
+    Unless a clock is given it is an hour later: what is unfinished was left so by a crash.
+    """
     if reader is None:
         reader = McapReader() if storage == "mcap" else Rosbag2Reader()
-    timed = clock or WallClock()
+    timed = clock or SettableClock(time.time_ns() + 3600 * NS_PER_S)
     index = IndexManager(bag_dir, reader, timed, refresh_s=0.0, split_duration_s=10.0)
     return Memory(index, reader, extractor(), timed, limits or Limits())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import random
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from rosbags.rosbag2 import Reader
@@ -56,7 +56,7 @@ def spanned(memory: Memory, session: Session) -> tuple[float, float]:
 
 def log_times(session: Session, topic: str) -> list[int]:
     """By plain rosbags, over all files of the session."""
-    times = []
+    times: list[int] = []
     paths = [session.folder] if (session.folder / "metadata.yaml").exists() else []
     for path in paths:
         with Reader(path) as reader:
@@ -206,7 +206,7 @@ def test_samples_decode_as_plain_rosbags_decodes_them(memory: Memory, session: S
         odom = [each for each in reader.connections if each.topic == "/odom"]
         for connection, stamp, payload in reader.messages(odom):
             if stamp in wanted:
-                message = typestore().deserialize_cdr(payload, connection.msgtype)
+                message: Any = typestore().deserialize_cdr(payload, connection.msgtype)
                 value = wanted[stamp]
                 assert isinstance(value, dict)
                 assert value["position"] == {
@@ -244,7 +244,8 @@ def test_the_battery_when_the_bumper_was_pressed() -> None:
         fields=["percentage"],
     )
     assert answer.value is not None
-    assert answer.value.sample.value == {"percentage": pytest.approx(0.775, abs=1e-4)}
+    value: Any = answer.value.sample.value
+    assert value["percentage"] == pytest.approx(0.775, abs=1e-4)
 
 
 @needs_recorded
