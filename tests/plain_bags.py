@@ -64,8 +64,8 @@ class PlainReader(BagReader):
     def closing(self, path: Path) -> Closing:
         self.closings[path.name] += 1
         text = _text(path)
-        bag = text.startswith("BAG") or not text
-        return Closing.OPEN if bag and not text.endswith("END") else Closing.CLOSED
+        left_open = text.startswith("BAG") and not text.endswith("END")
+        return Closing.OPEN if left_open else Closing.CLOSED
 
     def summarize(self, path: Path) -> BagSummary:
         self.summaries[path.name] += 1

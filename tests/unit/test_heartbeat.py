@@ -51,7 +51,9 @@ beats = st.builds(
 
 
 @given(beat=beats)
-def test_what_was_written_is_read(beat: Heartbeat, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_what_was_written_is_read(
+    beat: Heartbeat, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     folder = tmp_path_factory.mktemp("bags")
     write_heartbeat(folder, beat)
     assert read_heartbeat(folder) == (beat, None)
@@ -172,7 +174,9 @@ def test_keys_of_another_version_are_passed_over(tmp_path: Path) -> None:
         lambda inner: st.lists(inner) | st.dictionaries(st.sampled_from(BEAT.__slots__), inner),
     )
 )
-def test_any_json_is_read_without_a_crash(content: object, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_any_json_is_read_without_a_crash(
+    content: object, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     folder = tmp_path_factory.mktemp("bags")
     (folder / HEARTBEAT_FILE).write_text(json.dumps(content), encoding="utf-8")
     heartbeat, reason = read_heartbeat(folder)

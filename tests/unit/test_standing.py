@@ -9,7 +9,7 @@ import pytest
 
 from ros2_memory.errors import BagError, BagVanishedError
 from ros2_memory.model import BagState
-from ros2_memory.recorder.scan import Stamp, bag_kind
+from ros2_memory.recorder.scan import Stamp
 from ros2_memory.recorder.standing import (
     RETRY_NS,
     FileNotes,
@@ -63,7 +63,7 @@ class Eye:
             os.utime(path, ns=(mtime_ns, mtime_ns))
         stamp = Stamp.of(path.lstat())
         if self.notes is None:
-            self.notes = FileNotes.first(path, bag_kind(path.name) or "", stamp, now)
+            self.notes = FileNotes.first(path, stamp, now)
         else:
             self.notes.look(stamp, now)
         recordings = None if names is None else frozenset(names)
@@ -162,6 +162,17 @@ def test_a_growth_that_was_seen_counts_whatever_the_mtime_says(eye: Eye, tmp_pat
 def test_a_larger_file_put_in_its_place_did_not_grow(eye: Eye, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
     assert eye.look(path, age_s=3600) is Standing.INCOMPLETE
+    plain(tmp_path / "other", [1, 2, 3], closed=False).rename(path)
+    assert eye.look(path, age_s=3600) is Standing.INCOMPLETE
+
+
+def test_the_growth_of_a_file_is_not_that_of_the_one_put_in_its_place(
+    eye: Eye, tmp_path: Path
+) -> None:
+    path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
+    eye.look(path, age_s=3600)
+    grow(path, 2)
+    assert eye.look(path, age_s=3600) is Standing.ACTIVE
     plain(tmp_path / "other", [1, 2, 3], closed=False).rename(path)
     assert eye.look(path, age_s=3600) is Standing.INCOMPLETE
 

@@ -17,7 +17,7 @@ import structlog
 
 from ros2_memory.errors import BagVanishedError
 from ros2_memory.recorder.heartbeat import read_heartbeat
-from ros2_memory.recorder.scan import Tree, bag_kind
+from ros2_memory.recorder.scan import Tree
 from ros2_memory.recorder.snapshot import Snapshot, Timeline
 from ros2_memory.recorder.standing import FileNotes, Scene, Standing, judge
 from ros2_memory.timebase import ms_from_ns, ns_from_unix
@@ -169,7 +169,12 @@ class IndexManager:
         """Judges these files; gives those of which the verdict changed."""
         changed = set()
         for path, stamp in stamps.items():
-            notes = self._noted(path, stamp, scene.now)
+            notes = self._files.get(path)
+            if notes is None:
+                notes = FileNotes.first(Path(path), stamp, scene.now)
+                self._files[path] = notes
+            elif not notes.look(stamp, scene.now) and path not in self._watched:
+                continue
             try:
                 verdict = judge(notes, self._reader, scene)
             except BagVanishedError:
@@ -184,15 +189,6 @@ class IndexManager:
                 self._verdicts[path] = verdict
                 changed.add(path)
         return changed
-
-    def _noted(self, path: str, stamp: Stamp, now: Ns) -> FileNotes:
-        notes = self._files.get(path)
-        if notes is None:
-            notes = FileNotes.first(Path(path), bag_kind(path) or "", stamp, now)
-            self._files[path] = notes
-        else:
-            notes.look(stamp, now)
-        return notes
 
     def _recount(self, changed: Iterable[str]) -> tuple[list[BagFile], list[BagFile]]:
         """Brings `_counted` up to date; gives the bags that left it and those that came."""

@@ -28,6 +28,8 @@ _LINK = "a symbolic link, which is not followed: move or mount the bags into the
 def bag_kind(name: str) -> str | None:
     """The kind of bag that a file name claims, one of `BAG_KINDS`, or None."""
     lowered = name.lower()
+    if lowered in BAG_KINDS:
+        return None
     return next((kind for kind in BAG_KINDS if lowered.endswith(kind)), None)
 
 
@@ -144,7 +146,7 @@ class Tree:
         if path in walked.looked_at or path in walked.gone:
             return
         try:
-            walked.looked_at[path] = Stamp.of(Path(path).lstat())
+            walked.looked_at[path] = Stamp.of(os.lstat(path))
         except OSError:
             # Its folder looks as before, and may soon look the same with the file back in it.
             walked.gone.add(path)

@@ -20,13 +20,13 @@ after the bag in it was closed; it is open until its last frame is whole.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import BagError, BagVanishedError
-from ros2_memory.model import BagFile, BagState, BagSummary, SetAside
+from ros2_memory.model import BagFile, BagState, BagSummary, SetAside, TopicSummary
 from ros2_memory.recorder.scan import YOUNG_NS, bag_kind, settled
 from ros2_memory.storage.base import Closing
 from ros2_memory.timebase import NS_PER_S, Ns
@@ -114,21 +114,26 @@ class FileNotes:
     fault: str | None = None
 
     @classmethod
-    def first(cls, path: Path, kind: str, stamp: Stamp, now: Ns) -> FileNotes:
-        """The notes of a file that was not known before."""
-        return cls(path, kind, stamp, now, settled(stamp.mtime_ns, now))
+    def first(cls, path: Path, stamp: Stamp, now: Ns) -> FileNotes:
+        """The notes of a bag file that was not known before."""
+        return cls(path, bag_kind(path.name) or "", stamp, now, settled(stamp.mtime_ns, now))
 
-    def look(self, stamp: Stamp, now: Ns) -> None:
-        """Takes in how the file looks at this scan, and forgets what may not hold any more."""
+    def look(self, stamp: Stamp, now: Ns) -> bool:
+        """Takes in how the file looks at this scan, and forgets what may not hold any more.
+
+        Gives whether anything had to be forgotten.
+        """
         if stamp.inode != self.stamp.inode:
             self.grew_at = None  # another file under the same name
         elif stamp.size > self.stamp.size or (self.grew_at is not None and self.grew_at > now):
             self.grew_at = now  # also anew after the clock was set back
-        if self._outdated(stamp, now):
+        outdated = self._outdated(stamp, now)
+        if outdated:
             self.closing, self.summary, self.fault = None, None, None
             self.seen_at = now
         self.stamp = stamp
         self.trusted = settled(stamp.mtime_ns, now)
+        return outdated
 
     def grew_lately(self, scene: Scene) -> bool:
         """Whether the file grew within the last three splits."""
@@ -245,12 +250,16 @@ def _shared(summary: BagSummary) -> BagSummary:
     """The summary with one copy of each name: 60,000 bags repeat the same few."""
     intern = sys.intern
     topics = tuple(
-        replace(
-            each,
-            topic=intern(each.topic),
-            type=intern(each.type),
-            encoding=intern(each.encoding),
+        TopicSummary(
+            intern(each.topic),
+            intern(each.type),
+            intern(each.encoding),
+            each.count,
+            each.first,
+            each.last,
+            each.latched,
         )
         for each in summary.topics
     )
-    return replace(summary, topics=topics, silent=tuple(intern(name) for name in summary.silent))
+    silent = tuple(intern(name) for name in summary.silent)
+    return BagSummary(topics, silent, summary.complete, summary.notes)
