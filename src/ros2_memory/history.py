@@ -86,12 +86,11 @@ class View:
         """The bags that hold messages of these topics in the window, in bag order."""
         spans: dict[Path, Holding] = {}
         for topic in topics:
-            for bag, summary in self.snapshot.holding(topic):
-                if window.overlaps(summary.first, summary.last):
-                    known = spans.get(bag.path)
-                    first = min(known.first, summary.first) if known else summary.first
-                    last = max(known.last, summary.last) if known else summary.last
-                    spans[bag.path] = Holding(first, last, bag)
+            for bag, summary in self.snapshot.holding(topic, window):
+                known = spans.get(bag.path)
+                first = min(known.first, summary.first) if known else summary.first
+                last = max(known.last, summary.last) if known else summary.last
+                spans[bag.path] = Holding(first, last, bag)
         return sorted(spans.values(), key=lambda held: (held.first, held.last, held.bag.path))
 
     def stream(
