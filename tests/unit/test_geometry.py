@@ -314,6 +314,16 @@ def test_a_corner_is_kept_and_a_straight_line_is_not_sampled() -> None:
     assert simplify(path, 0.01) == [0, 10, 15]
 
 
+@pytest.mark.parametrize("count", [3, 10])
+def test_points_on_a_line_are_dropped_even_without_tolerance(count: int) -> None:
+    assert simplify([(float(x), 0.0, 0.0) for x in range(count)], 0.0) == [0, count - 1]
+
+
+def test_a_long_way_with_one_corner_keeps_that_corner_only() -> None:
+    path = [(min(i, 700) * 0.1, max(i - 700, 0) * 0.1, 0.0) for i in range(10_000)]
+    assert simplify(path, 0.01) == [0, 700, 9_999]
+
+
 def test_a_way_out_and_back_keeps_its_turning_point() -> None:
     path = [(float(x), 0.0, 0.0) for x in (0, 1, 2, 3, 2, 1, 0)]
     assert simplify(path, 0.01) == [0, 3, 6]
