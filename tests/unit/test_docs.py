@@ -1,0 +1,68 @@
+"""What README promises exists, and what exists is in README."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING, get_type_hints
+
+import pytest
+
+from ros2_memory.memory import Limits
+from ros2_memory.settings import Settings
+from ros2_memory.tools import Tool, build_tools
+from tests.memories import ROOT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+TOOLS = build_tools(Limits(), 25.0)
+
+
+def keys(cls: type, prefix: str = "") -> Iterator[str]:
+    hints = get_type_hints(cls)
+    for each in fields(cls):
+        name = f"{prefix}{each.name}"
+        kind = hints[each.name]
+        if is_dataclass(kind) and isinstance(kind, type):
+            yield from keys(kind, f"{name}.")
+        else:
+            section = name.partition(".")[0]
+            yield section if section in {"storage", "recorder"} else name
+
+
+@pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
+def test_readme_names_every_tool_with_all_its_arguments(tool: Tool) -> None:
+    row = next(line for line in README.splitlines() if line.startswith(f"| `{tool.name}` |"))
+    told = set(re.findall(r"(\w+)[?=,`]", row.split("|")[2]))
+    properties = tool.schema.get("properties")
+    assert isinstance(properties, dict)
+    assert set(properties) - told == set()
+
+
+def test_readme_lists_no_tool_that_does_not_exist() -> None:
+    rows = set(
+        re.findall(r"^\| `((?:get|list|find|data|trajectory|recent)_\w+)` \|", README, re.MULTILINE)
+    )
+    assert rows == {tool.name for tool in TOOLS}
+
+
+@pytest.mark.parametrize("key", sorted(set(keys(Settings))))
+def test_readme_names_every_configuration_key(key: str) -> None:
+    assert f"`{key}`" in README
+
+
+@pytest.mark.parametrize(
+    "variable",
+    re.findall(r"^([A-Z_]+)=", (ROOT / ".env.example").read_text(encoding="utf-8"), re.MULTILINE),
+)
+def test_readme_names_every_environment_variable(variable: str) -> None:
+    assert f"`{variable}`" in README
+
+
+def test_every_key_that_readme_tells_of_exists() -> None:
+    sections = {each.name for each in fields(Settings)}
+    told = set(re.findall(r"`(\w+\.\w+)(?:=[^`]*)?`", README))
+    known = set(keys(Settings))
+    assert {key for key in told if key.split(".")[0] in sections} <= known
