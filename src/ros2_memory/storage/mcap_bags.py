@@ -205,8 +205,11 @@ def _nothing(_place: int, _time: Ns) -> Record:
 def _from_bytes(data: bytes, channels: dict[int, Channel]) -> Callable[[int, Ns], Record]:
     """Fetches messages from a decompressed chunk."""
     unpack = MESSAGE.unpack_from
+    last = len(data) - MESSAGE.size
 
     def fetch(place: int, time: Ns) -> Record:
+        if not 0 <= place <= last:
+            raise UnreadableError("damaged: a message is not where its index says")
         opcode, length, number, _, log_time, publish_time = unpack(data, place)
         end = place + RECORD.size + length
         if opcode != Opcode.MESSAGE or log_time != time or end > len(data):

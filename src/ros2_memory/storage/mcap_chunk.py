@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 
 Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 
-_INDEX_HEAD: Final = RECORD.size + 2 + 4
+_INDEX_HEAD: Final = struct.Struct("<BQHI")
+"""A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
 _EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
 
 
@@ -84,11 +86,17 @@ def columns_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> 
     columns: dict[int, Column] = {}
     for channel, offset in offsets.items():
         at = offset - base
-        if at < 0 or at + _INDEX_HEAD > len(region) or region[at] != Opcode.MESSAGE_INDEX:
+        if at < 0 or at + _INDEX_HEAD.size > len(region):
             raise UnreadableError("damaged: a message index is not where its chunk index says")
-        size = int.from_bytes(region[at + _INDEX_HEAD - 4 : at + _INDEX_HEAD], "little")
-        pairs = np.frombuffer(region, "<i8", size // 8, at + _INDEX_HEAD).reshape(-1, 2)
-        columns[channel] = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
+        head = _INDEX_HEAD.unpack_from(region, at)
+        size = head[3]
+        if head != (Opcode.MESSAGE_INDEX, size + 6, channel, size):
+            raise UnreadableError("damaged: a message index is not what its chunk index says")
+        pairs = np.frombuffer(region, "<i8", size // 8, at + _INDEX_HEAD.size).reshape(-1, 2)
+        column = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
+        if column.times.size != len(pairs):
+            raise UnreadableError("damaged: a message index holds impossible log times")
+        columns[channel] = column
     return columns
 
 

@@ -63,6 +63,8 @@ def index_by_scan(file: OpenFile, max_chunk_bytes: int, note: str = "") -> McapI
         raise UnreadableError(EMPTY_FILE)
     if not begins_as_mcap(file):
         raise UnreadableError("not an MCAP file: it does not begin as one")
+    if file.size < MAGIC_SIZE:
+        raise UnreadableError(f"only its first {file.size} bytes had reached the disk")
     scan = _Scan(file, max_chunk_bytes)
     scan.run()
     return scan.index(note)

@@ -20,9 +20,10 @@ from ros2_memory.storage.mcap_records import offered_as_latched
 from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile
 from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
+from ros2_memory.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.model import BagSummary, TimeWindow
@@ -42,6 +43,8 @@ _ASCENDING: Final = """
     ORDER BY timestamp, rowid
 """
 _DESCENDING: Final = _ASCENDING.replace("timestamp, rowid\n", "timestamp DESC, rowid DESC\n")
+# Answered from an index where there is one: it may be damaged where the messages are not.
+_COUNT: Final = "SELECT count(*) FROM messages WHERE timestamp >= ? AND timestamp < ?"
 _PAYLOAD: Final = "SELECT data FROM messages WHERE rowid = ?"
 
 
@@ -72,10 +75,13 @@ class SqliteBags:
         """Topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
             rows: list[tuple[int, int, int, int, int]] = base.execute(_TOTALS).fetchall()
+            (indexed,) = base.execute(_COUNT, (MIN_NS, MAX_NS)).fetchone()
         if any(wrong for *_, wrong in rows):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
             )
+        if indexed != sum(row[1] for row in rows):
+            raise UnreadableError("damaged: its index by time lacks messages")
         held = [
             Held(topics.channels[number], count, first, last)
             for number, count, first, last, _ in rows
@@ -98,9 +104,11 @@ class SqliteBags:
             wanted = known.named(topics)
             order = _DESCENDING if newest_first else _ASCENDING
             arguments = (window.start, window.stop, json.dumps(list(wanted)))
-            for time, row, number in base.execute(order, arguments):
+            for time, row, number in _sorted(
+                base.execute(order, arguments), newest_first=newest_first
+            ):
                 found = base.execute(_PAYLOAD, (row,)).fetchone()
-                if found is None or not isinstance(found[0], bytes) or not isinstance(time, int):
+                if found is None or not isinstance(found[0], bytes):
                     raise UnreadableError("damaged: a message without a binary payload")
                 channel = wanted[number]
                 payload = plain_payload(found[0]) if channel.encoding == "cdr" else found[0]
@@ -110,7 +118,8 @@ class SqliteBags:
         """The log times of a topic's messages inside the window, ascending."""
         with self._opened(path) as (base, known):
             arguments = (window.start, window.stop, json.dumps(list(known.named({topic}))))
-            return [int(time) for time, _, _ in base.execute(_ASCENDING, arguments)]
+            rows = _sorted(base.execute(_ASCENDING, arguments), newest_first=False)
+            return [time for time, _, _ in rows]
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
@@ -122,6 +131,8 @@ class SqliteBags:
         address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         # A generator of records may be resumed on another thread.
         with closing(sqlite3.connect(address, uri=True, check_same_thread=False)) as base:
+            # One name that is not UTF-8 must not hide the others.
+            base.text_factory = _text
             topics = self._known.get(key)
             if topics is None:
                 topics = self._topics(base)
@@ -145,12 +156,30 @@ class SqliteBags:
                 Channel(
                     str(value["name"]),
                     # Before the column existed there was one format.
-                    str(value.get("serialization_format", "cdr")),
+                    str(value.get("serialization_format") or "cdr"),
                     schema,
-                    offered_as_latched(str(value.get("offered_qos_profiles", ""))),
+                    offered_as_latched(str(value.get("offered_qos_profiles") or "")),
                 )
             )
         return _Topics(channels)
+
+
+def _text(raw: bytes) -> str:
+    return raw.decode("utf-8", errors="replace")
+
+
+def _sorted(
+    rows: Iterable[tuple[int, int, int]], *, newest_first: bool
+) -> Iterator[tuple[int, int, int]]:
+    """The rows, whose order comes from an index that may be damaged."""
+    sign = -1 if newest_first else 1
+    before: tuple[int, int] | None = None
+    for row in rows:
+        key = (sign * row[0], sign * row[1])
+        if before is not None and key <= before:
+            raise UnreadableError("damaged: its index by time is out of order")
+        before = key
+        yield row
 
 
 def _columns(base: sqlite3.Connection, table: str) -> set[str]:

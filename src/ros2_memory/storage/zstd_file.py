@@ -48,6 +48,8 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
         whole = ends_whole(file)
     target = folder / path.stem
     damage = _unpack(path, target, reserve)
+    if not target.stat().st_size:
+        raise UnreadableError(f"nothing of it can be decompressed ({damage or 'it ends early'})")
     if damage:
         return target, f"its compressed file is damaged ({damage}); what comes after is lost"
     return target, "" if whole else "its compressed file ends early"
