@@ -1,22 +1,19 @@
-"""The composition root: the only place that sees the configuration and the adapters together."""
+"""The composition root of the query server: `adapters`, and what answers with them."""
 
 from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Final
 
-from hydra.errors import HydraException
-from hydra.utils import instantiate
-
+from ros2_memory.adapters import build_reader
 from ros2_memory.config import load_message_schemas
 from ros2_memory.dispatch import Dispatcher, EpisodicServer
-from ros2_memory.errors import ConfigError
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.instructions import instructions
 from ros2_memory.memory import Limits, Memory
+from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.replies import Replies
-from ros2_memory.storage.base import BagReader
 from ros2_memory.timebase import WallClock
 from ros2_memory.tools import build_tools
 
@@ -26,35 +23,13 @@ if TYPE_CHECKING:
 _PACKAGE: Final = "ros2-memory"
 
 
-def build_reader(settings: Settings) -> BagReader:
-    """The bag reader that the configuration chooses.
-
-    Raises:
-        ConfigError: it cannot be built.
-    """
-    node = settings.storage
-    try:
-        # `all`: the adapter receives plain lists, not the configuration library's.
-        reader: object = instantiate(
-            {"_target_": node.target, "_convert_": "all"}, **node.arguments
-        )
-    except HydraException as error:
-        # What the adapter refuses, it says itself; Hydra only wraps it.
-        if isinstance(error.__cause__, ConfigError):
-            raise error.__cause__ from None
-        raise ConfigError(f"storage: {node.target} cannot be built: {error}") from error
-    if not isinstance(reader, BagReader):
-        raise ConfigError(f"storage: {node.target} is not a bag reader")
-    return reader
-
-
 def build_memory(settings: Settings) -> Memory:
     """The memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.
     """
-    reader, clock = build_reader(settings), WallClock()
+    reader, clock = CountingReader(build_reader(settings)), WallClock()
     extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
     index = IndexManager(
         settings.recording.bag_dir,

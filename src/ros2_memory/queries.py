@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory import answers
 from ros2_memory import frames as frame_history
@@ -30,7 +30,7 @@ from ros2_memory.errors import (
     NoDataReason,
     UndecodableError,
 )
-from ros2_memory.history import View
+from ros2_memory.history import View, short_name
 from ros2_memory.model import BagState, Sample, SetAside, TimeWindow
 from ros2_memory.moments import Moment, Span, ns_argument, open_moment, open_span
 from ros2_memory.sampling import samples_note
@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from ros2_memory.copies import Found
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import JsonValue, Pose, Twist
+
+_ODD_BAGS: Final = 5
 
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, ...]:
@@ -84,7 +86,9 @@ def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
         for bag in snapshot.bags
         if bag.state is BagState.INCOMPLETE
     )
-    notes = (snapshot.problem,) if snapshot.problem else ()
+    if snapshot.problem:
+        view.note(snapshot.problem)
+    _note_odd_bags(view)
     return answers.TimeRange(
         earliest=snapshot.earliest,
         latest=snapshot.latest,
@@ -96,7 +100,7 @@ def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
         damaged=snapshot.damaged,
         unread=snapshot.unread,
         silent_topics=len(snapshot.silent_topics),
-        notes=notes,
+        notes=view.notes,
     )
 
 
@@ -379,6 +383,15 @@ def _undecodable_types(view: View, topic: str) -> dict[str, str]:
                 if reason:
                     reasons[summary.type] = reason
     return reasons
+
+
+def _note_odd_bags(view: View) -> None:
+    """Says of the newest closed bags that are odd what is odd about them."""
+    odd = [bag for bag in view.snapshot.bags if bag.state is BagState.CLOSED and bag.summary.notes]
+    for bag in odd[-_ODD_BAGS:]:
+        view.note(f"{short_name(bag.path)}: {'; '.join(bag.summary.notes)}")
+    if len(odd) > _ODD_BAGS:
+        view.note(f"{len(odd) - _ODD_BAGS} older bags are odd too")
 
 
 def _gaps(view: View) -> tuple[answers.Gap, ...]:

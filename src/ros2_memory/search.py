@@ -54,4 +54,4 @@ def unsearched(view: View) -> tuple[str, ...]:
     damaged = damaged_note(view)
     if damaged:
         view.note(damaged)
-    return view.notes
+    return view.notes if damaged or not view.complete else ()

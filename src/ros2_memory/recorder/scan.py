@@ -7,11 +7,12 @@ what was written *into* a file, so the caller names the files that it wants look
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.model import SetAside
+from ros2_memory.recorder.layout import HANDOVER_FILE
 from ros2_memory.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -40,12 +41,17 @@ def settled(mtime_ns: Ns, now: Ns) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """How a file looked from outside."""
+    """How a file looked from outside.
+
+    `sidecar_ns` is the mtime of the `handover.json` beside it, 0 without one: that file says which
+    messages of this one count.
+    """
 
     size: int
     mtime_ns: Ns
     ctime_ns: Ns
     inode: int
+    sidecar_ns: Ns = 0
 
     @classmethod
     def of(cls, stat: os.stat_result) -> Stamp:
@@ -78,6 +84,7 @@ class _Folder:
     files: set[str] = field(default_factory=set)
     links: list[Path] = field(default_factory=list)
     odd: list[SetAside] = field(default_factory=list)
+    sidecar_ns: Ns = 0
 
 
 class Tree:
@@ -145,8 +152,10 @@ class Tree:
     def _look(self, path: str, walked: Walked) -> None:
         if path in walked.looked_at or path in walked.gone:
             return
+        folder = self._folders.get(Path(path).parent)
         try:
-            walked.looked_at[path] = Stamp.of(os.lstat(path))
+            stamp = Stamp.of(os.lstat(path))
+            walked.looked_at[path] = replace(stamp, sidecar_ns=folder.sidecar_ns if folder else 0)
         except OSError:
             # Its folder looks as before, and may soon look the same with the file back in it.
             walked.gone.add(path)
@@ -165,6 +174,9 @@ def _visit(path: Path, known: _Folder | None, now: Ns, looked_at: dict[str, Stam
     with os.scandir(path) as entries:
         for entry in entries:
             _enter(folder, entry, looked_at)
+    if folder.sidecar_ns:
+        for file in folder.files:
+            looked_at[file] = replace(looked_at[file], sidecar_ns=folder.sidecar_ns)
     return folder
 
 
@@ -176,6 +188,8 @@ def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]
     elif entry.is_dir(follow_symlinks=False):
         if not hidden:
             folder.folders.append(Path(entry.path))
+    elif entry.name == HANDOVER_FILE:
+        folder.sidecar_ns = _mtime_ns(entry)
     elif bag_kind(entry.name):
         _enter_file(folder, entry, looked_at)
 
@@ -194,6 +208,13 @@ def _enter_file(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, S
         folder.trusted = False
         return
     folder.files.add(entry.path)
+
+
+def _mtime_ns(entry: os.DirEntry[str]) -> Ns:
+    try:
+        return entry.stat(follow_symlinks=False).st_mtime_ns
+    except OSError:
+        return 0
 
 
 def _is_folder(link: Path) -> bool:

@@ -154,7 +154,11 @@ class FileNotes:
 
     def _outdated(self, stamp: Stamp, now: Ns) -> bool:
         before = self.stamp
-        if not self.trusted or (stamp.size, stamp.mtime_ns) != (before.size, before.mtime_ns):
+        if not self.trusted or (stamp.size, stamp.mtime_ns, stamp.sidecar_ns) != (
+            before.size,
+            before.mtime_ns,
+            before.sidecar_ns,
+        ):
             return True
         # Permissions change only the ctime.
         return self.fault is not None and (
