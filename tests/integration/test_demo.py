@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from mcp.types import TextContent
 from rosbags.rosbag2 import Reader
 
 from ros2_memory.demo.questions import QUESTIONS
+from ros2_memory.demo.run import DemoOptions, run_demo
 
 PROGRAM = [str(Path(sys.executable).with_name("ros2-memory")), "demo"]
 TIMEOUT_S = 120
@@ -50,6 +52,17 @@ def test_once_it_answers_every_question_rightly_and_leaves_nothing_behind(scratc
     assert "WRONG" not in done.stdout
     assert f"{len(QUESTIONS)} of {len(QUESTIONS)} answers are right" in done.stdout
     assert list(scratch.iterdir()) == []
+
+
+def test_a_wrong_answer_is_told_and_is_the_exit_code() -> None:
+    """The memory is asked about 20 s ago where the judge holds it to 10 s ago."""
+    position = next(one for one in QUESTIONS if one.tool == "get_position_seconds_ago")
+    falsified = replace(position, arguments={"seconds_ago": 20})
+    said: list[str] = []
+    code = run_demo(DemoOptions(once=True, port=0), said.append, [position, falsified])
+    assert code == 1
+    assert "WRONG: expected the message of" in said[2]
+    assert said[-1] == "1 of 2 answers are right."
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -96,6 +109,26 @@ def test_a_port_in_use_is_named_and_nothing_is_started(scratch: Path) -> None:
     assert (refused.returncode, refused.stdout) == (2, "")
     assert f"port {port} on 127.0.0.1 is in use" in refused.stderr
     assert "--port" in refused.stderr
+    assert list(scratch.iterdir()) == []
+
+
+def test_it_says_so_when_its_server_is_ended_by_someone_else(scratch: Path) -> None:
+    with subprocess.Popen(
+        [*PROGRAM, "--port", "0", "--duration", "95"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(scratch),
+    ) as demo:
+        try:
+            _invited(demo)
+            children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
+            os.kill(int(children[0]), signal.SIGKILL)
+            _, said = demo.communicate(timeout=30)
+        finally:
+            demo.kill()
+    assert demo.returncode == 2
+    assert "the server ended by itself" in said
     assert list(scratch.iterdir()) == []
 
 

@@ -26,7 +26,7 @@ from ros2_memory.errors import ConfigError, EpisodicError
 from ros2_memory.timebase import NS_PER_S, WallClock, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from ros2_memory.demo.questions import Question
 
@@ -59,7 +59,9 @@ class DemoOptions:
     verbose: bool = False
 
 
-def run_demo(options: DemoOptions, say: Callable[[str], None]) -> int:
+def run_demo(
+    options: DemoOptions, say: Callable[[str], None], questions: Sequence[Question] = QUESTIONS
+) -> int:
     """Records, serves, asks, and (unless `once`) goes on until it is interrupted.
 
     Returns:
@@ -80,8 +82,8 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> int:
         )
         url = f"http://{HOST}:{port}"
         say(_heading(recorder, options, url))
-        wrong = anyio.run(_ask_all, f"{url}/sse", recorder, say)
-        total = len(QUESTIONS)
+        wrong = _asked(f"{url}/sse", recorder, say, questions)
+        total = len(questions)
         say(f"{total - wrong} of {total} answers are right.")
         if not options.once:
             say(f"\n{invitation(f'{url}/sse', f'{url}/mcp')}")
@@ -134,11 +136,27 @@ def _heading(recorder: DemoRecorder, options: DemoOptions, url: str) -> str:
     )
 
 
-async def _ask_all(url: str, recorder: DemoRecorder, say: Callable[[str], None]) -> int:
+def _asked(
+    url: str, recorder: DemoRecorder, say: Callable[[str], None], questions: Sequence[Question]
+) -> int:
+    try:
+        return anyio.run(_ask_all, url, recorder, say, questions)
+    except ExceptionGroup as group:
+        # What the client raises, and what is raised while it is open, comes nested in groups.
+        cause: BaseException = group
+        while isinstance(cause, BaseExceptionGroup):
+            cause = cause.exceptions[0]
+        why = str(cause) or type(cause).__name__
+        raise EpisodicError(f"the questions broke off: {why}") from group
+
+
+async def _ask_all(
+    url: str, recorder: DemoRecorder, say: Callable[[str], None], questions: Sequence[Question]
+) -> int:
     """Asks every question over one connection; how many answers were wrong."""
     wrong = 0
     async with Client(sse_client(url)) as client:
-        for number, question in enumerate(QUESTIONS, start=1):
+        for number, question in enumerate(questions, start=1):
             exchange = await _ask(client, question, recorder)
             say(f"{shown(number, exchange)}\n")
             wrong += not exchange.right
