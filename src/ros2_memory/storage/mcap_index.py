@@ -170,7 +170,8 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
         raise DoubtError
     exact = _agrees(stated, chunks)
     totals = totals_of(file, chunks, stated.counts if exact else None)
-    if {channel: total.count for channel, total in totals.items()} != stated.counts:
+    found = {channel: total.count for channel, total in totals.items()}
+    if found != stated.counts or sum(found.values()) != stated.messages:
         raise DoubtError
     notes = () if exact else (disagreement(stated, totals.values()),)
     held = tuple(chunk for chunk in chunks if chunk.channels)

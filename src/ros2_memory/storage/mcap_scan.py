@@ -10,6 +10,7 @@ from array import array
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.storage.base import Closing
 from ros2_memory.storage.faults import UnreadableError, damage
 from ros2_memory.storage.mcap_chunk import (
     CHUNK_HEAD_BYTES,
@@ -20,7 +21,7 @@ from ros2_memory.storage.mcap_chunk import (
     unpacked_in_part,
     walk,
 )
-from ros2_memory.storage.mcap_file import begins_as_mcap
+from ros2_memory.storage.mcap_file import begins_as_mcap, closing_of
 from ros2_memory.storage.mcap_index import (
     MAX_SECTION_BYTES,
     Chunk,
@@ -65,7 +66,7 @@ def index_by_scan(file: OpenFile, max_chunk_bytes: int, note: str = "") -> McapI
         raise UnreadableError("not an MCAP file: it does not begin as one")
     if file.size < MAGIC_SIZE:
         raise UnreadableError(f"only its first {file.size} bytes had reached the disk")
-    scan = _Scan(file, max_chunk_bytes)
+    scan = _Scan(file, max_chunk_bytes, closed=closing_of(file) is Closing.CLOSED)
     scan.run()
     return scan.index(note)
 
@@ -75,7 +76,8 @@ class _Scan:
     file: OpenFile
     max_chunk_bytes: int
     position: int = MAGIC_SIZE
-    finished: bool = False
+    closed: bool = False
+    data_ended: bool = False
     declarations: Declarations = field(default_factory=Declarations)
     chunks: list[Chunk] = field(default_factory=list)
     totals: dict[int, Total] = field(default_factory=dict)
@@ -90,10 +92,10 @@ class _Scan:
     def run(self) -> None:
         """Reads on until the footer, or until what follows is no whole record."""
         size = self.file.size
-        while not self.finished and self.position + RECORD.size <= size:
+        while self.position + RECORD.size <= size:
             opcode, length = RECORD.unpack(self._peek(self.position, RECORD.size))
             end = self.position + RECORD.size + length
-            if opcode == 0:
+            if opcode in {0, Opcode.FOOTER}:
                 return
             if end > size:
                 if opcode == Opcode.CHUNK:
@@ -112,7 +114,7 @@ class _Scan:
             places.append(self.position)
             self.messages += 1
             return
-        self.finished = opcode == Opcode.FOOTER
+        self.data_ended = self.data_ended or opcode == Opcode.DATA_END
         try:
             if opcode == Opcode.CHUNK:
                 self._whole_chunk(end)
@@ -211,13 +213,13 @@ class _Scan:
             tuple(self.chunks),
             known,
             _held(columns),
-            complete=self.finished,
+            complete=self.data_ended and self.closed,
             notes=tuple(notes),
         )
 
     def _notes(self, known: dict[int, Total]) -> list[str]:
         notes = []
-        if not self.finished:
+        if not (self.data_ended and self.closed):
             notes.append(self._end_note())
         if self.damaged:
             notes.append(f"{len(self.damaged)} damaged records were left out ({self.damaged[0]})")
@@ -227,7 +229,8 @@ class _Scan:
             notes.append(f"{orphans} messages belong to no declared channel and were left out")
         if self.messages > counted:
             notes.append(f"{self.messages - counted} messages bear no possible log time")
-        if self.stated is not None and not _agree(self.stated, known):
+        # Where something was left out, the statistics count it rightly.
+        if self.stated is not None and not notes and not _agree(self.stated, known):
             notes.append(disagreement(self.stated, known.values()))
         return notes
 
@@ -237,6 +240,8 @@ class _Scan:
                 f"the file ends early: of its last chunk, {self.partial} compressed bytes, only a"
                 " part could be read"
             )
+        if self.data_ended:
+            return "the file ends early, behind its messages: none is lost"
         unread = self.file.size - self.position
         if unread:
             return f"the file ends early: the last {unread} bytes could not be read"
@@ -248,7 +253,8 @@ def _held(columns: dict[int, Column]) -> dict[int, Column]:
 
 
 def _agree(stated: Statistics, totals: dict[int, Total]) -> bool:
-    if stated.counts != {channel: total.count for channel, total in totals.items()}:
+    counts = {channel: total.count for channel, total in totals.items()}
+    if stated.counts != counts or stated.messages != sum(counts.values()):
         return False
     if not totals:
         return True

@@ -1,0 +1,487 @@
+from __future__ import annotations
+
+import os
+import random
+import struct
+import zlib
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import lz4.frame  # type: ignore[import-untyped]
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from ros2_memory.errors import BagError, ConfigError, UndecodableError
+from ros2_memory.model import TimeWindow
+from ros2_memory.storage.base import Closing
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from mcap.records import ChunkIndex
+
+    from ros2_memory.storage.base import Record
+
+EVERYTHING = TimeWindow.everything()
+STRING = "std_msgs/msg/String"
+SMALL = McapLayout(chunk_size=400)
+_RECORD = struct.Struct("<BQ")
+_FOOTER = struct.Struct("<BQQQI")
+
+
+def read(reader: McapReader, path: Path, *topics: str, **how: Any) -> list[Record]:
+    return list(reader.records(path, topics or ("/chatter",), EVERYTHING, **how))
+
+
+def times(records: list[Record]) -> list[int]:
+    return [record.log_time for record in records]
+
+
+def chunks_of(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        return summary.chunk_indexes
+
+
+def spoil_chunk(path: Path, number: int) -> None:
+    """Flips a bit in the middle of a chunk's data."""
+    chunk = chunks_of(path)[number]
+    data = bytearray(path.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size // 2] ^= 1
+    path.write_bytes(data)
+
+
+def edit_summary(path: Path, opcode: Opcode, edit: Callable[[bytearray], None]) -> None:
+    """Changes the bodies of the summary's records of one kind, checksum kept right."""
+    data = path.read_bytes()
+    footer_at = len(data) - 8 - _FOOTER.size
+    kind, length, start, offsets, _ = _FOOTER.unpack_from(data, footer_at)
+    section = bytearray(data[start:footer_at])
+    position = 0
+    while position < len(section):
+        found, size = _RECORD.unpack_from(section, position)
+        position += _RECORD.size
+        if found == opcode:
+            body = section[position : position + size]
+            edit(body)
+            section[position : position + size] = body
+        position += size
+    footer = _FOOTER.pack(kind, length, start, offsets, 0)[:-4]
+    crc = zlib.crc32(footer, zlib.crc32(section))
+    path.write_bytes(data[:start] + section + footer + struct.pack("<I", crc) + data[-8:])
+
+
+def chatter(count: int, size: int = 100, start: int = 0) -> list[Msg]:
+    return [text(time, f"{time:0{size}d}") for time in range(start, start + count)]
+
+
+def raw_mcap(path: Path, fill: Callable[[Writer], None], **how: Any) -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream, **how)
+        writer.start(profile="", library="test")
+        fill(writer)
+        writer.finish()
+    return path
+
+
+class TestReadingOnlyWhatIsWanted:
+    def test_a_summary_and_log_times_need_no_chunk(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        for number in range(len(chunks_of(path))):
+            spoil_chunk(path, number)
+        reader = McapReader()
+        assert reader.summarize(path).count == 20
+        assert list(reader.log_times(path, "/chatter", TimeWindow(5, 9))) == [5, 6, 7, 8]
+        with pytest.raises(BagError, match="does not match its checksum"):
+            read(reader, path)
+
+    def test_a_damaged_chunk_disturbs_only_the_windows_that_it_overlaps(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        spoilt = chunks_of(path)[1]
+        spoil_chunk(path, 1)
+        reader = McapReader()
+        before = TimeWindow(0, spoilt.message_start_time)
+        after = TimeWindow(spoilt.message_end_time + 1, 100)
+        found = [
+            record.log_time
+            for window in (before, after)
+            for record in reader.records(path, ["/chatter"], window)
+        ]
+        lost = set(range(20)) - set(found)
+        assert lost == set(range(spoilt.message_start_time, spoilt.message_end_time + 1))
+
+    def test_a_chunk_without_the_topic_is_not_read(self, tmp_path: Path) -> None:
+        messages = [*chatter(12), *(boolean(time, True) for time in range(12, 40))]
+        path = write_mcap(tmp_path / "a.mcap", messages, SMALL)
+        spoil_chunk(path, 0)
+        assert times(read(McapReader(), path, "/bumper")) == list(range(12, 40))
+
+    def test_newest_first_begins_at_the_end_of_the_file(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        spoil_chunk(path, 0)
+        newest = McapReader().records(path, ["/chatter"], EVERYTHING, newest_first=True)
+        assert [next(newest).log_time for _ in range(3)] == [19, 18, 17]
+        with pytest.raises(BagError):
+            list(newest)
+
+    def test_what_was_read_is_kept_within_the_cache(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        reader = McapReader()
+        whole = read(reader, path)
+        status = path.stat()
+        data = bytearray(path.read_bytes())
+        data[8:-8] = bytes(len(data) - 16)
+        with path.open("r+b") as stream:
+            stream.write(data)
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+        assert read(reader, path) == whole
+        assert McapReader().summarize(path).count == 0
+
+    def test_without_a_cache_everything_is_read_again(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        reader = McapReader(cache_mb=0)
+        assert times(read(reader, path)) == times(read(reader, path)) == list(range(20))
+
+
+class TestIndexesThatAreWrong:
+    def test_a_damaged_summary_is_replaced_by_the_messages(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        data = bytearray(path.read_bytes())
+        data[-60] ^= 1
+        path.write_bytes(data)
+        summary = McapReader().summarize(path)
+        assert (summary.count, summary.start, summary.end) == (20, 0, 19)
+        assert summary.complete
+        assert "its summary section does not match its checksum" in summary.notes
+
+    def test_statistics_that_are_wrong_are_noted_and_not_believed(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+
+        edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, 21))
+        reader = McapReader()
+        summary = reader.summarize(path)
+        assert summary.count == len(read(reader, path)) == 20
+        assert any("its own statistics are wrong" in note for note in summary.notes)
+        assert any("21 messages" in note for note in summary.notes)
+
+    def test_a_chunk_index_that_states_wrong_times_is_not_believed(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20, start=100), SMALL)
+
+        def state_later(body: bytearray) -> None:
+            (start,) = struct.unpack_from("<Q", body)
+            if start == 100:
+                struct.pack_into("<Q", body, 0, 101)
+
+        edit_summary(path, Opcode.CHUNK_INDEX, state_later)
+        edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 26, 101))
+        reader = McapReader()
+        assert reader.summarize(path).start == 100
+        found = reader.records(path, ["/chatter"], TimeWindow(100, 102))
+        assert [record.log_time for record in found] == [100, 101]
+
+    def test_a_message_index_that_points_elsewhere_is_an_error(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(3))
+        (chunk,) = chunks_of(path)
+        data = bytearray(path.read_bytes())
+        (index_at,) = chunk.message_index_offsets.values()
+        struct.pack_into("<Q", data, index_at + 15 + 8, 7)
+        path.write_bytes(data)
+        with pytest.raises(BagError, match="a message is not where its index says"):
+            read(McapReader(), path)
+
+    def test_messages_outside_chunks_are_not_lost_beside_chunks(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(6), SMALL)
+        data = path.read_bytes()
+        body = struct.pack("<HIQQ", 1, 0, 3, 3) + text(3, "loose").payload
+        loose = _RECORD.pack(Opcode.MESSAGE, len(body)) + body
+        # Before the data end: behind the last message index, which moves the summary on.
+        chunk = chunks_of(path)[-1]
+        at = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+        moved = bytearray(data[:at] + loose + data[at:])
+        footer_at = len(moved) - 8 - _FOOTER.size
+        kind, length, start, _, _ = _FOOTER.unpack_from(moved, footer_at)
+        _FOOTER.pack_into(moved, footer_at, kind, length, start + len(loose), 0, 0)
+        path.write_bytes(moved)
+        edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, 7))
+        reader = McapReader()
+        assert reader.summarize(path).count == 7
+        assert times(read(reader, path)) == [0, 1, 2, 3, 3, 4, 5]
+        assert times(read(reader, path, newest_first=True)) == [5, 4, 3, 3, 2, 1, 0]
+
+
+class TestFilesThatEndEarly:
+    @pytest.mark.parametrize("layout", [McapLayout(), SMALL, McapLayout(chunk_size=None)])
+    def test_of_uncompressed_files_every_message_that_reached_the_disk_is_read(
+        self, layout: McapLayout, tmp_path: Path
+    ) -> None:
+        messages = [text(time, f"{time}", f"/{time % 2}") for time in (3, 1, 2, 5, 4, 0)]
+        whole = write_mcap(tmp_path / "whole.mcap", messages, layout).read_bytes()
+        ends = sorted(whole.index(m.payload) + len(m.payload) for m in messages)
+        path = tmp_path / "cut.mcap"
+        reader = McapReader()
+        for size in range(8, len(whole) - 8):
+            path.write_bytes(whole[:size])
+            summary = reader.summarize(path)
+            on_disk = sum(end <= size for end in ends)
+            assert summary.count == on_disk, size
+            assert len(read(reader, path, "/0", "/1")) == on_disk
+            assert reader.closing(path) is Closing.OPEN
+            path.unlink()
+
+    def test_the_note_says_how_much_could_not_be_read(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(5))
+        whole = path.read_bytes()
+        third = whole.index(chatter(5)[2].payload)
+        path.write_bytes(whole[: third + 10])
+        summary = McapReader().summarize(path)
+        assert summary.count == 2
+        assert not summary.complete
+        # Its record begins 31 bytes before the payload.
+        assert summary.notes == ("the file ends early: the last 41 bytes could not be read",)
+
+    def test_zeros_behind_the_last_record_are_what_a_power_cut_leaves(self, tmp_path: Path) -> None:
+        path = write_mcap(
+            tmp_path / "a.mcap", chatter(5), McapLayout(chunk_size=None, finish=False)
+        )
+        path.write_bytes(path.read_bytes() + bytes(4096))
+        summary = McapReader().summarize(path)
+        assert summary.count == 5
+        assert summary.notes == ("the file ends early: the last 4096 bytes could not be read",)
+
+    def test_a_file_whose_writer_stopped_between_records_has_lost_nothing(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(
+            tmp_path / "a.mcap", chatter(5), McapLayout(chunk_size=None, finish=False)
+        )
+        summary = McapReader().summarize(path)
+        assert (summary.count, summary.complete) == (5, False)
+        assert summary.notes == ("the file ends early: its writer did not finish it",)
+
+    @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+    def test_of_a_compressed_chunk_that_is_cut_what_can_be_decompressed_counts(
+        self, compression: CompressionType, tmp_path: Path
+    ) -> None:
+        messages = [
+            Msg("/noise", STRING, time, random.Random(time).randbytes(4000)) for time in range(300)
+        ]
+        path = write_mcap(
+            tmp_path / "a.mcap", messages, McapLayout(chunk_size=8 << 20, compression=compression)
+        )
+        whole = path.read_bytes()
+        path.write_bytes(whole[: len(whole) // 2])
+        reader = McapReader()
+        summary = reader.summarize(path)
+        assert 60 < summary.count < 240
+        assert not summary.complete
+        assert any("only a part could be read" in note for note in summary.notes)
+        found = read(reader, path, "/noise")
+        assert [r.payload for r in found] == [m.payload for m in messages[: summary.count]]
+
+    def test_a_cut_behind_the_messages_has_lost_none_and_says_so(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(5))
+        path.write_bytes(path.read_bytes()[:-20])
+        summary = McapReader().summarize(path)
+        assert (summary.count, summary.complete) == (5, False)
+        assert summary.notes == ("the file ends early, behind its messages: none is lost",)
+
+    def test_a_few_bytes_are_no_bag_yet(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.mcap"
+        path.write_bytes(b"\x89MCA")
+        assert McapReader().closing(path) is Closing.OPEN
+        with pytest.raises(BagError, match="only its first 4 bytes had reached the disk"):
+            McapReader().summarize(path)
+
+    def test_one_damaged_chunk_of_an_unfinished_file_is_left_out_and_told(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        lost = chunks_of(path)[1]
+        spoil_chunk(path, 1)
+        path.write_bytes(path.read_bytes()[:-100])
+        reader = McapReader()
+        summary = reader.summarize(path)
+        kept = set(range(20)) - set(range(lost.message_start_time, lost.message_end_time + 1))
+        assert times(read(reader, path)) == sorted(kept)
+        assert summary.count == len(kept)
+        assert any(note.startswith("1 damaged records were left out") for note in summary.notes)
+
+
+class TestWhatAWriterMayDo:
+    def test_two_channels_of_one_topic_and_type_are_one_topic(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            schema = writer.register_schema(STRING, "ros2msg", definition(STRING).encode())
+            first = writer.register_channel("/t", "cdr", schema)
+            second = writer.register_channel(
+                "/t", "cdr", schema, {"offered_qos_profiles": "durability: 1\n"}
+            )
+            for time, channel in ((1, first), (2, second), (3, first)):
+                writer.add_message(channel, time, text(time, "x").payload, time)
+
+        path = raw_mcap(tmp_path / "a.mcap", fill)
+        reader = McapReader()
+        (topic,) = reader.summarize(path).topics
+        assert (topic.count, topic.first, topic.last, topic.latched) == (3, 1, 3, True)
+        assert times(read(reader, path, "/t")) == [1, 2, 3]
+        assert [channel.latched for channel in reader.channels(path)] == [False, True]
+
+    @pytest.mark.parametrize(
+        ("qos", "latched"),
+        [
+            ("- durability: 1\n", True),
+            ("- durability: transient_local\n", True),
+            ("- durability: volatile\n- durability: transient_local\n", True),
+            ("- durability: 2\n", False),
+            ("- durability: 10\n", False),
+            (VOLATILE, False),
+            ("", False),
+        ],
+    )
+    def test_latched_is_what_some_publisher_offered_as_transient_local(
+        self, qos: str, latched: bool, tmp_path: Path
+    ) -> None:
+        def fill(writer: Writer) -> None:
+            channel = writer.register_channel("/t", "cdr", 0, {"offered_qos_profiles": qos})
+            writer.add_message(channel, 1, b"\x00", 1)
+
+        (topic,) = McapReader().summarize(raw_mcap(tmp_path / "a.mcap", fill)).topics
+        assert topic.latched is latched
+
+    def test_attachments_and_metadata_between_the_messages_are_passed_over(
+        self, tmp_path: Path
+    ) -> None:
+        def fill(writer: Writer) -> None:
+            channel = writer.register_channel("/t", "json", 0)
+            for time in range(4):
+                writer.add_message(channel, time, b"{}", time)
+                writer.add_attachment(time, time, "note", "text/plain", b"\x05" * 100)
+                writer.add_metadata("rosbag2", {"robot": "r1"})
+
+        for number, chunked in enumerate((True, False)):
+            path = raw_mcap(tmp_path / f"{number}.mcap", fill, use_chunking=chunked)
+            assert times(read(McapReader(), path, "/t")) == [0, 1, 2, 3]
+
+    def test_json_is_read_as_what_it_says(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            schema = writer.register_schema("Mouse", "jsonschema", b"{}")
+            channel = writer.register_channel("mouse", "json", schema)
+            writer.add_message(channel, 1, b'{"x": 1.5, "far": NaN, "tags": ["a"]}', 1)
+            writer.add_message(channel, 2, b"{not json", 2)
+            writer.add_message(channel, 3, b"[" * 100_000, 3)
+
+        reader = McapReader()
+        good, bad, deep = read(reader, raw_mcap(tmp_path / "a.mcap", fill), "mouse")
+        value = reader.decode(good)
+        assert isinstance(value, dict)
+        assert value["x"] == 1.5
+        assert value["far"] != value["far"]
+        assert reader.undecodable(good.channel) is None
+        for record in (bad, deep):
+            with pytest.raises(UndecodableError, match=r"mouse \(Mouse\): the payload is not JSON"):
+                reader.decode(record)
+
+    def test_a_foreign_encoding_is_listed_and_named(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            schema = writer.register_schema("foxglove.Pose", "protobuf", b"\x0a")
+            writer.add_message(writer.register_channel("p", "protobuf", schema), 1, b"\x08", 1)
+
+        reader = McapReader()
+        path = raw_mcap(tmp_path / "a.mcap", fill)
+        (record,) = read(reader, path, "p")
+        assert [t.topic for t in reader.summarize(path).topics] == ["p"]
+        with pytest.raises(UndecodableError, match="message encoding 'protobuf' is not read"):
+            reader.decode(record)
+
+    def test_a_message_that_was_compressed_by_itself_comes_plain(self, tmp_path: Path) -> None:
+        message = text(1, "hello " * 50)
+        packed = Msg("/chatter", STRING, 1, zstandard.compress(message.payload))
+        path = write_mcap(tmp_path / "a.mcap", [packed])
+        reader = McapReader()
+        (record,) = read(reader, path)
+        assert record.payload == message.payload
+        assert getattr(reader.decode(record), "data", "") == "hello " * 50
+
+    def test_a_compressed_message_that_is_damaged_is_undecodable(self, tmp_path: Path) -> None:
+        packed = zstandard.compress(text(1, "hello " * 50).payload)[:-3]
+        path = write_mcap(tmp_path / "a.mcap", [Msg("/chatter", STRING, 1, packed)])
+        reader = McapReader()
+        (record,) = read(reader, path)
+        with pytest.raises(UndecodableError, match="compressed payload is damaged"):
+            reader.decode(record)
+
+    def test_times_that_no_clock_shows_are_left_out_and_told(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            channel = writer.register_channel("/t", "json", 0)
+            for time in (5, 2**63 + 1, 2**64 - 1):
+                writer.add_message(channel, time, b"{}", time)
+
+        for number, chunked in enumerate((True, False)):
+            path = raw_mcap(tmp_path / f"{number}.mcap", fill, use_chunking=chunked)
+            reader = McapReader()
+            summary = reader.summarize(path)
+            assert (summary.count, summary.start, summary.end) == (1, 5, 5)
+            assert "2 messages bear no possible log time" in summary.notes
+            assert times(read(reader, path, "/t")) == [5]
+
+    def test_messages_without_a_channel_are_left_out_and_told(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            channel = writer.register_channel("/t", "json", 0)
+            writer.add_message(channel, 1, b"{}", 1)
+            writer.add_message(99, 2, b"{}", 2)
+
+        path = raw_mcap(tmp_path / "a.mcap", fill)
+        summary = McapReader().summarize(path)
+        assert summary.count == 1
+        assert "1 messages belong to no declared channel and were left out" in summary.notes
+
+
+class TestBounds:
+    def test_a_chunk_larger_than_allowed_is_refused_by_its_true_size(self, tmp_path: Path) -> None:
+        big = [text(time, "0" * 100_000) for time in range(30)]
+        for number, compression in enumerate(CompressionType):
+            layout = McapLayout(chunk_size=8 << 20, compression=compression)
+            path = write_mcap(tmp_path / f"{number}.mcap", big, layout)
+            reader = McapReader(max_chunk_mb=1)
+            assert reader.summarize(path).count == 30
+            with pytest.raises(BagError, match="larger than the 1 MiB allowed"):
+                read(reader, path)
+
+    def test_a_stated_size_is_not_allocated(self, tmp_path: Path) -> None:
+        packed = bytearray(zstandard.compress(b"\0" * 10))
+        # A frame header that states 2^56 bytes (RFC 8878, 3.1.1.1): 8 bytes of content size.
+        bomb = b"\x28\xb5\x2f\xfd\xe0" + (1 << 56).to_bytes(8, "little") + packed[6:]
+        assert zstandard.frame_content_size(bomb) == 1 << 56
+        for name, data in (("zstd", bomb), ("lz4", lz4.frame.compress(b"x")[:-1]), ("", b"x")):
+            path = tmp_path / f"{name or 'none'}.mcap"
+            path.write_bytes(_one_chunk(name, bytes(data)))
+            reader = McapReader()
+            summary = reader.summarize(path)
+            assert summary.empty
+            assert any("damaged" in note for note in summary.notes)
+
+    def test_folders_of_definitions_that_are_wrong_stop_the_start(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match=r"nowhere is not a folder"):
+            McapReader([tmp_path / "nowhere"])
+
+
+def _one_chunk(compression: str, data: bytes) -> bytes:
+    """An MCAP file with one chunk that states 2^60 bytes of content, and no summary."""
+    out = BytesIO()
+    writer = Writer(out, index_types=IndexType.NONE, use_statistics=False, use_chunking=False)
+    writer.start()
+    start = out.tell()
+    writer.finish()
+    name = compression.encode()
+    body = struct.pack("<QQQII", 1, 2, 1 << 60, 0, len(name)) + name
+    body += struct.pack("<Q", len(data)) + data
+    whole = out.getvalue()
+    return whole[:start] + _RECORD.pack(Opcode.CHUNK, len(body)) + body + whole[start:]
