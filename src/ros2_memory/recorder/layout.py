@@ -1,0 +1,61 @@
+"""What the recorder puts into the bag directory, by name.
+
+    bag_dir/
+      recorder.json                heartbeat
+      recorder.lock                who records here
+      recorder.qos.yaml            how latched topics are subscribed to
+      recorder.storage.yaml        how MCAP files are written
+      rec_20261120T043000Z/        one recording: what one `ros2 bag record` wrote
+        rec_20261120T043000Z_0.mcap, ...   its splits (distributions differ in the names)
+        metadata.yaml                      written by it at a clean end
+        handover.json                      which of it counts (see `handover`)
+
+The two YAML files stand beside the recordings, since a recording's own directory must not exist
+before `ros2 bag record` creates it, and it reads one of them again at every split. They say the
+same for every recording, so there is one pair.
+No name here ends as a bag file's does, so the index passes them by.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.recorder.heartbeat import HEARTBEAT_FILE
+from ros2_memory.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LOCK_FILE: Final = "recorder.lock"
+QOS_FILE: Final = "recorder.qos.yaml"
+STORAGE_FILE: Final = "recorder.storage.yaml"
+HANDOVER_FILE: Final = "handover.json"
+METADATA_FILE: Final = "metadata.yaml"
+
+OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
+"""What may be deleted from the bag directory itself, besides bags: it is written anew."""
+RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE})
+"""What stands in a recording's directory besides its bags, and has no meaning without them."""
+
+
+def recording_name(now: Ns, bag_dir: Path) -> str:
+    """A name for a recording that begins `now`: its UTC time, and a number where that is taken.
+
+    It is taken where two begin within one second, or where the clock was set back.
+    """
+    moment = datetime.fromtimestamp(now // NS_PER_S, tz=UTC)
+    stem = f"rec_{moment:%Y%m%dT%H%M%SZ}"
+    name, number = stem, 1
+    while (bag_dir / name).exists():
+        number += 1
+        name = f"{stem}_{number}"
+    return name
+
+
+def node_name(recording: str) -> str:
+    """A ROS node name of its own for each recording.
+
+    Two recorders of one name, as at a handover, would make their services ambiguous.
+    """
+    return f"ros2_memory_{recording}"

@@ -1,0 +1,83 @@
+"""Small files that are replaced at once and survive a power cut, and closed bags that do.
+
+A file is on the disk when it was flushed itself, and its name when its directory was.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+MAX_SMALL_FILE: Final = 1 << 20
+
+
+def write_durably(target: Path, text: str) -> None:
+    """Replaces the file at once: a reader sees what was there, or all of the new text.
+
+    Raises:
+        OSError: it cannot be written; what was there stands.
+    """
+    beside = target.with_name(f".{target.name}.tmp")
+    try:
+        with beside.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        beside.replace(target)
+    except OSError:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+        raise
+    flush(target.parent)
+
+
+def read_small_file(path: Path) -> str:
+    """The text of a small regular file. Never waits, as opening a FIFO would.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no regular file, no text, or larger than `MAX_SMALL_FILE`.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as stream:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ValueError("it is not a regular file")
+        data = stream.read(MAX_SMALL_FILE + 1)
+    if len(data) > MAX_SMALL_FILE:
+        raise ValueError(f"it is larger than {MAX_SMALL_FILE} bytes")
+    return data.decode("utf-8")
+
+
+def flush(path: Path) -> None:
+    """Waits until a file's content, or a directory's names, are on the disk.
+
+    Raises:
+        OSError: they are not.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def flush_bags(directory: Path, names: Iterable[str]) -> list[str]:
+    """Flushes closed splits and then the directory that names them.
+
+    Returns a sentence for each that could not be flushed; one that has been deleted is none.
+    """
+    faults: list[str] = []
+    for path in [*(directory / name for name in names), directory]:
+        try:
+            flush(path)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            faults.append(f"{path} may not survive a power cut: {error.strerror or error}")
+    return faults
