@@ -1,0 +1,62 @@
+"""What the recorder asks of others: a process that records, and someone who keeps order."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class RecorderProcess(Protocol):
+    """A running `ros2 bag record`, as `child.Child` is."""
+
+    @property
+    def pid(self) -> int:
+        """Its process number."""
+
+    def take_lines(self) -> list[str]:
+        """What it printed since the last call, oldest first."""
+
+    def exit_status(self) -> int | None:
+        """None while it runs; then its exit code, or minus the number of the signal it died by."""
+
+    def end(self) -> int | None:
+        """Has it end, without waiting: to be called again until there is an exit status."""
+
+    @property
+    def patience_s(self) -> float:
+        """For how long `end` is worth calling; after that nothing ends it."""
+
+
+class Housekeeper(Protocol):
+    """Repairs what a crash left, and deletes what the limits do not allow to keep.
+
+    All of it happens between two looks at the running recorder: it should not take long, and what
+    it raises from the error tree is reported and stops nothing.
+    """
+
+    def repair(self, bag_dir: Path) -> None:
+        """Puts right what a crash left. Called once, before anything is recorded."""
+
+    def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
+        """Deletes more than the budget asks, oldest first, until so much of the disk is free.
+
+        Where that cannot be reached it deletes what it may.
+        """
+
+    def apply(self, bag_dir: Path) -> None:
+        """Deletes what is beyond the budget or too old. Called when splits have been closed."""
+
+
+class NoHousekeeping:
+    """Repairs and deletes nothing."""
+
+    def repair(self, bag_dir: Path) -> None:
+        """Does nothing."""
+
+    def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
+        """Does nothing."""
+
+    def apply(self, bag_dir: Path) -> None:
+        """Does nothing."""
