@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 from mcp import Client
 
-from ros2_memory.bootstrap import build_memory, build_reader, build_server, package_version
+from ros2_memory.adapters import build_reader
+from ros2_memory.bootstrap import build_memory, build_server, package_version
 from ros2_memory.config import load_settings
 from ros2_memory.errors import ConfigError
 from ros2_memory.fitting import compact
