@@ -1,38 +1,38 @@
 from __future__ import annotations
 
 import os
-import random
 import struct
-import zlib
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, Writer
 
 from ros2_memory.errors import BagError, ConfigError, UndecodableError
 from ros2_memory.model import TimeWindow
-from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
+from tests.mcap_surgery import (
+    FOOTER,
+    RECORD,
+    SMALL,
+    chatter,
+    chunks_of,
+    edit_summary,
+    one_chunk,
+    raw_mcap,
+    spoil_chunk,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
-
-    from mcap.records import ChunkIndex
 
     from ros2_memory.storage.base import Record
 
 EVERYTHING = TimeWindow.everything()
 STRING = "std_msgs/msg/String"
-SMALL = McapLayout(chunk_size=400)
-_RECORD = struct.Struct("<BQ")
-_FOOTER = struct.Struct("<BQQQI")
 
 
 def read(reader: McapReader, path: Path, *topics: str, **how: Any) -> list[Record]:
@@ -41,54 +41,6 @@ def read(reader: McapReader, path: Path, *topics: str, **how: Any) -> list[Recor
 
 def times(records: list[Record]) -> list[int]:
     return [record.log_time for record in records]
-
-
-def chunks_of(path: Path) -> list[ChunkIndex]:
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-        assert summary is not None
-        return summary.chunk_indexes
-
-
-def spoil_chunk(path: Path, number: int) -> None:
-    """Flips a bit in the middle of a chunk's data."""
-    chunk = chunks_of(path)[number]
-    data = bytearray(path.read_bytes())
-    data[chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size // 2] ^= 1
-    path.write_bytes(data)
-
-
-def edit_summary(path: Path, opcode: Opcode, edit: Callable[[bytearray], None]) -> None:
-    """Changes the bodies of the summary's records of one kind, checksum kept right."""
-    data = path.read_bytes()
-    footer_at = len(data) - 8 - _FOOTER.size
-    kind, length, start, offsets, _ = _FOOTER.unpack_from(data, footer_at)
-    section = bytearray(data[start:footer_at])
-    position = 0
-    while position < len(section):
-        found, size = _RECORD.unpack_from(section, position)
-        position += _RECORD.size
-        if found == opcode:
-            body = section[position : position + size]
-            edit(body)
-            section[position : position + size] = body
-        position += size
-    footer = _FOOTER.pack(kind, length, start, offsets, 0)[:-4]
-    crc = zlib.crc32(footer, zlib.crc32(section))
-    path.write_bytes(data[:start] + section + footer + struct.pack("<I", crc) + data[-8:])
-
-
-def chatter(count: int, size: int = 100, start: int = 0) -> list[Msg]:
-    return [text(time, f"{time:0{size}d}") for time in range(start, start + count)]
-
-
-def raw_mcap(path: Path, fill: Callable[[Writer], None], **how: Any) -> Path:
-    with path.open("wb") as stream:
-        writer = Writer(stream, **how)
-        writer.start(profile="", library="test")
-        fill(writer)
-        writer.finish()
-    return path
 
 
 class TestReadingOnlyWhatIsWanted:
@@ -202,118 +154,20 @@ class TestIndexesThatAreWrong:
         path = write_mcap(tmp_path / "a.mcap", chatter(6), SMALL)
         data = path.read_bytes()
         body = struct.pack("<HIQQ", 1, 0, 3, 3) + text(3, "loose").payload
-        loose = _RECORD.pack(Opcode.MESSAGE, len(body)) + body
+        loose = RECORD.pack(Opcode.MESSAGE, len(body)) + body
         # Before the data end: behind the last message index, which moves the summary on.
         chunk = chunks_of(path)[-1]
         at = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
         moved = bytearray(data[:at] + loose + data[at:])
-        footer_at = len(moved) - 8 - _FOOTER.size
-        kind, length, start, _, _ = _FOOTER.unpack_from(moved, footer_at)
-        _FOOTER.pack_into(moved, footer_at, kind, length, start + len(loose), 0, 0)
+        footer_at = len(moved) - 8 - FOOTER.size
+        kind, length, start, _, _ = FOOTER.unpack_from(moved, footer_at)
+        FOOTER.pack_into(moved, footer_at, kind, length, start + len(loose), 0, 0)
         path.write_bytes(moved)
         edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, 7))
         reader = McapReader()
         assert reader.summarize(path).count == 7
         assert times(read(reader, path)) == [0, 1, 2, 3, 3, 4, 5]
         assert times(read(reader, path, newest_first=True)) == [5, 4, 3, 3, 2, 1, 0]
-
-
-class TestFilesThatEndEarly:
-    @pytest.mark.parametrize("layout", [McapLayout(), SMALL, McapLayout(chunk_size=None)])
-    def test_of_uncompressed_files_every_message_that_reached_the_disk_is_read(
-        self, layout: McapLayout, tmp_path: Path
-    ) -> None:
-        messages = [text(time, f"{time}", f"/{time % 2}") for time in (3, 1, 2, 5, 4, 0)]
-        whole = write_mcap(tmp_path / "whole.mcap", messages, layout).read_bytes()
-        ends = sorted(whole.index(m.payload) + len(m.payload) for m in messages)
-        path = tmp_path / "cut.mcap"
-        reader = McapReader()
-        for size in range(8, len(whole) - 8):
-            path.write_bytes(whole[:size])
-            summary = reader.summarize(path)
-            on_disk = sum(end <= size for end in ends)
-            assert summary.count == on_disk, size
-            assert len(read(reader, path, "/0", "/1")) == on_disk
-            assert reader.closing(path) is Closing.OPEN
-            path.unlink()
-
-    def test_the_note_says_how_much_could_not_be_read(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(5))
-        whole = path.read_bytes()
-        third = whole.index(chatter(5)[2].payload)
-        path.write_bytes(whole[: third + 10])
-        summary = McapReader().summarize(path)
-        assert summary.count == 2
-        assert not summary.complete
-        # Its record begins 31 bytes before the payload.
-        assert summary.notes == ("the file ends early: the last 41 bytes could not be read",)
-
-    def test_zeros_behind_the_last_record_are_what_a_power_cut_leaves(self, tmp_path: Path) -> None:
-        path = write_mcap(
-            tmp_path / "a.mcap", chatter(5), McapLayout(chunk_size=None, finish=False)
-        )
-        path.write_bytes(path.read_bytes() + bytes(4096))
-        summary = McapReader().summarize(path)
-        assert summary.count == 5
-        assert summary.notes == ("the file ends early: the last 4096 bytes could not be read",)
-
-    def test_a_file_whose_writer_stopped_between_records_has_lost_nothing(
-        self, tmp_path: Path
-    ) -> None:
-        path = write_mcap(
-            tmp_path / "a.mcap", chatter(5), McapLayout(chunk_size=None, finish=False)
-        )
-        summary = McapReader().summarize(path)
-        assert (summary.count, summary.complete) == (5, False)
-        assert summary.notes == ("the file ends early: its writer did not finish it",)
-
-    @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
-    def test_of_a_compressed_chunk_that_is_cut_what_can_be_decompressed_counts(
-        self, compression: CompressionType, tmp_path: Path
-    ) -> None:
-        messages = [
-            Msg("/noise", STRING, time, random.Random(time).randbytes(4000)) for time in range(300)
-        ]
-        path = write_mcap(
-            tmp_path / "a.mcap", messages, McapLayout(chunk_size=8 << 20, compression=compression)
-        )
-        whole = path.read_bytes()
-        path.write_bytes(whole[: len(whole) // 2])
-        reader = McapReader()
-        summary = reader.summarize(path)
-        assert 60 < summary.count < 240
-        assert not summary.complete
-        assert any("only a part could be read" in note for note in summary.notes)
-        found = read(reader, path, "/noise")
-        assert [r.payload for r in found] == [m.payload for m in messages[: summary.count]]
-
-    def test_a_cut_behind_the_messages_has_lost_none_and_says_so(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(5))
-        path.write_bytes(path.read_bytes()[:-20])
-        summary = McapReader().summarize(path)
-        assert (summary.count, summary.complete) == (5, False)
-        assert summary.notes == ("the file ends early, behind its messages: none is lost",)
-
-    def test_a_few_bytes_are_no_bag_yet(self, tmp_path: Path) -> None:
-        path = tmp_path / "a.mcap"
-        path.write_bytes(b"\x89MCA")
-        assert McapReader().closing(path) is Closing.OPEN
-        with pytest.raises(BagError, match="only its first 4 bytes had reached the disk"):
-            McapReader().summarize(path)
-
-    def test_one_damaged_chunk_of_an_unfinished_file_is_left_out_and_told(
-        self, tmp_path: Path
-    ) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
-        lost = chunks_of(path)[1]
-        spoil_chunk(path, 1)
-        path.write_bytes(path.read_bytes()[:-100])
-        reader = McapReader()
-        summary = reader.summarize(path)
-        kept = set(range(20)) - set(range(lost.message_start_time, lost.message_end_time + 1))
-        assert times(read(reader, path)) == sorted(kept)
-        assert summary.count == len(kept)
-        assert any(note.startswith("1 damaged records were left out") for note in summary.notes)
 
 
 class TestWhatAWriterMayDo:
@@ -462,7 +316,7 @@ class TestBounds:
         assert zstandard.frame_content_size(bomb) == 1 << 56
         for name, data in (("zstd", bomb), ("lz4", lz4.frame.compress(b"x")[:-1]), ("", b"x")):
             path = tmp_path / f"{name or 'none'}.mcap"
-            path.write_bytes(_one_chunk(name, bytes(data)))
+            path.write_bytes(one_chunk(name, bytes(data)))
             reader = McapReader()
             summary = reader.summarize(path)
             assert summary.empty
@@ -471,17 +325,3 @@ class TestBounds:
     def test_folders_of_definitions_that_are_wrong_stop_the_start(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"nowhere is not a folder"):
             McapReader([tmp_path / "nowhere"])
-
-
-def _one_chunk(compression: str, data: bytes) -> bytes:
-    """An MCAP file with one chunk that states 2^60 bytes of content, and no summary."""
-    out = BytesIO()
-    writer = Writer(out, index_types=IndexType.NONE, use_statistics=False, use_chunking=False)
-    writer.start()
-    start = out.tell()
-    writer.finish()
-    name = compression.encode()
-    body = struct.pack("<QQQII", 1, 2, 1 << 60, 0, len(name)) + name
-    body += struct.pack("<Q", len(data)) + data
-    whole = out.getvalue()
-    return whole[:start] + _RECORD.pack(Opcode.CHUNK, len(body)) + body + whole[start:]
