@@ -73,6 +73,8 @@ class RecordingSettings:
 
     bag_dir: AnyPath
     split_duration_s: Count
+    session_duration_s: Positive
+    use_sim_time: Switch
     clear_on_startup: Switch
     topics_file: ConfigFile
 
@@ -112,6 +114,7 @@ class RetentionSettings:
 
     max_total_gb: Positive
     max_age_h: Positive
+    min_free_gb: Tolerance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -175,6 +178,16 @@ class Ros2BagNode(AdapterNode):
     """`recorder=ros2bag`: a supervised `ros2 bag record`."""
 
     target: Literal["ros2_memory.recorder.ros2bag.Ros2BagRecorder"] = Field(alias="_target_")
+    bag_dir: AnyPath
+    topics_file: ConfigFile
+    split_duration_s: Count
+    session_duration_s: Positive
+    use_sim_time: Switch
+    min_free_gb: Tolerance
+    setup_files: tuple[AnyPath, ...]
+    latched_topics: tuple[Text, ...]
+    repeat_latched: tuple[Text, ...]
+    chunk_bytes: Annotated[int, Field(strict=True, ge=1024)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

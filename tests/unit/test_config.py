@@ -57,6 +57,8 @@ class TestDefaults:
             "recording": {
                 "bag_dir": Path("data/bags"),
                 "split_duration_s": 10,
+                "session_duration_s": 600.0,
+                "use_sim_time": False,
                 "clear_on_startup": False,
                 "topics_file": ROOT / "config/topics.yaml",
             },
@@ -77,7 +79,7 @@ class TestDefaults:
                 "chunk_cache_mb": 64,
                 "schemas_file": ROOT / "config/message_schemas.yaml",
             },
-            "retention": {"max_total_gb": 5.0, "max_age_h": 168.0},
+            "retention": {"max_total_gb": 5.0, "max_age_h": 168.0, "min_free_gb": 1.0},
             "server": {
                 "name": "episodic",
                 "transport": "stdio",
@@ -88,7 +90,19 @@ class TestDefaults:
             },
             "logging": {"level": "info", "format": "json"},
             "storage": {"target": MCAP, "custom_msg_paths": (), "cache_mb": 64},
-            "recorder": {"target": ROS2BAG},
+            "recorder": {
+                "target": ROS2BAG,
+                "bag_dir": Path("data/bags"),
+                "topics_file": ROOT / "config/topics.yaml",
+                "split_duration_s": 10,
+                "session_duration_s": 600.0,
+                "use_sim_time": False,
+                "min_free_gb": 1.0,
+                "setup_files": (),
+                "latched_topics": ("/tf_static",),
+                "repeat_latched": (),
+                "chunk_bytes": 16384,
+            },
         }
 
     def test_are_frozen(self) -> None:
