@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.model import TimeWindow
-from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, Ns, unix_from_ns, unix_rounded_up
+from ros2_memory.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    START_SLACK_NS,
+    Ns,
+    unix_from_ns,
+    unix_rounded_up,
+)
 
 if TYPE_CHECKING:
     from ros2_memory.history import View
@@ -122,8 +128,8 @@ def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     older = next(view.stream(topics, TimeWindow.until(window.start - 1), newest_first=True), None)
     newer = next(view.stream(topics, TimeWindow(window.stop, TimeWindow.everything().stop)), None)
     names = " or ".join(topics)
-    end = window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    told = [f"no message of {names} between {moment(window.start)} and {moment(end)}"]
+    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
+    told = [f"no message of {names} between {moment(start)} and {moment(end)}"]
     if older:
         told.append(f"the last one before is at {moment(older.time)}")
     if newer:

@@ -11,7 +11,14 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, TypeAlias
 
 from ros2_memory.errors import InvalidArgumentsError
-from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, Ns, ns_from_unix
+from ros2_memory.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    MIN_NS,
+    START_SLACK_NS,
+    Ns,
+    ns_from_unix,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,8 +41,7 @@ class TimeWindow:
     def from_unix(cls, start_s: float, end_s: float) -> TimeWindow:
         """The window of an inclusive question `[start_s, end_s]` in Unix seconds.
 
-        The end is granted the slack of a float of seconds (see `timebase`), the start twice
-        that: a timestamp fed back as the start was also rounded up past its own message.
+        Both bounds are granted the slack of a float of seconds (see `timebase`).
 
         Raises:
             InvalidArgumentsError: a bound is not finite, or the start is after the end.
@@ -50,8 +56,9 @@ class TimeWindow:
             raise InvalidArgumentsError(
                 f"start ({start_s}) is after end ({end_s}); give the earlier time first"
             )
-        slack = AT_OR_BEFORE_SLACK_NS
-        return cls(max(start - 2 * slack, MIN_NS), min(end + slack + 1, MAX_NS))
+        return cls(
+            max(start - START_SLACK_NS, MIN_NS), min(end + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
+        )
 
     @classmethod
     def everything(cls) -> TimeWindow:

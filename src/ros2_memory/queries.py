@@ -39,6 +39,7 @@ from ros2_memory.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
     MIN_NS,
+    START_SLACK_NS,
     Ns,
     ns_from_unix,
 )
@@ -289,8 +290,7 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Foun
     else:
         limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
         tolerance = ns_argument("tolerance_s", limit)
-    # A timestamp that was fed back lies up to a microsecond, and a float's error, past its message.
-    oldest = MIN_NS if tolerance is None else at - tolerance - 2 * AT_OR_BEFORE_SLACK_NS
+    oldest = MIN_NS if tolerance is None else at - tolerance - START_SLACK_NS
     start = max(oldest, MIN_NS)
     stop = min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
     found = view.newest(topic, TimeWindow(start, stop))
@@ -411,7 +411,8 @@ def _holes(view: View, longest: Ns) -> Iterator[answers.Gap]:
 def _note_edges(view: View, window: TimeWindow) -> None:
     """Says where a window was asked to reach past what the memory can answer."""
     snapshot = view.snapshot
-    if snapshot.earliest is not None and window.start < snapshot.earliest:
+    asked_from = window.start + START_SLACK_NS
+    if snapshot.earliest is not None and asked_from < snapshot.earliest:
         view.note(f"the memory begins at {moment(snapshot.earliest)}")
     if snapshot.latest is not None and window.stop - 1 > snapshot.latest and snapshot.active:
         view.note(

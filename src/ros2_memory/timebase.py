@@ -26,6 +26,8 @@ NS_PER_MS: Final = 1_000_000
 NS_PER_US: Final = 1_000
 AT_OR_BEFORE_SLACK_NS: Final[Ns] = NS_PER_US
 """What "at or before t" forgives, because t went through a float of seconds."""
+START_SLACK_NS: Final[Ns] = 2 * AT_OR_BEFORE_SLACK_NS
+"""What "from t on" forgives: a timestamp fed back was also rounded up past its own message."""
 
 MIN_NS: Final[Ns] = -(2**63)
 MAX_NS: Final[Ns] = 2**63 - 1
