@@ -1,0 +1,104 @@
+"""`recording.clear_on_startup`: deletes the bags, and what stands there because of them.
+
+For simulation and tests. Only files that are known by name are deleted; a directory goes when that
+leaves it empty. Links are not followed, and another file system that is mounted below is left
+alone.
+"""
+
+from __future__ import annotations
+
+import os
+import pwd
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from ros2_memory.errors import RecorderError
+from ros2_memory.recorder.layout import OWN_FILES, RECORDING_FILES
+from ros2_memory.recorder.scan import bag_kind
+
+_SQLITE_COMPANIONS: Final = (".db3-wal", ".db3-shm", ".db3-journal")
+
+
+@dataclass(slots=True)
+class Wiped:
+    """What was deleted, and a sentence for each thing that could not be."""
+
+    files: int = 0
+    bytes: int = 0
+    faults: list[str] = field(default_factory=list)
+
+
+def clear_bags(bag_dir: Path) -> Wiped:
+    """Deletes every bag below the directory.
+
+    Raises:
+        RecorderError: the directory is `/`, a home directory or above one: a mistake, surely.
+    """
+    root = bag_dir.resolve()
+    _refuse_homes(root)
+    wiped = Wiped()
+    with suppress(FileNotFoundError):
+        _clear(root, root.stat().st_dev, wiped, is_root=True)
+    return wiped
+
+
+def _refuse_homes(root: Path) -> None:
+    homes = {Path(entry.pw_dir) for entry in pwd.getpwall() if entry.pw_dir.startswith("/")}
+    with suppress(RuntimeError):
+        homes.add(Path.home())
+    for home in (Path("/"), *sorted(homes)):
+        if home.resolve().is_relative_to(root):
+            raise RecorderError(
+                f"recording.clear_on_startup refuses to delete bags below {root}, which holds "
+                f"{home}; let recording.bag_dir be a directory of its own"
+            )
+
+
+def _clear(directory: Path, device: int, wiped: Wiped, *, is_root: bool) -> None:
+    """Deletes the bags below a directory, and the directory with them if nothing else is in it."""
+    try:
+        with os.scandir(directory) as listing:
+            entries = list(listing)
+    except OSError as error:
+        wiped.faults.append(f"{directory} cannot be listed: {error.strerror}")
+        return
+    had_bags = any(_is_bag(entry) for entry in entries)
+    for entry in entries:
+        if _is_directory(entry, device):
+            _clear(Path(entry.path), device, wiped, is_root=False)
+        elif _is_bag(entry) or _goes_with_bags(entry, is_root=is_root, had_bags=had_bags):
+            _delete(entry, wiped)
+    if had_bags and not is_root:
+        with suppress(OSError):
+            directory.rmdir()
+
+
+def _is_directory(entry: os.DirEntry[str], device: int) -> bool:
+    if entry.name.startswith(".") or not entry.is_dir(follow_symlinks=False):
+        return False
+    return entry.stat(follow_symlinks=False).st_dev == device
+
+
+def _is_bag(entry: os.DirEntry[str]) -> bool:
+    named = bag_kind(entry.name) or entry.name.endswith(_SQLITE_COMPANIONS)
+    return bool(named) and entry.is_file(follow_symlinks=False)
+
+
+def _goes_with_bags(entry: os.DirEntry[str], *, is_root: bool, had_bags: bool) -> bool:
+    names = (OWN_FILES if is_root else frozenset()) | (RECORDING_FILES if had_bags else frozenset())
+    return entry.name in names and entry.is_file(follow_symlinks=False)
+
+
+def _delete(entry: os.DirEntry[str], wiped: Wiped) -> None:
+    try:
+        size = entry.stat(follow_symlinks=False).st_size
+        Path(entry.path).unlink()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        wiped.faults.append(f"{entry.path} cannot be deleted: {error.strerror}")
+        return
+    wiped.files += 1
+    wiped.bytes += size
