@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-_PIECE: Final = 1 << 20
+# As large as a block: what stands before a damaged one is not lost with it.
+_PIECE: Final = zstandard.DECOMPRESSION_RECOMMENDED_OUTPUT_SIZE
 
 
 def closing_of_zstd(path: Path) -> Closing:
