@@ -34,6 +34,7 @@ MAX_NESTING: Final = 40
 MAX_UNROLLED: Final = 5_000
 """Elements of fixed arrays of strings or messages: rosbags writes a line of code for each."""
 _CACHED_TYPES: Final = 4_096
+_REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
 _SERVICE: Final = re.compile(r"^---[ \t]*$", re.MULTILINE)
@@ -110,7 +111,7 @@ class Typestores:
             definitions = self._closure(root, _sections(root, encoding, text))
             store = _compiled(definitions, root)
         except _UnusableError as error:
-            return MessageType(name, None, str(error))
+            return MessageType(name, None, " ".join(str(error).split())[:_REASON_LENGTH])
 
         def deserialize(payload: bytes) -> object:
             return store.deserialize_cdr(payload, root)

@@ -6,6 +6,7 @@ import json
 from typing import TYPE_CHECKING
 
 from ros2_memory.errors import UndecodableError
+from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.zstd import FRAME_MAGIC
 from ros2_memory.typestore import Typestores
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Channel, Record
 
 _MAX_KNOWN = 10_000
+_EMPTY_MESSAGE_BYTES = 8
+"""CDR's header, the byte that stands for no fields, and padding."""
 
 
 class Decoding:
@@ -75,7 +78,21 @@ class Decoding:
         found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
         if found.deserialize is None:
             return found.reason or "its definition cannot be used"
-        return found.deserialize
+        return _of_nothing(found.deserialize) if found.fieldless else found.deserialize
+
+
+def _of_nothing(deserialize: Callable[[bytes], object]) -> Callable[[bytes], object]:
+    """For a type whose definition is empty, which may also mean that its text was not found."""
+
+    def decode(payload: bytes) -> object:
+        if len(payload) > _EMPTY_MESSAGE_BYTES:
+            raise UnreadableError(
+                "the definition in the bag is empty and the message is not; put the package's .msg"
+                " folder into reader.custom_msg_paths"
+            )
+        return deserialize(payload)
+
+    return decode
 
 
 def _why(record: Record, error: Exception) -> str:

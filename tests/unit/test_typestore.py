@@ -1,0 +1,328 @@
+from __future__ import annotations
+
+import shutil
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from ros2_memory.errors import ConfigError
+from ros2_memory.typestore import MAX_NESTING, MAX_TEXT_BYTES, MessageType, Typestores
+from tests.bags import VISION_DEFINITIONS, definition, detections, odom, text, typestore
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.bags import Msg
+
+RULE = "=" * 80
+CDR = b"\x00\x01\x00\x00"
+
+
+def decoded(found: MessageType, payload: bytes) -> object:
+    assert found.reason is None
+    assert found.deserialize is not None
+    return found.deserialize(payload)
+
+
+def reason(found: MessageType) -> str:
+    assert found.deserialize is None
+    assert found.reason
+    assert "\n" not in found.reason
+    assert len(found.reason) < 400
+    return found.reason
+
+
+def oracle(message: Msg) -> str:
+    return repr(typestore().deserialize_cdr(message.payload, message.type))
+
+
+def lookup(name: str, definition_text: str, encoding: str = "ros2msg") -> MessageType:
+    return Typestores().lookup(name, encoding, definition_text.encode())
+
+
+@pytest.fixture
+def vision(tmp_path: Path) -> Path:
+    """The folder of the package `ros2_vision_interfaces`."""
+    folder = tmp_path / "ros2_vision_interfaces"
+    (folder / "msg").mkdir(parents=True)
+    for name, message_text in VISION_DEFINITIONS.items():
+        (folder / "msg" / f"{name.rsplit('/', 1)[1]}.msg").write_text(message_text)
+    return folder
+
+
+class TestOrder:
+    def test_the_definition_inside_the_bag_counts_first(self, vision: Path) -> None:
+        name = "ros2_vision_interfaces/msg/StampedString"
+        found = Typestores([vision]).lookup(name, "ros2msg", b"uint8 only\n")
+        assert getattr(decoded(found, CDR + b"\x07"), "only", None) == 7
+
+    def test_then_the_configured_folders(self, vision: Path) -> None:
+        message = detections(1, ["cup", "scissors"])
+        found = Typestores([vision]).lookup(message.type, "", b"")
+        assert repr(decoded(found, message.payload)) == oracle(message)
+
+    def test_a_folder_counts_before_the_standard_types(self, tmp_path: Path) -> None:
+        folder = tmp_path / "std_msgs" / "msg"
+        folder.mkdir(parents=True)
+        (folder / "String.msg").write_text("uint8 length\n")
+        found = Typestores([tmp_path]).lookup("std_msgs/msg/String", "", b"")
+        assert getattr(decoded(found, CDR + b"\x09"), "length", None) == 9
+
+    def test_then_the_standard_types(self) -> None:
+        message = odom(1, 2.0, 3.0)
+        found = Typestores().lookup(message.type, "", b"")
+        assert repr(decoded(found, message.payload)) == oracle(message)
+
+    def test_what_is_nowhere_names_the_key_to_set(self) -> None:
+        why = reason(Typestores().lookup("nowhere_msgs/msg/Oddity", "", b""))
+        assert "reader.custom_msg_paths" in why
+
+    def test_a_missing_part_is_named_with_what_it_is_part_of(self) -> None:
+        why = reason(lookup("a_msgs/msg/A", "b_msgs/B part\n"))
+        assert "its part b_msgs/msg/B (in a_msgs/msg/A) has no definition" in why
+
+    def test_parts_that_the_bag_does_not_define_come_from_folders_and_standard(
+        self, vision: Path
+    ) -> None:
+        message = detections(1, ["cup"])
+        root_only = VISION_DEFINITIONS[message.type].encode()
+        found = Typestores([vision]).lookup(message.type, "ros2msg", root_only)
+        assert repr(decoded(found, message.payload)) == oracle(message)
+
+    def test_two_bags_that_define_a_type_differently_are_each_read_with_their_own(self) -> None:
+        stores = Typestores()
+        payload = CDR + bytes([1, 2, 0, 0])
+        one = stores.lookup("a_msgs/msg/A", "ros2msg", b"uint8 x\nuint8 y\n")
+        other = stores.lookup("a_msgs/msg/A", "ros2msg", b"uint16 both\n")
+        first, second = decoded(one, payload), decoded(other, payload)
+        assert (getattr(first, "x", None), getattr(first, "y", None)) == (1, 2)
+        assert getattr(second, "both", None) == 0x0201
+        assert stores.lookup("a_msgs/msg/A", "ros2msg", b"uint16 both\n") is other
+
+
+class TestTexts:
+    @pytest.mark.parametrize(
+        "message", [odom(1, 2.0, 3.0, 0.5), text(1, "héllo"), detections(1, ["a", "b"])]
+    )
+    def test_texts_as_the_recorder_writes_them(self, message: Msg) -> None:
+        found = lookup(message.type, definition(message.type))
+        assert repr(decoded(found, message.payload)) == oracle(message)
+
+    def test_every_standard_type_decodes_from_its_own_text(self) -> None:
+        standard = get_typestore(Stores.ROS2_JAZZY)
+        names = [
+            "sensor_msgs/msg/LaserScan",
+            "sensor_msgs/msg/PointCloud2",
+            "diagnostic_msgs/msg/DiagnosticArray",
+            "visualization_msgs/msg/MarkerArray",
+            "rcl_interfaces/msg/ParameterEvent",
+            "std_msgs/msg/Empty",
+        ]
+        for name in names:
+            whole = standard.generate_msgdef(name, ros_version=2)[0]
+            assert lookup(name, whole).reason is None, name
+
+    def test_windows_line_ends_a_byte_order_mark_and_odd_bytes_do_no_harm(self) -> None:
+        whole = "\ufeff# caf\u00e9\r\nuint8 x # \u00e9\r\nOther other\r\n"
+        whole += f"{RULE}\r\nMSG: a_msgs/Other\r\nuint8 y\r\n"
+        raw = whole.encode() + b"# \xff\xfe\r\n"
+        found = Typestores().lookup("a_msgs/msg/A", "ros2msg", raw)
+        message = decoded(found, CDR + b"\x01\x02")
+        assert getattr(getattr(message, "other", None), "y", None) == 2
+
+    def test_a_short_type_name_is_the_same_type(self) -> None:
+        message = text(1, "x")
+        assert repr(decoded(lookup("std_msgs/String", ""), message.payload)) == oracle(message)
+
+    def test_idl_as_the_recorder_writes_it(self) -> None:
+        whole = f"""{RULE}
+IDL: a_msgs/msg/A
+// generated from rosidl_adapter/resource/msg.idl.em
+#include "a_msgs/msg/B.idl"
+module a_msgs {{
+  module msg {{
+    module A_Constants {{
+      @verbatim (language="comment", text="no (real) comment" "\\n" "--- more")
+      const octet LIMIT = 5;
+      const string NAME = "a (b)";
+    }};
+    @verbatim (language="comment", text=
+      "A is (nested (twice))")
+    struct A {{
+      @unit (value="m")
+      double x;
+      /* of parts */ sequence<a_msgs::msg::B, 4> parts;
+      @default (value=7)
+      long corners[2];
+    }};
+  }};
+}};
+{RULE}
+IDL: a_msgs/msg/B
+module a_msgs {{ module msg {{ struct B {{ octet value; string name; }}; }}; }};
+"""
+        found = lookup("a_msgs/msg/A", whole, "ros2idl")
+        same = lookup(
+            "a_msgs/msg/A",
+            f"float64 x\nB[<=4] parts\nint32[2] corners\n{RULE}\nMSG: a_msgs/B\nbyte value\n"
+            "string name\n",
+        )
+        payload = CDR + np.array([1.5]).tobytes() + b"\x01\0\0\0\x05\0\0\0\x03\0\0\0hi\0\0"
+        payload += np.array([8, 9], dtype=np.int32).tobytes()
+        message = decoded(found, payload)
+        plain = decoded(same, payload)
+        for field in ("x", "parts", "corners"):
+            assert repr(getattr(message, field)) == repr(getattr(plain, field))
+        assert list(getattr(message, "corners", ())) == [8, 9]
+
+    def test_a_text_that_cannot_be_parsed_says_so(self) -> None:
+        assert "cannot be parsed" in reason(lookup("a_msgs/msg/A", "FROM ros:jazzy AS base\n"))
+
+    def test_other_schema_languages_are_named(self) -> None:
+        assert "'flatbuffer' is not read" in reason(lookup("a_msgs/msg/A", "x", "flatbuffer"))
+
+    @pytest.mark.parametrize(
+        ("whole", "kind"),
+        [
+            ("bool ask\n---\nbool answer\n", "a service definition; service events"),
+            ("int8 goal\n---\nint8 result\n---\nint8 feedback\n", "an action definition"),
+        ],
+    )
+    def test_services_and_actions_are_refused_as_what_they_are(self, whole: str, kind: str) -> None:
+        assert kind in reason(lookup("a_msgs/srv/A_Event", whole))
+
+    def test_a_type_without_fields_is_told_from_one_whose_text_was_not_found(self) -> None:
+        empty = lookup("a_msgs/msg/Nothing", "")
+        assert empty.fieldless
+        assert decoded(empty, CDR + b"\0") is not None
+        assert not lookup("std_msgs/msg/String", "").fieldless
+        assert reason(lookup("a_msgs/msg/Nothing", "", ""))
+
+
+class TestHostileDefinitions:
+    def test_a_definition_that_contains_itself(self) -> None:
+        assert "contains itself" in reason(lookup("a_msgs/msg/A", "A inner\n"))
+        loop = f"B b\n{RULE}\nMSG: a_msgs/B\nC[] c\n{RULE}\nMSG: a_msgs/C\nA a\n"
+        assert "contains itself" in reason(lookup("a_msgs/msg/A", loop))
+
+    def test_a_definition_that_nests_without_end(self) -> None:
+        parts = [f"{RULE}\nMSG: a_msgs/A{n}\nA{n + 1} a\n" for n in range(3000)]
+        whole = "A0 a\n" + "".join(parts) + f"{RULE}\nMSG: a_msgs/A3000\nuint8 x\n"
+        assert f"more than {MAX_NESTING} levels" in reason(lookup("a_msgs/msg/A", whole))
+
+    def test_nesting_up_to_the_bound_is_read(self) -> None:
+        depth = MAX_NESTING - 1
+        parts = [f"{RULE}\nMSG: a_msgs/A{n}\nA{n + 1} a\n" for n in range(depth)]
+        whole = "A0 a\n" + "".join(parts) + f"{RULE}\nMSG: a_msgs/A{depth}\nuint8 x\n"
+        assert lookup("a_msgs/msg/A", whole).reason is None
+
+    def test_a_definition_larger_than_any(self) -> None:
+        assert "larger than" in reason(lookup("a_msgs/msg/A", "#" * (MAX_TEXT_BYTES + 1)))
+
+    def test_a_definition_of_more_lines_than_any(self) -> None:
+        whole = "\n".join(f"uint8 f{n}" for n in range(20_000))
+        assert "too many" in reason(lookup("a_msgs/msg/A", whole))
+
+    def test_comments_do_not_count_as_lines(self) -> None:
+        assert lookup("a_msgs/msg/A", "# comment\n\n" * 20_000 + "uint8 x\n").reason is None
+
+    @pytest.mark.parametrize("field", ["string[2000000000] s", "Point[1000000] p"])
+    def test_fixed_arrays_that_would_be_spelled_out(self, field: str) -> None:
+        whole = f"{field}\n{RULE}\nMSG: a_msgs/Point\nfloat64 x\n"
+        assert "fixed arrays" in reason(lookup("a_msgs/msg/A", whole))
+
+    def test_a_large_array_of_numbers_costs_nothing_until_a_payload_holds_it(self) -> None:
+        found = lookup("a_msgs/msg/A", "float64[2000000000] x\n")
+        assert found.deserialize is not None
+        with pytest.raises(Exception, match="deserialize"):
+            found.deserialize(CDR + bytes(16))
+
+    @pytest.mark.parametrize(
+        "statement",
+        [
+            "const long X = ((((((1))))));",
+            "const long X = 1 << 99999999999;",
+            "struct A { sequence<sequence<sequence<sequence<long>>>> x; };",
+        ],
+    )
+    def test_idl_on_which_the_parser_would_not_come_to_an_end(self, statement: str) -> None:
+        whole = f"module a_msgs {{ module msg {{ {statement} struct A {{ long y; }}; }}; }};"
+        assert "is not read" in reason(lookup("a_msgs/msg/A", whole, "ros2idl"))
+
+    @pytest.mark.parametrize(
+        "name", ["", "/", "a//b", "a_msgs/msg/A\nuint8 x", "../../etc/passwd", "a" * 100_000]
+    )
+    def test_names_that_are_none(self, name: str) -> None:
+        found = lookup(name, "uint8 x\n")
+        assert found.reason is None or len(found.reason) < 400
+
+    def test_code_in_a_definition_is_not_run(self) -> None:
+        for whole in (
+            'string X="""\\n__import__("os").abort()\n',
+            "uint8 x = __import__('os').abort()\n",
+            "uint8 __import__('os').abort()\n",
+            "string X='''+__import__('os').abort()+'''\n",
+        ):
+            found = lookup("a_msgs/msg/A", whole)
+            assert found.reason is None or "its definition" in found.reason
+
+    def test_the_failure_of_one_type_leaves_the_others(self) -> None:
+        stores = Typestores()
+        assert stores.lookup("a_msgs/msg/A", "ros2msg", b"A a\n").reason
+        message = text(1, "x")
+        found = stores.lookup(message.type, "ros2msg", definition(message.type).encode())
+        assert repr(decoded(found, message.payload)) == oracle(message)
+
+
+class TestFolders:
+    def test_a_package_a_folder_of_packages_and_an_installed_tree_are_all_found(
+        self, vision: Path, tmp_path: Path
+    ) -> None:
+        installed = tmp_path / "install" / "share" / vision.name
+        shutil.copytree(vision, installed)
+        for path in (vision, vision.parent, str(vision), tmp_path / "install"):
+            found = Typestores([path]).lookup("ros2_vision_interfaces/msg/VisionDetection", "", b"")
+            assert found.reason is None
+
+    def test_the_name_in_package_xml_counts_before_the_folders(self, vision: Path) -> None:
+        (vision / "package.xml").write_text("<package><name>other_msgs</name></package>")
+        stores = Typestores([vision])
+        assert stores.lookup("other_msgs/msg/StampedString", "", b"").reason is None
+        assert stores.lookup("ros2_vision_interfaces/msg/StampedString", "", b"").reason
+
+    def test_the_first_of_two_folders_counts(self, tmp_path: Path) -> None:
+        for number, field in enumerate(("uint8 x", "uint8 y")):
+            folder = tmp_path / str(number) / "a_msgs" / "msg"
+            folder.mkdir(parents=True)
+            (folder / "A.msg").write_text(field)
+        found = Typestores([tmp_path / "0", tmp_path / "1"]).lookup("a_msgs/msg/A", "", b"")
+        assert getattr(decoded(found, CDR + b"\x03"), "x", None) == 3
+
+    def test_a_wrong_path_stops_the_start_and_is_named(self, tmp_path: Path) -> None:
+        missing = tmp_path / "missing"
+        with pytest.raises(ConfigError, match=r"custom_msg_paths: .*missing is not a folder"):
+            Typestores([missing])
+        missing.mkdir()
+        with pytest.raises(ConfigError, match=r"missing holds no msg/\*\.msg file"):
+            Typestores([missing])
+
+
+def test_threads_that_look_up_at_once_get_one_type() -> None:
+    stores = Typestores()
+    messages = [odom(1, 2.0, 3.0), detections(1, ["cup"]), text(1, "x")]
+    answers: list[tuple[str, str]] = []
+
+    def ask() -> None:
+        for message in messages:
+            found = stores.lookup(message.type, "ros2msg", definition(message.type).encode())
+            answers.append((message.type, repr(decoded(found, message.payload))))
+
+    threads = [threading.Thread(target=ask) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(answers) == sorted((m.type, oracle(m)) for m in messages * 8)
