@@ -73,8 +73,8 @@ def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended
             (
                 "[WARN] [1.5] [rosbag2_recorder]: A new publisher for subscribed topic /scan was "
                 "found offering RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT, but rosbag already "
-                "subscribed requesting RMW_QOS_POLICY_RELIABILITY_RELIABLE. Messages from this new publisher "
-                "will not be recorded."
+                "subscribed requesting RMW_QOS_POLICY_RELIABILITY_RELIABLE. Messages from this "
+                "new publisher will not be recorded."
             ),
             Said.QOS_REFUSED,
             "/scan",
