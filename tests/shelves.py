@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 import zstandard
 from mcap.writer import CompressionType, IndexType
 
+from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.bags import McapLayout, Msg, write_db3, write_mcap
@@ -152,5 +153,12 @@ ROSBAG2: Final = [
         keeps_publish_time=False,
     ),
 ]
-FILES: Final = MCAP + ROSBAG2
+COUNTING: Final = [
+    Shelf(
+        "counting: mcap",
+        lambda: CountingReader(McapReader()),
+        partial(_mcap, McapLayout(chunk_size=200)),
+    )
+]
+FILES: Final = MCAP + ROSBAG2 + COUNTING
 ALL: Final = [Shelf("fake", FakeReader, partial(_mcap, McapLayout())), *FILES]
