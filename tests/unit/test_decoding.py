@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from tests.bags import Msg
 
 
+CDR = b"\x00\x01\x00\x00"
+
+
 def record_of(message: Msg, schema: Schema | None = None) -> Record:
     given = schema or Schema(message.type, "ros2msg", definition(message.type).encode())
     return Record(Channel(message.topic, "cdr", given), 1, 1, message.payload)

@@ -53,8 +53,7 @@ class McapBags:
 
     def __init__(self, cache_mb: int = 64, max_chunk_mb: int = 256) -> None:
         self._max_chunk_bytes = max_chunk_mb << 20
-        self._indexes: ByteLru[McapIndex] = ByteLru((cache_mb << 20) // 8)
-        self._columns: ByteLru[Column] = ByteLru((cache_mb << 20) * 3 // 8)
+        self._found: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self._shared: Shared[Channel] = Shared()
 
@@ -129,30 +128,30 @@ class McapBags:
             yield Run(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
 
     def _index(self, file: OpenFile) -> McapIndex:
-        index = self._indexes.get(file.key)
-        if index is None:
+        index = self._found.get(file.key)
+        if not isinstance(index, McapIndex):
             index = _index_of(file, self._max_chunk_bytes)
             shared = {number: self._shared.of(each) for number, each in index.channels.items()}
             index = replace(index, channels=shared)
-            self._indexes.put(file.key, index, index.bytes_held)
+            self._found.put(file.key, index, index.bytes_held)
         return index
 
     def _chunk_columns(self, file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> list[Column]:
         columns: list[Column] = []
         missing: list[int] = []
         for channel in chunk.channels.intersection(wanted):
-            column = self._columns.get((file.key, chunk.offset, channel))
-            if column is None:
-                missing.append(channel)
-            else:
+            column = self._found.get((file.key, chunk.offset, channel))
+            if isinstance(column, Column):
                 columns.append(column)
+            else:
+                missing.append(channel)
         if missing:
             if chunk.index_offsets is not None:
                 read = chunk_columns(file, chunk, missing)
             else:
                 read = walk(self._chunk_data(file, chunk)).columns
-            for channel, column in read.items():
-                self._columns.put((file.key, chunk.offset, channel), column, column.bytes_held)
+            for channel, found in read.items():
+                self._found.put((file.key, chunk.offset, channel), found, found.bytes_held)
             columns += [read[channel] for channel in missing]
         return columns
 

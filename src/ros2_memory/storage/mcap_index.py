@@ -173,9 +173,8 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     found = {channel: total.count for channel, total in totals.items()}
     if found != stated.counts or sum(found.values()) != stated.messages:
         raise DoubtError
-    notes = () if exact else (disagreement(stated, totals.values()),)
     held = tuple(chunk for chunk in chunks if chunk.channels)
-    return McapIndex(channels, held, totals, notes=notes)
+    return McapIndex(channels, held, totals, notes=disagreements(stated, totals))
 
 
 def _summary(file: OpenFile) -> tuple[Declarations, list[ChunkIndex], Statistics | None]:
@@ -284,17 +283,21 @@ def add_column(totals: dict[int, Total], channel: int, column: Column) -> None:
     total.last = max(total.last, last)
 
 
-def disagreement(stated: Statistics, totals: Iterable[Total]) -> str:
-    """The note on statistics that the messages contradict."""
-    found = list(totals)
-    span = "none"
-    if found:
-        first, last = min(total.first for total in found), max(total.last for total in found)
-        span = f"{sum(t.count for t in found)} from {_seconds(first)} to {_seconds(last)}"
-    return (
+def disagreements(stated: Statistics, totals: Mapping[int, Total]) -> tuple[str, ...]:
+    """A note where the messages contradict the statistics."""
+    counts = {channel: total.count for channel, total in totals.items()}
+    count = sum(counts.values())
+    first = min((total.first for total in totals.values()), default=stated.start)
+    last = max((total.last for total in totals.values()), default=stated.end)
+    claimed = (stated.messages, stated.start, stated.end)
+    if stated.counts == counts and claimed == (count, first, last):
+        return ()
+    note = (
         f"its own statistics are wrong: they state {stated.messages} messages from"
-        f" {_seconds(stated.start)} to {_seconds(stated.end)}; it holds {span}"
+        f" {_seconds(stated.start)} to {_seconds(stated.end)}; it holds {count} from"
+        f" {_seconds(first)} to {_seconds(last)}"
     )
+    return (note,)
 
 
 def _seconds(moment: Ns) -> str:

@@ -28,7 +28,7 @@ from ros2_memory.storage.mcap_index import (
     McapIndex,
     Total,
     add_column,
-    disagreement,
+    disagreements,
 )
 from ros2_memory.storage.mcap_records import (
     MAGIC_SIZE,
@@ -230,8 +230,8 @@ class _Scan:
         if self.messages > counted:
             notes.append(f"{self.messages - counted} messages bear no possible log time")
         # Where something was left out, the statistics count it rightly.
-        if self.stated is not None and not notes and not _agree(self.stated, known):
-            notes.append(disagreement(self.stated, known.values()))
+        if self.stated is not None and not notes:
+            notes.extend(disagreements(self.stated, known))
         return notes
 
     def _end_note(self) -> str:
@@ -250,13 +250,3 @@ class _Scan:
 
 def _held(columns: dict[int, Column]) -> dict[int, Column]:
     return {channel: column for channel, column in columns.items() if column.times.size}
-
-
-def _agree(stated: Statistics, totals: dict[int, Total]) -> bool:
-    counts = {channel: total.count for channel, total in totals.items()}
-    if stated.counts != counts or stated.messages != sum(counts.values()):
-        return False
-    if not totals:
-        return True
-    first = min(total.first for total in totals.values())
-    return (stated.start, stated.end) == (first, max(t.last for t in totals.values()))
