@@ -98,10 +98,11 @@ def test_what_one_storage_does_not_read_the_other_does() -> None:
 
 
 @needs_real
-def test_of_a_public_pair_of_forms_one_is_indexed_and_a_text_file_is_damaged() -> None:
+def test_both_forms_of_a_public_pair_are_indexed_and_a_text_file_is_damaged() -> None:
     snapshot = _scan(REAL / "tiryoh_small_and_truncated", Rosbag2Reader())
     assert sorted(_states(snapshot)) == [
         ("test_sample.mcap", BagState.CLOSED),
+        ("test_sample.mcap.zstd", BagState.CLOSED),
         ("test_sample_no_rosout.mcap", BagState.CLOSED),
         ("test_sample_truncated.mcap", BagState.INCOMPLETE),
     ]

@@ -115,6 +115,7 @@ class IndexManager:
         self._verdicts: dict[str, Verdict] = {}
         self._counted: dict[str, Verdict] = {}  # of x.mcap and x.mcap.zstd only one
         self._set_aside: dict[str, Verdict] = {}  # those of `_counted` that are no bags
+        self._hidden: set[str] = set()  # the other form answers for these, for the time being
         self._watched: set[str] = set()
         self._patrol: list[str] = []
         self._odd = _Oddities()
@@ -126,7 +127,8 @@ class IndexManager:
         try:
             walked = self._tree.walk(scene.now, [*self._watched, *self._next_on_patrol()])
             changed = self._forget(walked.gone) | self._examine(walked.looked_at, scene)
-            removed, added = self._recount(changed)
+            removed, added = self._recount(changed | self._hidden, scene)
+            changed |= {str(bag.path) for bag in (*removed, *added)}
             self._timeline = self._timeline.changed(removed, added)
         except BaseException:
             # The walk does not show a second time what it has shown once.
@@ -190,11 +192,11 @@ class IndexManager:
                 changed.add(path)
         return changed
 
-    def _recount(self, changed: Iterable[str]) -> tuple[list[BagFile], list[BagFile]]:
+    def _recount(self, changed: Iterable[str], scene: Scene) -> tuple[list[BagFile], list[BagFile]]:
         """Brings `_counted` up to date; gives the bags that left it and those that came."""
         removed, added = [], []
         for path in {form for each in changed for form in (each, _other_form(each))}:
-            before, after = self._counted.pop(path, None), self._verdict_that_counts(path)
+            before, after = self._counted.pop(path, None), self._verdict_that_counts(path, scene)
             self._set_aside.pop(path, None)
             if after is not None:
                 self._counted[path] = after
@@ -208,17 +210,26 @@ class IndexManager:
                 added.append(after.bag)
         return removed, added
 
-    def _verdict_that_counts(self, path: str) -> Verdict | None:
+    def _verdict_that_counts(self, path: str, scene: Scene) -> Verdict | None:
         """The file's verdict; None where it is unknown, or its other form answers for it.
 
-        While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice.
+        While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Two
+        whole ones that have lain there for three splits are two files that somebody keeps.
         """
-        own = self._verdicts.get(path)
-        other = self._verdicts.get(_other_form(path))
+        self._hidden.discard(path)
+        own, other = self._verdicts.get(path), self._verdicts.get(_other_form(path))
         if own is None or other is None or own.standing > other.standing:
             return own
-        plain = not path.endswith(_COMPRESSED)
-        return own if plain and own.standing == other.standing else None
+        if own.standing == other.standing:
+            kept = own.standing is Standing.CLOSED and not self._being_compressed(path, scene)
+            if kept or not path.endswith(_COMPRESSED):
+                return own
+        self._hidden.add(path)
+        return None
+
+    def _being_compressed(self, path: str, scene: Scene) -> bool:
+        forms = [self._files[form] for form in (path, _other_form(path)) if form in self._files]
+        return any(notes.grew_lately(scene) for notes in forms)
 
     def _compose(self, now: Ns) -> Snapshot:
         timeline = self._timeline
