@@ -26,17 +26,24 @@ class UnreadableError(Exception):
     """Bytes of a bag that cannot be read; the text is the reason, without the file's name."""
 
 
-class reading:  # noqa: N801 - reads as a statement: `with reading(path):`
-    """Raises only `EpisodicError`, about `path`, whatever is raised inside the block.
+def reading(path: Path) -> _Reading:
+    """A context that raises only `EpisodicError`, about `path`, whatever is raised inside it.
 
-    A class and not a generator: it is entered for every query of every bag.
+    Raises:
+        BagVanishedError: the file or a folder above it is gone.
+        BagError: anything else; it ends on the reason.
     """
+    return _Reading(path)
+
+
+class _Reading:
+    # A class and not a generator: it is entered for every query of every bag.
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def __enter__(self) -> None:
-        """Nothing is opened."""
+        pass
 
     def __exit__(
         self,
@@ -44,12 +51,6 @@ class reading:  # noqa: N801 - reads as a statement: `with reading(path):`
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Translates.
-
-        Raises:
-            BagVanishedError: the file or a folder above it is gone.
-            BagError: anything else; it ends on the reason.
-        """
         if not isinstance(error, Exception) or isinstance(error, EpisodicError):
             return
         if isinstance(error, OSError) and error.errno in _GONE:

@@ -25,6 +25,8 @@ from ros2_memory.timebase import MAX_NS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from ros2_memory.storage.open_file import OpenFile
+
 Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
@@ -157,16 +159,36 @@ class ChunkHead(NamedTuple):
     data_at: int
 
 
-CHUNK_HEAD_BYTES: Final = 96
+_CHUNK_HEAD_BYTES: Final = 96
 """As much of a chunk record's body as holds its fields, whatever its compression is called."""
 
 
-def chunk_head(body: bytes) -> ChunkHead:
-    """The fields of a chunk record, from the beginning of its body.
+def packed_chunk(
+    file: OpenFile, body_at: int, body_size: int, max_bytes: int
+) -> tuple[ChunkHead, bytes]:
+    """The fields of a chunk record, and its data as far as the body reaches.
+
+    Args:
+        file: the open file.
+        body_at: where the record's body begins.
+        body_size: how much of the body there is.
+        max_bytes: what a chunk may hold.
 
     Raises:
-        UnreadableError: that is not enough of it.
+        UnreadableError: the fields are not all there, or the data are larger than allowed.
     """
+    head = _chunk_head(file.read(body_at, min(body_size, _CHUNK_HEAD_BYTES)))
+    if head.data_size > max_bytes:
+        raise _too_large(max_bytes)
+    held = min(body_size - head.data_at, head.data_size)
+    return head, file.read(body_at + head.data_at, held)
+
+
+def _too_large(max_bytes: int) -> UnreadableError:
+    return UnreadableError(f"a chunk is larger than the {max_bytes >> 20} MiB allowed")
+
+
+def _chunk_head(body: bytes) -> ChunkHead:
     if len(body) < CHUNK_TIMES.size + 12:
         raise UnreadableError("damaged: a chunk ends inside its own header")
     crc: int = CHUNK_TIMES.unpack_from(body)[3]
@@ -187,9 +209,11 @@ def unpacked(head: ChunkHead, packed: bytes, max_bytes: int) -> bytes:
     Raises:
         UnreadableError: it is damaged, larger than `max_bytes`, or in a compression not known.
     """
+    if len(packed) != head.data_size:
+        raise UnreadableError("damaged: a chunk is shorter than it states")
     data = _decompressed(head.compression, packed, max_bytes)
     if len(data) > max_bytes:
-        raise UnreadableError(f"a chunk is larger than the {max_bytes >> 20} MiB allowed")
+        raise _too_large(max_bytes)
     if head.crc and zlib.crc32(data) != head.crc:
         raise UnreadableError("damaged: a chunk does not match its checksum")
     return data

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.storage.faults import UnreadableError, damage
 from ros2_memory.storage.mcap_chunk import (
-    CHUNK_HEAD_BYTES,
     Column,
-    chunk_head,
     columns_from_index,
+    packed_chunk,
     unpacked,
     unpacked_in_part,
 )
@@ -133,14 +132,10 @@ def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
         UnreadableError: the chunk is damaged or larger than `max_bytes`.
     """
     body_at, body_size = chunk.offset + RECORD.size, chunk.length - RECORD.size
-    head = chunk_head(file.read(body_at, min(body_size, CHUNK_HEAD_BYTES)))
-    held = body_size - head.data_at
+    head, packed = packed_chunk(file, body_at, body_size, max_bytes)
     if chunk.usable is not None:
-        packed = file.read(body_at + head.data_at, min(held, head.data_size))
         return unpacked_in_part(head, packed, max_bytes)[: chunk.usable]
-    if head.data_size > held:
-        raise UnreadableError("damaged: a chunk is shorter than it states")
-    return unpacked(head, file.read(body_at + head.data_at, head.data_size), max_bytes)
+    return unpacked(head, packed, max_bytes)
 
 
 def index_from_summary(file: OpenFile) -> McapIndex:

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.faults import UnreadableError, damage
 from ros2_memory.storage.mcap_chunk import (
-    CHUNK_HEAD_BYTES,
     Walked,
-    chunk_head,
     column_of,
+    packed_chunk,
     unpacked,
     unpacked_in_part,
     walk,
@@ -43,7 +42,7 @@ from ros2_memory.storage.mcap_records import (
 from ros2_memory.storage.open_file import EMPTY_FILE
 
 if TYPE_CHECKING:
-    from ros2_memory.storage.mcap_chunk import Column
+    from ros2_memory.storage.mcap_chunk import ChunkHead, Column
     from ros2_memory.storage.open_file import OpenFile
 
 _BLOCK: Final = 256 * 1024
@@ -138,13 +137,8 @@ class _Scan:
         return self.file.read(start, end - start)
 
     def _whole_chunk(self, end: int) -> None:
-        body_at = self.position + RECORD.size
-        head = chunk_head(self.file.read(body_at, min(CHUNK_HEAD_BYTES, end - body_at)))
-        if body_at + head.data_at + head.data_size > end:
-            raise UnreadableError("damaged: a chunk is shorter than it states")
-        packed = self.file.read(body_at + head.data_at, head.data_size)
         with damage():
-            data = unpacked(head, packed, self.max_chunk_bytes)
+            data = unpacked(*self._packed(end), self.max_chunk_bytes)
         walked = walk(data)
         if walked.usable < len(data):
             self.damaged.append("damaged: a chunk holds something that is no record")
@@ -152,11 +146,8 @@ class _Scan:
 
     def _cut_chunk(self, size: int) -> None:
         """The chunk inside which the file ends."""
-        body_at = self.position + RECORD.size
         try:
-            head = chunk_head(self.file.read(body_at, min(CHUNK_HEAD_BYTES, size - body_at)))
-            held = size - body_at - head.data_at
-            packed = self.file.read(body_at + head.data_at, min(held, head.data_size))
+            head, packed = self._packed(size)
             with damage():
                 walked = walk(unpacked_in_part(head, packed, self.max_chunk_bytes))
         except UnreadableError:
@@ -168,7 +159,11 @@ class _Scan:
             self.partial = size - self.position
             self.position = size
         else:
-            self.position = body_at + head.data_at + walked.usable
+            self.position += RECORD.size + head.data_at + walked.usable
+
+    def _packed(self, end: int) -> tuple[ChunkHead, bytes]:
+        body_at = self.position + RECORD.size
+        return packed_chunk(self.file, body_at, end - body_at, self.max_chunk_bytes)
 
     def _take(self, walked: Walked, end: int, usable: int | None) -> None:
         for opcode, body in walked.declarations:
