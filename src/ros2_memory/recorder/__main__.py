@@ -1,0 +1,89 @@
+"""The recorder daemon: `ros2-memory-recorder [KEY=VALUE ...]`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from ros2_memory.adapters import build_reader, build_recorder
+from ros2_memory.config import exit_on_config_error, load_settings
+from ros2_memory.errors import ConfigError, EpisodicError
+from ros2_memory.logs import configure_logging
+from ros2_memory.recorder.daemon import Ticking, lock_and_prepare, record_until_told
+from ros2_memory.recorder.notify import ServiceManager
+from ros2_memory.recorder.ports import NoHousekeeping
+from ros2_memory.settings import NullRecorderNode
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.settings import Settings
+
+PROGRAM: Final = "ros2-memory-recorder"
+FAILED: Final = 1
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Records until it is told to stop, and returns the exit code.
+
+    0: stopped by a signal, or there is nothing to record (`recorder=none`); 1: recording cannot
+    begin; 2: the configuration or the command line is refused.
+    """
+    overrides: list[str] = _parser().parse_args(argv).overrides
+    with exit_on_config_error(PROGRAM):
+        settings = load_settings(overrides)
+        configure_logging(settings.logging.level, settings.logging.format)
+        if isinstance(settings.recorder, NullRecorderNode):
+            _log.info("nothing_to_record", reason="recorder=none: bags come from elsewhere")
+            return 0
+        try:
+            _record(settings)
+        except ConfigError:
+            raise
+        except EpisodicError as error:
+            _log.error("cannot_record", reason=str(error))
+            sys.stderr.write(f"{PROGRAM} cannot record: {error}\n")
+            return FAILED
+    return 0
+
+
+def _record(settings: Settings) -> None:
+    bag_dir = settings.recording.bag_dir.absolute()
+    reader, housekeeper = build_reader(settings), NoHousekeeping()
+    lock = lock_and_prepare(bag_dir, reader, housekeeper, clear=settings.recording.clear_on_startup)
+    try:
+        recorder = build_recorder(
+            settings, reader=reader, housekeeper=housekeeper, keep_open=(lock.descriptor,)
+        )
+        if not isinstance(recorder, Ticking):
+            raise ConfigError(f"recorder: {settings.recorder.target} cannot be run by {PROGRAM}")
+        _log.info("starting", bag_dir=str(bag_dir))
+        record_until_told(recorder, ServiceManager())
+        _log.info("stopped")
+    finally:
+        lock.release()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=PROGRAM,
+        description="Records a robot's topics with ros2 bag record, and keeps it recording.",
+        epilog="Environment: MEMORY_BAG_DIR, MEMORY_DEPLOYMENT, MEMORY_CONFIG_DIR, "
+        "MEMORY_CONFIG_OVERRIDES, ROS_DOMAIN_ID, and what else ros2 reads.",
+    )
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="key=value",
+        help="settings that take precedence over the configuration, e.g. recording.bag_dir=/bags",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,65 @@
+"""The heartbeat of a running recorder: what it is doing, written every few seconds."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+from ros2_memory.errors import RecorderError
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.recorder.crew import Crew
+    from ros2_memory.recorder.journal import Journal
+    from ros2_memory.timebase import Clock
+
+
+class Pulse:
+    """Writes `recorder.json`; `interval_s` is how often it is asked to."""
+
+    def __init__(self, bag_dir: Path, interval_s: float, clock: Clock, journal: Journal) -> None:
+        self._bag_dir = bag_dir
+        self._interval_s = interval_s
+        self._clock = clock
+        self._journal = journal
+        self._state = RecorderState.STOPPED
+        self._since = clock.now()
+        self._announced: tuple[str, ...] = ()
+
+    def announce(self, name: str) -> None:
+        """Names a recording that is about to be begun, in every heartbeat until `arrived`."""
+        self._announced = (name,)
+
+    def arrived(self) -> None:
+        """The recording that was announced is one of the crew's, or does not come."""
+        self._announced = ()
+
+    def beat(self, state: RecorderState, crew: Crew) -> None:
+        """Writes a heartbeat. One that cannot be written is reported, and stops nothing."""
+        now = self._clock.now()
+        if state is not self._state:
+            self._state, self._since = state, now
+        sessions = crew.sessions
+        names = (*(session.name for session in sessions), *self._announced)
+        subscribed = frozenset[str]().union(*(session.subscribed for session in sessions))
+        silent = frozenset() if crew.current is None else crew.current.silent()
+        heartbeat = Heartbeat(
+            pid=os.getpid(),
+            updated=now,
+            state=state,
+            recordings=tuple(dict.fromkeys(names)),
+            since=self._since,
+            bytes_written=crew.bytes_written,
+            subscribed=tuple(sorted(subscribed)),
+            silent=tuple(sorted(silent)),
+            last_error=self._journal.last_error,
+            interval_s=self._interval_s,
+        )
+        try:
+            write_heartbeat(self._bag_dir, heartbeat)
+        except RecorderError as error:
+            self._journal.fail_once("heartbeat_not_written", str(error))
+        else:
+            self._journal.over("heartbeat_not_written")

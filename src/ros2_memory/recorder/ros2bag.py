@@ -1,0 +1,193 @@
+"""`recorder=ros2bag`: a supervised `ros2 bag record`."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.errors import RecorderError
+from ros2_memory.recorder.base import Recorder
+from ros2_memory.recorder.child import Child, run_bounded
+from ros2_memory.recorder.command import (
+    HELP_ARGV,
+    options_in_help,
+    qos_overrides,
+    record_argv,
+    storage_config,
+)
+from ros2_memory.recorder.environment import find_ros2, robot_environment
+from ros2_memory.recorder.layout import QOS_FILE, STORAGE_FILE, node_name
+from ros2_memory.recorder.ports import NoHousekeeping
+from ros2_memory.recorder.supervisor import Orders, Supervisor
+from ros2_memory.recorder.sync import write_durably
+from ros2_memory.recorder.topics import TopicSelection, load_topics
+from ros2_memory.timebase import WallClock
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from ros2_memory.recorder.ports import Housekeeper
+    from ros2_memory.storage.base import BagReader
+    from ros2_memory.timebase import Clock
+
+__all__ = ["Ros2BagRecorder", "record_argv"]
+
+HELP_TIMEOUT_S: Final = 60.0
+LOGS_KEPT: Final = 20
+GB: Final = 10**9
+
+
+class Ros2BagRecorder(Recorder):
+    """Records with `ros2 bag record`, and keeps it recording while `tick` is called.
+
+    Args:
+        reader: reads splits that are closed.
+        bag_dir: where recordings lie; it is made where it does not exist.
+        topics_file: `topics.yaml`, see `topics`.
+        split_duration_s: length of one bag file, whole seconds.
+        session_duration_s: how long one recording lasts before the next takes over.
+        use_sim_time: whether log times come from `/clock`.
+        min_free_gb: what must be free on the disk for recording to go on, in 10^9 bytes.
+        setup_files: bash files that make the ROS environment.
+        latched_topics: topics whose publishers are transient local; of those that are recorded by
+            name every message is kept, however many there are.
+        repeat_latched: `topic` or `topic=depth`, to begin every split with, where the distribution
+            can do that. Their log times may lie long before the split.
+        chunk_bytes: size of an MCAP chunk before compression.
+        housekeeper: repairs and deletes; nobody where None.
+        clock: the wall clock.
+        keep_open: file descriptors that the recorder's process inherits.
+    """
+
+    def __init__(
+        self,
+        reader: BagReader,
+        *,
+        bag_dir: Path,
+        topics_file: Path,
+        split_duration_s: int,
+        session_duration_s: float,
+        use_sim_time: bool,
+        min_free_gb: float,
+        setup_files: Sequence[Path],
+        latched_topics: Sequence[str],
+        repeat_latched: Sequence[str],
+        chunk_bytes: int,
+        housekeeper: Housekeeper | None = None,
+        clock: Clock | None = None,
+        keep_open: Collection[int] = (),
+    ) -> None:
+        self._bag_dir = bag_dir.absolute()
+        self._topics_file = topics_file
+        self._split_duration_s = split_duration_s
+        self._use_sim_time = use_sim_time
+        self._setup_files = tuple(setup_files)
+        self._latched_topics = tuple(latched_topics)
+        self._repeat_latched = tuple(repeat_latched)
+        self._chunk_bytes = chunk_bytes
+        self._keep_open = tuple(keep_open)
+        self._log_dir: Path | None = None
+        self._topics = TopicSelection(())
+        self._env: dict[str, str] = {}
+        self._ros2 = "ros2"
+        self._options: frozenset[str] = frozenset()
+        self._supervisor = Supervisor(
+            Orders(
+                bag_dir=self._bag_dir,
+                split_duration_s=split_duration_s,
+                session_duration_s=session_duration_s,
+                min_free_bytes=round(min_free_gb * GB),
+                simulated=use_sim_time,
+            ),
+            self._start_child,
+            reader,
+            housekeeper or NoHousekeeping(),
+            clock or WallClock(),
+        )
+
+    def start(self) -> None:
+        """Begins to record; from then on `tick` must be called some times a second.
+
+        Raises:
+            ConfigError: the list of topics is refused.
+            RecorderError: recording cannot begin.
+        """
+        if self._log_dir is not None:
+            return
+        self._topics = load_topics(self._topics_file)
+        self._log_dir = Path(tempfile.mkdtemp(prefix="ros2-memory-log-"))
+        try:
+            self._env = robot_environment(self._setup_files, self._log_dir)
+            self._ros2 = find_ros2(self._env)
+            self._options = self._known_options()
+            self._supervisor.start()
+        except BaseException:
+            self._forget_logs()
+            raise
+
+    def tick(self) -> None:
+        """Does what supervision needs at this moment; does not wait, and raises nothing."""
+        self._supervisor.tick()
+
+    def stop(self) -> None:
+        """Ends recording, within the bounded patience of its children."""
+        self._supervisor.stop()
+        self._forget_logs()
+
+    def is_running(self) -> bool:
+        """Whether a recorder runs and has said that it records."""
+        return self._supervisor.is_recording
+
+    def _known_options(self) -> frozenset[str]:
+        finished = run_bounded([self._ros2, *HELP_ARGV], self._env, HELP_TIMEOUT_S)
+        if finished.status != 0:
+            said = " ".join(finished.errors.decode(errors="replace").split())[-300:]
+            raise RecorderError(
+                f"{self._ros2} bag record --help fails with status {finished.status} ({said}); "
+                "install the packages ros-$ROS_DISTRO-ros2bag and -rosbag2-storage-mcap, and "
+                "correct recorder.setup_files"
+            )
+        return options_in_help(finished.output.decode(errors="replace"))
+
+    def _start_child(self, name: str, directory: Path) -> Child:
+        qos_file, storage_file = self._bag_dir / QOS_FILE, self._bag_dir / STORAGE_FILE
+        latched = [topic for topic in self._topics.exact if topic in self._latched_topics]
+        try:
+            write_durably(qos_file, qos_overrides(latched))
+            write_durably(storage_file, storage_config(self._chunk_bytes))
+        except OSError as error:
+            raise RecorderError(
+                f"{error.filename} cannot be written: {error.strerror}; the recorder must be able "
+                "to write into recording.bag_dir"
+            ) from error
+        if self._log_dir is not None:
+            _prune(self._log_dir)
+        argv = record_argv(
+            ros2=self._ros2,
+            directory=directory,
+            topics=self._topics,
+            split_duration_s=self._split_duration_s,
+            qos_file=qos_file,
+            storage_file=storage_file,
+            node_name=node_name(name),
+            use_sim_time=self._use_sim_time,
+            repeat_latched=self._repeat_latched,
+            known_options=self._options,
+        )
+        return Child.start(argv, self._env, keep_open=self._keep_open)
+
+    def _forget_logs(self) -> None:
+        if self._log_dir is not None:
+            shutil.rmtree(self._log_dir, ignore_errors=True)
+            self._log_dir = None
+
+
+def _prune(log_dir: Path) -> None:
+    """Keeps the newest logs: every run of `ros2` leaves one, and all it says is read here."""
+    with suppress(OSError):
+        logs = sorted(log_dir.iterdir(), key=lambda path: path.lstat().st_mtime_ns)
+        for path in logs[:-LOGS_KEPT]:
+            path.unlink()

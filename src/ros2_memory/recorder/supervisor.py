@@ -1,0 +1,327 @@
+"""Keeps recording: when to begin, rotate, pause and restart, and who is told.
+
+Everything happens in `tick`, which its caller runs some times a second from the main thread, and
+which does not wait. What to do is decided elsewhere (`plan`, `rotation`, `watchdog`), and done
+elsewhere (`crew`); here the two meet.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.errors import EpisodicError, RecorderError
+from ros2_memory.recorder.crew import Crew
+from ros2_memory.recorder.heartbeat import RecorderState
+from ros2_memory.recorder.journal import Journal
+from ros2_memory.recorder.plan import Backoff, SilenceWatch, session_over
+from ros2_memory.recorder.pulse import Pulse
+from ros2_memory.recorder.rotation import Moment, Step
+from ros2_memory.recorder.watchdog import Space, resume_bytes, space, time_was_set_back
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from ros2_memory.recorder.ports import Housekeeper, RecorderProcess
+    from ros2_memory.storage.base import BagReader
+    from ros2_memory.timebase import Clock
+
+LOOK_S: Final = 0.5
+SPACE_S: Final = 1.0
+HOUSE_S: Final = 10.0
+QUIET_HOUSE_S: Final = 60.0
+"""How often the house is kept when no split is closed: what is there grows old all the same."""
+SETTLE_S: Final = 5.0
+"""A young recording writes its headers and the latched messages; the robot has said nothing yet."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Orders:
+    """What is to be done. Durations in seconds.
+
+    `simulated`: log times come from a simulated clock. `subscribe_timeout_s` and `both_s` are
+    those of a handover (see `rotation`), the next three those of a recorder that dies.
+    """
+
+    bag_dir: Path
+    split_duration_s: float
+    session_duration_s: float
+    min_free_bytes: int
+    simulated: bool = False
+    heartbeat_s: float = 2.0
+    subscribe_timeout_s: float = 20.0
+    both_s: float = 2.0
+    first_backoff_s: float = 1.0
+    longest_backoff_s: float = 60.0
+    stable_s: float = 60.0
+
+
+def _free_bytes_of(directory: Path) -> int:
+    """What the file system has left for this user."""
+    return shutil.disk_usage(directory).free
+
+
+class Supervisor:
+    """Keeps one recording going, two during a handover.
+
+    `start_child` starts the recorder of a recording, given its name and its directory.
+    """
+
+    def __init__(
+        self,
+        orders: Orders,
+        start_child: Callable[[str, Path], RecorderProcess],
+        reader: BagReader,
+        housekeeper: Housekeeper,
+        clock: Clock,
+        *,
+        monotonic: Callable[[], float] = time.monotonic,
+        free_bytes_of: Callable[[Path], int] = _free_bytes_of,
+    ) -> None:
+        self._orders = orders
+        self._housekeeper = housekeeper
+        self._clock = clock
+        self._monotonic = monotonic
+        self._free_bytes_of = free_bytes_of
+        self._journal = Journal()
+        self._pulse = Pulse(orders.bag_dir, orders.heartbeat_s, clock, self._journal)
+        self._crew = Crew(
+            orders.bag_dir,
+            start_child,
+            self._announce,
+            reader,
+            self._journal,
+            simulated=orders.simulated,
+            subscribe_timeout_s=orders.subscribe_timeout_s,
+            both_s=orders.both_s,
+        )
+        limits = (orders.first_backoff_s, orders.longest_backoff_s, orders.stable_s)
+        self._backoff = Backoff(*limits)
+        self._rotation_backoff = Backoff(*limits)
+        self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
+        self._rotating_for_silence = False
+        self._rotate_now = False
+        self._paused = False
+        self._room_made = False
+        self._splits_closed = False
+        self._house_kept_s = monotonic()
+        self._stopped = True
+        self._due_s: dict[str, float] = {}
+        self._last = self._now()
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether a recorder runs and has said that it records."""
+        current = self._crew.current
+        return current is not None and current.ready and current.child.exit_status() is None
+
+    def start(self) -> None:
+        """Begins a first recording, unless one is under way or the disk is full.
+
+        Raises:
+            RecorderError: it cannot be begun.
+        """
+        if not self._stopped:
+            return
+        self._last = now = self._now()
+        self._due_s.clear()
+        self._make_bag_dir()
+        self._mind_space(now)
+        if not self._paused:
+            self._begin(now)
+        self._stopped = False
+        self._beat()
+
+    def tick(self) -> None:
+        """Does what is due. Raises nothing: what goes wrong is reported, and tried again."""
+        if self._stopped:
+            return
+        now = self._now()
+        if time_was_set_back(self._last, now):
+            self._rotate_now = True
+            self._journal.warn("clock_set_back", "the clock was set back: a new recording begins")
+        self._last = now
+        if self._is_due("look", LOOK_S, now):
+            self._splits_closed |= self._crew.look(now)
+        self._mind_deaths(now)
+        self._mind_space(now)
+        self._mind_takeover(now)
+        self._mind_rotation(now)
+        self._mind_restart(now)
+        self._crew.reap(now)
+        self._keep_house(now)
+        if self._is_due("beat", self._orders.heartbeat_s, now):
+            self._beat()
+
+    def stop(self) -> None:
+        """Ends everything that runs, within the patience of its children."""
+        if self._stopped:
+            return
+        self._stopped = True
+        self._pulse.beat(RecorderState.STOPPING, self._crew)
+        self._crew.end(self._now())
+        self._paused = False
+        self._pulse.beat(RecorderState.STOPPED, self._crew)
+
+    def _mind_deaths(self, now: Moment) -> None:
+        before = self._crew.current
+        for lived_s in self._crew.bury(now):
+            self._put_off("rotate", self._rotation_backoff.failed(lived_s), now)
+            self._put_off("restart", self._backoff.failed(lived_s), now)
+        current = self._crew.current
+        if current is not None and current is not before:
+            self._silence.began(now.monotonic_s, SETTLE_S)
+
+    def _mind_space(self, now: Moment) -> None:
+        """Deletes more, pauses and resumes, by what the disk has left."""
+        if not self._is_due("space", SPACE_S, now):
+            return
+        free = self._free_bytes()
+        if free is None:
+            return
+        least = self._orders.min_free_bytes
+        action = space(free, least, paused=self._paused, room_made=self._room_made)
+        if action is Space.MAKE_ROOM:
+            self._room_made = True
+            self._make_room()
+            free = self._free_bytes() or 0
+            action = space(free, least, paused=False, room_made=True)
+        if action is Space.STAY_PAUSED and self._is_due("room", QUIET_HOUSE_S, now):
+            # What was being written when recording was paused may be deleted since.
+            self._make_room()
+        if action is Space.PAUSE:
+            self._pause(now, free)
+        elif action is Space.RESUME:
+            self._paused = False
+            self._put_off("restart", 0.0, now)
+            self._journal.note("recording_resumed", free_bytes=free)
+        elif action is Space.ENOUGH:
+            self._room_made = False
+
+    def _pause(self, now: Moment, free: int) -> None:
+        self._paused = True
+        self._crew.dismiss(now)
+        self._journal.fail(
+            "recording_paused",
+            f"recording is paused: {free} bytes are free on the disk, and "
+            f"{self._orders.min_free_bytes} are the least (retention.min_free_gb); it resumes "
+            f"by itself at {resume_bytes(self._orders.min_free_bytes)}",
+        )
+        self._beat()
+
+    def _mind_takeover(self, now: Moment) -> None:
+        step = self._crew.advance_takeover(now)
+        if step is Step.COMPLETE:
+            self._silence.rotated(for_silence=self._rotating_for_silence)
+            self._silence.began(now.monotonic_s, SETTLE_S)
+        elif step is Step.ABANDON:
+            self._put_off("rotate", self._rotation_backoff.failed(0.0), now)
+
+    def _mind_rotation(self, now: Moment) -> None:
+        current = self._crew.current
+        if current is None:
+            return
+        silent = self._silence.is_silent(now.monotonic_s, current.splits.bytes_written)
+        age_s = now.monotonic_s - current.began.monotonic_s
+        over = session_over(age_s, self._orders.session_duration_s)
+        wanted = self._rotate_now or silent or over
+        ready = current.ready and current.splits.exists and self._crew.takeover is None
+        if not (wanted and ready and self._is_due("rotate", 0.0, now)):
+            return
+        if silent:
+            self._journal.note("no_growth", recording=current.name)
+        self._rotating_for_silence = silent and not over
+        self._rotate_now = False
+        try:
+            self._crew.begin_takeover(now)
+        except RecorderError as error:
+            self._journal.fail("rotation_failed", str(error), recording=current.name)
+            self._put_off("rotate", self._rotation_backoff.failed(0.0), now)
+
+    def _mind_restart(self, now: Moment) -> None:
+        if self._crew.current is not None or self._paused:
+            return
+        if not self._is_due("restart", 0.0, now):
+            return
+        try:
+            self._begin(now)
+        except RecorderError as error:
+            self._journal.fail("recorder_not_started", str(error))
+            self._put_off("restart", self._backoff.failed(0.0), now)
+
+    def _begin(self, now: Moment) -> None:
+        self._make_bag_dir()
+        self._crew.begin(now)
+        self._silence.began(now.monotonic_s, SETTLE_S)
+
+    def _make_bag_dir(self) -> None:
+        try:
+            self._bag_dir.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RecorderError(
+                f"{self._bag_dir} cannot be made: {error.strerror or error}"
+            ) from error
+
+    def _make_room(self) -> None:
+        wanted = resume_bytes(self._orders.min_free_bytes)
+        self._keep("make_room", lambda: self._housekeeper.make_room(self._bag_dir, wanted))
+
+    def _keep_house(self, now: Moment) -> None:
+        every_s = HOUSE_S if self._splits_closed else QUIET_HOUSE_S
+        if now.monotonic_s - self._house_kept_s < every_s:
+            return
+        self._house_kept_s = now.monotonic_s
+        self._splits_closed = False
+        self._keep("apply", lambda: self._housekeeper.apply(self._bag_dir))
+
+    def _keep(self, task: str, do: Callable[[], None]) -> None:
+        """Has the housekeeper do something; recording goes on, whatever comes of it."""
+        event = f"housekeeping_failed {task}"
+        try:
+            do()
+        except (EpisodicError, OSError) as error:
+            self._journal.fail_once(event, str(error))
+        else:
+            self._journal.over(event)
+
+    def _announce(self, name: str) -> None:
+        self._pulse.announce(name)
+        self._beat()
+        # It stays in that heartbeat until the next, and then is one of the crew's.
+        self._pulse.arrived()
+
+    def _beat(self) -> None:
+        if self._paused:
+            state = RecorderState.PAUSED
+        else:
+            state = RecorderState.RECORDING if self.is_recording else RecorderState.STARTING
+        self._pulse.beat(state, self._crew)
+
+    def _free_bytes(self) -> int | None:
+        try:
+            free = self._free_bytes_of(self._bag_dir)
+        except OSError as error:
+            self._journal.fail_once("free_space_unknown", f"{self._bag_dir}: {error.strerror}")
+            return None
+        self._journal.over("free_space_unknown")
+        return free
+
+    def _is_due(self, task: str, every_s: float, now: Moment) -> bool:
+        """Whether a task is due; it then is not for `every_s`."""
+        if now.monotonic_s < self._due_s.get(task, 0.0):
+            return False
+        self._due_s[task] = now.monotonic_s + every_s
+        return True
+
+    def _put_off(self, task: str, wait_s: float, now: Moment) -> None:
+        self._due_s[task] = now.monotonic_s + wait_s
+
+    def _now(self) -> Moment:
+        return Moment(self._monotonic(), self._clock.now())
+
+    @property
+    def _bag_dir(self) -> Path:
+        return self._orders.bag_dir

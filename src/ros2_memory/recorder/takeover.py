@@ -1,0 +1,141 @@
+"""One recording taking over from another: the sidecars are written as the handover goes on.
+
+Each is written before what it speaks of can matter: the old recording names the new one before
+that is started, the new one counts for nothing as soon as it exists, and when the cut is made it is
+written to the new one first. So a crash leaves a pair that `settle` can bring to its end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from ros2_memory.recorder.handover import CutClock, Handover, read_handover, write_handover
+from ros2_memory.recorder.rotation import handed_over, intended, pending, void, withdrawn
+from ros2_memory.recorder.settle import cut_clock, settle
+
+if TYPE_CHECKING:
+    from ros2_memory.recorder.rotation import Moment, Passage, Step
+    from ros2_memory.recorder.session import Session
+    from ros2_memory.storage.base import BagReader
+
+
+class Takeover:
+    """A handover from one running session to another.
+
+    `simulated`: log times come from a simulated clock.
+    """
+
+    def __init__(
+        self, old: Session, new: Session, passage: Passage, reader: BagReader, *, simulated: bool
+    ) -> None:
+        self.old = old
+        self.new = new
+        self._passage = passage
+        self._reader = reader
+        self._simulated = simulated
+        self._marked = False
+        self._closed_before = old.splits.closed_names
+
+    @staticmethod
+    def announce(old: Session, new_name: str) -> None:
+        """Has the old recording name the new one, which is about to be started.
+
+        Raises:
+            RecorderError: it cannot be written.
+        """
+        directory = old.splits.directory
+        write_handover(directory, intended(read_handover(directory).handover, new_name))
+
+    @staticmethod
+    def withdraw(old: Session) -> None:
+        """Has the old recording name no next one, if it is still there.
+
+        Raises:
+            RecorderError: it cannot be written.
+        """
+        directory = old.splits.directory
+        if directory.is_dir():
+            write_handover(directory, withdrawn(read_handover(directory).handover))
+
+    @property
+    def missing(self) -> frozenset[str]:
+        """Topics that the old recorder has subscribed to, and the new one not yet."""
+        return frozenset(self.old.subscribed - self.new.subscribed)
+
+    def advance(self, now: Moment) -> Step:
+        """What is due at this moment.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        if not self._marked and self.new.splits.exists:
+            write_handover(self.new.splits.directory, pending(self.old.name))
+            self._marked = True
+        ready = self._marked and self.new.ready
+        return self._passage.advance(now, ready=ready, missing=self.missing)
+
+    def complete(self, now: Moment) -> bool:
+        """Makes the cut, when both recorders receive; False where they do not overlap yet.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        bounds = self._passage.bounds(now)
+        if bounds is None:
+            return False
+        sidecars = handed_over(
+            read_handover(self.old.splits.directory).handover,
+            self.old.name,
+            self.new.name,
+            bounds,
+            old_files=self._old_files(),
+            new_files=self.new.splits.names(),
+            simulated=self._simulated,
+            clock=self._clock(),
+        )
+        write_handover(self.new.splits.directory, sidecars.new)
+        write_handover(self.old.splits.directory, sidecars.old)
+        return True
+
+    def abandon(self) -> None:
+        """The old recording goes on, and has all that the new one has.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        if self.new.splits.directory.is_dir():
+            write_handover(self.new.splits.directory, void(self.old.name))
+        self.withdraw(self.old)
+
+    def old_has_ended(self) -> None:
+        """Adds the splits that the old recorder opened after the cut, while it was ending.
+
+        Raises:
+            RecorderError: the sidecar cannot be written.
+        """
+        directory = self.old.splits.directory
+        handover = read_handover(directory).handover
+        if handover.end is not None:
+            files = tuple(sorted(self._old_files() | frozenset(handover.end.files)))
+            write_handover(directory, replace(handover, end=replace(handover.end, files=files)))
+
+    def settle(self) -> None:
+        """After the old recorder died half-way: the new recording counts from where it ends.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        if self.old.splits.directory.is_dir():
+            settle(self.old.splits.directory, self.new.splits.directory, self._reader)
+        elif self.new.splits.directory.is_dir():
+            write_handover(self.new.splits.directory, Handover())
+
+    def _old_files(self) -> frozenset[str]:
+        return self.old.splits.names() - self._closed_before
+
+    def _clock(self) -> CutClock:
+        closed = sorted(self.old.splits.closed_names)
+        if not closed:
+            return CutClock.PUBLISH
+        return cut_clock(self.old.splits.directory / closed[-1], self._reader)
