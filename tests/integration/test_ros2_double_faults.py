@@ -1,0 +1,372 @@
+"""What the double of `ros2 bag record` does when it is signalled, starved or robbed."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import time
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import pytest
+from rosbags.highlevel import AnyReader
+
+from tests.ros_live import needs_ros, publishing_robot, ros_environment, wait_for
+from tests.ros_recordings import (
+    Recording,
+    embedded,
+    in_file,
+    is_closed,
+    messages,
+    metadata,
+    records,
+    summary_of,
+)
+from tests.shared_bags import RECORDED, needs_recorded
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = needs_ros
+
+SECOND = 10**9
+
+
+EVERY_SECOND = ("-e", "/odom", "-d", "1")
+# Name: distribution and options. They all begin at once, since each takes its time to begin.
+STARTED = {
+    "sigint": ("jazzy", ("-e", "/odom|/bumper")),
+    "sigterm": ("jazzy", ("-e", "/odom|/bumper")),
+    "twice": ("jazzy", EVERY_SECOND),
+    "sighup": ("jazzy", EVERY_SECOND),
+    "sigkill": ("jazzy", EVERY_SECOND),
+    "ignoring": ("jazzy", EVERY_SECOND),
+    "moved": ("jazzy", EVERY_SECOND),
+    "thinned": ("jazzy", EVERY_SECOND),
+    "humble": ("humble", ("-d", "1", "/odom")),
+    "lyrical": (
+        "lyrical",
+        ("-d", "1", "-e", "/odom|/tf_static", "--repeat-transient-local", "/tf_static=1"),
+    ),
+    "packed": (
+        "jazzy",
+        (*EVERY_SECOND, "--compression-mode", "file", "--compression-format", "zstd"),
+    ),
+    "blocks": ("jazzy", ("-e", "/odom", "--storage-preset-profile", "fastwrite")),
+}
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """An environment in which a robot drives all the time."""
+    folder = tmp_path_factory.mktemp("driving")
+    topics = ("--topics", "/odom", "/tf_static", "/bumper")
+    with ros_environment(folder) as env, publishing_robot(env, folder / "truth.json", *topics):
+        yield env
+
+
+@pytest.fixture(scope="module")
+def started(
+    env: dict[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[dict[str, Recording]]:
+    """Recordings under way, each for one test."""
+    folder = tmp_path_factory.mktemp("started")
+    with ExitStack() as stack:
+        yield {
+            name: stack.enter_context(
+                Recording(
+                    {**env, "ROS2_DOUBLE_DISTRO": distro},
+                    folder / name,
+                    *options,
+                    ignore_sigint=name == "ignoring",
+                )
+            )
+            for name, (distro, options) in STARTED.items()
+        }
+
+
+@pytest.fixture
+def quiet(tmp_path: Path) -> Iterator[dict[str, str]]:
+    """An environment in which nothing is published."""
+    with ros_environment(tmp_path) as env:
+        yield env
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_recording_cleanly(
+    started: dict[str, Recording], number: signal.Signals
+) -> None:
+    recording = started[number.name.lower()]
+    recording.await_subscribed("/odom", "/bumper")
+    assert recording.stop(number) == 0
+    assert is_closed(recording.splits()[0])
+    assert (recording.directory / "metadata.yaml").is_file()
+    assert f"signal_handler(signum={number.value})" in recording.said
+
+
+def test_repeated_signals_kill_it_once_its_files_are_complete(
+    started: dict[str, Recording],
+) -> None:
+    recording = started["twice"]
+    recording.await_splits(2)
+    recording.process.send_signal(signal.SIGTERM)
+    assert recording.stop(signal.SIGINT) == -signal.SIGINT
+    assert all(is_closed(split) for split in recording.splits())
+    assert (recording.directory / "metadata.yaml").is_file()
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
+def test_other_signals_leave_the_recording_open(
+    started: dict[str, Recording], number: signal.Signals
+) -> None:
+    recording = started[number.name.lower()]
+    recording.await_splits(2)
+    wait_for(lambda: is_closed(recording.splits()[0]), "the first split's footer")
+    assert recording.stop(number) == -number
+    assert is_closed(recording.splits()[-2])
+    assert recording.splits()[-1].stat().st_size == 0
+    assert not (recording.directory / "metadata.yaml").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_at_the_very_beginning_kills_it_before_it_has_a_directory(
+    env: dict[str, str], tmp_path: Path, number: signal.Signals
+) -> None:
+    with Recording(env, tmp_path / "a", "-e", "/odom") as recording:
+        assert recording.stop(number) == -number
+    assert not recording.directory.exists()
+
+
+def test_a_sigint_that_was_ignored_before_it_began_stays_ignored(
+    started: dict[str, Recording],
+) -> None:
+    recording = started["ignoring"]
+    recording.await_subscribed("/odom")
+    recording.process.send_signal(signal.SIGINT)
+    recording.await_splits(len(recording.splits()) + 2)
+    assert recording.stop(signal.SIGTERM) == 0
+    assert "signal_handler(signum=15)" in recording.said
+
+
+def test_its_help_exits_with_0_and_an_unknown_option_with_2(quiet: dict[str, str]) -> None:
+    record = ["ros2", "bag", "record"]
+    asked = subprocess.run([*record, "--help"], env=quiet, capture_output=True, check=False)
+    assert (asked.returncode, asked.stderr) == (0, b"")
+    assert b"--node-name" in asked.stdout
+    wrong = subprocess.run([*record, "--wrong"], env=quiet, capture_output=True, check=False)
+    assert wrong.returncode == 2
+
+
+def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    with Recording(quiet, tmp_path / "a", "-e", "/odom") as recording:
+        assert recording.process.wait(timeout=20) == 1
+    said = f"[ERROR] [ros2bag]: Output folder '{tmp_path / 'a'}' already exists.\n"
+    assert recording.said == said
+
+
+def test_parents_of_the_directory_are_created(quiet: dict[str, str], tmp_path: Path) -> None:
+    deep = tmp_path / "bags" / "of" / "a"
+    with Recording(quiet, deep, "-e", "/odom") as recording:
+        recording.await_said("Recording...")
+        assert recording.stop() == 0
+    assert [split.name for split in recording.splits()] == ["a_0.mcap"]
+
+
+@needs_recorded
+def test_a_recording_of_nothing_is_as_the_real_one(quiet: dict[str, str], tmp_path: Path) -> None:
+    with Recording(quiet, tmp_path / "never", "-e", "/never") as recording:
+        recording.await_said("Recording...")
+        assert recording.stop() == 0
+    real = RECORDED / "extra" / "never"
+    assert metadata(recording.directory) == metadata(real)
+    assert embedded(recording.splits()[0]) == embedded(real / "never_0.mcap")
+    own, same = (
+        [type(record) for record in records(file, emit_chunks=True)]
+        for file in (recording.splits()[0], real / "never_0.mcap")
+    )
+    assert own == same
+
+
+def test_a_silent_robot_leaves_its_last_split_open_until_it_speaks_again(
+    quiet: dict[str, str], tmp_path: Path
+) -> None:
+    bumper = ("--topics", "/bumper", "--subscribers", "1")
+    with Recording(quiet, tmp_path / "a", "-e", "/bumper", "-d", "1") as recording:
+        with publishing_robot(quiet, tmp_path / "1.json", *bumper, duration_s=0.2) as robot:
+            silent_since = robot.t0
+            robot.finish()
+        wait_for(lambda: time.time_ns() > silent_since + 2 * SECOND, "silence")
+        assert [split.stat().st_size for split in recording.splits()] == [0]
+        with publishing_robot(quiet, tmp_path / "2.json", *bumper, duration_s=0.2) as robot:
+            robot.finish()
+        assert recording.stop() == 0
+    assert [len(in_file(split)) for split in recording.splits()] == [1, 1]
+
+
+def test_publishers_that_cannot_meet_what_was_asked_are_not_recorded_and_warned_of(
+    quiet: dict[str, str], tmp_path: Path
+) -> None:
+    bumper = ("--topics", "/bumper", "/vision/scene/scene_objects")
+    override = tmp_path / "qos.yaml"
+    override.write_text("/bumper: {reliability: reliable, durability: transient_local}\n")
+    unsourced = {name: text for name, text in quiet.items() if name != "AMENT_PREFIX_PATH"}
+    both = ("-e", "/bumper|/vision/.*")
+    with ExitStack() as stack:
+        plain = stack.enter_context(Recording(quiet, tmp_path / "plain", *both))
+        unknowing = stack.enter_context(Recording(unsourced, tmp_path / "unknowing", *both))
+        asking = stack.enter_context(
+            Recording(
+                quiet, tmp_path / "asking", *both, "--qos-profile-overrides-path", str(override)
+            )
+        )
+        reliable = stack.enter_context(publishing_robot(quiet, tmp_path / "1.json", *bumper))
+        plain.await_subscribed("/bumper")
+        late = stack.enter_context(
+            publishing_robot(quiet, tmp_path / "2.json", *bumper, "--best-effort")
+        )
+        plain.await_said(
+            "A new publisher for subscribed topic /bumper was found offering "
+            "RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT, but rosbag already subscribed requesting "
+            "RMW_QOS_POLICY_RELIABILITY_RELIABLE."
+        )
+        asking.await_said(
+            "New publisher discovered on topic '/bumper', offering incompatible QoS. "
+            "No messages will be received from it."
+        )
+        unknowing.await_said(
+            "Topic '/vision/scene/scene_objects' has unknown type "
+            "'ros2_vision_interfaces/msg/VisionDetectionArray' ."
+        )
+        late.stop()
+        published = reliable.stop()
+        assert [recording.stop() for recording in (plain, unknowing, asking)] == [0, 0, 0]
+    heard = [topic for topic, *_ in messages(plain)]
+    assert 0 < heard.count("/bumper") <= published["/bumper"]
+    assert "/bumper" not in {topic for topic, *_ in messages(asking)}
+    assert {topic for topic, *_ in messages(unknowing)} == {"/bumper"}
+    assert unknowing.said.count("has unknown type") == 1
+
+
+def test_a_directory_that_vanishes_aborts_it_at_the_next_split(
+    started: dict[str, Recording],
+) -> None:
+    recording = started["moved"]
+    recording.await_subscribed("/odom")
+    recording.directory.rename(recording.directory.with_name("elsewhere"))
+    assert recording.process.wait(timeout=20) == -signal.SIGABRT
+
+
+def test_closed_splits_that_vanish_do_not_disturb_it(started: dict[str, Recording]) -> None:
+    recording = started["thinned"]
+    recording.await_splits(2)
+    first = recording.splits()[0]
+    wait_for(lambda: is_closed(first), "the first split's footer")
+    first.unlink()
+    recording.await_splits(2)
+    assert recording.stop() == 0
+    assert metadata(recording.directory)["relative_file_paths"][0] == first.name
+
+
+def test_a_full_disk_is_no_error_and_it_goes_on_once_there_is_room(
+    env: dict[str, str], tmp_path: Path
+) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)],
+        capture_output=True,
+        check=False,
+    )
+    if mounted.returncode:
+        pytest.skip("this user may not mount a small disk")
+    try:
+        ballast = disk / "ballast"
+        ballast.write_bytes(bytes(60 * 1024))
+        # What it says lies beside the disk, which has no room for it; the last -o counts.
+        options = (*EVERY_SECOND, "-o", str(disk / "a"))
+        with Recording(env, tmp_path / "a", *options) as recording:
+            recording.directory = disk / "a"
+            recording.await_splits(3)
+            sizes = [split.stat().st_size for split in recording.splits()]
+            ballast.unlink()
+            recording.await_splits(5)
+            assert recording.stop() == 0
+        assert sizes[0] % 4096 == 0
+        assert sizes[1:] == [0, 0]
+        assert not is_closed(recording.splits()[1])
+        assert is_closed(recording.splits()[3])
+        assert "ERROR" not in recording.said
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_humble_writes_one_time_for_both(started: dict[str, Recording]) -> None:
+    recording = started["humble"]
+    recording.await_splits(2)
+    assert recording.stop() == 0
+    assert all(log == published for _, log, published, _ in messages(recording))
+    assert metadata(recording.directory)["ros_distro"] == "humble"
+
+
+def test_lyrical_repeats_latched_messages_in_every_split_and_names_files_by_time(
+    started: dict[str, Recording],
+) -> None:
+    recording = started["lyrical"]
+    recording.await_splits(3)
+    assert recording.stop() == 0
+    time_of_day = r"\d{4}(_\d\d){2}-\d\d(_\d\d){2}"
+    for number, split in enumerate(recording.splits()):
+        assert re.fullmatch(rf"{number}_lyrical_{time_of_day}\.mcap", split.name)
+    before, after = (in_file(split) for split in recording.splits()[:2])
+    assert after[0][0] == "/tf_static"
+    # The copy has both times of the message before it.
+    assert after[0][1:3] == before[-1][1:3]
+    assert after[0][3] in [payload for topic, *_, payload in before if topic == "/tf_static"]
+
+
+def test_whole_files_are_compressed_once_they_are_closed(started: dict[str, Recording]) -> None:
+    recording = started["packed"]
+    recording.await_splits(3)
+    assert recording.stop() == 0
+    assert all(split.name.endswith(".mcap.zstd") for split in recording.splits())
+    with AnyReader([recording.directory]) as reader:
+        assert reader.message_count == metadata(recording.directory)["message_count"] > 20
+
+
+def test_with_sim_time_nothing_is_recorded_before_the_clock_and_its_time_is_the_log_time(
+    quiet: dict[str, str], tmp_path: Path
+) -> None:
+    odom = ("--topics", "/odom")
+    with (
+        Recording(quiet, tmp_path / "a", "-e", "/odom", "--use-sim-time") as recording,
+        publishing_robot(quiet, tmp_path / "1.json", *odom),
+    ):
+        recording.await_said("use_sim_time set, waiting for /clock")
+        assert "Subscribed" not in recording.said
+        with publishing_robot(quiet, tmp_path / "2.json", "--topics", "/clock") as clock:
+            start = clock.t0
+            recording.await_said("Sim time /clock found, starting recording.")
+            recording.await_subscribed("/odom")
+            wait_for(lambda: time.time_ns() > start + 3 * SECOND, "messages")
+            assert recording.stop() == 0
+    found = messages(recording)
+    assert found
+    assert all(0 < log < 60 * SECOND < published for _, log, published, _ in found)
+
+
+def test_without_chunks_what_comes_reaches_the_disk_in_blocks(
+    started: dict[str, Recording],
+) -> None:
+    recording = started["blocks"]
+    recording.await_subscribed("/odom")
+    active = recording.splits()[0]
+    wait_for(lambda: active.stat().st_size >= 2 * 4096, "two blocks")
+    assert active.stat().st_size % 4096 == 0
+    assert recording.stop() == 0
+    summary = summary_of(active)
+    assert summary.statistics is not None
+    assert (summary.statistics.chunk_count, len(summary.chunk_indexes)) == (0, 0)
+    assert summary.statistics.message_count == len(in_file(active))

@@ -1,0 +1,1 @@
+"""A test double of `ros2 bag record`; see README.md."""

@@ -1,0 +1,166 @@
+"""The options of `ros2 bag record`, as far as the double has them, distro by distro."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from tests.ros2_double.mcap_file import Layout
+
+DISTROS: Final = ("humble", "jazzy", "kilted", "lyrical")
+_LEVELS: Final = {"Fastest": -5, "Fast": -3, "Default": 1, "Slow": 5, "Slowest": 19}
+_PRESETS: Final = {
+    "none": Layout(),
+    "fastwrite": Layout(chunk_bytes=None, summary_crc=False),
+    "zstd_fast": Layout(zstd_level=_LEVELS["Fastest"]),
+    "zstd_small": Layout(zstd_level=_LEVELS["Slowest"], chunk_bytes=4 * 1024 * 1024),
+}
+
+
+class RefusedError(Exception):
+    """What was asked for is refused with this sentence."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What was asked for."""
+
+    output: Path
+    topics: tuple[str, ...]
+    regex: str
+    duration_s: int
+    layout: Layout
+    cached: bool
+    overrides: dict[str, dict[str, Any]]
+    compress_files: bool
+    include_hidden: bool
+    use_sim_time: bool
+    node_name: str
+    custom: dict[str, str]
+    keyboard: bool
+    repeats: dict[str, int]
+
+
+def parser(distro: str) -> argparse.ArgumentParser:
+    """The model of one distro's options; an option that it lacks is unknown."""
+    model = argparse.ArgumentParser(
+        prog="ros2 bag record",
+        description=f"Test double of `ros2 bag record`, ROS 2 {distro.capitalize()}.",
+        allow_abbrev=False,
+    )
+    add = model.add_argument
+    if distro != "lyrical":
+        add("positional_topics", nargs="*", default=[], metavar="topics", help="Topics to record.")
+    if distro != "humble":
+        add("--topics", nargs="+", default=[], metavar="Topic", help="Topics to record.")
+    add("-a", "--all", action="store_true", help="Record all topics.")
+    add("-e", "--regex", default="", help="Record only topics that the whole expression matches.")
+    add("-o", "--output", help="Directory to create; it must not exist.")
+    add("-s", "--storage", default="mcap", choices=("mcap", "sqlite3"))
+    add("-d", "--max-bag-duration", type=int, default=0, help="Seconds after which to split.")
+    add("--max-cache-size", type=int, default=100 * 1024 * 1024, help="0: write directly.")
+    add("--storage-preset-profile", default="none", choices=tuple(_PRESETS))
+    add("--storage-config-file", type=_file, help="YAML with options of the MCAP writer.")
+    add("--qos-profile-overrides-path", type=_file, help="YAML with QoS profiles by topic.")
+    add("--compression-mode", default="none", choices=("none", "file", "message"))
+    add("--compression-format", default="", choices=("", "zstd"))
+    add("--include-hidden-topics", action="store_true")
+    add("--use-sim-time", action="store_true", help="Times are those of /clock.")
+    if distro != "humble":
+        add("--node-name", default="rosbag2_recorder")
+        add("--custom-data", nargs="*", default=[], metavar="KEY=VALUE")
+        add("--disable-keyboard-controls", action="store_true")
+    if distro == "lyrical":
+        add("--repeat-transient-local", nargs="+", default=[], metavar="Topic[=Depth]")
+        add("--max-bag-files", type=int, default=0)
+        add("--max-cache-duration", type=int, default=0)
+    return model
+
+
+def options(distro: str, argv: list[str]) -> Options:
+    """Parses the arguments behind `ros2 bag record`; exits 2 on those that the distro lacks.
+
+    Raises:
+        RefusedError: as the real recorder does, or for what the double does not do.
+    """
+    given = vars(parser(distro).parse_args(argv))
+    topics = (*given.get("topics", ()), *given.get("positional_topics", ()))
+    regex = ".*" if given["all"] else given["regex"]
+    if not topics and not regex:
+        raise RefusedError("Need to specify at least one option out of --all, topics or --regex")
+    if given["output"] is None:
+        raise RefusedError("the double needs --output")
+    output = Path(given["output"])
+    if output.is_dir():
+        raise RefusedError(f"Output folder '{output}' already exists.")
+    if bool(given["compression_format"]) != (given["compression_mode"] != "none"):
+        raise RefusedError("Compression needs both a mode and a format.")
+    for name, allowed in (
+        ("storage", "mcap"),
+        ("max_bag_files", 0),
+        ("max_cache_duration", 0),
+    ):
+        if given.get(name, allowed) != allowed:
+            raise RefusedError(f"the double does not do --{name.replace('_', '-')} {given[name]}")
+    if given["compression_mode"] == "message":
+        raise RefusedError("MCAP storage plugin does not support message compression")
+    return Options(
+        output=output,
+        topics=topics,
+        regex=regex,
+        duration_s=given["max_bag_duration"],
+        layout=_layout(given["storage_preset_profile"], given["storage_config_file"]),
+        cached=given["max_cache_size"] > 0,
+        overrides=_yaml(given["qos_profile_overrides_path"]),
+        compress_files=given["compression_mode"] == "file",
+        include_hidden=given["include_hidden_topics"],
+        use_sim_time=given["use_sim_time"],
+        node_name=given.get("node_name", "rosbag2_recorder"),
+        custom=dict(_pair(text, "") for text in given.get("custom_data", ())),
+        keyboard=not given.get("disable_keyboard_controls", False),
+        repeats=dict(_depth(text) for text in given.get("repeat_transient_local", ())),
+    )
+
+
+def _file(name: str) -> Path:
+    if not Path(name).is_file():
+        raise argparse.ArgumentTypeError(f"can't open '{name}'")
+    return Path(name)
+
+
+def _yaml(file: Path | None) -> dict[str, Any]:
+    return {} if file is None else yaml.safe_load(file.read_text("utf-8")) or {}
+
+
+def _layout(preset: str, file: Path | None) -> Layout:
+    base, given = _PRESETS[preset], _yaml(file)
+    if unknown := given.keys() - {"chunkSize", "compression", "compressionLevel", "noChunking"}:
+        raise RefusedError(f"the double knows no MCAP writer option {sorted(unknown)}")
+    compression = given.get("compression", "None" if base.zstd_level is None else "Zstd")
+    level = given.get("compressionLevel", "Default")
+    if compression not in {"None", "Zstd"} or level not in _LEVELS:
+        raise RefusedError(f"yaml-cpp: bad conversion: {compression} {level}")
+    zstd_level = base.zstd_level if base.zstd_level is not None else _LEVELS[level]
+    chunk_bytes: int | None = given.get("chunkSize", base.chunk_bytes)
+    unchunked: bool = given.get("noChunking", base.chunk_bytes is None)
+    return Layout(
+        chunk_bytes=None if unchunked else chunk_bytes,
+        zstd_level=zstd_level if compression == "Zstd" else None,
+        summary_crc=base.summary_crc,
+    )
+
+
+def _pair(text: str, default: str) -> tuple[str, str]:
+    key, _, value = text.partition("=")
+    return key, value or default
+
+
+def _depth(text: str) -> tuple[str, int]:
+    topic, depth = _pair(text, "1")
+    if not depth.isdigit() or not int(depth):
+        raise RefusedError(f"Invalid depth for --repeat-transient-local: {text}")
+    return topic, int(depth)

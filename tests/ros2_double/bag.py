@@ -1,0 +1,159 @@
+"""A recording: a directory of splits, and `metadata.yaml` once it was closed."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import zstandard
+
+from tests.ros2_double.definitions import full_text
+from tests.ros2_double.mcap_file import DISK_FULL, McapFile
+from tests.ros2_double.metadata import Info, Span, Topic, metadata_text, whole_file
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tests.ros2_double.mcap_file import Layout
+
+_FLUSHING: Final = "Writing remaining messages from cache to the bag. It may take a while"
+
+
+@dataclass(frozen=True)
+class Writing:
+    """How a recording is written."""
+
+    directory: Path
+    layout: Layout
+    split_after_ns: int | None
+    distro: str
+    custom: dict[str, str]
+    compress_files: bool
+    cached: bool
+    repeats: dict[str, int]  # topic: how many of its last messages begin every split
+
+
+@dataclass(frozen=True)
+class _Message:
+    topic: str
+    payload: bytes
+    log_time: int
+    publish_time: int
+
+
+class Bag:
+    """An open recording. Making it makes the directory; `say` logs as (level, logger, text)."""
+
+    def __init__(self, how: Writing, say: Callable[[str, str, str], None]) -> None:
+        self._how = how
+        self._say = say
+        self._topics: dict[str, Topic] = {}
+        self._latched = {topic: deque[_Message](maxlen=n) for topic, n in how.repeats.items()}
+        self._last = (0, 0)  # log and publish time of the newest message
+        compression = ("zstd", "FILE") if how.compress_files else ("", "")
+        self._info = Info(how.distro, how.custom, compression)
+        how.directory.mkdir(parents=True)
+        self._file = self._opened()
+        self._list()
+        self._file.metadata(metadata_text(self._info))
+
+    @property
+    def count(self) -> int:
+        return sum(topic.count for topic in self._topics.values())
+
+    def subscribe(self, topic: Topic) -> None:
+        self._topics[topic.name] = topic
+        self._declare(topic)
+
+    def write(self, topic: str, payload: bytes, log_time: int, publish_time: int) -> None:
+        """Writes a message; one that comes too late for this split opens the next one."""
+        span = self._info.files[-1][1]
+        limit = self._how.split_after_ns
+        if limit is not None and log_time - span.start > limit:
+            self._split()
+            span = self._info.files[-1][1]
+        span.take(log_time)
+        whole = self._info.whole
+        whole.start = min(whole.start, log_time)
+        whole.duration = max(whole.duration, log_time - whole.start)
+        self._put(_Message(topic, payload, log_time, publish_time))
+        if topic in self._latched:
+            self._latched[topic].append(_Message(topic, payload, log_time, publish_time))
+        self._last = (log_time, publish_time)
+
+    def close(self) -> None:
+        self._flush()
+        closing = deepcopy(self._info)
+        closing.whole.count = self.count
+        # The copy in the last file differs from those before it: it knows the topics.
+        self._file.metadata(metadata_text(closing, self._topics.values()))
+        self._file.close()
+        self._compress()
+        closing.paths = self._info.paths
+        text = whole_file(metadata_text(closing, self._topics.values()))
+        try:
+            (self._how.directory / "metadata.yaml").write_text(text, "utf-8")
+        except OSError as error:
+            if error.errno not in DISK_FULL:
+                raise
+
+    def _put(self, message: _Message) -> None:
+        self._topics[message.topic].count += 1
+        self._file.message(message.topic, message.payload, message.log_time, message.publish_time)
+
+    def _declare(self, topic: Topic) -> None:
+        metadata = {"offered_qos_profiles": topic.qos, "topic_type_hash": topic.type_hash}
+        self._file.declare(topic.name, topic.type, full_text(topic.type), metadata)
+
+    def _split(self) -> None:
+        """The next file is there before the footer of this one is."""
+        self._flush()
+        self._file.metadata(metadata_text(self._info))
+        closed, self._file = self._file, self._opened()
+        closed.close()
+        self._compress()
+        self._file.metadata(metadata_text(self._info))
+        self._list()
+        # The real recorder declares in the order of a hash table: ids differ between files.
+        for topic in reversed(self._topics.values()):
+            self._declare(topic)
+        self._repeat()
+
+    def _repeat(self) -> None:
+        """Lyrical gives the copies both times of the message before them, not their own."""
+        span = self._info.files[-1][1]
+        latched = (message for last in self._latched.values() for message in last)
+        for message in sorted(latched, key=lambda message: message.log_time):
+            self._put(_Message(message.topic, message.payload, *self._last))
+            span.count += 1
+
+    def _flush(self) -> None:
+        if self._how.cached:
+            self._say("info", "rosbag2_cpp", _FLUSHING)
+
+    def _opened(self) -> McapFile:
+        index, name = len(self._info.files), self._how.directory.name
+        self._name = f"{name}_{index}.mcap"
+        if self._how.distro == "lyrical":
+            self._name = f"{index}_{name}_{time.strftime('%Y_%m_%d-%H_%M_%S')}.mcap"
+        return McapFile(self._how.directory / self._name, self._how.layout)
+
+    def _list(self) -> None:
+        self._info.files.append((self._name, Span()))
+        self._info.paths.append(self._name)
+
+    def _compress(self) -> None:
+        """Whole files, once they are closed; `files` keeps their former names."""
+        if not self._how.compress_files:
+            return
+        name = self._info.paths[-1]
+        self._say("info", "rosbag2_compression", f"Compressing file: {name}")
+        file = self._how.directory / name
+        packed = file.with_name(f"{name}.zstd")
+        packed.write_bytes(zstandard.compress(file.read_bytes()))
+        file.unlink()
+        self._info.paths[-1] = packed.name

@@ -1,0 +1,217 @@
+"""The node: finds topics, subscribes to them as their publishers allow, and writes what comes."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.logging import get_logger
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+
+from tests.ros2_double.bag import Bag, Writing
+from tests.ros2_double.definitions import package_is_known, type_hash
+from tests.ros2_double.metadata import Topic, qos_text
+from tests.ros2_double.qos import adapted, offered, overrides, refused
+from tests.ros_types import subscription
+
+if TYPE_CHECKING:
+    from tests.ros2_double.arguments import Options
+    from tests.ros2_double.signals import Signals
+
+_POLLING_S: Final = 0.1
+_DRAINING_S: Final = 0.1
+
+
+def record(options: Options, distro: str, signals: Signals) -> None:
+    """Records until a signal comes. The directory is complete when this returns.
+
+    Raises:
+        RefusedError: the overrides are no profiles; nothing was begun.
+        OSError: the next split cannot be opened.
+    """
+    profiles = overrides(options.overrides)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    recorder = _Recorder(options, distro, profiles, signals)
+    try:
+        recorder.run()
+    finally:
+        recorder.destroy()
+        rclpy.shutdown()
+
+
+class _Recorder:
+    def __init__(
+        self, options: Options, distro: str, profiles: dict[str, Any], signals: Signals
+    ) -> None:
+        self._options = options
+        self._distro = distro
+        self._profiles = profiles
+        self._signals = signals
+        self._regex = re.compile(options.regex)
+        self._asked: dict[str, Any] = {}  # what was asked for, by subscribed topic
+        self._warned: set[str] = set()
+        self._seeking = True
+        self._name = options.node_name
+        self._node = rclpy.create_node(
+            options.node_name,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=[Parameter("use_sim_time", value=options.use_sim_time)],
+        )
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+
+    def run(self) -> None:
+        self._greet()
+        self._signals.take_over()
+        self._bag = Bag(self._writing(), _say)
+        self._log("Listening for topics...")
+        self._log("Event publisher thread: Starting")
+        self._log("Recording...")
+        if self._options.use_sim_time:
+            self._await_clock()
+        due = 0.0
+        while not self._signals.received:
+            if self._seeking and time.monotonic() >= due:
+                self._discover()
+                due = time.monotonic() + _POLLING_S
+            self._executor.spin_once(timeout_sec=_POLLING_S / 2)
+        self._end()
+
+    def destroy(self) -> None:
+        self._executor.shutdown()
+        self._node.destroy_node()
+
+    def _writing(self) -> Writing:
+        options = self._options
+        return Writing(
+            directory=options.output,
+            layout=options.layout,
+            split_after_ns=options.duration_s * 10**9 or None,
+            distro=self._distro,
+            custom=options.custom,
+            compress_files=options.compress_files,
+            cached=options.cached,
+            repeats=options.repeats,
+        )
+
+    def _greet(self) -> None:
+        if not self._options.keyboard:
+            return
+        if not sys.stdin.isatty():
+            sys.stderr.write("stdin is not a terminal device. Keyboard handling disabled.")
+            sys.stderr.flush()
+        self._log("Press SPACE for pausing/resuming")
+
+    def _await_clock(self) -> None:
+        self._log("use_sim_time set, waiting for /clock before starting recording...")
+        while not self._signals.received and not self._node.get_clock().now().nanoseconds:
+            self._executor.spin_once(timeout_sec=_POLLING_S / 2)
+        if not self._signals.received:
+            self._log("Sim time /clock found, starting recording.")
+
+    def _end(self) -> None:
+        self._log("Pausing recording.")
+        self._drain()
+        self._bag.close()
+        self._log("Event publisher thread: Exiting")
+        self._log("Recording stopped")
+        _say("info", "rclcpp", f"signal_handler(signum={self._signals.received[0]})")
+
+    def _drain(self) -> None:
+        """Takes what has already arrived: the real recorder's threads are never behind."""
+        until = time.monotonic() + _DRAINING_S
+        before = -1
+        while before < self._bag.count and time.monotonic() < until:
+            before = self._bag.count
+            self._executor.spin_once(timeout_sec=0)
+
+    def _discover(self) -> None:
+        for topic, types in self._node.get_topic_names_and_types():
+            if topic in self._asked:
+                self._check(topic)
+            elif self._wants(topic, types):
+                self._subscribe(topic, types[0])
+        if self._options.topics and len(self._asked) == len(self._options.topics):
+            self._log("All requested topics are subscribed. Stopping discovery...")
+            self._seeking = False
+
+    def _wants(self, topic: str, types: list[str]) -> bool:
+        options = self._options
+        if options.topics and topic not in options.topics:
+            return False
+        if not options.topics and not self._regex.fullmatch(topic):
+            return False
+        if len(types) > 1:
+            self._warn_once(
+                topic,
+                f"Topic '{topic}' has more than one type associated. "
+                "Only topics with one type are supported",
+            )
+            return False
+        package = types[0].split("/")[0]
+        if not package_is_known(package):
+            self._warn_once(
+                types[0],
+                f"Topic '{topic}' has unknown type '{types[0]}' . Only topics with known type are "
+                f"supported. Reason: 'package '{package}' not found",
+            )
+            return False
+        if not options.include_hidden and any(part.startswith("_") for part in topic.split("/")):
+            self._warn_once(
+                topic, "Hidden topics are not recorded. Enable them with --include-hidden-topics"
+            )
+            return False
+        return bool(self._node.get_publishers_info_by_topic(topic))
+
+    def _subscribe(self, topic: str, type_name: str) -> None:
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        if not publishers:
+            return
+        offers = [publisher.qos_profile for publisher in publishers]
+        hashes = {bytes(p.topic_type_hash.value) for p in publishers if p.topic_type_hash.version}
+        named = f"RIHS01_{hashes.pop().hex()}" if len(hashes) == 1 else ""
+        self._bag.subscribe(Topic(topic, type_name, qos_text(map(offered, offers)), named))
+        if topic in self._profiles:
+            self._log(f"Overriding subscription profile for {topic}")
+            asked = self._profiles[topic]
+        else:
+            asked = adapted(topic, offers, lambda text: _say("warn", "rosbag2_storage", text))
+        self._asked[topic] = asked
+
+        def take(payload: bytes, info: dict[str, int]) -> None:
+            self._take(topic, payload, info)
+
+        subscription(self._node, topic, (type_name, type_hash(type_name)), asked, take)
+        self._log(f"Subscribed to topic '{topic}'")
+
+    def _take(self, topic: str, payload: bytes, info: dict[str, int]) -> None:
+        log_time = info["received_timestamp"]
+        if self._options.use_sim_time:
+            log_time = self._node.get_clock().now().nanoseconds
+        # Humble has one time for both.
+        publish_time = log_time if self._distro == "humble" else info["source_timestamp"]
+        self._bag.write(topic, payload, log_time, publish_time)
+
+    def _check(self, topic: str) -> None:
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        warning = refused(topic, [p.qos_profile for p in publishers], self._asked[topic])
+        if warning is not None:
+            self._warn_once(f"qos {topic}", warning)
+
+    def _warn_once(self, about: str, text: str) -> None:
+        if about not in self._warned:
+            self._warned.add(about)
+            _say("warn", self._name, text)
+
+    def _log(self, text: str) -> None:
+        _say("info", self._name, text)
+
+
+def _say(level: str, logger: str, text: str) -> None:
+    getattr(get_logger(logger), level)(text)
