@@ -9,12 +9,13 @@
 FROM python:3.11-slim AS build
 WORKDIR /src
 RUN pip install --no-cache-dir uv
+ENV UV_PROJECT_ENVIRONMENT=/opt/ros2-memory UV_COMPILE_BYTECODE=1
 COPY pyproject.toml uv.lock README.md LICENSE ./
 # The dependencies alone first: a layer that only a change of the lock rebuilds.
-RUN UV_PROJECT_ENVIRONMENT=/opt/ros2-memory uv sync --locked --no-default-groups --no-install-project
+RUN uv sync --locked --no-default-groups --no-install-project
 COPY src src
 COPY config config
-RUN UV_PROJECT_ENVIRONMENT=/opt/ros2-memory uv sync --locked --no-default-groups --no-editable
+RUN uv sync --locked --no-default-groups --no-editable
 
 FROM python:3.11-slim
 RUN useradd --system --no-create-home --shell /usr/sbin/nologin ros2-memory
