@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mcap.opcode import Opcode
 
 from ros2_memory.storage.base import Channel, Closing, Record
 from ros2_memory.storage.faults import UnreadableError
@@ -25,7 +26,7 @@ from ros2_memory.storage.mcap_index import (
     chunk_data,
     index_from_summary,
 )
-from ros2_memory.storage.mcap_records import MESSAGE, RECORD, Opcode
+from ros2_memory.storage.mcap_records import MESSAGE, RECORD
 from ros2_memory.storage.mcap_scan import index_by_scan
 from ros2_memory.storage.merge import Rows, Run, merged
 from ros2_memory.storage.open_file import OpenFile

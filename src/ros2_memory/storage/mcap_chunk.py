@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
+from mcap.opcode import Opcode
 
 from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.mcap_records import (
@@ -17,7 +18,6 @@ from ros2_memory.storage.mcap_records import (
     MESSAGE,
     MESSAGE_FIELDS,
     RECORD,
-    Opcode,
 )
 from ros2_memory.storage.zstd import unpacked_zstd
 from ros2_memory.timebase import MAX_NS

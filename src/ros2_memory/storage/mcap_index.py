@@ -12,6 +12,8 @@ import zlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from mcap.opcode import Opcode
+
 from ros2_memory.storage.faults import UnreadableError, damage
 from ros2_memory.storage.mcap_chunk import (
     Column,
@@ -26,7 +28,6 @@ from ros2_memory.storage.mcap_records import (
     RECORD,
     ChunkIndex,
     Declarations,
-    Opcode,
     Statistics,
     chunk_index,
     framed,

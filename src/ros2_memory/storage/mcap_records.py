@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.stream_reader import MAGIC_SIZE
 from mcap.writer import MCAP0_MAGIC
 
 from ros2_memory.storage.base import Channel, Schema
@@ -27,9 +26,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.timebase import Ns
 
-__all__ = ["MAGIC", "MAGIC_SIZE", "Declarations", "Opcode", "framed"]
-
 MAGIC: Final = MCAP0_MAGIC
+MAGIC_SIZE: Final = len(MAGIC)
 RECORD: Final = struct.Struct("<BQ")
 """Opcode and length of the body."""
 MESSAGE: Final = struct.Struct("<BQHIQQ")

@@ -10,6 +10,8 @@ from array import array
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from mcap.opcode import Opcode
+
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.faults import UnreadableError, damage
 from ros2_memory.storage.mcap_chunk import (
@@ -35,7 +37,6 @@ from ros2_memory.storage.mcap_records import (
     MESSAGE_FIELDS,
     RECORD,
     Declarations,
-    Opcode,
     Statistics,
     statistics,
 )
