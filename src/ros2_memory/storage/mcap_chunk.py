@@ -159,7 +159,7 @@ class ChunkHead(NamedTuple):
     data_at: int
 
 
-_CHUNK_HEAD_BYTES: Final = 96
+CHUNK_HEAD_BYTES: Final = 96
 """As much of a chunk record's body as holds its fields, whatever its compression is called."""
 
 
@@ -177,7 +177,7 @@ def packed_chunk(
     Raises:
         UnreadableError: the fields are not all there, or the data are larger than allowed.
     """
-    head = _chunk_head(file.read(body_at, min(body_size, _CHUNK_HEAD_BYTES)))
+    head = chunk_head(file.read(body_at, min(body_size, CHUNK_HEAD_BYTES)))
     if head.data_size > max_bytes:
         raise _too_large(max_bytes)
     held = min(body_size - head.data_at, head.data_size)
@@ -188,7 +188,12 @@ def _too_large(max_bytes: int) -> UnreadableError:
     return UnreadableError(f"a chunk is larger than the {max_bytes >> 20} MiB allowed")
 
 
-def _chunk_head(body: bytes) -> ChunkHead:
+def chunk_head(body: bytes) -> ChunkHead:
+    """The fields of a chunk record, from the beginning of its body.
+
+    Raises:
+        UnreadableError: that is not enough of it.
+    """
     if len(body) < CHUNK_TIMES.size + 12:
         raise UnreadableError("damaged: a chunk ends inside its own header")
     crc: int = CHUNK_TIMES.unpack_from(body)[3]

@@ -26,6 +26,24 @@ if TYPE_CHECKING:
 
     from ros2_memory.timebase import Ns
 
+__all__ = [
+    "CHUNK_TIMES",
+    "FOOTER",
+    "MAGIC",
+    "MAGIC_SIZE",
+    "MESSAGE",
+    "MESSAGE_FIELDS",
+    "RECORD",
+    "ChunkIndex",
+    "Declarations",
+    "Opcode",
+    "Statistics",
+    "chunk_index",
+    "framed",
+    "offered_as_latched",
+    "statistics",
+]
+
 MAGIC: Final = MCAP0_MAGIC
 MAGIC_SIZE: Final = len(MAGIC)
 RECORD: Final = struct.Struct("<BQ")
@@ -148,6 +166,7 @@ class Declarations:
                 channel.message_encoding,
                 self._schemas.get(channel.schema_id, Schema("")),
                 offered_as_latched(channel.metadata.get("offered_qos_profiles", "")),
+                tuple(channel.metadata.items()),
             )
             for number, channel in self._channels.items()
         }
