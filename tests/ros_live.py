@@ -209,7 +209,8 @@ def _domain() -> Iterator[int]:
 
 
 def _shared_memory() -> set[Path]:
-    return set(SHARED_MEMORY.glob("*fastrtps_*"))
+    """What Fast DDS has there: 2 calls it fastrtps, 3 fastdds."""
+    return {*SHARED_MEMORY.glob("*fastrtps_*"), *SHARED_MEMORY.glob("*fastdds_*")}
 
 
 def _remove_unused(files: set[Path]) -> None:

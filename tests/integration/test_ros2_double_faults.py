@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -27,7 +28,6 @@ from tests.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 pytestmark = needs_ros
 
@@ -165,6 +165,21 @@ def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Pat
         assert recording.process.wait(timeout=20) == 1
     said = f"[ERROR] [ros2bag]: Output folder '{tmp_path / 'a'}' already exists.\n"
     assert recording.said == said
+
+
+def test_what_a_killed_recorder_leaves_in_shared_memory_is_removed_with_its_environment(
+    tmp_path: Path,
+) -> None:
+    with (
+        ros_environment(tmp_path) as env,
+        Recording(env, tmp_path / "a", "-e", "/odom") as recording,
+    ):
+        recording.await_said("Recording...")
+        maps = Path(f"/proc/{recording.process.pid}/maps").read_text()
+        mapped = {Path(name) for name in re.findall(r"/dev/shm/\S*fast\S+", maps)}
+        recording.stop(signal.SIGKILL)
+        assert any(file.exists() for file in mapped)
+    assert not any(file.exists() for file in mapped)
 
 
 def test_parents_of_the_directory_are_created(quiet: dict[str, str], tmp_path: Path) -> None:
