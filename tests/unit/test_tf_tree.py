@@ -243,6 +243,8 @@ def test_a_static_transform_holds_at_all_times(time: int) -> None:
 
 def test_of_several_static_transforms_the_newest_received_holds() -> None:
     older = edge("base", "laser", 900, 1.0, log_time=10, static=True)
+    again = edge("base", "laser", 900, 3.0, log_time=10, static=True)
+    assert shift(FrameGraph([older, again]), "base", "laser", 0) == 3.0
     newer = edge("torso", "laser", 5, 2.0, log_time=20, static=True)
     for order in ([older, newer], [newer, older]):
         graph = FrameGraph(order)
@@ -328,8 +330,7 @@ def test_nothing_is_extrapolated_and_the_range_of_the_edge_is_told(time: int, of
     refused = refusal(graph, "map", "base", time)
     assert refused.reason is NoDataReason.OUTSIDE_RANGE
     assert "no transform of 'base' in 'odom'" in refused.detail
-    assert "100.000000 to 105.000000 (Unix seconds)" in refused.detail
-    assert f"{off} the time asked" in refused.detail
+    assert f"100.000000 to 105.000000 (Unix seconds), {off} the time asked" in refused.detail
     assert refusal(graph, "base", "map", time).detail == refused.detail
 
 
@@ -345,6 +346,13 @@ def test_a_gap_wider_than_the_cache_is_told_with_both_its_edges() -> None:
     assert refused.reason is NoDataReason.GAP
     assert "100.000000 (4.000 s before) and 111.000000 (7.000 s after)" in refused.detail
     assert "10.000 s is not interpolated" in refused.detail
+
+
+def test_a_refusal_names_the_parent_of_the_nearest_message() -> None:
+    assert "of 'cup' in 'table' at 9.0" in refusal(picked_up(), "map", "cup", 9 * S).detail
+    assert "of 'cup' in 'gripper' at 17.0" in refusal(picked_up(), "map", "cup", 17 * S).detail
+    graph = FrameGraph([edge("a", "cup", 0), edge("b", "cup", 20 * S), edge("c", "cup", 21 * S)])
+    assert "of 'cup' in 'a' at 5.0" in refusal(graph, "a", "cup", 5 * S).detail
 
 
 def test_the_width_of_a_gap_is_the_callers_to_choose() -> None:

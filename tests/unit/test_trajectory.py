@@ -71,6 +71,11 @@ def test_a_known_path_has_its_length_duration_and_mean_speed() -> None:
     assert found.max_speed_from == "positions"
 
 
+def test_poses_at_ten_hertz_each_tell_a_speed() -> None:
+    found = summarise(driven(along_x(0, 0.1, 0.2, 0.7, 0.8), 100 * MS), LIMIT_MPS)
+    assert found.max_speed == pytest.approx(5.0)
+
+
 def test_height_counts_in_the_length() -> None:
     assert summarise(driven([(0, 0, 0), (0, 3, 4)]), LIMIT_MPS).distance_m == 5.0
 
