@@ -42,12 +42,17 @@ class Schema:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One topic under one type in one bag. `encoding` is the message encoding (`cdr`, `json`)."""
+    """One topic under one type in one bag. `encoding` is the message encoding (`cdr`, `json`).
+
+    `metadata` is what the recorder noted of it, such as what publishers offer
+    (`offered_qos_profiles`), as it stands in the bag.
+    """
 
     topic: str
     encoding: str
     schema: Schema
     latched: bool = False
+    metadata: tuple[tuple[str, str], ...] = ()
 
     @property
     def type(self) -> str:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory.storage.base import Closing
+from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.mcap_records import MAGIC, MAGIC_SIZE
+from ros2_memory.storage.open_file import EMPTY_FILE
 
 if TYPE_CHECKING:
     from ros2_memory.storage.open_file import OpenFile
@@ -24,3 +26,17 @@ def closing_of(file: OpenFile) -> Closing:
 def begins_as_mcap(file: OpenFile) -> bool:
     """Whether it begins with MCAP's magic, or with as much of it as the file has bytes."""
     return MAGIC.startswith(file.read(0, min(file.size, MAGIC_SIZE)))
+
+
+def require_mcap(file: OpenFile) -> None:
+    """Refuses what cannot be read as MCAP from its beginning.
+
+    Raises:
+        UnreadableError: it is no MCAP file, or ends within its magic.
+    """
+    if not file.size:
+        raise UnreadableError(EMPTY_FILE)
+    if not begins_as_mcap(file):
+        raise UnreadableError("not an MCAP file: it does not begin as one")
+    if file.size < MAGIC_SIZE:
+        raise UnreadableError(f"only its first {file.size} bytes had reached the disk")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from contextlib import suppress
 from io import BytesIO
 from typing import TYPE_CHECKING, Final
 
@@ -18,16 +17,14 @@ from mcap.data_stream import ReadDataStream
 
 from ros2_memory.storage.faults import UnreadableError, damage
 from ros2_memory.storage.mcap_chunk import (
-    CHUNK_HEAD_BYTES,
-    chunk_head,
+    packed_chunk,
     unpacked,
     unpacked_in_part,
     walk,
 )
-from ros2_memory.storage.mcap_file import begins_as_mcap
+from ros2_memory.storage.mcap_file import require_mcap
 from ros2_memory.storage.mcap_index import MAX_SECTION_BYTES
 from ros2_memory.storage.mcap_records import MAGIC_SIZE, MESSAGE_FIELDS, RECORD, Opcode
-from ros2_memory.storage.open_file import EMPTY_FILE
 from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:
@@ -35,14 +32,14 @@ if TYPE_CHECKING:
 
     from ros2_memory.storage.open_file import OpenFile
 
-_KINDS: Final = {
-    int(Opcode.HEADER): mcap_records.Header,
-    int(Opcode.SCHEMA): mcap_records.Schema,
-    int(Opcode.CHANNEL): mcap_records.Channel,
-    int(Opcode.MESSAGE): mcap_records.Message,
-    int(Opcode.ATTACHMENT): mcap_records.Attachment,
-    int(Opcode.METADATA): mcap_records.Metadata,
+_READERS: Final[dict[int, Callable[[ReadDataStream], mcap_records.McapRecord]]] = {
+    Opcode.HEADER: mcap_records.Header.read,
+    Opcode.SCHEMA: mcap_records.Schema.read,
+    Opcode.CHANNEL: mcap_records.Channel.read,
+    Opcode.ATTACHMENT: mcap_records.Attachment.read,
+    Opcode.METADATA: mcap_records.Metadata.read,
 }
+_CONTENT: Final = frozenset((*_READERS, Opcode.MESSAGE))
 """The records that say something of their own; the others say where these are."""
 _MESSAGE_BODY: Final = struct.Struct("<HIQQ")
 """Channel, sequence, log time and publish time; the payload follows."""
@@ -60,14 +57,11 @@ class Salvage:
         """The records that say something of their own as (opcode, body).
 
         Raises:
-            UnreadableError: it is no MCAP file, or is empty.
+            UnreadableError: it is no MCAP file, or ends within its magic.
         """
         file = self._file
-        if not file.size:
-            raise UnreadableError(EMPTY_FILE)
-        if not begins_as_mcap(file):
-            raise UnreadableError("not an MCAP file: it does not begin as one")
-        position, data_ended = min(MAGIC_SIZE, file.size), False
+        require_mcap(file)
+        position, data_ended = MAGIC_SIZE, False
         while position + RECORD.size <= file.size:
             opcode, length = RECORD.unpack(file.read(position, RECORD.size))
             start, end = position + RECORD.size, position + RECORD.size + length
@@ -89,7 +83,7 @@ class Salvage:
     def _whole(self, opcode: int, start: int, end: int) -> Iterator[tuple[int, bytes]]:
         if opcode == Opcode.CHUNK:
             yield from self._chunk(start, end)
-        elif opcode in _KINDS:
+        elif opcode in _CONTENT:
             if end - start <= MAX_SECTION_BYTES:
                 yield opcode, self._file.read(start, end - start)
             else:
@@ -98,10 +92,7 @@ class Salvage:
     def _chunk(self, start: int, end: int) -> Iterator[tuple[int, bytes]]:
         try:
             with damage():
-                head = chunk_head(self._file.read(start, min(CHUNK_HEAD_BYTES, end - start)))
-                if start + head.data_at + head.data_size > end:
-                    raise UnreadableError("damaged: a chunk is shorter than it states")
-                packed = self._file.read(start + head.data_at, head.data_size)
+                head, packed = packed_chunk(self._file, start, end - start, self._max_chunk_bytes)
                 data = unpacked(head, packed, self._max_chunk_bytes)
         except UnreadableError:
             # Those behind it may be whole.
@@ -116,9 +107,7 @@ class Salvage:
         held = self._file.size - start
         try:
             with damage():
-                head = chunk_head(self._file.read(start, min(CHUNK_HEAD_BYTES, held)))
-                size = min(held - head.data_at, head.data_size)
-                packed = self._file.read(start + head.data_at, size)
+                head, packed = packed_chunk(self._file, start, held, self._max_chunk_bytes)
                 data = unpacked_in_part(head, packed, self._max_chunk_bytes)
         except UnreadableError:
             self.lost_bytes += held
@@ -133,7 +122,7 @@ def _whole_records(data: bytes, usable: int) -> Iterator[tuple[int, bytes]]:
     while position < usable:
         opcode, length = RECORD.unpack_from(data, position)
         position += RECORD.size + length
-        if opcode in _KINDS:
+        if opcode in _CONTENT:
             yield opcode, data[position - length : position]
 
 
@@ -145,59 +134,63 @@ def parsed(records: Iterable[tuple[int, bytes]]) -> Iterator[mcap_records.McapRe
             data = body[_MESSAGE_BODY.size :]
             yield mcap_records.Message(channel, log_time, data, publish_time, sequence)
             continue
-        kind = _KINDS[opcode]
-        with suppress(UnreadableError), damage():
-            yield kind.read(ReadDataStream(BytesIO(body)))
+        try:
+            with damage():
+                record = _READERS[opcode](ReadDataStream(BytesIO(body)))
+        except UnreadableError:
+            continue
+        yield record
 
 
 class Tally:
-    """What counts of a file, and a digest of it that another file with the same content shares.
+    """What counts of a file; `said` is the same for two files that hold the same.
 
     Schemas and channels count by what they say, since their numbers are local to a file. A message
     counts where its channel is declared before it and its log time is one.
     """
 
     def __init__(self) -> None:
-        self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        self._schemas: dict[int, mcap_records.Schema] = {}
         self._channels: dict[int, bytes] = {}
-        self._hash = hashlib.blake2b()
+        self._in_order = hashlib.blake2b()
+        self._beside = hashlib.blake2b()
         self.messages = 0
 
     @property
-    def digest(self) -> bytes:
-        """Of all records that count but the header, in their order."""
-        return self._hash.digest()
+    def said(self) -> tuple[bytes, bytes, frozenset[bytes]]:
+        """Digests of the messages in their order, of what stands between them, and of channels."""
+        channels = frozenset(self._channels.values())
+        return self._in_order.digest(), self._beside.digest(), channels
 
     def counts(self, record: mcap_records.McapRecord) -> bool:
         """Takes a record in; whether it counts. A declaration that is repeated does not."""
         if isinstance(record, mcap_records.Message):
             return self._message(record)
         if isinstance(record, mcap_records.Schema):
-            said = (record.name, record.encoding, record.data)
             known = record.id == 0 or record.id in self._schemas
-            self._schemas.setdefault(record.id, said)
+            self._schemas.setdefault(record.id, record)
             return not known
         if isinstance(record, mcap_records.Channel):
             return self._channel(record)
         if not isinstance(record, mcap_records.Header):
-            self._hash.update(repr(record).encode())
+            self._beside.update(repr(record).encode())
         return True
 
     def _channel(self, channel: mcap_records.Channel) -> bool:
         if channel.id in self._channels:
             return False
         schema = self._schemas.get(channel.schema_id)
-        said = (channel.topic, channel.message_encoding, schema, channel.metadata)
-        self._channels[channel.id] = hashlib.blake2b(repr(said).encode()).digest()
-        self._hash.update(self._channels[channel.id])
+        definition = (schema.name, schema.encoding, schema.data) if schema else None
+        said = repr((channel.topic, channel.message_encoding, channel.metadata, definition))
+        self._channels[channel.id] = hashlib.blake2b(said.encode()).digest()
         return True
 
     def _message(self, message: mcap_records.Message) -> bool:
-        said = self._channels.get(message.channel_id)
-        if said is None or message.log_time >= MAX_NS:
+        channel = self._channels.get(message.channel_id)
+        if channel is None or message.log_time >= MAX_NS:
             return False
-        times = (message.sequence, message.log_time, message.publish_time, len(message.data))
-        self._hash.update(said + repr(times).encode())
-        self._hash.update(message.data)
+        numbers = (message.sequence, message.log_time, message.publish_time, len(message.data))
+        self._in_order.update(channel + repr(numbers).encode())
+        self._in_order.update(message.data)
         self.messages += 1
         return True

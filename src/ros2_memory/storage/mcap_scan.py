@@ -22,7 +22,7 @@ from ros2_memory.storage.mcap_chunk import (
     unpacked_in_part,
     walk,
 )
-from ros2_memory.storage.mcap_file import begins_as_mcap, closing_of
+from ros2_memory.storage.mcap_file import closing_of, require_mcap
 from ros2_memory.storage.mcap_index import (
     MAX_SECTION_BYTES,
     Chunk,
@@ -40,7 +40,6 @@ from ros2_memory.storage.mcap_records import (
     Statistics,
     statistics,
 )
-from ros2_memory.storage.open_file import EMPTY_FILE
 
 if TYPE_CHECKING:
     from ros2_memory.storage.mcap_chunk import ChunkHead, Column
@@ -60,12 +59,7 @@ def index_by_scan(file: OpenFile, max_chunk_bytes: int, note: str = "") -> McapI
     Raises:
         UnreadableError: it is no MCAP file, or is empty.
     """
-    if not file.size:
-        raise UnreadableError(EMPTY_FILE)
-    if not begins_as_mcap(file):
-        raise UnreadableError("not an MCAP file: it does not begin as one")
-    if file.size < MAGIC_SIZE:
-        raise UnreadableError(f"only its first {file.size} bytes had reached the disk")
+    require_mcap(file)
     scan = _Scan(file, max_chunk_bytes, closed=closing_of(file) is Closing.CLOSED)
     scan.run()
     return scan.index(note)

@@ -80,13 +80,13 @@ class McapWriter(BagWriter):
         with OpenFile(target) as file:
             for record in parsed(Salvage(file, self._max_chunk_mb << 20).records()):
                 again.counts(record)
-        if (after.topics, again.digest) != (before.topics, tally.digest):
+        if (after.topics, again.said) != (before.topics, tally.said):
             raise UnreadableError("what was written is not what could be read")
         return before.notes
 
 
 class _Copy:
-    """Puts the records of another file into a writer. Numbers of schemas and channels may differ."""
+    """Puts the records of another file into a writer, which numbers schemas and channels anew."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer

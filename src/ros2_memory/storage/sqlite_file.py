@@ -45,6 +45,11 @@ _ASCENDING: Final = """
 _DESCENDING: Final = _ASCENDING.replace("timestamp, rowid\n", "timestamp DESC, rowid DESC\n")
 # Answered from an index where there is one: it may be damaged where the messages are not.
 _COUNT: Final = "SELECT count(*) FROM messages WHERE timestamp >= ? AND timestamp < ?"
+_METADATA: Final = (
+    ("offered_qos_profiles", "offered_qos_profiles"),
+    ("type_description_hash", "topic_type_hash"),
+)
+"""Columns of the table of topics, and what an MCAP file calls them in a channel's metadata."""
 _PAYLOAD: Final = "SELECT data FROM messages WHERE rowid = ?"
 
 
@@ -159,6 +164,9 @@ class SqliteBags:
                     str(value.get("serialization_format") or "cdr"),
                     schema,
                     offered_as_latched(str(value.get("offered_qos_profiles") or "")),
+                    tuple(
+                        (known, str(value[name])) for name, known in _METADATA if value.get(name)
+                    ),
                 )
             )
         return _Topics(channels)
