@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import select
 import signal
+import socket
 import time
-from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
 
 import structlog
 
@@ -17,13 +20,14 @@ from ros2_memory.recorder.wipe import clear_bags
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+    from types import FrameType
 
     from ros2_memory.recorder.notify import ServiceManager
     from ros2_memory.recorder.ports import Housekeeper
     from ros2_memory.storage.base import BagReader
 
 TICK_S: Final = 0.2
-ENDING: Final = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
+ENDING: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -74,43 +78,74 @@ def lock_and_prepare(
     return lock
 
 
-def record_until_told(
-    recorder: Ticking, manager: ServiceManager, *, pause: Callable[[float], bool] | None = None
-) -> None:
+def record_until_told(recorder: Ticking, manager: ServiceManager) -> None:
     """Records until SIGTERM, SIGINT or SIGHUP comes, and ends what it started.
 
-    `pause` waits for so many seconds and says whether to go on; where None, until a signal comes.
     It must be called from the main thread, which the recorder's processes die with.
 
     Raises:
         EpisodicError: recording cannot begin.
     """
-    wait = pause or wait_for_signal
-    # From here on a signal is waited for, and interrupts nothing. A child resets this for itself.
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
-    # A child whose end is ignored would be reaped by the system, and its number taken by another.
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     interval_s = watchdog_interval_s()
-    try:
-        recorder.start()
-        manager.tell(READY)
-        next_sign_s = 0.0
-        while wait(TICK_S):
-            recorder.tick()
-            if interval_s is not None and time.monotonic() >= next_sign_s:
-                manager.tell(WATCHDOG)
-                next_sign_s = time.monotonic() + interval_s / 2
-    finally:
-        manager.tell(STOPPING)
-        recorder.stop()
+    next_sign_s = 0.0
+    with EndingSignals() as signals:
+        try:
+            recorder.start()
+            manager.tell(READY)
+            while signals.wait(TICK_S):
+                recorder.tick()
+                if interval_s is not None and time.monotonic() >= next_sign_s:
+                    manager.tell(WATCHDOG)
+                    next_sign_s = time.monotonic() + interval_s / 2
+        finally:
+            manager.tell(STOPPING)
+            recorder.stop()
 
 
-def wait_for_signal(seconds: float) -> bool:
-    """Waits; False when one of the ending signals has come. They must be blocked."""
-    info = signal.sigtimedwait(ENDING, seconds)
-    if info is not None:
-        _log.info("signal_received", signal=signal.Signals(info.si_signo).name)
-    return info is None
+class EndingSignals:
+    """While it is entered, the ending signals are noted, and interrupt nothing.
+
+    They are not blocked and waited for: a thread that a library started before would take them,
+    and they would end the program. The end of children is not ignored either, or the system would
+    reap them, and their numbers would be taken by others.
+    """
+
+    def __init__(self) -> None:
+        self._received: int | None = None
+        self._readable, self._writable = socket.socketpair()
+        self._put_back = ExitStack()
+
+    def __enter__(self) -> Self:
+        """Installs the handlers. Only in the main thread."""
+        for end in (self._readable, self._writable):
+            end.setblocking(False)
+            self._put_back.enter_context(end)
+        before = signal.set_wakeup_fd(self._writable.fileno(), warn_on_full_buffer=False)
+        self._put_back.callback(signal.set_wakeup_fd, before)
+        for number in ENDING:
+            handler = signal.signal(number, self._note)
+            self._put_back.callback(signal.signal, number, handler)
+        handler = signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        self._put_back.callback(signal.signal, signal.SIGCHLD, handler)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Puts back what was installed before."""
+        self._put_back.close()
+
+    def wait(self, seconds: float) -> bool:
+        """Waits for so long, or until a signal comes; whether none has come yet."""
+        if self._received is None:
+            select.select([self._readable], [], [], seconds)
+            with suppress(BlockingIOError):
+                self._readable.recv(64)
+        if self._received is None:
+            return True
+        _log.info("signal_received", signal=signal.Signals(self._received).name)
+        return False
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self._received = number
 
 
 def _prepare(bag_dir: Path, reader: BagReader, housekeeper: Housekeeper) -> None:

@@ -1,0 +1,383 @@
+"""The recorder's program, run whole over a stand-in for `ros2` (see `tests/stub_ros2.py`)."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.recorder.handover import read_handover
+from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.storage.base import Closing
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.waiting import until
+
+STUB = Path(__file__).resolve().parents[1] / "stub_ros2.py"
+PERIOD_NS = 10_000_000
+
+
+@dataclass
+class Daemon:
+    """A running recorder daemon and what it wrote."""
+
+    process: subprocess.Popen[bytes]
+    bag_dir: Path
+    log: Path
+
+    def events(self, name: str) -> list[dict[str, Any]]:
+        found = []
+        for line in self.log.read_text().splitlines():
+            if line.startswith("{") and line.endswith("}"):
+                event = json.loads(line)
+                if event["event"] == name:
+                    found.append(event)
+        return found
+
+    def wait_for(self, name: str, count: int = 1) -> list[dict[str, Any]]:
+        def come() -> list[dict[str, Any]] | None:
+            found = self.events(name)
+            return found if len(found) >= count else None
+
+        return until(come, timeout_s=40)
+
+    def wait_for_state(self, state: RecorderState) -> None:
+        def is_so() -> bool:
+            beat = read_heartbeat(self.bag_dir).heartbeat
+            return beat is not None and beat.state is state and beat.pid == self.process.pid
+
+        until(is_so, timeout_s=40)
+
+    @property
+    def child(self) -> int:
+        """The process number of the newest recorder."""
+        return int(self.wait_for("recorder_started")[-1]["pid"])
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        self.process.send_signal(number)
+        return self.process.wait(40)
+
+    def recordings(self) -> list[Path]:
+        return sorted(path for path in self.bag_dir.glob("rec_*") if path.is_dir())
+
+
+class Site:
+    """A machine with a `ros2` program, on which daemons are started."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.bag_dir = folder / "bags"
+        self.topics = folder / "topics.yaml"
+        self.topics.write_text("topics: [/odom, /tf]\n")
+        self.silent = folder / "silent"
+        self.daemons: list[Daemon] = []
+        programs = folder / "bin"
+        programs.mkdir()
+        ros2 = programs / "ros2"
+        ros2.write_text(
+            f"#!{sys.executable}\nimport runpy\n"
+            f"runpy.run_path({str(STUB)!r}, run_name='__main__')\n"
+        )
+        ros2.chmod(0o755)
+        self.env = {
+            **os.environ,
+            "PATH": f"{programs}:{os.environ['PATH']}",
+            "STUB_SILENT": str(self.silent),
+            "STUB_PERIOD_MS": str(PERIOD_NS // 10**6),
+        }
+
+    def run(self, *overrides: str, wait: bool = True, **options: Any) -> Daemon:
+        log = self.folder / f"log{len(self.daemons)}"
+        with log.open("wb") as stream:
+            process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    "ros2_memory.recorder",
+                    f"recording.bag_dir={self.bag_dir}",
+                    f"recording.topics_file={self.topics}",
+                    "recording.split_duration_s=1",
+                    "recording.session_duration_s=3600",
+                    "retention.min_free_gb=0",
+                    *overrides,
+                ],
+                env=self.env,
+                stderr=stream,
+                stdin=subprocess.DEVNULL,
+                **options,
+            )
+        daemon = Daemon(process, self.bag_dir, log)
+        self.daemons.append(daemon)
+        if wait:
+            daemon.wait_for_state(RecorderState.RECORDING)
+        return daemon
+
+    def refusal(self, *overrides: str) -> tuple[int, str]:
+        """Exit code and output of a daemon that does not begin."""
+        daemon = self.run(*overrides, wait=False)
+        return daemon.process.wait(40), daemon.log.read_text()
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path)
+    yield site
+    for daemon in site.daemons:
+        if daemon.process.poll() is None:
+            daemon.stop()
+
+
+def published(bag_dir: Path, *, counting: bool) -> Counter[int]:
+    """How often each publish time of `/odom` stands in the bags, or counts in them."""
+    reader = CountingReader(McapReader()) if counting else McapReader()
+    found: Counter[int] = Counter()
+    for path in sorted(bag_dir.glob("*/*.mcap")):
+        if path.stat().st_size:
+            records = reader.records(path, ["/odom"], TimeWindow.everything())
+            found.update(record.publish_time for record in records)
+    return found
+
+
+def assert_nothing_lost_or_doubled(bag_dir: Path) -> None:
+    stands, counts = published(bag_dir, counting=False), published(bag_dir, counting=True)
+    assert counts == dict.fromkeys(stands, 1)
+    assert len(stands) == (max(stands) - min(stands)) // PERIOD_NS + 1
+
+
+def test_over_rotations_no_message_is_lost_or_counts_twice(site: Site) -> None:
+    daemon = site.run("recording.session_duration_s=2")
+    daemon.wait_for("rotated", 3)
+    assert daemon.stop() == 0
+    assert_nothing_lost_or_doubled(site.bag_dir)
+    twice = [times for times in published(site.bag_dir, counting=False).values() if times > 1]
+    assert len(twice) > 3 * 100
+    beat = read_heartbeat(site.bag_dir).heartbeat
+    assert beat is not None
+    assert (beat.state, beat.recordings, beat.last_error) == (RecorderState.STOPPED, (), None)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_ends_it_and_every_file_is_complete(site: Site, number: int) -> None:
+    daemon = site.run()
+    daemon.wait_for("split_closed")
+    child = daemon.child
+    assert daemon.stop(number) == 0
+    assert not Path(f"/proc/{child}").exists()
+    (recording,) = daemon.recordings()
+    assert (recording / "metadata.yaml").exists()
+    states = {McapReader().closing(path) for path in recording.glob("*.mcap")}
+    assert states == {Closing.CLOSED}
+
+
+def test_a_killed_recorder_is_replaced_by_a_new_recording(site: Site) -> None:
+    daemon = site.run()
+    first = daemon.child
+    os.kill(first, signal.SIGKILL)
+    daemon.wait_for("recorder_started", 2)
+    daemon.wait_for("recording", 2)
+    (died,) = daemon.events("recorder_died")
+    assert "status -9" in died["reason"]
+    assert daemon.stop() == 0
+    assert len(daemon.recordings()) == 2
+
+
+def test_a_killed_daemon_takes_its_recorder_with_it_and_the_next_goes_on(site: Site) -> None:
+    daemon = site.run()
+    daemon.wait_for("split_closed")
+    child = daemon.child
+    assert daemon.stop(signal.SIGKILL) == -signal.SIGKILL
+    until(lambda: not Path(f"/proc/{child}").exists())
+    (recording,) = daemon.recordings()
+    assert (recording / "metadata.yaml").exists()
+    following = site.run()
+    assert len(following.recordings()) == 2
+    assert following.stop() == 0
+
+
+def test_one_that_starts_while_the_child_of_a_killed_one_still_closes_waits_for_it(
+    site: Site,
+) -> None:
+    daemon = site.run()
+    child = daemon.child
+    os.kill(child, signal.SIGSTOP)
+    daemon.stop(signal.SIGKILL)
+    following = site.run(wait=False)
+    with pytest.raises(subprocess.TimeoutExpired):
+        following.process.wait(1)
+    assert following.events("recorder_started") == []
+    os.kill(child, signal.SIGCONT)
+    following.wait_for_state(RecorderState.RECORDING)
+    assert following.stop() == 0
+
+
+@pytest.mark.parametrize("step", ["rotation_begun", "rotated"])
+def test_killed_at_a_rotation_the_next_start_settles_what_counts(site: Site, step: str) -> None:
+    daemon = site.run("recording.session_duration_s=1")
+    daemon.wait_for(step)
+    children = [int(event["pid"]) for event in daemon.wait_for("recorder_started", 2)]
+    daemon.stop(signal.SIGKILL)
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children))
+    assert site.run().stop() == 0
+    stands, counts = (
+        published(site.bag_dir, counting=False),
+        published(site.bag_dir, counting=True),
+    )
+    assert counts == dict.fromkeys(stands, 1)
+
+
+def test_a_second_recorder_is_refused_and_told_who_records(site: Site) -> None:
+    daemon = site.run()
+    code, said = site.refusal()
+    assert code == 1
+    assert f"process {daemon.process.pid} on {socket.gethostname()}" in said
+    assert daemon.stop() == 0
+
+
+def test_a_disk_with_too_little_room_pauses_recording_within_seconds(site: Site) -> None:
+    daemon = site.run("retention.min_free_gb=1e9", wait=False)
+    daemon.wait_for_state(RecorderState.PAUSED)
+    (paused,) = daemon.events("recording_paused")
+    assert paused["level"] == "error"
+    assert daemon.recordings() == []
+    assert daemon.stop() == 0
+
+
+def test_a_robot_that_falls_silent_has_its_last_words_closed(site: Site) -> None:
+    daemon = site.run()
+    daemon.wait_for("split_closed", 5)
+    site.silent.touch()
+    daemon.wait_for("rotated")
+    first = daemon.recordings()[0]
+    until(lambda: {McapReader().closing(p) for p in first.glob("*.mcap")} == {Closing.CLOSED})
+    assert daemon.stop() == 0
+    assert published(site.bag_dir, counting=True) == dict.fromkeys(
+        published(site.bag_dir, counting=False), 1
+    )
+
+
+def test_a_recording_that_is_deleted_is_followed_by_another(site: Site) -> None:
+    daemon = site.run()
+    daemon.wait_for("split_closed")
+    (recording,) = daemon.recordings()
+    recording.rename(site.folder / "elsewhere")
+    daemon.wait_for("recording_vanished")
+    daemon.wait_for("recording", 2)
+    assert daemon.stop() == 0
+
+
+def test_the_service_manager_is_told(site: Site) -> None:
+    address = site.folder / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(address))
+        manager.settimeout(40)
+        site.env |= {"NOTIFY_SOCKET": str(address), "WATCHDOG_USEC": "1000000"}
+        daemon = site.run(wait=False)
+        assert manager.recv(100) == b"READY=1"
+        assert manager.recv(100) == b"WATCHDOG=1"
+        assert manager.recv(100) == b"WATCHDOG=1"
+        assert daemon.stop() == 0
+        told = b""
+        while told != b"STOPPING=1":
+            told = manager.recv(100)
+        assert "NOTIFY_SOCKET" not in Path(f"/proc/{os.getpid()}/environ").read_text()
+
+
+def test_options_that_this_ros2_knows_are_used(site: Site) -> None:
+    site.env["STUB_OPTIONS"] = "--node-name --custom-data"
+    daemon = site.run()
+    argv = Path(f"/proc/{daemon.child}/cmdline").read_bytes().split(b"\0")
+    assert f"ros2_memory_{daemon.recordings()[0].name}".encode() in argv
+    assert b"recorded_by=ros2-memory" in argv
+    assert b"--disable-keyboard-controls" not in argv
+    assert daemon.stop() == 0
+
+
+def test_the_environment_of_the_recorder_is_the_robots(site: Site) -> None:
+    setup = site.folder / "setup.bash"
+    setup.write_text("export FROM_SETUP=yes\n")
+    site.env |= {"ROS_DOMAIN_ID": "42", "VIRTUAL_ENV": "/of/ours", "PYTHONHOME": sys.base_prefix}
+    daemon = site.run(f"recorder.setup_files=[{setup}]")
+    environ = Path(f"/proc/{daemon.child}/environ").read_bytes().split(b"\0")
+    assert {b"FROM_SETUP=yes", b"ROS_DOMAIN_ID=42"} <= set(environ)
+    names = {entry.partition(b"=")[0] for entry in environ}
+    assert {b"VIRTUAL_ENV", b"PYTHONHOME", b"BASH_ENV"}.isdisjoint(names)
+    (log_dir,) = [e.partition(b"=")[2] for e in environ if e.startswith(b"ROS_LOG_DIR=")]
+    assert Path(log_dir.decode()).is_dir()
+    assert daemon.stop() == 0
+    assert not Path(log_dir.decode()).exists()
+
+
+def test_old_bags_are_cleared_only_when_that_is_asked_for(site: Site) -> None:
+    old = site.bag_dir / "rec_old"
+    old.mkdir(parents=True)
+    (old / "rec_old_0.mcap").write_bytes(b"old")
+    (site.bag_dir / "notes.txt").write_text("mine")
+    assert site.run().stop() == 0
+    assert (old / "rec_old_0.mcap").exists()
+    daemon = site.run("recording.clear_on_startup=true")
+    assert daemon.stop() == 0
+    assert not old.exists()
+    assert (site.bag_dir / "notes.txt").exists()
+
+
+class TestRefusals:
+    def test_an_invalid_topic_stops_it_with_exit_code_2(self, site: Site) -> None:
+        site.topics.write_text("topics: [odom]\n")
+        code, said = site.refusal()
+        assert code == 2
+        assert f"{site.topics}: 'odom' cannot be recorded" in said
+
+    def test_without_a_ros2_it_says_what_to_do(self, site: Site) -> None:
+        site.env["PATH"] = os.defpath
+        code, said = site.refusal()
+        assert code == 1
+        assert "recorder.setup_files" in said
+
+    def test_a_setup_file_that_is_missing_is_named(self, site: Site) -> None:
+        code, said = site.refusal(f"recorder.setup_files=[{site.folder}/none.bash]")
+        assert code == 1
+        assert f"{site.folder}/none.bash is not there" in said
+
+    def test_a_bag_directory_that_cannot_be_made_is_named(self, site: Site) -> None:
+        site.bag_dir.write_text("a file")
+        code, said = site.refusal()
+        assert code == 1
+        assert "recording.bag_dir" in said
+
+    def test_a_refused_start_leaves_nothing_running_and_no_lock(self, site: Site) -> None:
+        site.refusal(f"recorder.setup_files=[{site.folder}/none.bash]")
+        assert site.run().stop() == 0
+
+
+def test_recorder_none_says_so_and_touches_nothing(site: Site) -> None:
+    site.bag_dir.mkdir()
+    (site.bag_dir / "rec_0.mcap").write_bytes(b"kept")
+    site.bag_dir.chmod(0o555)
+    before = {path: path.stat() for path in site.folder.rglob("*") if path.name != "log0"}
+    code, said = site.refusal("recorder=none", "recording.clear_on_startup=true")
+    assert code == 0
+    assert "recorder=none" in said
+    after = {path: path.stat() for path in site.folder.rglob("*") if path.name != "log0"}
+    assert {p: s.st_mtime_ns for p, s in after.items() if p != site.folder} == {
+        p: s.st_mtime_ns for p, s in before.items() if p != site.folder
+    }
+
+
+def test_a_handover_names_both_recordings(site: Site) -> None:
+    daemon = site.run("recording.session_duration_s=1")
+    daemon.wait_for("rotated")
+    daemon.stop()
+    first, second = daemon.recordings()[:2]
+    assert read_handover(first).handover.next == second.name
+    assert read_handover(second).handover.previous == first.name

@@ -1,0 +1,26 @@
+"""Waiting for something that a process is about to do: for as long as it takes, up to a bound."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+T = TypeVar("T")
+
+
+def until(what: Callable[[], T | None], *, timeout_s: float = 20.0) -> T:
+    """The first result of `what` that is neither None nor False.
+
+    Raises:
+        AssertionError: there was none within the timeout.
+    """
+    give_up = time.monotonic() + timeout_s
+    while True:
+        found = what()
+        if found is not None and found is not False:
+            return found
+        assert time.monotonic() < give_up, f"{what} did not come about within {timeout_s:g} s"
+        time.sleep(0.01)
