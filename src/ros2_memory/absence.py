@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 
 def seconds(duration: Ns) -> str:
-    """A duration for a sentence."""
-    return f"{unix_from_ns(duration):.3g} s"
+    """A duration for a sentence: to three digits, and never less exact than to the second."""
+    length = unix_from_ns(duration)
+    return f"{length:.0f} s" if length >= 100 else f"{length:.3g} s"
 
 
 def moment(at: Ns) -> str:
@@ -107,8 +108,8 @@ def nothing_at(view: View, topics: tuple[str, ...], at: Ns, tolerance: Ns | None
     older = next(view.stream(topics, TimeWindow.until(at), newest_first=True), None)
     newer = next(view.stream(topics, TimeWindow(at + 1, TimeWindow.everything().stop)), None)
     names = " or ".join(topics)
-    within = "" if tolerance is None else f" within {seconds(tolerance)} before"
-    told = [f"no message of {names}{within} {moment(at)}"]
+    when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
+    told = [f"no message of {names} {when} {moment(at)}"]
     if older:
         told.append(
             f"the nearest older one is {seconds(at - older.time)} before it, at "
@@ -134,7 +135,7 @@ def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         told.append(f"the last one before is at {moment(older.time)}")
     if newer:
         told.append(f"the first one after is at {moment(newer.time)}")
-    reason = NoDataReason.GAP if older and newer else beyond(view, window.start)
+    reason = NoDataReason.GAP if older and newer else beyond(view, end)
     told.append(_advice(view, reason, window.start, None))
     return NoDataError(reason, "; ".join(told))
 
@@ -178,5 +179,5 @@ def _advice(view: View, reason: NoDataReason, at: Ns, older: Ns | None) -> str:
         )
     if older is not None:
         enough = math.ceil(unix_from_ns(at - older) * 1000) / 1000
-        advice.append(f"to accept the older one, ask with tolerance_s of at least {enough:g}")
+        advice.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return "; ".join(advice)

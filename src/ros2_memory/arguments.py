@@ -130,7 +130,7 @@ ConditionValue: TypeAlias = Annotated[
     ),
 ]
 SearchField: TypeAlias = Annotated[
-    _Text, Field(description="Dot-path in the message that alone is tested.")
+    _Text, Field(description="Dot-path in value that alone is tested.")
 ]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.absence import beyond, not_recorded, nothing_at
+from ros2_memory.absence import beyond, moment, not_recorded, nothing_at, seconds
 from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.model import StampedTransform, TimeWindow
 from ros2_memory.tf_tree import (
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment dynamic transforms are read; the last is as far as tf2 remembers."""
+
+
+_OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAMES_NOT_CONNECTED})
 
 
 class FoundTransform(NamedTuple):
@@ -59,7 +62,10 @@ def transform_at(view: View, parent: str, child: str, at: Ns) -> FoundTransform:
             failure = error
     if limits.tf_clock == "stamp":
         dynamic = list(_stamped_near(view, at))
-        return _lookup(static, dynamic, "stamp", (parent, child), at)
+        try:
+            return _lookup(static, dynamic, "stamp", (parent, child), at)
+        except NoDataError as error:
+            raise _of_stamps(error, at, nothing_near=not dynamic) from error
     raise _explained(view, failure, at, nothing_near=not dynamic) from failure
 
 
@@ -99,12 +105,34 @@ def _explained(view: View, failure: NoDataError, at: Ns, *, nothing_near: bool) 
     topics = _recorded(view, view.memory.limits.tf_topics)
     if topics and nothing_near:
         return nothing_at(view, topics, at, None)
+    if failure.reason in _OF_ALL_TIMES:
+        return _of_then(failure, at)
     if failure.reason is not NoDataReason.OUTSIDE_RANGE:
         return failure
     after = TimeWindow(at + 1, MAX_NS)
     later = next(view.stream(topics, after), None) if topics else None
     reason = NoDataReason.GAP if later else beyond(view, at)
     return NoDataError(reason, failure.detail)
+
+
+def _of_stamps(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:
+    """The failure of a lookup by header stamps, wherever in log time they were recorded."""
+    if nothing_near:
+        return NoDataError(
+            NoDataReason.OUTSIDE_RANGE,
+            f"no moving transform has a header stamp within {seconds(TF_CACHE_NS)} of "
+            f"{moment(at)}; data.tf_clock has them looked up by header stamp, not by log time",
+        )
+    return _of_then(failure, at) if failure.reason in _OF_ALL_TIMES else failure
+
+
+def _of_then(failure: NoDataError, at: Ns) -> NoDataError:
+    """A failure that sounds as if it held for all times, said of the time that was looked at."""
+    return NoDataError(
+        failure.reason,
+        f"within {seconds(TF_CACHE_NS)} of {moment(at)}: {failure.detail}; "
+        "list_frames names the frames of all times",
+    )
 
 
 def _static_at(view: View, at: Ns) -> list[StampedTransform]:

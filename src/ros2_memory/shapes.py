@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.fitting import JsonObject
-    from ros2_memory.model import JsonValue, SetAside, Vector3
+    from ros2_memory.model import JsonValue, Quaternion, SetAside, Vector3
 
 Answer: TypeAlias = (
     tuple[answers.TopicRow, ...]
@@ -190,7 +190,7 @@ def _velocity(answer: answers.Velocity, _bag_dir: Path) -> JsonObject:
 
 @shown.register(answers.TransformAt)
 def _transform(answer: answers.TransformAt, _bag_dir: Path) -> JsonObject:
-    rotation = answer.transform.rotation
+    rotation = _upright(answer.transform.rotation)
     reply: JsonObject = {
         "translation": _xyz(answer.transform.translation),
         "rotation": {name: _rounded(part, 6) for name, part in zip("xyzw", rotation, strict=True)},
@@ -324,6 +324,12 @@ def _xyz(vector: Vector3) -> JsonObject:
 
 def _degrees(angle: float | None) -> float | None:
     return None if angle is None else _rounded(math.degrees(angle), 2)
+
+
+def _upright(rotation: Quaternion) -> Quaternion:
+    """Of the two quaternions of one rotation the one with w >= 0."""
+    x, y, z, w = rotation
+    return (-x, -y, -z, -w) if w < 0 else rotation
 
 
 def _rounded(number: float, places: int) -> float | None:

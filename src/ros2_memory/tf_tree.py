@@ -136,9 +136,9 @@ class _History:
         span = f"only at {_unix(first)}" if first == last else f"{_unix(first)} to {_unix(last)}"
         return NoDataError(
             NoDataReason.OUTSIDE_RANGE,
-            f"no transform of '{self.child}' in '{parent}' at {_unix(time)}: it is recorded"
-            f" {span} (Unix seconds), {off} the time asked, and nothing is extrapolated; ask for"
-            " a time in that range",
+            f"no transform of '{self.child}' in '{parent}' at {_unix(time)}: around then it is"
+            f" recorded {span} (Unix seconds), {off} the time asked, and nothing is"
+            " extrapolated; ask for a time in that range",
         )
 
 

@@ -236,7 +236,7 @@ _FRAMES = Entry(
 )
 _CONDITIONS = (
     "contains (text anywhere in the message, or list element), equals (boolean, number or text), "
-    'near_position ({{"x": m, "y": m}} within {near} m)'
+    'near_position ({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
 )
 _LAST_MATCH = Entry(
     (Variant("find_last_match", "Last time something held (blocking)"),),
