@@ -1,0 +1,224 @@
+"""Which bags are deleted: those too old, then the oldest beyond the budget. Pure decisions.
+
+Age counts from the newest recorded data, not from the wall clock: a robot that was switched off
+does not erase itself when it wakes. Clocks step, so not every date is believed:
+
+- A bag dated in the future, before there was ROS 2, or longer than any recording is not dated: it
+  neither ages others nor is aged.
+- A pause longer than `max_age_ns`, and than a day, is a robot that was off or a clock that was
+  set, which nothing can tell apart. It parts two eras, and no bag ages those of another era.
+
+The budget takes them all, oldest first: a dated bag of the present era by its newest message, any
+other by the time of its file. The newest bag stays, whatever the limits say.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+from ros2_memory.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+FIRST_BAGS_NS: Final[Ns] = 1_483_228_800 * NS_PER_S
+"""2017-01-01: there was no release of ROS 2 before. Clocks without a battery start in 1970."""
+FUTURE_NS: Final[Ns] = 60 * NS_PER_S
+"""A date so little ahead of the clock comes from a clock that is being corrected."""
+SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
+"""A shorter pause never parts two eras, however little history is kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class RetentionLimits:
+    """How much is kept: bytes in all, age of the oldest, and what must stay free on the disk."""
+
+    max_total_bytes: int
+    max_age_ns: Ns
+    min_free_bytes: int = 0
+
+
+class StoredFile(NamedTuple):
+    """One file of a bag. Files that share an inode (device and number) take their space once.
+
+    `size` is what the budget counts, `disk` what deleting it frees.
+    """
+
+    inode: tuple[int, int]
+    size: int
+    disk: int
+
+
+class Span(NamedTuple):
+    """The log times of the first and the last message (inclusive)."""
+
+    start: Ns
+    end: Ns
+
+
+class StoredBag(NamedTuple):
+    """A bag that may be deleted (a tuple: a week is 60,000 of them, weighed every few seconds).
+
+    `span` leaves latched topics out, since each recording receives those again; None where the bag
+    holds nothing else. `written` is when its file was last written to; `recording` is the
+    directory that it lies in.
+    """
+
+    path: str
+    recording: str
+    span: Span | None
+    written: Ns
+    files: tuple[StoredFile, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Stock:
+    """All that lies in the bag directory because of this program.
+
+    `sidecars` says, for each recording that goes with its last bag, how many bytes go with it.
+    `other_bytes` is what nothing here may delete: open bags, and what is not worth deleting.
+    `free_bytes` is what the disk has left; None where that is not to count.
+    """
+
+    bags: Sequence[StoredBag]
+    now: Ns
+    sidecars: Mapping[str, int] = field(default_factory=dict)
+    other_bytes: int = 0
+    free_bytes: int | None = None
+
+
+def expired(stock: Stock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
+    """The bags to delete, oldest first: all that are too old, and no more than the budget needs."""
+    eras = _eras(stock, limits)
+    aged = _aged(stock.bags, eras, limits.max_age_ns)
+    plan = _Plan(stock)
+    if not aged and plan.fits(limits):
+        return ()
+    order = _oldest_first(stock.bags, eras[-1] if eras else [])
+    kept = _inodes(_newest(order, eras))
+    doomed: list[StoredBag] = []
+    for bag in order:
+        if bag.path in aged and kept.isdisjoint(_inodes(bag)):
+            doomed.append(bag)
+            plan.delete(bag)
+    for bag in order:
+        if plan.fits(limits):
+            break
+        # What shares a file with the bag that stays would free nothing.
+        if bag.path not in aged and kept.isdisjoint(_inodes(bag)):
+            doomed.append(bag)
+            plan.delete(bag)
+    return tuple(doomed)
+
+
+def total_bytes(stock: Stock) -> int:
+    """What the budget counts: every file once, however many names it has."""
+    return _Plan(stock).total
+
+
+class _Plan:
+    """What is left when some bags are deleted."""
+
+    def __init__(self, stock: Stock) -> None:
+        files = [each for bag in stock.bags for each in bag.files]
+        sizes = {each.inode: each.size for each in files}
+        self._links: Counter[tuple[int, int]] = Counter()
+        if len(sizes) < len(files):
+            self._links.update(each.inode for each in files)
+        self._bags_in = Counter(bag.recording for bag in stock.bags)
+        self._sidecars = stock.sidecars
+        self.total = stock.other_bytes + sum(sizes.values()) + sum(stock.sidecars.values())
+        self._free = stock.free_bytes
+
+    def delete(self, bag: StoredBag) -> None:
+        """Leaves one bag out."""
+        for each in bag.files:
+            self._links[each.inode] -= 1
+            if self._links[each.inode] <= 0:
+                self._release(each.size, each.disk)
+        self._bags_in[bag.recording] -= 1
+        if not self._bags_in[bag.recording]:
+            size = self._sidecars.get(bag.recording, 0)
+            self._release(size, size)
+
+    def fits(self, limits: RetentionLimits) -> bool:
+        """Whether what is left is within the budget, and leaves enough of the disk."""
+        enough = self._free is None or self._free >= limits.min_free_bytes
+        return enough and self.total <= limits.max_total_bytes
+
+    def _release(self, size: int, disk: int) -> None:
+        self.total -= size
+        if self._free is not None:
+            self._free += disk
+
+
+_Era: TypeAlias = "list[tuple[Span, StoredBag]]"
+
+
+def _eras(stock: Stock, limits: RetentionLimits) -> list[_Era]:
+    """The dated bags, parted where a pause is too long; the last era is the present one."""
+    longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
+    latest = stock.now + FUTURE_NS
+    dated = [
+        (bag.span, bag)
+        for bag in stock.bags
+        if bag.span is not None
+        and bag.span.start >= FIRST_BAGS_NS
+        and bag.span.end <= latest
+        and bag.span.end - bag.span.start <= longest
+    ]
+    dated.sort()
+    eras: list[_Era] = []
+    reach: Ns = 0
+    for each in dated:
+        start, end = each[0]
+        if not eras or start - reach > longest:
+            eras.append([])
+        eras[-1].append(each)
+        reach = max(reach, end)
+    return eras
+
+
+def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
+    """The bags that are too old for the newest of their era.
+
+    One without a span is of the present era if it was written in it, else of none.
+    """
+    aged: set[str] = set()
+    for era in eras:
+        oldest = max(span.end for span, _ in era) - max_age_ns
+        aged.update(bag.path for span, bag in era if span.end < oldest)
+        if era is eras[-1]:
+            begun = era[0][0].start
+            silent = (bag for bag in bags if bag.span is None)
+            aged.update(bag.path for bag in silent if begun <= bag.written < oldest)
+    return aged
+
+
+def _oldest_first(bags: Sequence[StoredBag], present: _Era) -> list[StoredBag]:
+    """All bags, oldest first. One whose bytes a newer one shares frees nothing before that goes."""
+    moments = {bag.path: bag.written for bag in bags}
+    moments.update((bag.path, span.end) for span, bag in present)
+    newest: dict[tuple[int, int], Ns] = {}
+    for bag in bags:
+        moment = moments[bag.path]
+        for each in bag.files:
+            if newest.setdefault(each.inode, moment) < moment:
+                newest[each.inode] = moment
+    for bag in bags:
+        moments[bag.path] = max(newest[each.inode] for each in bag.files)
+    return sorted(bags, key=lambda bag: (moments[bag.path], bag.path))
+
+
+def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:
+    """The bag that stays: the newest dated one, else the last written that holds anything."""
+    if eras:
+        return max(eras[-1], key=lambda each: (each[0].end, each[1].path))[1]
+    holding = [bag for bag in order if bag.span is not None] or order
+    return holding[-1] if holding else None
+
+
+def _inodes(bag: StoredBag | None) -> set[tuple[int, int]]:
+    return set() if bag is None else {each.inode for each in bag.files}
