@@ -1,0 +1,258 @@
+"""Makes the history that the benchmark asks about, as `ros2 bag record` would have left it.
+
+The reference rates: 1,261 messages in a split of 10 s. Splits lie in recordings of 60, in zstd
+chunks of 16 KiB, with the publishers' QoS on every channel and, as rosbag2 does it, the tale of all
+earlier splits of the recording embedded in each; `metadata.yaml` closes a recording. Recordings
+follow each other without overlap. Everything is drawn from the split's number: the same command
+makes the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from textwrap import indent
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from benchmarks import payloads
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+SPLIT_S: Final = 10
+SPLIT_NS: Final = SPLIT_S * 1_000_000_000
+SPLITS_OF_A_RECORDING: Final = 60
+WEEK: Final = 60_480
+END_NS: Final = 1_768_176_000_000_000_000
+"""Where every history ends: 2026-01-12 00:00 UTC."""
+
+_FORMAT: Final = 1  # of what is written here; folders of another one are made anew
+_CHUNK_BYTES: Final = 16 * 1024
+_QOS: Final = """\
+- history: unknown
+  depth: 0
+  reliability: reliable
+  durability: {durability}
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: automatic
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false"""
+
+
+class Topic(NamedTuple):
+    """One topic: its type and how many messages of it a split holds."""
+
+    name: str
+    type: str
+    messages: int
+    durability: str = "volatile"
+
+
+ODOM: Final = Topic("/odom", "nav_msgs/msg/Odometry", 50 * SPLIT_S)
+TF: Final = Topic("/tf", "tf2_msgs/msg/TFMessage", 50 * SPLIT_S)
+CMD_VEL: Final = Topic("/cmd_vel", "geometry_msgs/msg/Twist", 20 * SPLIT_S)
+SCENE: Final = Topic("/vision/scene/scene_objects", payloads.DETECTIONS, SPLIT_S)
+FOUND: Final = Topic("/vision/find_object/detections_meta", payloads.DETECTIONS, 5 * SPLIT_S)
+TF_STATIC: Final = Topic("/tf_static", "tf2_msgs/msg/TFMessage", 1, "transient_local")
+TOPICS: Final = (ODOM, TF, CMD_VEL, SCENE, FOUND, TF_STATIC)
+MESSAGES_OF_A_SPLIT: Final = sum(topic.messages for topic in TOPICS)
+
+
+class Split(NamedTuple):
+    """One bag file and its place in its recording. It covers `[start, start + SPLIT_NS)`."""
+
+    number: int
+    path: Path
+    start: int
+    nth: int
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """Recordings in a folder: consecutive splits that end at `END_NS`."""
+
+    folder: Path
+    bags: int
+
+    @property
+    def start(self) -> int:
+        """The first moment, in nanoseconds."""
+        return END_NS - self.bags * SPLIT_NS
+
+    @property
+    def end(self) -> int:
+        """The moment after the last one."""
+        return END_NS
+
+    def splits(self) -> Iterator[Split]:
+        """The bag files, oldest first."""
+        for number in range(self.bags):
+            recording, nth = divmod(number, SPLITS_OF_A_RECORDING)
+            name = f"rec_{recording:04}"
+            path = self.folder / name / f"{name}_{nth}.mcap"
+            yield Split(number, path, self.start + number * SPLIT_NS, nth)
+
+
+def made(folder: Path, bags: int, *, jobs: int | None = None) -> History:
+    """The history of so many splits in `folder`, taken as it lies there or made.
+
+    Raises:
+        ValueError: there is not a bag to make.
+    """
+    if bags < 1:
+        raise ValueError(f"a history of {bags} bags cannot be made: give 1 or more")
+    place = folder / f"bags_{bags}"
+    history = History(place, bags)
+    seal = folder / f"bags_{bags}.json"
+    facts = {"format": _FORMAT, "bags": bags, "messages_of_a_split": MESSAGES_OF_A_SPLIT}
+    if seal.is_file() and json.loads(seal.read_text(encoding="utf-8")) == facts:
+        return history
+    seal.unlink(missing_ok=True)
+    shutil.rmtree(place, ignore_errors=True)
+    splits = list(history.splits())
+    recordings = [
+        splits[at : at + SPLITS_OF_A_RECORDING] for at in range(0, bags, SPLITS_OF_A_RECORDING)
+    ]
+    if len(recordings) == 1:
+        _record(recordings[0])
+    else:
+        with ProcessPoolExecutor(jobs) as workers:
+            for _ in workers.map(_record, recordings):
+                pass
+    seal.write_text(json.dumps(facts), encoding="utf-8")
+    return history
+
+
+def _record(splits: list[Split]) -> None:
+    """Writes one recording."""
+    splits[0].path.parent.mkdir(parents=True)
+    for split in splits:
+        _write(split, splits[: split.nth + 1])
+        # A bag that was closed long ago, as most bags of a history were.
+        closed = split.start + SPLIT_NS
+        os.utime(split.path, ns=(closed, closed))
+    text = "rosbag2_bagfile_information:\n" + indent(metadata(splits), "  ") + "\n"
+    (splits[0].path.parent / "metadata.yaml").write_text(text, encoding="utf-8")
+
+
+def _write(split: Split, so_far: Sequence[Split]) -> None:
+    noise = np.random.default_rng(split.number)
+    with split.path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="ros2-memory benchmark")
+        channels = _declared(writer)
+        rows = [row for topic in TOPICS for row in _rows(split, topic, channels[topic], noise)]
+        rows.sort(key=lambda row: row[0])
+        for sequence, (log_time, publish_time, channel, payload) in enumerate(rows):
+            writer.add_message(channel, log_time, payload, publish_time, sequence)
+        writer.add_metadata("rosbag2", {"serialized_metadata": metadata(so_far)})
+        writer.finish()
+
+
+def _declared(writer: Writer) -> dict[Topic, int]:
+    schemas = {
+        name: writer.register_schema(name, "ros2msg", _definition(name).encode())
+        for name in dict.fromkeys(topic.type for topic in TOPICS)
+    }
+    return {
+        topic: writer.register_channel(
+            topic.name,
+            "cdr",
+            schemas[topic.type],
+            {"offered_qos_profiles": _QOS.format(durability=topic.durability)},
+        )
+        for topic in TOPICS
+    }
+
+
+def _rows(
+    split: Split, topic: Topic, channel: int, noise: np.random.Generator
+) -> list[tuple[int, int, int, bytes]]:
+    """Log time, publish time, channel and payload of a topic's messages."""
+    if topic is TF_STATIC:
+        recording_began = split.start - split.nth * SPLIT_NS
+        return [(split.start, recording_began, channel, payloads.fixed_frames())]
+    published = split.start + np.arange(topic.messages) * (SPLIT_NS // topic.messages)
+    # Log time: some tenths of a millisecond in the middleware, never past the next split.
+    logged = published + noise.integers(60_000, 460_000, topic.messages)
+    bodies = _payloads(split, topic, published.astype(np.int64), noise)
+    number = [channel] * topic.messages
+    return list(zip(logged.tolist(), published.tolist(), number, bodies, strict=True))
+
+
+def _payloads(
+    split: Split, topic: Topic, published: NDArray[np.int64], noise: np.random.Generator
+) -> list[bytes]:
+    t = (published - (END_NS - WEEK * SPLIT_NS)) / 1e9
+    if topic is ODOM:
+        return payloads.odometry(t, published, split.number)
+    if topic is TF:
+        return payloads.moving_frame(t, published, split.number)
+    if topic is CMD_VEL:
+        return payloads.command(t)
+    skill, fewest, most = ("scene", 3, 9) if topic is SCENE else ("find_object", 0, 3)
+    return [
+        payloads.detections(stamp, skill, int(noise.integers(fewest, most)), noise)
+        for stamp in published.tolist()
+    ]
+
+
+def metadata(splits: Sequence[Split]) -> str:
+    """What rosbag2 tells of a recording (its metadata, version 9) when it has these splits."""
+    lines = [
+        "version: 9",
+        "storage_identifier: mcap",
+        f"duration:\n  nanoseconds: {len(splits) * SPLIT_NS}",
+        f"starting_time:\n  nanoseconds_since_epoch: {splits[0].start}",
+        f"message_count: {len(splits) * MESSAGES_OF_A_SPLIT}",
+        "topics_with_message_count:",
+        *(_topic_told(topic, len(splits)) for topic in TOPICS),
+        'compression_format: ""',
+        'compression_mode: ""',
+        "relative_file_paths:",
+        *(f"  - {split.path.name}" for split in splits),
+        "files:",
+        *(_split_told(split) for split in splits),
+        "custom_data: ~",
+        "ros_distro: jazzy",
+    ]
+    return "\n".join(lines)
+
+
+def _topic_told(topic: Topic, splits: int) -> str:
+    return (
+        f"  - topic_metadata:\n      name: {topic.name}\n      type: {topic.type}\n"
+        "      serialization_format: cdr\n      offered_qos_profiles:\n"
+        + indent(_QOS.format(durability=topic.durability), " " * 8)
+        + f'\n      type_description_hash: ""\n    message_count: {topic.messages * splits}'
+    )
+
+
+def _split_told(split: Split) -> str:
+    return (
+        f"  - path: {split.path.name}\n    starting_time:\n"
+        f"      nanoseconds_since_epoch: {split.start}\n    duration:\n"
+        f"      nanoseconds: {SPLIT_NS}\n    message_count: {MESSAGES_OF_A_SPLIT}"
+    )
+
+
+@cache
+def _definition(type_name: str) -> str:
+    return payloads.typestore().generate_msgdef(type_name, ros_version=2)[0]
