@@ -19,6 +19,7 @@ from ros2_memory.geometry import distance
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from ros2_memory.evidence import Evidence
     from ros2_memory.model import JsonValue, Vector3
 
 Scalar: TypeAlias = bool | int | float | str
@@ -56,9 +57,15 @@ class Contains:
         if isinstance(self.needle, str):
             folded = self.needle.casefold()
             return any(
-                isinstance(leaf, str) and folded in leaf.casefold() for leaf in _leaves(value)
+                isinstance(leaf, str) and folded in leaf.casefold() for leaf in leaves(value)
             )
         return any(self._equals.is_leaf(element) for element in _elements(value))
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may contain the needle."""
+        if isinstance(self.needle, str):
+            return evidence.may_hold_text(self.needle.casefold())
+        return self._equals.may_match(evidence)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +91,15 @@ class Equals:
 
     def matches(self, value: JsonValue) -> bool:
         """Whether any leaf at any depth is equal."""
-        return any(self.is_leaf(leaf) for leaf in _leaves(value))
+        return any(self.is_leaf(leaf) for leaf in leaves(value))
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may have such a leaf."""
+        if isinstance(self.value, str) and evidence.may_hold_text(self.value.casefold()):
+            return True
+        if self._boolean is not None and evidence.may_hold_boolean(self._boolean):
+            return True
+        return any(evidence.may_hold_number(number) for number in self._numbers)
 
     def is_leaf(self, leaf: JsonValue) -> bool:
         """Whether this leaf is equal."""
@@ -112,6 +127,15 @@ class NearPosition:
         """Whether any position in the value is near."""
         return any(self.is_near(x, y, z) for x, y, z in positions(value))
 
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may hold a position that is near."""
+        return evidence.may_hold_place(self.x, self.y, self.z, self.tolerance_m)
+
+    def may_match_elsewhere(self, evidence: Evidence) -> bool:
+        """As `may_match`, for positions that stand where only a field leads to."""
+        axes = (self.x, self.y) if self.z is None else (self.x, self.y, self.z)
+        return all(evidence.may_hold_number_near(axis, self.tolerance_m) for axis in axes)
+
     def is_near(self, x: float, y: float, z: float) -> bool:
         """Whether this position (m) is near; its z may be NaN where none is asked."""
         here: Vector3 = (x, y, 0.0 if self.z is None else z)
@@ -133,6 +157,15 @@ class Condition:
         if self.field is None:
             return self.test.matches(value)
         return any(self.test.matches(target) for target in at_field(value, self.field))
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may match; False rules all of them out.
+
+        What a field leads to is part of the value, so what the whole value rules out is out.
+        """
+        if self.field is not None and isinstance(self.test, NearPosition):
+            return self.test.may_match_elsewhere(evidence)
+        return self.test.may_match(evidence)
 
 
 def parse_condition(
@@ -260,7 +293,7 @@ def _step(held: JsonValue, segment: str) -> Iterator[JsonValue]:
                 yield from _step(element, segment)
 
 
-def _leaves(value: JsonValue) -> Iterator[JsonValue]:
+def leaves(value: JsonValue) -> Iterator[JsonValue]:
     """Everything at any depth that is neither a list nor an object."""
     waiting = [value]
     while waiting:

@@ -158,6 +158,7 @@ class BagFile:
     """One bag file that answers questions (closed or incomplete, and not empty).
 
     `start` and `end` are the log times of its first and last message, both inclusive.
+    `sidecar_ns` is the mtime of the file beside it that says which of its messages count, or 0.
     """
 
     path: Path
@@ -167,6 +168,7 @@ class BagFile:
     summary: BagSummary
     start: Ns
     end: Ns
+    sidecar_ns: Ns = 0
 
     @property
     def recording(self) -> Path:

@@ -7,32 +7,25 @@ deviations of these stages add up to at most the tolerance, unless a limit on co
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal
 
 from ros2_memory.geometry import distance, normalised, simplify_to, yaw
-from ros2_memory.timebase import NS_PER_MS, Ns, unix_from_ns
+from ros2_memory.motion import Motion, PoseDigest, Vertex, faster, is_place
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from ros2_memory.model import Pose, Quaternion, Vector3
+    from ros2_memory.timebase import Ns
 
-ARRIVAL_JITTER_NS: Final[Ns] = 100 * NS_PER_MS
-"""How far apart two poses must have been recorded for their distance to tell a speed.
-
-Log time is the time of arrival. Transports and a busy recorder deliver in bursts: public bags
-hold poses 3 ms apart that lie 0.2 m apart, which is GNSS noise and not 72 m/s.
-"""
-
-_FARTHEST_M: Final = 1e12
-"""Coordinates beyond this are no place on Earth but memory that nobody filled in."""
+TOLERANCE_M: Final = 0.05
+"""How far a pose may lie from the drawn path, unless a limit on count widens it."""
 
 _BLOCK: Final = 4096
 _MOST_VERTICES: Final = 20_000
-
-_Vertex: TypeAlias = "tuple[Ns, Vector3, Quaternion | None]"
+_BAG_VERTICES: Final = 32
+"""Vertices of the path that is kept of one bag."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +72,7 @@ def summarise(
     poses: Iterable[tuple[Ns, Pose, float | None]],
     max_plausible_speed_mps: float,
     max_waypoints: int = 50,
-    tolerance_m: float = 0.05,
+    tolerance_m: float = TOLERANCE_M,
 ) -> Trajectory:
     """The trajectory of (log time, pose, the message's own speed in m/s or None) in time order.
 
@@ -99,7 +92,7 @@ class TrajectoryBuilder:
         self,
         max_plausible_speed_mps: float,
         max_waypoints: int = 50,
-        tolerance_m: float = 0.05,
+        tolerance_m: float = TOLERANCE_M,
     ) -> None:
         """Limits as for `summarise`.
 
@@ -111,23 +104,35 @@ class TrajectoryBuilder:
                 f"a trajectory needs 2 or more waypoints ({max_waypoints}), a plausible speed"
                 f" ({max_plausible_speed_mps} m/s) and a tolerance ({tolerance_m} m) above 0"
             )
-        self._motion = _Motion(max_plausible_speed_mps)
+        self._motion = Motion(max_plausible_speed_mps)
         self._path = _Path(tolerance_m)
         self._max_waypoints = max_waypoints
         self._invalid = 0
         self._twist: float | None = None
+        self._frames: dict[str, None] = {}
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frames of all poses so far, valid or not, in order of appearance."""
+        return tuple(self._frames)
 
     def add(self, time: Ns, pose: Pose, speed_mps: float | None = None) -> None:
         """Takes the next pose, and the speed that its message states, if it states one."""
-        x, y, z = pose.position
-        # A comparison with NaN is false, so this one refuses all three kinds.
-        if not (abs(x) < _FARTHEST_M and abs(y) < _FARTHEST_M and abs(z) < _FARTHEST_M):
+        self._frames[pose.frame_id] = None
+        if not is_place(pose.position):
             self._invalid += 1
             return
-        if speed_mps is not None and math.isfinite(speed_mps):
-            self._twist = max(self._twist or 0.0, abs(speed_mps))
+        self._twist = faster(self._twist, speed_mps)
         self._motion.add(time, pose.position)
         self._path.add((time, pose.position, pose.orientation))
+
+    def join(self, whole: PoseDigest) -> None:
+        """Takes all poses of a bag that come next, as if they were added one by one."""
+        self._frames.update(dict.fromkeys(whole.frames))
+        self._invalid += whole.invalid
+        self._twist = faster(self._twist, whole.twist)
+        self._motion.join(whole)
+        self._path.extend(whole.vertices, whole.error_m)
 
     @property
     def vertices(self) -> int:
@@ -137,18 +142,18 @@ class TrajectoryBuilder:
     def result(self) -> Trajectory:
         """The trajectory so far; more poses may be added after."""
         motion = self._motion
-        duration_s = unix_from_ns(motion.time - motion.first_time)
+        duration_s = motion.duration_s
         avg_speed = motion.distance_m / duration_s if duration_s > 0 else 0.0
         # Drivers that know no twist leave it zero: then it says nothing of a robot that moved.
         stated = self._twist if self._twist or not motion.distance_m else None
-        waypoints, error = self._path.drawn(self._max_waypoints)
+        vertices, error = self._path.drawn(self._max_waypoints)
         return Trajectory(
             distance_m=motion.distance_m,
             duration_s=duration_s,
             avg_speed=avg_speed,
             max_speed=max(motion.max_speed, avg_speed) if stated is None else stated,
             max_speed_from="positions" if stated is None else "twist",
-            waypoints=waypoints,
+            waypoints=tuple(_waypoint(vertex) for vertex in vertices),
             waypoint_error_m=error,
             poses=motion.poses,
             invalid=self._invalid,
@@ -157,45 +162,51 @@ class TrajectoryBuilder:
         )
 
 
-class _Motion:
-    """Distance, speed and jumps of the positions in order."""
+class PoseCollector:
+    """Makes the digest of one bag's poses, which come in log-time order.
+
+    `max_plausible_speed_mps` must be that of the trajectories which join the digest.
+    """
 
     def __init__(self, max_plausible_speed_mps: float) -> None:
-        self._limit = max_plausible_speed_mps
-        self.poses = 0
-        self.first_time: Ns = 0
-        self.time: Ns = 0
-        self.distance_m = 0.0
-        self.max_speed = 0.0
-        self.jumps = 0
-        self.jumped_m = 0.0
-        self._position: Vector3 = (0.0, 0.0, 0.0)
-        self._measured_from: tuple[Ns, Vector3] = (0, self._position)
+        self._motion = Motion(max_plausible_speed_mps)
+        self._path = _Path(TOLERANCE_M / 8)
+        self._invalid = 0
+        self._twist: float | None = None
+        self._frames: dict[str, None] = {}
 
-    def add(self, time: Ns, position: Vector3) -> None:
-        self.poses += 1
-        if self.poses == 1:
-            self.first_time = time
-            self._measured_from = (time, position)
-        else:
-            self._step(time, position)
-        self.time, self._position = time, position
-
-    def _step(self, time: Ns, position: Vector3) -> None:
-        step_m = distance(self._position, position)
-        # A burst squeezes the time between two poses to nothing; it does not make a jump of them.
-        step_s = unix_from_ns(max(time - self.time, ARRIVAL_JITTER_NS))
-        if step_m > self._limit * step_s * (1 + 1e-9):
-            self.jumps += 1
-            self.jumped_m += step_m
-            self._measured_from = (time, position)
+    def add(self, time: Ns, pose: Pose, speed_mps: float | None = None) -> None:
+        """Takes the next pose, and the speed that its message states, if it states one."""
+        self._frames[pose.frame_id] = None
+        if not is_place(pose.position):
+            self._invalid += 1
             return
-        self.distance_m += step_m
-        since, origin = self._measured_from
-        if time - since >= ARRIVAL_JITTER_NS:
-            speed = distance(origin, position) / unix_from_ns(time - since)
-            self.max_speed = max(self.max_speed, speed)
-            self._measured_from = (time, position)
+        self._twist = faster(self._twist, speed_mps)
+        self._motion.add(time, pose.position)
+        self._path.add((time, pose.position, pose.orientation))
+
+    def digest(self) -> PoseDigest:
+        """What the poses amount to."""
+        motion = self._motion
+        kept, error = self._path.drawn(_BAG_VERTICES)
+        vertices = ((time, position, _heading(turn)) for time, position, turn in kept)
+        return PoseDigest(
+            poses=motion.poses,
+            invalid=self._invalid,
+            first=motion.first,
+            last=motion.last,
+            length_m=motion.distance_m,
+            jumps=motion.jumps,
+            jumped_m=motion.jumped_m,
+            anchor=motion.anchor,
+            anchored_by_jump=motion.anchored_by_jump,
+            max_speed=motion.later_speed,
+            measured_from=motion.measured_from,
+            twist=self._twist,
+            frames=tuple(self._frames),
+            vertices=tuple(vertices),
+            error_m=error,
+        )
 
 
 class _Path:
@@ -203,25 +214,26 @@ class _Path:
 
     A simplification of a simplification: the deviations add and do no more, since a vertex that
     the second drops lies beside the same kept segment as its neighbours. A quarter of the
-    tolerance goes to merging small steps, a quarter to the blocks, and what is left to the whole.
-    Where that keeps too many vertices the first two quarters are doubled, so that all earlier
-    deviations together are no more than the last one.
+    tolerance goes to merging small steps, a quarter to the blocks, and what is left to the whole;
+    paths that are kept of bags have taken an eighth of it. Where that keeps too many vertices the
+    first two quarters are doubled.
     """
 
     def __init__(self, tolerance_m: float) -> None:
         self._tolerance_m = tolerance_m
         self._stage_m = tolerance_m / 4
-        self._kept: list[_Vertex] = []
-        self._block: list[_Vertex] = []
-        self._merged: _Vertex | None = None
+        self._kept: list[Vertex] = []
+        self._block: list[Vertex] = []
+        self._merged: Vertex | None = None
         self._merged_m = 0.0
         self._dropped_m = 0.0
+        self._given_m = 0.0
 
     @property
     def size(self) -> int:
         return len(self._kept) + len(self._block)
 
-    def add(self, vertex: _Vertex) -> None:
+    def add(self, vertex: Vertex) -> None:
         if self._block:
             off = distance(self._block[-1][1], vertex[1])
             if off <= self._stage_m:
@@ -233,16 +245,22 @@ class _Path:
         if len(self._block) == _BLOCK:
             self._close_block()
 
-    def drawn(self, at_most: int) -> tuple[tuple[Waypoint, ...], float]:
-        """The waypoints, and the bound on how far (m) any pose lies from their polyline."""
+    def extend(self, vertices: Iterable[Vertex], error_m: float) -> None:
+        """Takes a path that is drawn already, from which poses lie `error_m` off at most."""
+        self._given_m = max(self._given_m, error_m)
+        for vertex in vertices:
+            self.add(vertex)
+
+    def drawn(self, at_most: int) -> tuple[list[Vertex], float]:
+        """The vertices, and the bound on how far (m) any pose lies from their polyline."""
         vertices = [*self._kept, *self._block]
         if self._merged is not None:
             vertices.append(self._merged)
-        so_far = self._merged_m + self._dropped_m
+        so_far = self._given_m + self._merged_m + self._dropped_m
         kept, error = _thinned(
-            vertices, max(self._tolerance_m - so_far, self._tolerance_m / 2), at_most
+            vertices, max(self._tolerance_m - so_far, self._tolerance_m / 4), at_most
         )
-        return tuple(_waypoint(vertex) for vertex in kept), so_far + error
+        return kept, so_far + error
 
     def _close_block(self) -> None:
         """Keeps the vertices that draw the block; its last one begins the next block."""
@@ -258,13 +276,20 @@ class _Path:
 
 
 def _thinned(
-    vertices: list[_Vertex], tolerance_m: float, at_most: int
-) -> tuple[list[_Vertex], float]:
+    vertices: list[Vertex], tolerance_m: float, at_most: int
+) -> tuple[list[Vertex], float]:
     indices, error = simplify_to([vertex[1] for vertex in vertices], tolerance_m, at_most)
     return [vertices[index] for index in indices], error
 
 
-def _waypoint(vertex: _Vertex) -> Waypoint:
-    time, position, orientation = vertex
-    unit = None if orientation is None else normalised(orientation)
-    return Waypoint(time, position, None if unit is None else yaw(unit))
+def _waypoint(vertex: Vertex) -> Waypoint:
+    time, position, turn = vertex
+    return Waypoint(time, position, _heading(turn))
+
+
+def _heading(turn: Quaternion | float | None) -> float | None:
+    """The heading (rad) of a vertex; None where it has none."""
+    if turn is None or isinstance(turn, float):
+        return turn
+    unit = normalised(turn)
+    return None if unit is None else yaw(unit)

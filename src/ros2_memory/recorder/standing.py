@@ -235,7 +235,14 @@ def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
     state = BagState.CLOSED if closed else BagState.INCOMPLETE
     stamp = notes.stamp
     bag = BagFile(
-        notes.path, stamp.size, stamp.mtime_ns, state, summary, summary.start, summary.end
+        notes.path,
+        stamp.size,
+        stamp.mtime_ns,
+        state,
+        summary,
+        summary.start,
+        summary.end,
+        stamp.sidecar_ns,
     )
     return Verdict(Standing.CLOSED if closed else Standing.INCOMPLETE, bag=bag)
 

@@ -1,0 +1,286 @@
+"""What each closed bag was found to hold, in one SQLite file that outlives the process.
+
+Everything here is derived: deleting the file changes no answer, only how long it takes. An entry
+is of one file, told by its path below the bag directory, its size and mtime and the mtime of the
+sidecar that says which of its messages count, under one way of reading (a hash of the
+configuration). An entry never changes; what takes its place has another number, and numbers are
+not used twice.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import threading
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+
+from ros2_memory.catalogue_file import open_base, set_aside
+from ros2_memory.catalogue_sql import (
+    EVIDENCE,
+    drop,
+    evidence_of,
+    held_rows,
+    kept_rows,
+    keys_rows,
+    numbers_of,
+    put,
+)
+from ros2_memory.digest import EdgeDigest
+from ros2_memory.logs import get_logger
+from ros2_memory.packing import Shape, unpacked_poses
+from ros2_memory.storage.base import Channel, Record, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from ros2_memory.catalogue_file import Opened
+    from ros2_memory.digest import Digest
+    from ros2_memory.evidence import Evidence
+    from ros2_memory.model import BagFile, BagSummary
+    from ros2_memory.motion import PoseDigest
+    from ros2_memory.timebase import Ns
+
+FOLDER: Final = ".episodic"
+FILE: Final = "catalogue.sqlite"
+
+T = TypeVar("T")
+
+log = get_logger(__name__)
+
+
+class BagKey(NamedTuple):
+    """Which bytes an entry is of: a file below the bag directory, as it looked from outside."""
+
+    path: str
+    size: int
+    mtime_ns: Ns
+    sidecar_ns: Ns
+
+    @classmethod
+    def of(cls, bag: BagFile, bag_dir: Path) -> BagKey:
+        """The key of a bag of the index."""
+        return cls(relative(bag.path, bag_dir), bag.size, bag.mtime_ns, bag.sidecar_ns)
+
+
+class KnownBag(NamedTuple):
+    """An entry's file and its summary."""
+
+    key: BagKey
+    summary: BagSummary
+
+
+class Catalogue:
+    """Keeps digests under one configuration. Safe for several threads and several processes.
+
+    Nothing is ever raised because of the file: where it fails, nothing is known of any bag.
+
+    Args:
+        places: where the file may lie, in order of preference; memory where none can be written.
+        config: what digests depend on besides the bag, as a hash.
+    """
+
+    def __init__(self, places: Sequence[Path], config: str) -> None:
+        self._config = config
+        self._lock = threading.Lock()
+        self._places = tuple(places)
+        self._opened: Opened | None = open_base(self._places)
+        self._channels: dict[int, Channel] = {}
+
+    @property
+    def path(self) -> Path | None:
+        """Where the file lies; None in memory."""
+        return None if self._opened is None else self._opened.path
+
+    def close(self) -> None:
+        """Ends; afterwards nothing is known of any bag."""
+        with self._lock:
+            if self._opened is not None:
+                self._opened.base.close()
+                self._opened = None
+
+    def newest(self) -> int:
+        """The greatest number of any entry: it grows with each one that is added, by whomever."""
+
+        def ask(base: sqlite3.Connection) -> int:
+            return int(base.execute("SELECT max(id) FROM bags").fetchone()[0] or 0)
+
+        return self._read(ask, 0)
+
+    def summaries(self) -> dict[str, KnownBag]:
+        """What is known of every file, by path."""
+
+        def ask(base: sqlite3.Connection) -> dict[str, KnownBag]:
+            shapes = {
+                number: Shape(text) for number, text in base.execute("SELECT id, text FROM shapes")
+            }
+            return {
+                path: KnownBag(BagKey(path, *stamp), shapes[shape].filled(counts))
+                for path, *stamp, shape, counts in base.execute(
+                    "SELECT path, size, mtime, sidecar, shape, counts FROM bags WHERE config = ?",
+                    (self._config,),
+                )
+            }
+
+        return self._read(ask, {})
+
+    def find(self, keys: Sequence[BagKey]) -> list[int | None]:
+        """The number of each file's entry; None where there is none, or it is of other bytes."""
+
+        def ask(base: sqlite3.Connection) -> dict[BagKey, int]:
+            rows = keys_rows(base, self._config, [key.path for key in keys])
+            return {BagKey(*key): number for number, *key in rows}
+
+        found: dict[BagKey, int] = self._read(ask, {})
+        return [found.get(key) for key in keys]
+
+    def evidence(self, topic: str, numbers: Sequence[int]) -> dict[int, Evidence]:
+        """What the entries say of the topic; those that hold none of it are left out."""
+
+        def ask(base: sqlite3.Connection) -> dict[int, Evidence]:
+            return {row[0]: evidence_of(row) for row in held_rows(base, EVIDENCE, topic, numbers)}
+
+        return self._read(ask, {})
+
+    def poses(self, topic: str, numbers: Sequence[int]) -> dict[int, PoseDigest]:
+        """The poses of the topic in the entries; those that are not all poses are left out."""
+
+        def ask(base: sqlite3.Connection) -> dict[int, PoseDigest]:
+            rows = held_rows(base, "poses", topic, numbers)
+            return {number: unpacked_poses(packed) for number, packed in rows if packed is not None}
+
+        return self._read(ask, {})
+
+    def edges(self, topic: str, numbers: Sequence[int]) -> dict[int, EdgeDigest]:
+        """The frame edges of the topic in the entries; where they are not all known: left out."""
+
+        def ask(base: sqlite3.Connection) -> dict[int, EdgeDigest]:
+            columns = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
+            pairs: dict[str, tuple[tuple[str, str], ...]] = {}
+            found: dict[int, EdgeDigest] = {}
+            for number, text, first, last in held_rows(base, columns, topic, numbers):
+                if text is None:
+                    continue
+                if text not in pairs:
+                    pairs[text] = tuple((parent, child) for parent, child in json.loads(text))
+                found[number] = EdgeDigest(pairs[text], first, last)
+            return found
+
+        return self._read(ask, {})
+
+    def kept(self, topic: str, numbers: Sequence[int]) -> dict[int, tuple[Record, ...]]:
+        """All messages of the topic in the entries that keep them."""
+
+        def ask(base: sqlite3.Connection) -> dict[int, tuple[Record, ...]]:
+            found: dict[int, list[Record]] = {
+                number: [] for number, keeps in held_rows(base, "kept", topic, numbers) if keeps
+            }
+            rows = kept_rows(base, topic, [*found])
+            for number, channel, log_time, publish_time, payload in rows:
+                record = Record(self._channel(base, channel), log_time, publish_time, payload)
+                found[number].append(record)
+            return {number: tuple(records) for number, records in found.items()}
+
+        return self._read(ask, {})
+
+    def put(self, key: BagKey, digest: Digest) -> bool:
+        """Adds an entry in place of any other of that path; whether it could be written."""
+        return self.put_all([(key, digest)])
+
+    def put_all(self, entries: Sequence[tuple[BagKey, Digest]]) -> bool:
+        """Adds entries, all or none of them; whether they could be written."""
+
+        def write(base: sqlite3.Connection) -> None:
+            self._forget(base, [key.path for key, _ in entries])
+            for key, digest in entries:
+                put(base, self._config, key, digest)
+
+        return self._write(write)
+
+    def forget(self, paths: Sequence[str]) -> None:
+        """Drops what is known of these files."""
+
+        def write(base: sqlite3.Connection) -> None:
+            self._forget(base, paths)
+            base.execute("DELETE FROM payloads WHERE id NOT IN (SELECT payload FROM kept)")
+
+        if paths:
+            self._write(write)
+
+    def forget_other_configurations(self) -> None:
+        """Drops what was found under other configurations."""
+
+        def write(base: sqlite3.Connection) -> None:
+            rows = base.execute("SELECT id FROM bags WHERE config <> ?", (self._config,))
+            drop(base, [row[0] for row in rows.fetchall()])
+
+        self._write(write)
+
+    def _forget(self, base: sqlite3.Connection, paths: Sequence[str]) -> None:
+        drop(base, numbers_of(base, self._config, paths))
+
+    def _channel(self, base: sqlite3.Connection, number: int) -> Channel:
+        """The channel of a number: one object for all records, as decoders are found by it."""
+        if number not in self._channels:
+            topic, encoding, latched, name, kind, text = base.execute(
+                "SELECT topic, encoding, latched, schema_name, schema_encoding, schema_text"
+                " FROM channels WHERE id = ?",
+                (number,),
+            ).fetchone()
+            schema = Schema(name, kind, text)
+            self._channels[number] = Channel(topic, encoding, schema, bool(latched))
+        return self._channels[number]
+
+    def _read(self, ask: Callable[[sqlite3.Connection], T], unknown: T) -> T:
+        """What the base says; `unknown` where it cannot be asked."""
+        with self._lock:
+            if self._opened is None:
+                return unknown
+            try:
+                return ask(self._opened.base)
+            # Rows of a damaged file hold anything.
+            except (sqlite3.Error, ValueError, TypeError, LookupError) as error:
+                self._failed(error)
+                return unknown
+
+    def _write(self, write: Callable[[sqlite3.Connection], None]) -> bool:
+        with self._lock:
+            if self._opened is None:
+                return False
+            base = self._opened.base
+            try:
+                base.execute("BEGIN IMMEDIATE")
+                write(base)
+                base.execute("COMMIT")
+            except sqlite3.Error as error:
+                with suppress(sqlite3.Error):
+                    base.execute("ROLLBACK")
+                self._failed(error)
+                return False
+            # A number or text that SQLite does not hold: the bags stay without an entry.
+            except (ValueError, OverflowError) as error:
+                base.execute("ROLLBACK")
+                log.warning("catalogue_refused", reason=str(error))
+                return False
+            return True
+
+    def _failed(self, error: Exception) -> None:
+        """A base that is only busy or full is asked again; any other is set aside."""
+        if isinstance(error, sqlite3.OperationalError):
+            log.warning("catalogue_failed", path=str(self.path), reason=str(error))
+            return
+        opened, self._opened = self._opened, None
+        self._channels = {}
+        if opened is not None:
+            opened.base.close()
+            if opened.path is not None:
+                set_aside(opened.path, f"it is damaged: {error}")
+        self._opened = open_base(self._places)
+
+
+def relative(path: Path, bag_dir: Path) -> str:
+    """A file as entries name it, so that the bag directory can be moved."""
+    below = str(path.relative_to(bag_dir)) if path.is_relative_to(bag_dir) else str(path)
+    # A name that is no UTF-8 would be no text for SQLite.
+    return below.encode("utf-8", "backslashreplace").decode()

@@ -1,0 +1,131 @@
+"""The file of the catalogue: opened, made, or set aside where it is not what is known here."""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.logs import get_logger
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+VERSION: Final = 1
+"""Of the tables below and of what stands in them; a file of any other is set aside."""
+
+_BUSY_S: Final = 1.0
+_TABLES: Final = """
+CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, path TEXT NOT NULL,
+  size INTEGER NOT NULL, mtime INTEGER NOT NULL, sidecar INTEGER NOT NULL,
+  shape INTEGER NOT NULL, counts BLOB NOT NULL, UNIQUE (config, path));
+CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
+CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
+CREATE TABLE held (topic INTEGER NOT NULL, bag INTEGER NOT NULL, flags INTEGER NOT NULL,
+  words TEXT, low REAL NOT NULL, high REAL NOT NULL, numbers TEXT,
+  min_x REAL, max_x REAL, min_y REAL, max_y REAL, min_z REAL, max_z REAL,
+  poses BLOB, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER, kept INTEGER,
+  PRIMARY KEY (topic, bag)) WITHOUT ROWID;
+CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
+CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
+  log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,
+  payload INTEGER NOT NULL, PRIMARY KEY (topic, bag, nth)) WITHOUT ROWID;
+CREATE TABLE channels (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, topic TEXT NOT NULL,
+  encoding TEXT NOT NULL, latched INTEGER NOT NULL, schema_name TEXT NOT NULL,
+  schema_encoding TEXT NOT NULL, schema_text BLOB NOT NULL);
+CREATE TABLE payloads (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, bytes BLOB NOT NULL);
+"""
+
+log = get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """An open base, and its file; None in memory."""
+
+    base: sqlite3.Connection
+    path: Path | None
+
+
+def open_base(places: Sequence[Path]) -> Opened:
+    """The base at the first place that can be written; in memory where none can."""
+    for path in places:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return Opened(_ready(path), path)
+        except _LockedError:
+            log.warning("catalogue_locked", path=str(path), instead="memory")
+            break
+        except (OSError, sqlite3.Error) as error:
+            log.info("catalogue_place_refused", path=str(path), reason=str(error))
+    base = _connected(":memory:")
+    base.executescript(_TABLES)
+    return Opened(base, None)
+
+
+class _LockedError(Exception):
+    """Another program holds the file: it is left alone."""
+
+
+class _OtherError(Exception):
+    """The file is not a catalogue of this version; the sentence says what it is."""
+
+
+def _ready(path: Path) -> sqlite3.Connection:
+    """The base in a file that can be written, with its tables.
+
+    Raises:
+        _LockedError: another program holds it.
+        OSError: it cannot be set aside.
+        sqlite3.Error: it cannot be opened, or not be written.
+    """
+    for _ in range(2):
+        base = _connected(str(path))
+        try:
+            _prepare(base)
+        except _OtherError as error:
+            base.close()
+            set_aside(path, str(error))
+            continue
+        except sqlite3.OperationalError as error:
+            base.close()
+            if error.sqlite_errorcode & 0xFF in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+                raise _LockedError from error
+            raise
+        except sqlite3.DatabaseError as error:
+            base.close()
+            set_aside(path, f"it is damaged: {error}")
+            continue
+        return base
+    raise sqlite3.OperationalError("another program replaces it again and again")
+
+
+def _connected(target: str) -> sqlite3.Connection:
+    return sqlite3.connect(target, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+
+
+def _prepare(base: sqlite3.Connection) -> None:
+    """Makes the tables of a new base, and looks whether an old one can be used."""
+    base.execute("PRAGMA journal_mode = WAL")
+    base.execute("PRAGMA synchronous = NORMAL")
+    base.execute("BEGIN IMMEDIATE")
+    version = base.execute("PRAGMA user_version").fetchone()[0]
+    tables = base.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+    if version == 0 and tables == 0:
+        for statement in _TABLES.split(";"):
+            base.execute(statement)
+        base.execute(f"PRAGMA user_version = {VERSION:d}")
+    base.execute("COMMIT")
+    if tables and version != VERSION:
+        raise _OtherError(f"it is of version {version}, and {VERSION} is what is known")
+    base.execute("SELECT 1 FROM bags, held, kept, payloads, channels, edges, shapes LIMIT 1")
+
+
+def set_aside(path: Path, reason: str) -> None:
+    """Makes room for a new file; the old one stays beside it for whoever wants to look."""
+    aside = path.with_name(f"{path.name}.aside")
+    log.warning("catalogue_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
+    for suffix in ("-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+    path.rename(aside)

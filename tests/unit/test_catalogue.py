@@ -1,0 +1,242 @@
+"""The catalogue keeps what digests say, and never does harm."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import structlog
+
+from ros2_memory.catalogue import FILE, FOLDER, BagKey, Catalogue, relative
+from ros2_memory.digest import Digester
+from tests.bags import boolean, detections, odom, tf, transform
+from tests.fakes import FakeReader
+from tests.memories import extractor
+
+if TYPE_CHECKING:
+    from ros2_memory.digest import Digest, TopicDigest
+    from tests.bags import Msg
+
+S = 10**9
+T0 = 1_700_000_000 * S
+KEY = BagKey("rec/rec_0.mcap", 1234, T0, 0)
+
+
+def digest_of(*messages: Msg) -> Digest:
+    reader = FakeReader()
+    path = reader.add(Path("bag.mcap"), messages)
+    return Digester(reader, extractor(), 10.0).digest(path)
+
+
+DIGEST = digest_of(
+    tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static"),
+    odom(T0, 1.0, 2.0, 0.3, vx=0.5),
+    odom(T0 + S, 2.0, 2.0, 0.3, vx=0.5),
+    detections(T0 + S, ["cup", "person"]),
+    boolean(T0 + S, True),
+)
+
+
+def topic(digest: Digest, name: str) -> TopicDigest:
+    return next(each for each in digest.topics if each.topic == name)
+
+
+def catalogue_in(folder: Path, config: str = "config") -> Catalogue:
+    return Catalogue([folder / FOLDER / FILE], config)
+
+
+def holds(catalogue: Catalogue, key: BagKey = KEY) -> bool:
+    return catalogue.find([key]) != [None]
+
+
+def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_path: Path) -> None:
+    first = catalogue_in(tmp_path)
+    assert first.put(KEY, DIGEST)
+    first.close()
+    again = catalogue_in(tmp_path)
+    [number] = again.find([KEY])
+    assert number is not None
+    assert again.summaries() == {KEY.path: (KEY, DIGEST.summary)}
+    for held in DIGEST.topics:
+        evidence = again.evidence(held.topic, [number])[number]
+        assert set(evidence.numbers or ()) == set(held.evidence.numbers or ())
+        assert (evidence.words, evidence.box, evidence.low, evidence.high, evidence.booleans) == (
+            held.evidence.words,
+            held.evidence.box,
+            held.evidence.low,
+            held.evidence.high,
+            held.evidence.booleans,
+        )
+        assert again.poses(held.topic, [number]).get(number) == held.poses
+        assert again.edges(held.topic, [number]).get(number) == held.edges
+        assert again.kept(held.topic, [number]).get(number) == held.kept
+    assert topic(DIGEST, "/odom").poses is not None
+    assert topic(DIGEST, "/tf_static").kept is not None
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        KEY._replace(size=1235),
+        KEY._replace(mtime_ns=T0 + 1),
+        KEY._replace(sidecar_ns=T0),
+        KEY._replace(path="rec/rec_1.mcap"),
+    ],
+)
+def test_an_entry_is_of_one_file_as_it_looked_then(tmp_path: Path, other: BagKey) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.put(KEY, DIGEST)
+    assert holds(catalogue)
+    assert not holds(catalogue, other)
+
+
+def test_an_entry_of_another_configuration_is_not_seen_and_can_be_dropped(tmp_path: Path) -> None:
+    catalogue_in(tmp_path, "one").put(KEY, DIGEST)
+    other = catalogue_in(tmp_path, "two")
+    assert not holds(other)
+    other.put(KEY, DIGEST)
+    assert holds(catalogue_in(tmp_path, "one"))
+    other.forget_other_configurations()
+    assert not holds(catalogue_in(tmp_path, "one"))
+    assert holds(other)
+
+
+def test_a_changed_file_takes_the_place_of_its_entry_under_a_new_number(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.put(KEY, DIGEST)
+    [before] = catalogue.find([KEY])
+    changed = KEY._replace(size=99)
+    catalogue.put(changed, digest_of(boolean(T0, False)))
+    [after] = catalogue.find([changed])
+    assert before is not None
+    assert after is not None
+    assert after > before
+    assert catalogue.newest() == after
+    assert not holds(catalogue)
+    assert catalogue.evidence("/odom", [before, after]) == {}
+
+
+def test_what_is_forgotten_leaves_nothing_behind(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.put(KEY, DIGEST)
+    catalogue.forget([KEY.path])
+    catalogue.close()
+    with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
+        for table in ("bags", "held", "kept", "payloads"):
+            assert base.execute(f"SELECT count(*) FROM {table}").fetchone() == (0,)  # noqa: S608
+
+
+@pytest.mark.parametrize(
+    "content", [b"not a database at all" * 500, b"SQLite format 3\x00" + b"\xff" * 5000]
+)
+def test_a_damaged_file_is_set_aside_and_made_anew(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / FOLDER / FILE
+    path.parent.mkdir()
+    path.write_bytes(content)
+    with structlog.testing.capture_logs() as logs:
+        catalogue = catalogue_in(tmp_path)
+    assert [event["event"] for event in logs] == ["catalogue_set_aside"]
+    assert path.with_name(f"{FILE}.aside").read_bytes() == content
+    assert catalogue.put(KEY, DIGEST)
+    assert holds(catalogue_in(tmp_path))
+
+
+def test_a_file_that_turns_out_damaged_while_it_is_asked_is_set_aside_then(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.put(KEY, DIGEST)
+    [number] = catalogue.find([KEY])
+    assert number is not None
+    with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
+        base.execute("UPDATE held SET poses = x'00' WHERE poses IS NOT NULL")
+        base.commit()
+    assert catalogue.poses("/odom", [number]) == {}
+    assert not holds(catalogue)
+    assert catalogue.put(KEY, DIGEST)
+    assert holds(catalogue)
+
+
+def test_a_file_of_a_newer_version_is_set_aside(tmp_path: Path) -> None:
+    catalogue_in(tmp_path).close()
+    path = tmp_path / FOLDER / FILE
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("PRAGMA user_version = 99")
+    with structlog.testing.capture_logs() as logs:
+        catalogue = catalogue_in(tmp_path)
+    assert [event["event"] for event in logs] == ["catalogue_set_aside"]
+    assert "version 99" in logs[0]["reason"]
+    assert catalogue.path == path
+    assert catalogue.put(KEY, DIGEST)
+
+
+def test_a_locked_file_is_left_alone_and_memory_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ros2_memory.catalogue_file._BUSY_S", 0.01)
+    catalogue_in(tmp_path).close()
+    path = tmp_path / FOLDER / FILE
+    with closing(sqlite3.connect(path, isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        with structlog.testing.capture_logs() as logs:
+            catalogue = catalogue_in(tmp_path)
+        assert [event["event"] for event in logs] == ["catalogue_locked"]
+        assert catalogue.path is None
+        assert catalogue.put(KEY, DIGEST)
+        assert holds(catalogue)
+    assert path.exists()
+    assert not holds(catalogue_in(tmp_path))
+
+
+def test_where_the_first_place_cannot_be_written_the_next_one_is_used(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("a file, and no folder")
+    refused = tmp_path / "file" / FOLDER / FILE
+    second = tmp_path / "cache" / FILE
+    assert Catalogue([refused, second], "config").path == second
+    nowhere = Catalogue([refused], "config")
+    assert nowhere.path is None
+    assert nowhere.put(KEY, DIGEST)
+    assert holds(nowhere)
+
+
+def test_two_catalogues_over_one_file_see_each_others_entries(tmp_path: Path) -> None:
+    one, two = catalogue_in(tmp_path), catalogue_in(tmp_path)
+    before = two.newest()
+    one.put(KEY, DIGEST)
+    assert two.newest() > before
+    assert holds(two)
+
+
+def test_threads_share_a_catalogue(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    keys = [KEY._replace(path=f"rec/rec_{n}.mcap") for n in range(40)]
+
+    def put(part: list[BagKey]) -> None:
+        for key in part:
+            catalogue.put(key, DIGEST)
+            assert holds(catalogue, key)
+
+    threads = [threading.Thread(target=put, args=(keys[n::4],)) for n in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert None not in catalogue.find(keys)
+
+
+def test_a_closed_catalogue_knows_nothing_and_complains_of_nothing(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.close()
+    assert catalogue.find([KEY]) == [None]
+    assert not catalogue.put(KEY, DIGEST)
+    assert catalogue.newest() == 0
+
+
+def test_a_name_that_is_no_text_can_be_kept(tmp_path: Path) -> None:
+    odd = tmp_path / "rec" / "bag\udcff.mcap"
+    key = KEY._replace(path=relative(odd, tmp_path))
+    catalogue = catalogue_in(tmp_path)
+    assert catalogue.put(key, DIGEST)
+    assert holds(catalogue, key)
