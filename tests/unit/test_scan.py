@@ -44,6 +44,9 @@ def _names(walked: Walked) -> list[str]:
         ("metadata.yaml", None),
         ("rec_0.db3-wal", None),
         ("rec_0.mcap.tmp", None),
+        (".rec_0.mcap.repair", None),
+        (".carried.mcap.tmp", None),
+        ("recorder.qos.yaml", None),
         ("rec_0.zstd", None),
         ("mcap", None),
         (".mcap", None),
@@ -60,6 +63,13 @@ def test_bags_are_found_at_any_depth_and_foreign_files_are_not(tmp_path: Path) -
     for name in ("recorder.json", "rec/metadata.yaml", "rec/b.db3-shm", "notes.txt"):
         _file(tmp_path / name)
     assert _names(Tree(tmp_path).walk(NOW, ())) == ["a.mcap", "b.db3", "c.mcap.zstd", "d.db3.zstd"]
+
+
+def test_what_a_file_system_check_put_aside_is_left_out(tmp_path: Path) -> None:
+    _file(tmp_path / "lost+found" / "a.mcap")
+    _file(tmp_path / "b.mcap")
+    walked = Tree(tmp_path).walk(NOW, ())
+    assert (_names(walked), walked.damaged) == (["b.mcap"], [])
 
 
 def test_folders_that_begin_with_a_dot_are_left_out_and_files_are_not(tmp_path: Path) -> None:

@@ -23,6 +23,9 @@ BAG_KINDS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 """Two changes within one tick of the file system share an mtime: a younger one proves nothing."""
 
+LOST_AND_FOUND: Final = "lost+found"
+"""Stands in the root of a file system, where only the system's administrator may look into it."""
+
 _LINK = "a symbolic link, which is not followed: move or mount the bags into the bag directory"
 
 
@@ -91,7 +94,7 @@ class Tree:
     """The directories under one root, as the last walk saw them.
 
     The root itself may be a symbolic link; inside it none is followed. Folders whose name begins
-    with a dot are left out. Not for several threads at once.
+    with a dot are left out, and so is `lost+found`. Not for several threads at once.
     """
 
     def __init__(self, root: Path) -> None:
@@ -186,7 +189,7 @@ def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]
         if not hidden or bag_kind(entry.name):
             folder.links.append(Path(entry.path))
     elif entry.is_dir(follow_symlinks=False):
-        if not hidden:
+        if not hidden and entry.name != LOST_AND_FOUND:
             folder.folders.append(Path(entry.path))
     elif entry.name == HANDOVER_FILE:
         folder.sidecar_ns = _mtime_ns(entry)
