@@ -24,6 +24,7 @@ from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.health import health, keep_fresh
 from ros2_memory.http import STREAM_PATH, web_app
 from ros2_memory.logs import configure_logging, get_logger
+from ros2_memory.recorder.notify import READY, STOPPING, ServiceManager
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -166,8 +167,10 @@ class _Listener(uvicorn.Server):
             host, port = each.getsockname()[:2]
             shown = f"[{host}]" if ":" in host else host
             log.info("listening", url=f"http://{shown}:{port}{STREAM_PATH}", host=host, port=port)
+        ServiceManager().tell(READY)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        ServiceManager().tell(STOPPING)
         self._server.dispatcher.stop()
         self._app.stop()
         await super().shutdown(sockets)
