@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from benchmarks import footprint, ours, report
+from benchmarks import digests, footprint, ours, report
 from benchmarks.bags import MESSAGES_OF_A_SPLIT, made
 from benchmarks.questions import QUESTIONS, Case
 from benchmarks.timing import agreed, timed
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from benchmarks.bags import History
-    from benchmarks.report import Row
+    from benchmarks.report import Figure, Row
 
 _DIR: Final = Path(__file__).resolve().parents[1] / "build" / "benchmarks"
 _ENOUGH_S: Final = 20.0
@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         flush=True,
     )
     rows = measured(history, asked.only or list(QUESTIONS), asked.runs)
-    figures = [] if asked.only else footprint.figures(history)
+    figures = [] if asked.only else _figures(history, asked.runs)
     print("\n" + report.as_table(rows, figures))
     if asked.json is not None:
         told = report.as_json(rows, figures, about) | {"bags": history.bags}
@@ -60,6 +60,11 @@ def measured(history: History, slugs: Sequence[str], runs: int) -> list[Row]:
         agreed(found, silent=question.silent)
         rows.append(report.row(slug, question, found))
     return rows
+
+
+def _figures(history: History, runs: int) -> list[Figure]:
+    case = Case(history, ours.settings_for(history.folder))
+    return [digests.cost(case, runs), *footprint.figures(history)]
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,0 +1,86 @@
+"""What the catalogue keeps of a bag: what making it costs, and the same bag as of another time."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from benchmarks import ours
+from benchmarks.bags import ODOM
+from benchmarks.report import Figure
+from ros2_memory.digest import Digester
+
+if TYPE_CHECKING:
+    from benchmarks.questions import Case
+    from ros2_memory.digest import Digest, TopicDigest
+    from ros2_memory.model import BagSummary
+    from ros2_memory.motion import PoseDigest, Stop
+
+_MAX_MS = 10.0
+
+
+def digester(case: Case, *, fresh: bool = False) -> Digester:
+    """Makes digests as the server's index does; a fresh one has read no bag yet."""
+    memory = case.memory
+    if fresh:
+        memory = ours.forgetful(memory, case.settings, case.splits[0], ODOM.name)
+    limit = case.settings.data.max_plausible_speed_mps
+    return Digester(memory.reader, memory.extractor, limit)
+
+
+def cost(case: Case, runs: int) -> Figure:
+    """The processor time of digesting one bag that was not read before, as a median."""
+    spent = []
+    for _ in range(runs):
+        fresh = digester(case, fresh=True)
+        # The first one compiles the other topics' decoders, as it does once in a server's life.
+        for nth, (split, _) in enumerate(case.moments(10)):
+            begun = time.process_time()
+            fresh.digest(split.path)
+            if nth:
+                spent.append(time.process_time() - begun)
+    words = "processor time of digesting one fresh bag"
+    return Figure("digest", words, statistics.median(spent) * 1e3, "ms", _MAX_MS)
+
+
+def moved(digest: Digest, by: int) -> Digest:
+    """The digest of the same bag recorded so many nanoseconds later; whole hours keep it exact."""
+    return replace(
+        digest,
+        summary=_moved_summary(digest.summary, by),
+        topics=tuple(_moved_topic(each, by) for each in digest.topics),
+    )
+
+
+def _moved_summary(summary: BagSummary, by: int) -> BagSummary:
+    topics = (replace(each, first=each.first + by, last=each.last + by) for each in summary.topics)
+    return replace(summary, topics=tuple(topics))
+
+
+def _moved_topic(topic: TopicDigest, by: int) -> TopicDigest:
+    edges, kept = topic.edges, topic.kept
+    if edges is not None and edges.first_stamp is not None and edges.last_stamp is not None:
+        edges = replace(edges, first_stamp=edges.first_stamp + by, last_stamp=edges.last_stamp + by)
+    if kept is not None:
+        kept = tuple(
+            each._replace(log_time=each.log_time + by, publish_time=each.publish_time + by)
+            for each in kept
+        )
+    poses = None if topic.poses is None else _moved_poses(topic.poses, by)
+    return replace(topic, poses=poses, edges=edges, kept=kept)
+
+
+def _moved_poses(poses: PoseDigest, by: int) -> PoseDigest:
+    def later(stop: Stop | None) -> Stop | None:
+        return None if stop is None else stop._replace(time=stop.time + by)
+
+    return replace(
+        poses,
+        first=later(poses.first),
+        last=later(poses.last),
+        anchor=later(poses.anchor),
+        measured_from=later(poses.measured_from),
+        vertices=tuple((moment + by, place, turn) for moment, place, turn in poses.vertices),
+    )
