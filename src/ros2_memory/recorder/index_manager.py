@@ -1,8 +1,9 @@
 """Keeps what is known of the bag directory: which bags answer, and what was set aside.
 
 A scan looks at what changed, judges each file (see `standing`), and swaps a whole new `Snapshot`
-in: a query that holds one sees one consistent index for as long as it likes. Nothing is written,
-and no thread is started: whoever asks a question, or calls `refresh` now and then, scans.
+in: a query that holds one sees one consistent index for as long as it likes. No thread is started:
+whoever asks a question, or calls `refresh` now and then, scans. Nothing is written or deleted,
+unless it was built to dispose of bags, as the recorder's daemon alone does.
 """
 
 from __future__ import annotations
@@ -16,18 +17,21 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.errors import BagVanishedError
+from ros2_memory.recorder.disposal import Disposed
 from ros2_memory.recorder.heartbeat import read_heartbeat
-from ros2_memory.recorder.scan import Tree
+from ros2_memory.recorder.inventory import Known
+from ros2_memory.recorder.scan import COMPRESSED, Tree, other_form
 from ros2_memory.recorder.snapshot import Snapshot, Timeline
 from ros2_memory.recorder.standing import FileNotes, Scene, Standing, judge
 from ros2_memory.timebase import ms_from_ns, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from structlog.typing import FilteringBoundLogger
 
     from ros2_memory.model import BagFile, SetAside
+    from ros2_memory.recorder.disposal import Disposal
     from ros2_memory.recorder.heartbeat import Heartbeat
     from ros2_memory.recorder.scan import Stamp, Walked
     from ros2_memory.recorder.standing import Verdict
@@ -40,8 +44,6 @@ SPLITS_OF_PATIENCE: Final = 3
 """A file that lay still for so many splits is not being written, unless a heartbeat says so."""
 PATROL: Final = 256
 """Closed files looked at in each scan, in turn: one overwritten in place changes no directory."""
-
-_COMPRESSED: Final = ".zstd"
 
 
 class _Oddities(NamedTuple):
@@ -56,7 +58,8 @@ class IndexManager:
     """Keeps the snapshot of one bag directory. Safe for several threads at once.
 
     `refresh_s` is how old a snapshot may become before a question has it renewed;
-    `split_duration_s` is how long the recorder writes one file.
+    `split_duration_s` is how long the recorder writes one file. `disposal` deletes bags by its
+    limits when it is told to; without it nothing here deletes anything.
     """
 
     def __init__(
@@ -67,8 +70,10 @@ class IndexManager:
         *,
         refresh_s: float,
         split_duration_s: float,
+        disposal: Disposal | None = None,
     ) -> None:
         self._bag_dir = bag_dir
+        self._disposal = disposal
         self._reader = reader
         self._clock = clock
         self._refresh: Ns = ns_from_unix(refresh_s)
@@ -97,6 +102,28 @@ class IndexManager:
         """Scans now, and gives the result."""
         with self._lock:
             return self._scan()
+
+    def apply_retention(
+        self, *, free_bytes: Callable[[], int] | None = None, min_free_bytes: int | None = None
+    ) -> Disposed:
+        """Scans, and deletes what the limits do not allow to keep; nothing without a `disposal`.
+
+        `free_bytes` measures what the disk has left, where that is to count; `min_free_bytes` is
+        what it must have, where that is not as the limits say.
+        """
+        if self._disposal is None:
+            return Disposed()
+        with self._lock:
+            snapshot = self._scan()
+            heartbeat = self.heartbeat()
+            named = () if heartbeat is None else heartbeat.recordings
+            known = Known(self._counted, self._hidden, self._files, named, snapshot.scanned_at)
+            done = self._disposal.apply(
+                known, snapshot, free_bytes=free_bytes, min_free_bytes=min_free_bytes
+            )
+            if done.bags:
+                self._scan()
+            return done
 
     def heartbeat(self) -> Heartbeat | None:
         """What the recorder last wrote of itself, live or not; None where that cannot be read."""
@@ -195,7 +222,7 @@ class IndexManager:
     def _recount(self, changed: Iterable[str], scene: Scene) -> tuple[list[BagFile], list[BagFile]]:
         """Brings `_counted` up to date; gives the bags that left it and those that came."""
         removed, added = [], []
-        for path in {form for each in changed for form in (each, _other_form(each))}:
+        for path in {form for each in changed for form in (each, other_form(each))}:
             before, after = self._counted.pop(path, None), self._verdict_that_counts(path, scene)
             self._set_aside.pop(path, None)
             if after is not None:
@@ -217,18 +244,18 @@ class IndexManager:
         whole ones that have lain there for three splits are two files that somebody keeps.
         """
         self._hidden.discard(path)
-        own, other = self._verdicts.get(path), self._verdicts.get(_other_form(path))
+        own, other = self._verdicts.get(path), self._verdicts.get(other_form(path))
         if own is None or other is None or own.standing > other.standing:
             return own
         if own.standing == other.standing:
             kept = own.standing is Standing.CLOSED and not self._being_compressed(path, scene)
-            if kept or not path.endswith(_COMPRESSED):
+            if kept or not path.endswith(COMPRESSED):
                 return own
         self._hidden.add(path)
         return None
 
     def _being_compressed(self, path: str, scene: Scene) -> bool:
-        forms = [self._files[form] for form in (path, _other_form(path)) if form in self._files]
+        forms = [self._files[form] for form in (path, other_form(path)) if form in self._files]
         return any(notes.grew_lately(scene) for notes in forms)
 
     def _compose(self, now: Ns) -> Snapshot:
@@ -274,11 +301,6 @@ class IndexManager:
             problem=after.problem,
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
         )
-
-
-def _other_form(path: str) -> str:
-    """The name of the same bag compressed, or no longer so."""
-    return path.removesuffix(_COMPRESSED) if path.endswith(_COMPRESSED) else path + _COMPRESSED
 
 
 def _oddities(walked: Walked) -> _Oddities:

@@ -89,13 +89,31 @@ class Stock:
     free_bytes: int | None = None
 
 
+class Weighed(NamedTuple):
+    """What the limits say of a stock.
+
+    `doomed` are the bags to delete, oldest first. `total_bytes` is what the budget counted, each
+    file once; `fits` says whether the limits are kept when those bags are gone.
+    """
+
+    doomed: tuple[StoredBag, ...]
+    total_bytes: int
+    fits: bool
+
+
 def expired(stock: Stock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
     """The bags to delete, oldest first: all that are too old, and no more than the budget needs."""
+    return weighed(stock, limits).doomed
+
+
+def weighed(stock: Stock, limits: RetentionLimits) -> Weighed:
+    """The bags to delete, and what came of weighing them."""
+    plan = _Plan(stock)
+    total = plan.total
     eras = _eras(stock, limits)
     aged = _aged(stock.bags, eras, limits.max_age_ns)
-    plan = _Plan(stock)
     if not aged and plan.fits(limits):
-        return ()
+        return Weighed((), total, fits=True)
     order = _oldest_first(stock.bags, eras[-1] if eras else [])
     kept = _inodes(_newest(order, eras))
     doomed: list[StoredBag] = []
@@ -110,12 +128,7 @@ def expired(stock: Stock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
         if bag.path not in aged and kept.isdisjoint(_inodes(bag)):
             doomed.append(bag)
             plan.delete(bag)
-    return tuple(doomed)
-
-
-def total_bytes(stock: Stock) -> int:
-    """What the budget counts: every file once, however many names it has."""
-    return _Plan(stock).total
+    return Weighed(tuple(doomed), total, plan.fits(limits))
 
 
 class _Plan:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 BAG_KINDS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 """How the names of bag files end, whichever reader reads them."""
+COMPRESSED: Final = ".zstd"
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 """Two changes within one tick of the file system share an mtime: a younger one proves nothing."""
 
@@ -35,6 +36,11 @@ def bag_kind(name: str) -> str | None:
     if lowered in BAG_KINDS:
         return None
     return next((kind for kind in BAG_KINDS if lowered.endswith(kind)), None)
+
+
+def other_form(path: str) -> str:
+    """The name of the same bag compressed as a whole, or no longer so."""
+    return path.removesuffix(COMPRESSED) if path.endswith(COMPRESSED) else path + COMPRESSED
 
 
 def settled(mtime_ns: Ns, now: Ns) -> bool:

@@ -1,0 +1,169 @@
+"""Deletes what the limits do not allow to keep, after what must outlive it was carried on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from ros2_memory.errors import EpisodicError
+from ros2_memory.recorder.inventory import Inventory
+from ros2_memory.recorder.removal import Inode, remove_bag, remove_emptied
+from ros2_memory.recorder.retention import weighed
+from ros2_memory.recorder.scan import other_form
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Sequence
+
+    from ros2_memory.recorder.inventory import Known
+    from ros2_memory.recorder.latched import Carrier
+    from ros2_memory.recorder.retention import RetentionLimits, StoredBag
+    from ros2_memory.recorder.snapshot import Snapshot
+
+MOST_AT_ONCE: Final = 2000
+"""Bags deleted in one pass: some tenths of a second. The next pass goes on."""
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+@dataclass(slots=True)
+class Disposed:
+    """What one pass did.
+
+    `total_bytes` is what the budget counts afterwards, and `fits` whether the limits are kept.
+    `carried` is how many latched messages are carried, where their bag was written anew; `failed`
+    is how many bags could not be deleted.
+    """
+
+    bags: int = 0
+    bytes: int = 0
+    recordings: int = 0
+    carried: int | None = None
+    failed: int = 0
+    total_bytes: int = 0
+    fits: bool = True
+
+
+@dataclass(slots=True)
+class _Pass:
+    """One pass under way: bags that were deleted, and those that could not be."""
+
+    done: Disposed = field(default_factory=Disposed)
+    gone: set[str] = field(default_factory=set)
+    staying: set[str] = field(default_factory=set)
+
+
+class Disposal:
+    """Keeps one bag directory within its limits. Not for several threads at once.
+
+    Args:
+        bag_dir: the bag directory.
+        limits: how much is kept.
+        carrier: carries latched messages on.
+        static_topics: topics that are latched whatever their publishers say.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        limits: RetentionLimits,
+        carrier: Carrier,
+        *,
+        static_topics: Collection[str] = (),
+    ) -> None:
+        self._bag_dir = bag_dir
+        self._limits = limits
+        self._carrier = carrier
+        self._inventory = Inventory(bag_dir, static_topics)
+        self._told: set[str] = set()
+        self._untidy: set[Path] = set()
+
+    def apply(
+        self,
+        known: Known,
+        snapshot: Snapshot,
+        *,
+        free_bytes: Callable[[], int] | None = None,
+        min_free_bytes: int | None = None,
+    ) -> Disposed:
+        """Deletes what is too old, and then what is too much. Raises nothing: faults are reported.
+
+        Args:
+            known: what the index knows of files.
+            snapshot: what it publishes of them.
+            free_bytes: measures what the disk has left; where None, that does not count.
+            min_free_bytes: what must be free, where that is not as the limits have it.
+        """
+        limits = self._limits
+        if min_free_bytes is not None:
+            limits = replace(limits, min_free_bytes=min_free_bytes)
+        under_way = _Pass()
+        while True:
+            stock = self._inventory.stock(known, gone=under_way.gone, staying=under_way.staying)
+            if free_bytes is not None:
+                stock = replace(stock, free_bytes=free_bytes())
+            found = weighed(stock, limits)
+            under_way.done.total_bytes, under_way.done.fits = found.total_bytes, found.fits
+            doomed = found.doomed[: MOST_AT_ONCE - len(under_way.gone)]
+            if not doomed:
+                break
+            self._dispose(doomed, snapshot, under_way)
+        self._tidy(known, under_way)
+        return under_way.done
+
+    def _dispose(self, doomed: Sequence[StoredBag], snapshot: Snapshot, under_way: _Pass) -> None:
+        leaving = {Path(bag.path) for bag in doomed} | {Path(path) for path in under_way.gone}
+        try:
+            carried = self._carrier.carry(snapshot, leaving)
+        except (EpisodicError, OSError) as error:
+            # The others may go all the same, and make the room that was missing.
+            for bag in self._carrier.concerned(snapshot, leaving):
+                self._stays(
+                    str(bag.path), f"its latched messages cannot be kept: {error}", under_way
+                )
+        else:
+            under_way.done.carried = under_way.done.carried if carried is None else carried
+        for each in doomed:
+            if each.path not in under_way.staying:
+                self._delete(each, under_way)
+
+    def _delete(self, bag: StoredBag, under_way: _Pass) -> None:
+        size = 0
+        for path, file in zip((bag.path, other_form(bag.path)), bag.files, strict=False):
+            try:
+                size += remove_bag(self._bag_dir, Path(path), Inode(*file.inode))
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                self._stays(bag.path, str(error), under_way)
+                return
+        self._told.discard(bag.path)
+        under_way.gone.add(bag.path)
+        under_way.done.bags += 1
+        under_way.done.bytes += size
+
+    def _tidy(self, known: Known, under_way: _Pass) -> None:
+        """Deletes what is left of recordings without a bag, unless one is being written."""
+        named = {self._bag_dir / name for name in known.named}
+        self._untidy |= {Path(path).parent for path in under_way.gone}
+        for recording in self._untidy - named:
+            try:
+                remove_emptied(self._bag_dir, recording)
+            except OSError as error:
+                self._tell(str(recording), str(error))
+            else:
+                self._untidy.discard(recording)
+                under_way.done.recordings += not recording.exists()
+
+    def _stays(self, path: str, reason: str, under_way: _Pass) -> None:
+        under_way.staying.add(path)
+        under_way.done.failed += 1
+        self._tell(path, reason)
+
+    def _tell(self, path: str, reason: str) -> None:
+        """Reports a fault; silent while it stands."""
+        if path not in self._told:
+            self._told.add(path)
+            _log.error("not_deleted", path=path, reason=reason)

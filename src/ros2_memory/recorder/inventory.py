@@ -1,0 +1,206 @@
+"""What lies in the bag directory because of this program, and which of it may be deleted.
+
+The index knows the bags; here stands what retention weighs besides: what goes with the last bag of
+a recording, what nothing may delete, and which files are two names of one. Worked out for what
+changed since the last time, since a week is 60,000 bags.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.recorder.latched import CARRY_FILE, is_carried
+from ros2_memory.recorder.layout import LOCK_FILE, OWN_FILES
+from ros2_memory.recorder.removal import beside_bags
+from ros2_memory.recorder.retention import Span, Stock, StoredBag, StoredFile
+from ros2_memory.recorder.scan import other_form
+from ros2_memory.recorder.standing import Standing
+from ros2_memory.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from ros2_memory.recorder.scan import Stamp
+    from ros2_memory.recorder.standing import FileNotes, Verdict
+
+DERIVED_FOLDER: Final = ".episodic"
+"""Where what is derived from bags is kept."""
+SETTLED_NS: Final[Ns] = 120 * NS_PER_S
+"""A directory that changed longer ago holds what it will hold."""
+_BLOCK: Final = 4096
+_WHOLE: Final = frozenset({Standing.CLOSED, Standing.EMPTY})
+_OWN_RECORDING: Final = re.compile(r"rec_\d{8}T\d{6}Z(_\d+)?")
+
+
+def is_own_recording(name: str) -> bool:
+    """Whether a directory is called as this program calls a recording."""
+    return _OWN_RECORDING.fullmatch(name) is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What the index knows of the bag directory, by path.
+
+    `counted` are the verdicts on bags, of two forms of one only that which answers; `hidden` are
+    the other forms. `named` are the recordings that the recorder last said it is writing.
+    """
+
+    counted: Mapping[str, Verdict]
+    hidden: Collection[str]
+    files: Mapping[str, FileNotes]
+    named: Collection[str]
+    now: Ns
+
+
+class _Entry(NamedTuple):
+    """A bag, and what it was made from."""
+
+    verdict: Verdict
+    stamp: Stamp
+    bag: StoredBag
+
+
+class _Folder(NamedTuple):
+    """A recording's directory: its device, and the size of what goes with its last bag."""
+
+    mtime_ns: Ns
+    settled: bool
+    device: int
+    size: int
+
+
+class Inventory:
+    """The stock of one bag directory. Not for several threads at once.
+
+    `static_topics` are latched whatever their publishers say.
+    """
+
+    def __init__(self, root: Path, static_topics: Collection[str] = ()) -> None:
+        self._root = root
+        self._static_topics = frozenset(static_topics)
+        self._entries: dict[str, _Entry] = {}
+        self._folders: dict[str, _Folder] = {}
+
+    def stock(
+        self, known: Known, *, gone: Collection[str] = (), staying: Collection[str] = ()
+    ) -> Stock:
+        """The bags that may be deleted, and the size of everything else.
+
+        A bag that is being written may not, nor one that cannot be read: it says nothing of its
+        age. Whole bags may that were left open by a crash, unless the recorder named them last.
+
+        Args:
+            known: what the index knows.
+            gone: bags that have been deleted since.
+            staying: bags that cannot be deleted.
+        """
+        bags: list[StoredBag] = []
+        others = self._own_bytes()
+        occupied: set[str] = set()
+        named = {str(self._root / name) for name in known.named}
+        for path, verdict in known.counted.items():
+            if path in gone:
+                continue
+            entry = self._entry(path, verdict, known)
+            bag = entry.bag
+            if path not in staying and _is_deletable(verdict, bag, named):
+                bags.append(bag)
+            elif _counts(verdict, bag):
+                others += sum(file.size for file in bag.files)
+                occupied.add(bag.recording)
+        self._forget(known)
+        sidecars: dict[str, int] = {}
+        for recording in {bag.recording for bag in bags} | occupied:
+            size = self._folder(recording, known.now).size
+            if recording in occupied or recording in named or recording == str(self._root):
+                others += size
+            else:
+                sidecars[recording] = size
+        return Stock(bags, known.now, sidecars, others)
+
+    def _entry(self, path: str, verdict: Verdict, known: Known) -> _Entry:
+        entry = self._entries.get(path)
+        stamp = known.files[path].stamp
+        if entry is None or entry.verdict is not verdict or entry.stamp is not stamp:
+            entry = _Entry(verdict, stamp, self._stored(path, verdict, known))
+            self._entries[path] = entry
+        return entry
+
+    def _stored(self, path: str, verdict: Verdict, known: Known) -> StoredBag:
+        recording = str(known.files[path].path.parent)
+        device = self._folder(recording, known.now).device
+        other = other_form(path)
+        forms = (path, other) if other in known.hidden and other in known.files else (path,)
+        stamps = [known.files[form].stamp for form in forms]
+        files = (
+            StoredFile((device, each.inode), each.size, _on_disk(each.size)) for each in stamps
+        )
+        return StoredBag(path, recording, self._span(verdict), stamps[0].mtime_ns, tuple(files))
+
+    def _span(self, verdict: Verdict) -> Span | None:
+        if verdict.bag is None:
+            return None
+        said = [
+            (topic.first, topic.last)
+            for topic in verdict.bag.summary.topics
+            if not topic.latched and topic.topic not in self._static_topics
+        ]
+        if not said:
+            return None
+        return Span(min(first for first, _ in said), max(last for _, last in said))
+
+    def _folder(self, path: str, now: Ns) -> _Folder:
+        known = self._folders.get(path)
+        try:
+            status = Path(path).stat()
+        except OSError:
+            return _Folder(0, settled=False, device=-1, size=0)
+        if known is None or not known.settled or known.mtime_ns != status.st_mtime_ns:
+            # metadata.yaml is made, and written some moments later.
+            since = abs(now - status.st_mtime_ns)
+            size = beside_bags(Path(path))
+            known = _Folder(status.st_mtime_ns, since >= SETTLED_NS, status.st_dev, size)
+            self._folders[path] = known
+        return known
+
+    def _forget(self, known: Known) -> None:
+        if len(self._entries) > len(known.counted):
+            for path in self._entries.keys() - known.counted.keys():
+                del self._entries[path]
+            recordings = {entry.bag.recording for entry in self._entries.values()}
+            for path in self._folders.keys() - recordings:
+                del self._folders[path]
+
+    def _own_bytes(self) -> int:
+        """The size of what this program keeps beside the recordings."""
+        own = [self._root / name for name in (*OWN_FILES, LOCK_FILE)]
+        with suppress(OSError):
+            own += (self._root / DERIVED_FOLDER).iterdir()
+        size = 0
+        for path in own:
+            with suppress(OSError):
+                size += path.lstat().st_size
+        return size
+
+
+def _is_deletable(verdict: Verdict, bag: StoredBag, named: Collection[str]) -> bool:
+    if verdict.standing is Standing.INCOMPLETE:
+        return bag.recording not in named
+    if verdict.standing not in _WHOLE:
+        return False
+    return not (bag.path.endswith(CARRY_FILE) and is_carried(Path(bag.path)))
+
+
+def _counts(verdict: Verdict, bag: StoredBag) -> bool:
+    """Whether the budget counts a bag that may not be deleted: not what came from elsewhere."""
+    if verdict.standing is Standing.UNREAD:
+        return False
+    return verdict.standing is not Standing.DAMAGED or is_own_recording(Path(bag.recording).name)
+
+
+def _on_disk(size: int) -> int:
+    return -(-size // _BLOCK) * _BLOCK

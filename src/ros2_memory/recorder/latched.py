@@ -1,0 +1,278 @@
+"""Carries latched messages past the deletion of the bags that they stand in.
+
+A latched message holds until the next one, so an answer about today may need one received weeks
+ago: a transform of `/tf_static` stands only in the split in which it was received. What answers
+still need is therefore carried into one small bag, `latched/carried.mcap`, before its split is
+deleted. Everything of a message stays as it is but the file that it stands in, so that an answer
+stays the same to the nanosecond.
+
+What is needed, of all messages that would be gone otherwise:
+
+- The newest message of a topic; and of transforms the newest of each child frame, since every
+  broadcaster publishes only its own.
+- One that held while something was recorded that is kept. Deleting goes by age, so mostly that is
+  the newest only; but clocks step.
+- One that a kept bag repeats because its recording received it again: only the earliest copy tells
+  when it was first received.
+
+Whatever is superseded leaves the bag when that is written the next time, so it stays small.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from bisect import bisect_left
+from collections import defaultdict
+from itertools import accumulate, pairwise
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import structlog
+
+from ros2_memory.errors import BagError, BagVanishedError, UndecodableError
+from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.sync import flush
+from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.model import BagFile
+    from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.storage.base import BagReader, Record
+    from ros2_memory.storage.writing import BagWriter
+
+CARRY_FOLDER: Final = "latched"
+CARRY_FILE: Final = "carried.mcap"
+RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
+"""A latched message logged so long after it was published may have been received before."""
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+def is_carried(path: Path) -> bool:
+    """Whether a bag file is the one of carried messages: it says nothing of what was recorded."""
+    return path.name == CARRY_FILE and path.parent.name == CARRY_FOLDER
+
+
+class Identity(NamedTuple):
+    """What all copies of one message share, whichever recording received them."""
+
+    topic: str
+    publish_time: Ns
+    payload: bytes
+
+
+class Latched(NamedTuple):
+    """One latched message without its payload.
+
+    `holds` names what it holds for: its topic, and each child frame of its transforms.
+    """
+
+    log_time: Ns
+    identity: Identity
+    holds: tuple[tuple[str, str], ...]
+
+
+def latched_message(record: Record, frames: Collection[str]) -> Latched:
+    """What is to know of a message; `frames` are the child frames of its transforms, if any."""
+    topic = record.channel.topic
+    digest = hashlib.blake2b(record.payload, digest_size=16).digest()
+    holds = ((topic, ""), *((topic, frame) for frame in frames))
+    return Latched(record.log_time, Identity(topic, record.publish_time, digest), holds)
+
+
+def is_late(message: Latched) -> bool:
+    """Whether it may have been received before, by another recording."""
+    return message.log_time - message.identity.publish_time > RECEIVED_AGAIN_NS
+
+
+def worth_carrying(
+    messages: Iterable[Latched],
+    recorded_in: Callable[[Ns, Ns], bool],
+    repeated: Mapping[Identity, Ns],
+) -> set[Latched]:
+    """Which of these messages are still needed when the bags that they stand in are gone.
+
+    Args:
+        messages: all that would be gone, those carried before included, in any order.
+        recorded_in: whether anything is kept that was recorded in `[start, stop)`.
+        repeated: late messages that stand in kept bags, and their earliest log time there.
+    """
+    earliest: dict[Identity, Latched] = {}
+    for each in messages:
+        known = earliest.get(each.identity)
+        if known is None or each.log_time < known.log_time:
+            earliest[each.identity] = each
+    missing = [
+        each for each in earliest.values() if repeated.get(each.identity, MAX_NS) > each.log_time
+    ]
+    needed = {each for each in missing if each.identity in repeated}
+    by_hold: defaultdict[tuple[str, str], list[Latched]] = defaultdict(list)
+    for each in sorted(missing):
+        for hold in each.holds:
+            by_hold[hold].append(each)
+    for (_, frame), held in by_hold.items():
+        needed.add(held[-1])
+        # A static transform holds before it was received, too.
+        since = MIN_NS if frame else held[0].log_time
+        for message, following in pairwise(held):
+            if message not in needed and recorded_in(since, following.log_time):
+                needed.add(message)
+            since = following.log_time
+    return needed
+
+
+class Carrier:
+    """Writes the bag of carried messages of one bag directory.
+
+    Args:
+        bag_dir: where the bags lie.
+        reader: reads them.
+        writer: writes the one of carried messages.
+        static_topics: carried though no publisher is known to have offered them as transient local.
+    """
+
+    def __init__(
+        self, bag_dir: Path, reader: BagReader, writer: BagWriter, static_topics: Collection[str]
+    ) -> None:
+        self.path = bag_dir / CARRY_FOLDER / CARRY_FILE
+        self._reader = reader
+        self._writer = writer
+        self._static_topics = frozenset(static_topics)
+        self._late: dict[tuple[Path, Ns, str], dict[Identity, Ns]] = {}
+
+    def concerned(self, snapshot: Snapshot, doomed: Collection[Path]) -> tuple[BagFile, ...]:
+        """Those of the bags that hold messages of a latched topic."""
+        found: dict[Path, BagFile] = {}
+        for topic in self._topics(snapshot):
+            held = snapshot.holding(topic)
+            found.update((bag.path, bag) for bag, _ in held if bag.path in doomed)
+        return tuple(found.values())
+
+    def carry(self, snapshot: Snapshot, doomed: Collection[Path]) -> int | None:
+        """Writes what must outlive these bags; how many messages are carried then.
+
+        None where nothing had to be written. All is on the disk when this returns.
+
+        Raises:
+            BagError: it cannot be written; what was carried before still is.
+            OSError: likewise.
+        """
+        leaving = self.concerned(snapshot, doomed)
+        if not leaving:
+            return None
+        topics = self._topics(snapshot)
+        before = set(self._read(self.path, topics))
+        messages = {*before, *(each for bag in leaving for each in self._read(bag.path, topics))}
+        kept = [bag for bag in snapshot.bags if bag.path not in doomed and not is_carried(bag.path)]
+        repeated = self._repeated(snapshot, topics, doomed)
+        wanted = worth_carrying(messages, _presence(kept), repeated)
+        if {each[:2] for each in wanted} == {each[:2] for each in before}:
+            return None
+        sources = [self.path, *(bag.path for bag in leaving)]
+        self._write(sorted(self._fetched(sources, topics, wanted), key=lambda each: each.log_time))
+        return len(wanted)
+
+    def _topics(self, snapshot: Snapshot) -> tuple[str, ...]:
+        return tuple(
+            topic
+            for topic in snapshot.topics()
+            if topic in self._static_topics or snapshot.is_latched(topic)
+        )
+
+    def _read(self, path: Path, topics: Collection[str]) -> Iterator[Latched]:
+        """The messages of these topics; of a bag that cannot be read to its end, the readable."""
+        for record in self._records(path, topics):
+            yield latched_message(record, self._frames(record))
+
+    def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
+        try:
+            yield from self._reader.records(path, topics, TimeWindow.everything())
+        except BagVanishedError:
+            return
+        except BagError as error:
+            _log.warning("latched_not_read", path=str(path), reason=error.reason)
+
+    def _fetched(
+        self, sources: Iterable[Path], topics: Collection[str], wanted: Collection[Latched]
+    ) -> Iterator[Record]:
+        """The messages themselves; the chosen are few, so they are held at once."""
+        missing = {each[:2] for each in wanted}
+        for path in sources:
+            for record in self._records(path, topics):
+                key = latched_message(record, ())[:2]
+                if key in missing:
+                    missing.remove(key)
+                    yield record
+
+    def _frames(self, record: Record) -> tuple[str, ...]:
+        """The child frames of a message of transforms, as they are written in it."""
+        if record.channel.type.rpartition("/")[2].lower() != "tfmessage":
+            return ()
+        try:
+            message = self._reader.decode(record)
+        except UndecodableError:
+            return ()
+        transforms: Iterable[object] = getattr(message, "transforms", ())
+        return tuple({str(getattr(each, "child_frame_id", "")) for each in transforms})
+
+    def _repeated(
+        self, snapshot: Snapshot, topics: Iterable[str], doomed: Collection[Path]
+    ) -> dict[Identity, Ns]:
+        """The late messages of kept bags, and their earliest log time.
+
+        They come first in a recording, when its recorder has just subscribed.
+        """
+        repeated: dict[Identity, Ns] = {}
+        asked: dict[tuple[Path, Ns, str], dict[Identity, Ns]] = {}
+        for topic in topics:
+            seen: set[Path] = set()
+            for bag, _ in snapshot.holding(topic):
+                if bag.recording in seen or bag.path in doomed or is_carried(bag.path):
+                    continue
+                seen.add(bag.recording)
+                key = (bag.path, bag.mtime_ns, topic)
+                known = self._late.get(key)
+                asked[key] = self._late_in(bag.path, topic) if known is None else known
+                for identity, moment in asked[key].items():
+                    repeated[identity] = min(moment, repeated.get(identity, moment))
+        self._late = asked
+        return repeated
+
+    def _late_in(self, path: Path, topic: str) -> dict[Identity, Ns]:
+        late: dict[Identity, Ns] = {}
+        for record in self._records(path, (topic,)):
+            message = latched_message(record, ())
+            if not is_late(message):
+                break
+            late.setdefault(message.identity, message.log_time)
+        return late
+
+    def _write(self, records: Sequence[Record]) -> None:
+        folder = self.path.parent
+        if not records:
+            self.path.unlink(missing_ok=True)
+            return
+        folder.mkdir(exist_ok=True)
+        if folder.is_symlink():
+            raise BagError(str(folder), "a symbolic link, which is not followed: remove it")
+        beside = folder / f".{CARRY_FILE}.tmp"
+        beside.unlink(missing_ok=True)
+        self._writer.write(beside, records)
+        beside.replace(self.path)
+        flush(folder)
+        flush(folder.parent)
+
+
+def _presence(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:
+    """Tells whether any of these bags has a moment in `[start, stop)`."""
+    spans = sorted((bag.start, bag.end) for bag in bags)
+    starts = [start for start, _ in spans]
+    reach = list(accumulate((end for _, end in spans), max))
+
+    def recorded_in(start: Ns, stop: Ns) -> bool:
+        begun = bisect_left(starts, stop)
+        return begun > 0 and reach[begun - 1] >= start
+
+    return recorded_in
