@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import MutableMapping
@@ -199,6 +198,38 @@ class TestDeath:
         assert "status -6" in str(died["reason"])
         assert "terminate called" in str(died["reason"])
         assert world.heartbeat()["last_error"] == died["reason"]
+
+    def test_one_that_does_not_begin_is_given_up_and_another_is_started(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.defaults = {"ready_s": 10**9}
+        world.supervisor.start()
+        with capture_logs() as logs:
+            world.run(119)
+            assert len(world.recorders) == 1
+            world.run(4)
+        assert [recorder.status for recorder in world.recorders] == [0, None]
+        assert len(events(logs, "recorder_not_ready")) == 1
+
+    def test_a_new_one_that_does_not_begin_never_takes_over(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(19)
+        world.defaults = {"ready_s": 10**9}
+        world.run(125)
+        old, new = world.recorders[:2]
+        assert (old.status, new.status) == (None, 0)
+        assert read_handover(old.directory).handover.next != new.directory.name
+
+    def test_what_never_held_a_byte_leaves_no_directory(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.disk_full = True
+        world.supervisor.start()
+        world.run(0.5)
+        world.recorders[0].die()
+        world.run(0.5)
+        assert not world.recorders[0].directory.exists()
 
     def test_its_recording_is_not_named_as_open_any_more(self, tmp_path: Path) -> None:
         world = World(tmp_path)
@@ -572,14 +603,24 @@ class TestWatch:
 
 
 class TestHeartbeat:
-    def test_it_comes_every_two_seconds(self, tmp_path: Path) -> None:
+    def test_it_comes_every_five_seconds(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()
+        world.run(5)
         moments = set()
-        for _ in range(40):
-            world.run(0.5)
+        for _ in range(80):
+            world.run(0.25)
             moments.add(world.heartbeat()["updated"])
-        assert len(moments) == 10
+        assert len(moments) == 4
+
+    def test_a_change_is_told_at_once(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(7)
+        world.recorders[0].die()
+        world.run(0.25)
+        beat = world.heartbeat()
+        assert (beat["state"], beat["recordings"]) == ("starting", [])
 
     def test_one_that_cannot_be_written_is_told_once_and_recording_goes_on(
         self, tmp_path: Path
@@ -603,4 +644,4 @@ class TestHeartbeat:
         assert sizes == sorted(sizes, key=lambda size: int(str(size)))
         on_disk = sum(path.stat().st_size for path in tmp_path.glob("*/*.mcap"))
         assert abs(int(str(sizes[-1])) - on_disk) < 20_000
-        assert json.loads((tmp_path / "recorder.json").read_text())["interval_s"] == 2.0
+        assert world.heartbeat()["interval_s"] == 5.0

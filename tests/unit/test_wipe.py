@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.errors import RecorderError
-from ros2_memory.recorder.wipe import clear_bags
+from ros2_memory.recorder.wipe import clear_bags, remove_if_empty
 
 
 def make(root: Path, *names: str) -> None:
@@ -128,3 +128,29 @@ def test_no_file_of_another_kind_is_ever_deleted(
     clear_bags(root)
     kept = {name for name in left(root) if (root / name).is_file()}
     assert kept == {name for name in names if not name.endswith((".mcap", ".db3"))}
+
+
+def test_a_recording_without_a_byte_is_removed(tmp_path: Path) -> None:
+    recording = tmp_path / "rec_1"
+    recording.mkdir()
+    (recording / "rec_1_0.mcap").touch()
+    (recording / "metadata.yaml").touch()
+    (recording / "handover.json").write_text("{}")
+    assert remove_if_empty(recording)
+    assert not recording.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("rec_1_0.mcap", b"1"), ("notes.txt", b""), ("metadata.yaml", b"x: 1")]
+)
+def test_a_recording_with_anything_in_it_stays(tmp_path: Path, name: str, content: bytes) -> None:
+    recording = tmp_path / "rec_1"
+    recording.mkdir()
+    (recording / "rec_1_1.mcap").touch()
+    (recording / name).write_bytes(content)
+    assert not remove_if_empty(recording)
+    assert len(list(recording.iterdir())) == 2
+
+
+def test_a_recording_that_is_not_there_is_not_removed(tmp_path: Path) -> None:
+    assert not remove_if_empty(tmp_path / "rec_1")

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 PROGRAM: Final = "ros2-memory-recorder"
 FAILED: Final = 1
+INTERRUPTED: Final = 130
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -32,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Records until it is told to stop, and returns the exit code.
 
     0: stopped by a signal, or there is nothing to record (`recorder=none`); 1: recording cannot
-    begin; 2: the configuration or the command line is refused.
+    begin; 2: the configuration or the command line is refused; 130: interrupted before it began.
     """
     overrides: list[str] = _parser().parse_args(argv).overrides
     with exit_on_config_error(PROGRAM):
@@ -49,6 +50,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             _log.error("cannot_record", reason=str(error))
             sys.stderr.write(f"{PROGRAM} cannot record: {error}\n")
             return FAILED
+        except KeyboardInterrupt:
+            # It came while the bag directory was put in order, which can be broken off.
+            return INTERRUPTED
     return 0
 
 

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.child import end_all
 from ros2_memory.recorder.layout import METADATA_FILE, recording_name
-from ros2_memory.recorder.rotation import Passage, Step
+from ros2_memory.recorder.rotation import READY_TIMEOUT_S, Passage, Step
 from ros2_memory.recorder.session import Session
 from ros2_memory.recorder.splits import Splits
 from ros2_memory.recorder.sync import flush_bags
 from ros2_memory.recorder.takeover import Takeover
 from ros2_memory.recorder.watchdog import silence_told
+from ros2_memory.recorder.wipe import remove_if_empty
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -155,6 +156,19 @@ class Crew:
             self._lose_current()
         return lived
 
+    def give_up(self, now: Moment) -> bool:
+        """Ends a current recorder that does not begin to record; whether there was one."""
+        current = self.current
+        if current is None or current.ready:
+            return False
+        if now.monotonic_s - current.began.monotonic_s < READY_TIMEOUT_S:
+            return False
+        sentence = f"ros2 bag record does not begin to record: {current.last_words}"
+        self._journal.fail("recorder_not_ready", sentence, recording=current.name)
+        self._leave(current)
+        self.current = None
+        return True
+
     def reap(self, now: Moment) -> None:
         """Reminds those that are ending, and lets go of those that have ended."""
         for session in tuple(self._leaving):
@@ -208,7 +222,7 @@ class Crew:
             sentence = f"{session.name}/{name} is empty although a newer split was begun"
             self._journal.fail("split_empty", sentence, recording=session.name)
         for fault in changes.faults:
-            self._journal.fail_once(f"unreadable {session.name}", fault, recording=session.name)
+            self._journal.fail_once("unreadable", session.name, fault, recording=session.name)
 
     def _complete(self, takeover: Takeover, now: Moment) -> None:
         if takeover.missing:
@@ -278,6 +292,8 @@ class Crew:
             except RecorderError as error:
                 self._journal.fail("rotation_failed", str(error), recording=session.name)
         splits = session.splits
+        if remove_if_empty(splits.directory):
+            self._journal.note("recording_empty", recording=session.name)
         faults = [*flush_bags(splits.directory, [METADATA_FILE]), *flush_bags(self._bag_dir, [])]
         for fault in faults:
             self._journal.warn("not_flushed", fault, recording=session.name)

@@ -32,7 +32,7 @@ class Journal:
 
     def __init__(self) -> None:
         self.last_error: str | None = None
-        self._standing: set[str] = set()
+        self._standing: set[tuple[str, str]] = set()
 
     def note(self, event: str, **values: object) -> None:
         """Something that is as it should be."""
@@ -48,15 +48,15 @@ class Journal:
         self.last_error = sentence
         _log.error(event, reason=sentence, **values)
 
-    def fail_once(self, event: str, sentence: str, **values: object) -> None:
-        """As `fail`, and silent while the same fault stands (see `over`)."""
-        if event not in self._standing:
-            self._standing.add(event)
+    def fail_once(self, event: str, about: str, sentence: str, **values: object) -> None:
+        """As `fail`, and silent while the fault stands for what it is about (see `over`)."""
+        if (event, about) not in self._standing:
+            self._standing.add((event, about))
             self.fail(event, sentence, **values)
 
-    def over(self, event: str) -> None:
+    def over(self, event: str, about: str) -> None:
         """The fault does not stand any more: it is told when it comes again."""
-        self._standing.discard(event)
+        self._standing.discard((event, about))
 
     def tell(self, recording: str, lines: Iterable[Line]) -> None:
         """What the recorder of a recording said."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ros2_memory.errors import RecorderError
@@ -27,6 +28,7 @@ class Pulse:
         self._state = RecorderState.STOPPED
         self._since = clock.now()
         self._announced: tuple[str, ...] = ()
+        self._told: Heartbeat | None = None
 
     def announce(self, name: str) -> None:
         """Names a recording that is about to be begun, in every heartbeat until `arrived`."""
@@ -38,6 +40,15 @@ class Pulse:
 
     def beat(self, state: RecorderState, crew: Crew) -> None:
         """Writes a heartbeat. One that cannot be written is reported, and stops nothing."""
+        self._write(self._heartbeat(state, crew))
+
+    def beat_if_news(self, state: RecorderState, crew: Crew) -> None:
+        """Writes a heartbeat where it would say something new, besides times and amounts."""
+        heartbeat = self._heartbeat(state, crew)
+        if _news(heartbeat) != self._told:
+            self._write(heartbeat)
+
+    def _heartbeat(self, state: RecorderState, crew: Crew) -> Heartbeat:
         now = self._clock.now()
         if state is not self._state:
             self._state, self._since = state, now
@@ -45,7 +56,7 @@ class Pulse:
         names = (*(session.name for session in sessions), *self._announced)
         subscribed = frozenset[str]().union(*(session.subscribed for session in sessions))
         silent = frozenset() if crew.current is None else crew.current.silent()
-        heartbeat = Heartbeat(
+        return Heartbeat(
             pid=os.getpid(),
             updated=now,
             state=state,
@@ -57,9 +68,16 @@ class Pulse:
             last_error=self._journal.last_error,
             interval_s=self._interval_s,
         )
+
+    def _write(self, heartbeat: Heartbeat) -> None:
+        self._told = _news(heartbeat)
         try:
             write_heartbeat(self._bag_dir, heartbeat)
         except RecorderError as error:
-            self._journal.fail_once("heartbeat_not_written", str(error))
+            self._journal.fail_once("heartbeat_not_written", "", str(error))
         else:
-            self._journal.over("heartbeat_not_written")
+            self._journal.over("heartbeat_not_written", "")
+
+
+def _news(heartbeat: Heartbeat) -> Heartbeat:
+    return replace(heartbeat, updated=0, bytes_written=0)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
 SUBSCRIBE_TIMEOUT_S: Final = 20.0
+READY_TIMEOUT_S: Final = 120.0
+"""A recorder that has not begun after so long does not begin."""
 BOTH_S: Final = 2.0
 STEP_NS: Final[Ns] = 100 * NS_PER_MS
 """A clock that falls behind by so much at once was set back; a slewed one falls behind slowly."""
@@ -49,7 +51,9 @@ class Step(Enum):
 
     WAIT = auto()
     COMPLETE = auto()
-    ABANDON = auto()  # the clock was set back meanwhile: one cut cannot part what was published
+    # The new recorder does not begin, or the clock was set back: then one cut cannot part what was
+    # published before and after it.
+    ABANDON = auto()
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +99,10 @@ class Passage:
         if set_back(before, now):
             return Step.ABANDON
         if self._both is None:
-            late = now.monotonic_s - self.began.monotonic_s >= self._timeout_s
-            if ready and (late or not missing):
+            age_s = now.monotonic_s - self.began.monotonic_s
+            if ready and (age_s >= self._timeout_s or not missing):
                 self._both = now
-            return Step.WAIT
+            return Step.WAIT if ready or age_s < READY_TIMEOUT_S else Step.ABANDON
         over = now.monotonic_s - self._both.monotonic_s >= self._both_s
         return Step.COMPLETE if over else Step.WAIT
 

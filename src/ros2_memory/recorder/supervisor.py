@@ -51,7 +51,7 @@ class Orders:
     session_duration_s: float
     min_free_bytes: int
     simulated: bool = False
-    heartbeat_s: float = 2.0
+    heartbeat_s: float = 5.0
     subscribe_timeout_s: float = 20.0
     both_s: float = 2.0
     first_backoff_s: float = 1.0
@@ -155,6 +155,8 @@ class Supervisor:
         self._keep_house(now)
         if self._is_due("beat", self._orders.heartbeat_s, now):
             self._beat()
+        else:
+            self._pulse.beat_if_news(self._state, self._crew)
 
     def stop(self) -> None:
         """Ends everything that runs, within the patience of its children."""
@@ -171,6 +173,8 @@ class Supervisor:
         for lived_s in self._crew.bury(now):
             self._put_off("rotate", self._rotation_backoff.failed(lived_s), now)
             self._put_off("restart", self._backoff.failed(lived_s), now)
+        if self._crew.give_up(now):
+            self._put_off("restart", self._backoff.failed(0.0), now)
         current = self._crew.current
         if current is not None and current is not before:
             self._silence.began(now.monotonic_s, SETTLE_S)
@@ -279,13 +283,12 @@ class Supervisor:
 
     def _keep(self, task: str, do: Callable[[], None]) -> None:
         """Has the housekeeper do something; recording goes on, whatever comes of it."""
-        event = f"housekeeping_failed {task}"
         try:
             do()
         except (EpisodicError, OSError) as error:
-            self._journal.fail_once(event, str(error))
+            self._journal.fail_once("housekeeping_failed", task, str(error), task=task)
         else:
-            self._journal.over(event)
+            self._journal.over("housekeeping_failed", task)
 
     def _announce(self, name: str) -> None:
         self._pulse.announce(name)
@@ -294,19 +297,22 @@ class Supervisor:
         self._pulse.arrived()
 
     def _beat(self) -> None:
+        self._pulse.beat(self._state, self._crew)
+
+    @property
+    def _state(self) -> RecorderState:
         if self._paused:
-            state = RecorderState.PAUSED
-        else:
-            state = RecorderState.RECORDING if self.is_recording else RecorderState.STARTING
-        self._pulse.beat(state, self._crew)
+            return RecorderState.PAUSED
+        return RecorderState.RECORDING if self.is_recording else RecorderState.STARTING
 
     def _free_bytes(self) -> int | None:
         try:
             free = self._free_bytes_of(self._bag_dir)
         except OSError as error:
-            self._journal.fail_once("free_space_unknown", f"{self._bag_dir}: {error.strerror}")
+            sentence = f"{self._bag_dir}: {error.strerror or error}"
+            self._journal.fail_once("free_space_unknown", "", sentence)
             return None
-        self._journal.over("free_space_unknown")
+        self._journal.over("free_space_unknown", "")
         return free
 
     def _is_due(self, task: str, every_s: float, now: Moment) -> bool:

@@ -1,8 +1,8 @@
-"""`recording.clear_on_startup`: deletes the bags, and what stands there because of them.
+"""Deletes what is not history: recordings without a byte, and all bags where that is asked for.
 
-For simulation and tests. Only files that are known by name are deleted; a directory goes when that
-leaves it empty. Links are not followed, and another file system that is mounted below is left
-alone.
+`recording.clear_on_startup` is for simulation and tests. Only files that are known by name are
+deleted; a directory goes when that leaves it empty. Links are not followed, and another file system
+that is mounted below is left alone.
 """
 
 from __future__ import annotations
@@ -15,7 +15,12 @@ from pathlib import Path
 from typing import Final
 
 from ros2_memory.errors import RecorderError
-from ros2_memory.recorder.layout import OWN_FILES, RECORDING_FILES
+from ros2_memory.recorder.layout import (
+    HANDOVER_FILE,
+    METADATA_FILE,
+    OWN_FILES,
+    RECORDING_FILES,
+)
 from ros2_memory.recorder.scan import bag_kind
 
 _SQLITE_COMPANIONS: Final = (".db3-wal", ".db3-shm", ".db3-journal")
@@ -42,6 +47,33 @@ def clear_bags(bag_dir: Path) -> Wiped:
     with suppress(FileNotFoundError):
         _clear(root, root.stat().st_dev, wiped, is_root=True)
     return wiped
+
+
+def remove_if_empty(recording: Path) -> bool:
+    """Deletes the directory of a recording that ended without a byte; whether it did.
+
+    A recorder that dies as soon as it starts would leave one with every attempt.
+    """
+    try:
+        with os.scandir(recording) as listing:
+            entries = list(listing)
+        if not all(_is_nothing(entry) for entry in entries):
+            return False
+        for entry in entries:
+            Path(entry.path).unlink()
+        recording.rmdir()
+    except OSError:
+        return False
+    return True
+
+
+def _is_nothing(entry: os.DirEntry[str]) -> bool:
+    if not entry.is_file(follow_symlinks=False):
+        return False
+    empty = entry.stat(follow_symlinks=False).st_size == 0
+    return entry.name == HANDOVER_FILE or (
+        empty and (_is_bag(entry) or entry.name == METADATA_FILE)
+    )
 
 
 def _refuse_homes(root: Path) -> None:
