@@ -31,6 +31,8 @@ Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
 """A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
+_PAIR_BYTES: Final = 16
+_IMPOSSIBLE_TIMES: Final = "damaged: a message index holds impossible log times"
 _EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
 
 
@@ -54,6 +56,8 @@ class Column(NamedTuple):
         if times.size > 1 and not bool((times[1:] > times[:-1]).all()):
             order = np.lexsort((places, times))
             times, places = times[order], places[order]
+        if times.size and times[0] >= 0 and times[-1] < MAX_NS:
+            return cls(times, places)
         # An unsigned time past the signed range has wrapped to below zero.
         first = int(np.searchsorted(times, 0))
         stop = int(np.searchsorted(times, MAX_NS))
@@ -87,19 +91,47 @@ def columns_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> 
     """
     columns: dict[int, Column] = {}
     for channel, offset in offsets.items():
-        at = offset - base
-        if at < 0 or at + _INDEX_HEAD.size > len(region):
-            raise UnreadableError("damaged: a message index is not where its chunk index says")
-        head = _INDEX_HEAD.unpack_from(region, at)
-        size = head[3]
-        if head != (Opcode.MESSAGE_INDEX, size + 6, channel, size):
-            raise UnreadableError("damaged: a message index is not what its chunk index says")
-        pairs = np.frombuffer(region, "<i8", size // 8, at + _INDEX_HEAD.size).reshape(-1, 2)
+        at, count = _index_at(region, channel, offset - base)
+        pairs = np.frombuffer(region, "<i8", 2 * count, at).reshape(-1, 2)
         column = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
-        if column.times.size != len(pairs):
-            raise UnreadableError("damaged: a message index holds impossible log times")
+        if column.times.size != count:
+            raise UnreadableError(_IMPOSSIBLE_TIMES)
         columns[channel] = column
     return columns
+
+
+class Extent(NamedTuple):
+    """How many messages of a channel a chunk holds, and their least and greatest log time."""
+
+    messages: int
+    first: int
+    last: int
+
+
+def extents_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> dict[int, Extent]:
+    """What `columns_from_index` amounts to, of the channels that have messages."""
+    extents: dict[int, Extent] = {}
+    for channel, offset in offsets.items():
+        at, count = _index_at(region, channel, offset - base)
+        if not count:
+            continue
+        # Few numbers: an array would cost more than it saves.
+        times = struct.unpack_from(f"<{2 * count}Q", region, at)[::2]
+        extents[channel] = extent = Extent(count, min(times), max(times))
+        if extent.last >= MAX_NS:
+            raise UnreadableError(_IMPOSSIBLE_TIMES)
+    return extents
+
+
+def _index_at(region: bytes, channel: int, at: int) -> tuple[int, int]:
+    """Where the pairs of log time and offset of a message index begin, and how many there are."""
+    if at < 0 or at + _INDEX_HEAD.size > len(region):
+        raise UnreadableError("damaged: a message index is not where its chunk index says")
+    opcode, length, number, size = _INDEX_HEAD.unpack_from(region, at)
+    known = opcode == Opcode.MESSAGE_INDEX and number == channel
+    if not known or length != size + 6 or size % _PAIR_BYTES:
+        raise UnreadableError("damaged: a message index is not what its chunk index says")
+    return at + _INDEX_HEAD.size, size // _PAIR_BYTES
 
 
 @dataclass(slots=True)

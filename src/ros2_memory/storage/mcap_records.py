@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass, field
+from functools import lru_cache
 from io import BytesIO
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -58,6 +59,8 @@ FOOTER: Final = struct.Struct("<BQQQI")
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 _INDEX_OFFSET: Final = struct.Struct("<HQ")
 _SIZE: Final = struct.Struct("<Q")
+_MOST_REMEMBERED: Final = 256
+_LONGEST_REMEMBERED: Final = 16 * 1024
 
 # QoS stands in a channel's metadata as YAML; parsing it costs fifty times this search. Newer
 # distros write the durability's name, older ones rmw's number for it.
@@ -144,10 +147,10 @@ class Declarations:
     def add(self, opcode: int, body: bytes) -> None:
         """Takes note of a schema or channel record; others are ignored."""
         if opcode == Opcode.SCHEMA:
-            schema: mcap_records.Schema = mcap_records.Schema.read(_stream(body))
-            self._schemas[schema.id] = Schema(schema.name, schema.encoding, schema.data)
+            number, schema = _schema(body) if _is_short(body) else _schema.__wrapped__(body)
+            self._schemas[number] = schema
         elif opcode == Opcode.CHANNEL:
-            channel: mcap_records.Channel = mcap_records.Channel.read(_stream(body))
+            channel = _channel(body) if _is_short(body) else _channel.__wrapped__(body)
             self._channels[channel.id] = channel
 
     @property
@@ -170,6 +173,24 @@ class Declarations:
             )
             for number, channel in self._channels.items()
         }
+
+
+# The bags of one robot declare the same, byte for byte.
+@lru_cache(_MOST_REMEMBERED)
+def _schema(body: bytes) -> tuple[int, Schema]:
+    schema: mcap_records.Schema = mcap_records.Schema.read(_stream(body))
+    return schema.id, Schema(schema.name, schema.encoding, schema.data)
+
+
+@lru_cache(_MOST_REMEMBERED)
+def _channel(body: bytes) -> mcap_records.Channel:
+    channel: mcap_records.Channel = mcap_records.Channel.read(_stream(body))
+    return channel
+
+
+def _is_short(body: bytes) -> bool:
+    """Whether it may be remembered: what is, together, stays below some MB."""
+    return len(body) <= _LONGEST_REMEMBERED
 
 
 def _stream(body: bytes) -> ReadDataStream:
