@@ -255,15 +255,18 @@ def test_the_compressed_form_takes_over_when_the_plain_one_goes(tmp_path: Path) 
     assert _names(yard.scan_after().bags) == ["rec_0.mcap.zstd"]
 
 
-def test_a_form_that_is_not_read_is_no_complaint_beside_one_that_is(tmp_path: Path) -> None:
+def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_other(
+    tmp_path: Path,
+) -> None:
     yard = Yard(tmp_path, ".mcap")
     plain(tmp_path / "rec_0.mcap", [1])
-    plain(tmp_path / "rec_0.mcap.zstd", [1])
     plain(tmp_path / "rec_1.mcap.zstd", [1])
     yard.age()
+    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1]), ns=(NOW, NOW))
     snapshot = yard.scan_after()
     assert _names(snapshot.bags) == ["rec_0.mcap"]
     assert _names(snapshot.unread) == ["rec_1.mcap.zstd"]
+    assert _names(yard.scan_after(31).unread) == ["rec_0.mcap.zstd", "rec_1.mcap.zstd"]
 
 
 def test_a_bag_that_vanishes_while_it_is_read_is_left_out_and_found_if_it_comes_back(
