@@ -154,8 +154,9 @@ class IndexManager:
         try:
             walked = self._tree.walk(scene.now, [*self._watched, *self._next_on_patrol()])
             changed = self._forget(walked.gone) | self._examine(walked.looked_at, scene)
-            removed, added = self._recount(changed | self._hidden, scene)
-            changed |= {str(bag.path) for bag in (*removed, *added)}
+            hidden = frozenset(self._hidden)
+            removed, added = self._recount(changed | hidden, scene)
+            changed |= hidden - self._hidden
             self._timeline = self._timeline.changed(removed, added)
         except BaseException:
             # The walk does not show a second time what it has shown once.
