@@ -36,6 +36,12 @@ def repair_name(name: str) -> str:
     return f".{name}{REPAIR_SUFFIX}"
 
 
+def left_by_repair(name: str) -> bool:
+    """Whether a file is what a repair that was cut short left."""
+    left = _LEFTOVER.fullmatch(name)
+    return left is not None and bag_kind(left["bag"] or "") is not None
+
+
 def goes_with_bags(name: str) -> bool:
     """Whether a file of a recording has no meaning without its bags.
 
@@ -43,7 +49,7 @@ def goes_with_bags(name: str) -> bool:
     """
     left = _LEFTOVER.fullmatch(name)
     if left is not None:
-        return left["target"] in RECORDING_FILES or bag_kind(left["bag"] or "") is not None
+        return left["target"] in RECORDING_FILES or left_by_repair(name)
     return name in RECORDING_FILES or _COMPANION.fullmatch(name) is not None
 
 

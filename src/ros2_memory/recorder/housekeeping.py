@@ -1,0 +1,291 @@
+"""Keeps the bag directory in order for a recorder: repairs what crashes left, deletes by limits.
+
+Before anything is recorded only those recordings are looked at that a crash must have left: the
+ones that were being written, and those whose recorder never wrote its last word. Whatever else is
+found unfinished later on, when nothing writes it, is repaired then.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from ros2_memory.errors import BagError, BagVanishedError, EpisodicError
+from ros2_memory.model import BagState
+from ros2_memory.recorder.disposal import Disposal
+from ros2_memory.recorder.heartbeat import read_heartbeat
+from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
+from ros2_memory.recorder.inventory import is_own_recording
+from ros2_memory.recorder.latched import Carrier
+from ros2_memory.recorder.layout import METADATA_FILE
+from ros2_memory.recorder.removal import left_by_repair, remove_emptied
+from ros2_memory.recorder.repair import Repairer, open_files
+from ros2_memory.timebase import ms_from_ns, ns_from_unix
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+    from pathlib import Path
+
+    from ros2_memory.recorder.disposal import Disposed
+    from ros2_memory.recorder.ports import Housekeeper
+    from ros2_memory.recorder.repair import Repaired
+    from ros2_memory.recorder.retention import RetentionLimits
+    from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.storage.base import BagReader
+    from ros2_memory.storage.writing import BagWriter
+    from ros2_memory.timebase import Clock
+
+REFRESH_S: Final = 60.0
+MOST_REPAIRED_BYTES: Final = 1 << 30
+"""A larger file would keep a recorder waiting for minutes; it is left to `ros2-memory recover`."""
+
+_MCAP: Final = ".mcap"
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+def free_bytes(bag_dir: Path) -> int:
+    """What the file system of a directory has left for this user.
+
+    Raises:
+        OSError: it cannot be measured.
+    """
+    return shutil.disk_usage(bag_dir).free
+
+
+class Housekeeping:
+    """Repairs and deletes in one bag directory, whose lock its caller holds.
+
+    Args:
+        bag_dir: the bag directory.
+        reader: reads bags.
+        writer: writes those that are repaired, and the one of carried messages.
+        clock: the wall clock.
+        limits: how much is kept.
+        split_duration_s: how long the recorder writes one file.
+        static_topics: topics that are latched whatever their publishers say.
+        measure_free: measures what the disk has left.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        reader: BagReader,
+        writer: BagWriter,
+        clock: Clock,
+        limits: RetentionLimits,
+        *,
+        split_duration_s: float,
+        static_topics: Collection[str] = (),
+        measure_free: Callable[[Path], int] = free_bytes,
+    ) -> None:
+        carrier = Carrier(bag_dir, reader, writer, static_topics)
+        self._index = IndexManager(
+            bag_dir,
+            reader,
+            clock,
+            refresh_s=REFRESH_S,
+            split_duration_s=split_duration_s,
+            disposal=Disposal(bag_dir, limits, carrier, static_topics=static_topics),
+        )
+        self._repairer = Repairer(reader, writer)
+        self._clock = clock
+        self._patience = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
+        self._measure_free = measure_free
+        self._tried: set[tuple[Path, int, int]] = set()
+        self._short = False
+
+    def repair(self, bag_dir: Path) -> None:
+        """Puts right what a crash left in recordings of this program. Nothing may be recording.
+
+        Raises:
+            OSError: the bag directory cannot be listed.
+        """
+        named = _named(bag_dir)
+        for directory in sorted(bag_dir.iterdir()):
+            if directory.is_symlink() or not directory.is_dir():
+                continue
+            if directory in named or (is_own_recording(directory.name) and _unfinished(directory)):
+                self._repair_recording(bag_dir, directory)
+
+    def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
+        """Deletes, oldest first, until so much of the disk is free, or nothing may be deleted.
+
+        Raises:
+            OSError: what is free cannot be measured.
+        """
+        begun = time.perf_counter_ns()
+        done = self._index.apply_retention(
+            free_bytes=lambda: self._measure_free(bag_dir), min_free_bytes=free_bytes_wanted
+        )
+        self._report(done, begun, free_bytes_wanted=free_bytes_wanted)
+
+    def apply(self, bag_dir: Path) -> None:
+        """Deletes what is beyond the budget or too old; repairs what nobody writes any more."""
+        begun = time.perf_counter_ns()
+        done = self._index.apply_retention()
+        self._report(done, begun)
+        self._tell_shortage(done)
+        if self._repair_left(bag_dir, self._index.snapshot()):
+            self._index.refresh()
+
+    def _repair_recording(self, bag_dir: Path, directory: Path) -> None:
+        try:
+            for path in sorted(directory.iterdir()):
+                if left_by_repair(path.name) and not path.is_symlink():
+                    path.unlink()
+                elif path.suffix == _MCAP:
+                    self._repair(path)
+            # A recording of nothing but empty splits.
+            remove_emptied(bag_dir, directory)
+        except OSError as error:
+            _log.error("not_repaired", path=str(directory), reason=error.strerror or str(error))
+
+    def _repair_left(self, bag_dir: Path, snapshot: Snapshot) -> int:
+        """Repairs what the index found unfinished and nothing writes; how many files."""
+        paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
+        paths += [aside.path for aside in snapshot.damaged]
+        candidates = [path for path in paths if path.suffix == _MCAP and self._is_left(path)]
+        if not candidates:
+            return 0
+        named, held = _named(bag_dir), open_files()
+        repaired = 0
+        for path in candidates:
+            with suppress(OSError):
+                status = path.lstat()
+                if path.parent in named or (status.st_dev, status.st_ino) in held:
+                    continue
+                self._tried.add((path, status.st_size, status.st_mtime_ns))
+                repaired += self._repair(path)
+        return repaired
+
+    def _is_left(self, path: Path) -> bool:
+        """Whether a file may be repaired that was not tried before as it is.
+
+        In another's recording it must have lain still: what is not in the heartbeat may be written.
+        """
+        try:
+            status = path.lstat()
+        except OSError:
+            return False
+        if (path, status.st_size, status.st_mtime_ns) in self._tried:
+            return False
+        lay_still = abs(self._clock.now() - status.st_mtime_ns) > self._patience
+        return lay_still or is_own_recording(path.parent.name)
+
+    def _repair(self, path: Path) -> bool:
+        """Repairs one file, and tells what came of it; whether it was not whole."""
+        begun = time.perf_counter_ns()
+        try:
+            repaired = self._repaired(path)
+        except (BagVanishedError, FileNotFoundError):
+            return False
+        except BagError as error:
+            _log.error("bag_not_repaired", path=str(path), reason=error.reason)
+            return False
+        if repaired is None:
+            return False
+        if repaired.rewritten is None:
+            _log.warning("empty_split_removed", path=str(path))
+            return True
+        _log.warning(
+            "bag_repaired",
+            path=str(path),
+            messages=repaired.rewritten.messages,
+            was_bytes=repaired.was_bytes,
+            is_bytes=repaired.is_bytes,
+            lost_bytes=repaired.rewritten.lost_bytes,
+            notes=list(repaired.rewritten.notes),
+            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+        )
+        return True
+
+    def _repaired(self, path: Path) -> Repaired | None:
+        size = path.lstat().st_size
+        if size > MOST_REPAIRED_BYTES:
+            reason = f"{size} bytes are too many for now: run ros2-memory recover {path}"
+            raise BagError(str(path), reason)
+        return self._repairer.repair(path)
+
+    def _report(self, done: Disposed, begun: int, **values: object) -> None:
+        tell = _log.info if done.bags or done.failed else _log.debug
+        tell(
+            "retention_applied",
+            bags=done.bags,
+            bytes=done.bytes,
+            recordings=done.recordings,
+            carried=done.carried,
+            failed=done.failed,
+            total_bytes=done.total_bytes,
+            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+            **values,
+        )
+
+    def _tell_shortage(self, done: Disposed) -> None:
+        """Says once that the budget cannot be held."""
+        if not done.fits and not self._short:
+            _log.error(
+                "budget_not_held",
+                total_bytes=done.total_bytes,
+                reason="what is left may not be deleted: open bags, damaged ones, the newest; "
+                "raise retention.max_total_gb or look for damaged files",
+            )
+        self._short = not done.fits
+
+
+class InBackground:
+    """Has another housekeeper apply its limits in a thread of its own.
+
+    The first look at a week of bags takes seconds, in which the robot shall be recorded. Repair
+    and making room are waited for.
+    """
+
+    def __init__(self, housekeeper: Housekeeper) -> None:
+        self._housekeeper = housekeeper
+        self._thread: threading.Thread | None = None
+
+    def repair(self, bag_dir: Path) -> None:
+        """Puts right what a crash left, and returns when that is done."""
+        self._housekeeper.repair(bag_dir)
+
+    def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
+        """Deletes until so much of the disk is free, and returns when that is done."""
+        self._housekeeper.make_room(bag_dir, free_bytes_wanted)
+
+    def apply(self, bag_dir: Path) -> None:
+        """Begins to apply the limits, unless that is still under way."""
+        if self._thread is not None and self._thread.is_alive():
+            return
+        self._thread = threading.Thread(
+            target=self._apply, args=(bag_dir,), name="housekeeping", daemon=True
+        )
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Waits until nothing is under way."""
+        if self._thread is not None:
+            self._thread.join()
+
+    def _apply(self, bag_dir: Path) -> None:
+        try:
+            self._housekeeper.apply(bag_dir)
+        except (EpisodicError, OSError) as error:
+            _log.error("housekeeping_failed", task="apply", reason=str(error))
+
+
+def _named(bag_dir: Path) -> frozenset[Path]:
+    """The recordings that a recorder last said it was writing, whether it still lives or not."""
+    heartbeat = read_heartbeat(bag_dir).heartbeat
+    return frozenset(bag_dir / name for name in heartbeat.recordings) if heartbeat else frozenset()
+
+
+def _unfinished(recording: Path) -> bool:
+    """Whether its recorder never wrote its last word, or the disk was full when it did."""
+    try:
+        return (recording / METADATA_FILE).lstat().st_size == 0
+    except OSError:
+        return True
