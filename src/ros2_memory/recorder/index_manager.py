@@ -248,10 +248,13 @@ class IndexManager:
         own, other = self._verdicts.get(path), self._verdicts.get(other_form(path))
         if own is None or other is None or own.standing > other.standing:
             return own
-        if own.standing == other.standing:
-            kept = own.standing is Standing.CLOSED and not self._being_compressed(path, scene)
-            if kept or not path.endswith(COMPRESSED):
-                return own
+        kept = not self._being_compressed(path, scene)
+        if kept and own.standing is Standing.UNREAD:
+            return own
+        if own.standing == other.standing and (
+            (kept and own.standing is Standing.CLOSED) or not path.endswith(COMPRESSED)
+        ):
+            return own
         self._hidden.add(path)
         return None
 
