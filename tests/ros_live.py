@@ -138,7 +138,8 @@ class Robot:
         return {str(topic): int(count) for topic, count in self._truth()["published"].items()}
 
     def stop(self) -> dict[str, int]:
-        """Ends the drive, and tells as `finish` does."""
+        """Ends the drive, once it has begun, and tells as `finish` does."""
+        wait_for(self.truth_file.is_file, "the robot's start", alive=self.process)
         self.process.send_signal(signal.SIGINT)
         return self.finish()
 
