@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, get_type_hints
 import pytest
 
 from ros2_memory.memory import Limits
-from ros2_memory.settings import Settings
+from ros2_memory.settings import Ros2BagNode, Settings
 from ros2_memory.tools import Tool, build_tools
 from tests.memories import ROOT
 
@@ -64,5 +64,6 @@ def test_readme_names_every_environment_variable(variable: str) -> None:
 def test_every_key_that_readme_tells_of_exists() -> None:
     sections = {each.name for each in fields(Settings)}
     told = set(re.findall(r"`(\w+\.\w+)(?:=[^`]*)?`", README))
-    known = set(keys(Settings))
+    known = set(keys(Settings)) | {f"recorder.{each.name}" for each in fields(Ros2BagNode)}
+    known.add("recorder.json")  # a file
     assert {key for key in told if key.split(".")[0] in sections} <= known
