@@ -184,6 +184,37 @@ class Catalogue:
 
         return self._read(ask, {})
 
+    def undecodable(self, topic: str, numbers: Sequence[int]) -> dict[int, dict[str, str]]:
+        """By type, why messages of the topic in the entries cannot be decoded; mostly nothing."""
+
+        def ask(base: sqlite3.Connection) -> dict[int, dict[str, str]]:
+            rows = held_rows(base, "undecodable", topic, numbers)
+            return {number: {} if text is None else json.loads(text) for number, text in rows}
+
+        return self._read(ask, {})
+
+    def remembered(self, question: str) -> str | None:
+        """The answer that was worked out from entries, if they all stand."""
+
+        def ask(base: sqlite3.Connection) -> str | None:
+            row = base.execute(
+                "SELECT answer FROM remembered WHERE question = ?", (question,)
+            ).fetchone()
+            return None if row is None else str(row[0])
+
+        return self._read(ask, None)
+
+    def remember(self, question: str, numbers: Sequence[int], answer: str) -> None:
+        """Keeps an answer until the oldest of the entries goes; the question names them all."""
+
+        def write(base: sqlite3.Connection) -> None:
+            base.execute(
+                "INSERT OR REPLACE INTO remembered VALUES (?, ?, ?)",
+                (question, min(numbers), answer),
+            )
+
+        self._write(write)
+
     def put(self, key: BagKey, digest: Digest) -> bool:
         """Adds an entry in place of any other of that path; whether it could be written."""
         return self.put_all([(key, digest)])

@@ -26,6 +26,7 @@ CREATE TABLE held (topic INTEGER NOT NULL, bag INTEGER NOT NULL, flags INTEGER N
   words TEXT, low REAL NOT NULL, high REAL NOT NULL, numbers TEXT,
   min_x REAL, max_x REAL, min_y REAL, max_y REAL, min_z REAL, max_z REAL,
   poses BLOB, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER, kept INTEGER,
+  undecodable TEXT,
   PRIMARY KEY (topic, bag)) WITHOUT ROWID;
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
@@ -34,6 +35,7 @@ CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT
 CREATE TABLE channels (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, topic TEXT NOT NULL,
   encoding TEXT NOT NULL, latched INTEGER NOT NULL, schema_name TEXT NOT NULL,
   schema_encoding TEXT NOT NULL, schema_text BLOB NOT NULL);
+CREATE TABLE remembered (question TEXT PRIMARY KEY, oldest INTEGER NOT NULL, answer TEXT NOT NULL);
 CREATE TABLE payloads (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, bytes BLOB NOT NULL);
 """
 

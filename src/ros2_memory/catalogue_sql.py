@@ -71,6 +71,7 @@ def drop(base: sqlite3.Connection, numbers: Sequence[int]) -> None:
         for table in ("held", "kept"):
             base.execute(f"DELETE FROM {table} WHERE topic = ? AND bag {AMONG}", (topic, listed))
     base.execute(f"DELETE FROM bags WHERE id {AMONG}", (listed,))
+    base.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
 
 
 def put(
@@ -98,7 +99,7 @@ def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
     )
     pairs = None if edges is None else _number(base, "edges", "pairs", json.dumps(edges.pairs))
     base.execute(
-        f"INSERT INTO held VALUES ({', '.join('?' * 18)})",
+        f"INSERT INTO held VALUES ({', '.join('?' * 19)})",
         (
             number,
             bag,
@@ -113,6 +114,7 @@ def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
             None if edges is None else edges.first_stamp,
             None if edges is None else edges.last_stamp,
             topic.kept is not None,
+            json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
         ),
     )
     for nth, record in enumerate(topic.kept or ()):

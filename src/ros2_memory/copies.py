@@ -59,28 +59,31 @@ def copy_key(record: Record) -> Copy:
     return Copy(record.channel.topic, record.publish_time, len(payload), hash(payload))
 
 
-def contested(holdings: Sequence[Holding]) -> list[tuple[Ns, Ns]]:
+def contested(holdings: Iterable[Holding]) -> list[tuple[Ns, Ns]]:
     """The half-open spans in which bags of different recordings can hold copies, merged.
 
     Two bags contest the time that both hold, widened by the horizon at both ends.
     """
+    return contested_spans((held.first, held.last, held.bag.recording) for held in holdings)
+
+
+def contested_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
+    """As `contested`, of first and last log time (inclusive) and recording."""
     spans: list[tuple[Ns, Ns]] = []
-    open_bags: list[Holding] = []
-    for held in sorted(holdings, key=lambda each: each.first):
-        open_bags = [each for each in open_bags if each.last + COPY_HORIZON_NS >= held.first]
+    open_ones: list[tuple[Ns, Path]] = []
+    for first, last, recording in sorted(held, key=lambda each: each[0]):
+        open_ones = [each for each in open_ones if each[0] + COPY_HORIZON_NS >= first]
         spans.extend(
-            (
-                held.first - COPY_HORIZON_NS,
-                min(each.last, held.last) + COPY_HORIZON_NS + 1,
-            )
-            for each in open_bags
-            if each.bag.recording != held.bag.recording
+            (first - COPY_HORIZON_NS, min(other, last) + COPY_HORIZON_NS + 1)
+            for other, folder in open_ones
+            if folder != recording
         )
-        open_bags.append(held)
-    return _united(spans)
+        open_ones.append((last, recording))
+    return united(spans)
 
 
-def _united(spans: list[tuple[Ns, Ns]]) -> list[tuple[Ns, Ns]]:
+def united(spans: Iterable[tuple[Ns, Ns]]) -> list[tuple[Ns, Ns]]:
+    """Half-open spans, sorted, those that touch made one."""
     united: list[tuple[Ns, Ns]] = []
     for start, stop in sorted(spans):
         if united and start <= united[-1][1]:

@@ -70,6 +70,7 @@ class TopicDigest:
         poses: what its poses amount to; None where some message carries none.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
+        undecodable: by type, why none of its messages can be decoded; for most nothing.
     """
 
     topic: str
@@ -77,6 +78,7 @@ class TopicDigest:
     poses: PoseDigest | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
+    undecodable: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,20 @@ class Digester:
         }
         for record in self._reader.records(path, tuple(topics), TimeWindow.everything()):
             collectors[record.channel.topic].add(record)
-        return Digest(summary, tuple(each.digest() for each in collectors.values()))
+        reasons = self._reasons(path)
+        return Digest(
+            summary,
+            tuple(each.digest(reasons.get(topic, {})) for topic, each in collectors.items()),
+        )
+
+    def _reasons(self, path: Path) -> dict[str, dict[str, str]]:
+        """By topic and type, why messages cannot be decoded."""
+        reasons: dict[str, dict[str, str]] = {}
+        for channel in self._reader.channels(path):
+            reason = self._reader.undecodable(channel)
+            if reason:
+                reasons.setdefault(channel.topic, {})[channel.type] = reason
+        return reasons
 
 
 class _Collector:
@@ -169,7 +184,7 @@ class _Collector:
         ):
             self._edges = None
 
-    def digest(self) -> TopicDigest:
+    def digest(self, undecodable: dict[str, str]) -> TopicDigest:
         edges = None if self._edges is None else self._edges.digest()
         few = self._kept is not None and (self._latched or bool(edges and edges.pairs))
         return TopicDigest(
@@ -178,6 +193,7 @@ class _Collector:
             poses=None if self._poses is None else self._poses.digest(),
             edges=edges,
             kept=tuple(self._kept) if self._kept is not None and few else None,
+            undecodable=tuple(undecodable.items()),
         )
 
     def _keep(self, record: Record) -> None:

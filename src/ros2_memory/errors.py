@@ -62,9 +62,17 @@ class NoDataError(EpisodicError):
 
 
 class QueryTimeoutError(EpisodicError):
-    """The query passed its deadline."""
+    """The query passed its deadline.
+
+    `searched_back_to` (nanoseconds of log time) is how far back a search got without a match; None
+    where it can only begin anew.
+    """
 
     code = "timeout"
+
+    def __init__(self, sentence: str, searched_back_to: int | None = None) -> None:
+        super().__init__(sentence)
+        self.searched_back_to = searched_back_to
 
 
 class BagError(EpisodicError):

@@ -10,6 +10,7 @@ import time
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.absence import beyond, moment, not_recorded, nothing_at, seconds
+from ros2_memory.copies import united
 from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.model import StampedTransform, TimeWindow
 from ros2_memory.tf_tree import (
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.copies import Found
     from ros2_memory.history import View
+    from ros2_memory.model import BagFile
+    from ros2_memory.recorder.timeline import Run
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment dynamic transforms are read; the last is as far as tf2 remembers."""
@@ -75,15 +78,45 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     A pair that was published both ways stands once, as dynamic.
     """
     limits = view.memory.limits
-    everything = TimeWindow.everything()
     pairs: dict[tuple[str, str], bool] = {}
-    for each in _transforms(view, limits.tf_static_topics, everything, static=True):
-        pairs[each.parent, each.child] = True
-    for each in _transforms(view, limits.tf_topics, everything, static=False):
-        pairs[each.parent, each.child] = False
+    for topics, static in ((limits.tf_static_topics, True), (limits.tf_topics, False)):
+        pairs.update((pair, static) for pair in _pairs(view, topics, static=static))
     return tuple(
         FrameEdge(parent, child, static) for (parent, child), static in sorted(pairs.items())
     )
+
+
+def _pairs(view: View, topics: Iterable[str], *, static: bool) -> set[tuple[str, str]]:
+    """The pairs of these topics: of which the catalogue says none, their bags are read."""
+    pairs: set[tuple[str, str]] = set()
+    recorded = _recorded(view, topics)
+    unknown: list[tuple[Ns, Ns]] = []
+    for topic in recorded:
+        for run in view.snapshot.runs:
+            known, spans = _known_pairs(view, run, topic)
+            pairs |= known
+            unknown += spans
+    for span in united(unknown):
+        for found in view.stream(recorded, TimeWindow(*span)):
+            pairs.update((each.parent, each.child) for each in _decoded(view, found, static=static))
+    return pairs
+
+
+def _known_pairs(
+    view: View, run: Run, topic: str
+) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
+    """The pairs that the catalogue has of a run of bags, and the time of bags it has none of."""
+    held = run.held.get(topic, ())
+    notes = view.recalled(run) if held else None
+    numbers = {} if notes is None else notes.numbers
+    edges = {} if notes is None else notes.edges(topic)
+    known = {pair for each in edges.values() for pair in each.pairs}
+    rest = [
+        (summary.first, summary.last + 1)
+        for bag, summary in held
+        if numbers.get(bag.path, 0) not in edges
+    ]
+    return known, rest
 
 
 def _lookup(
@@ -156,15 +189,27 @@ def _stamped_near(view: View, at: Ns) -> Iterator[StampedTransform]:
     topics = _recorded(view, view.memory.limits.tf_topics)
     everything = TimeWindow.everything()
     for held in view.holdings(topics, everything):
-        ends = [
-            transform.stamp
-            for newest_first in (False, True)
-            for found in _first(view.read(held.bag, topics, everything, newest_first=newest_first))
-            for transform in _decoded(view, found, static=False)
-        ]
+        ends = _stamps_at_ends(view, held.bag, topics)
         if ends and min(ends) - TF_CACHE_NS <= at <= max(ends) + TF_CACHE_NS:
-            for found in view.read(held.bag, topics, everything):
+            for found in view.used(view.read(held.bag, topics, everything)):
                 yield from _decoded(view, found, static=False)
+
+
+def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]:
+    """The stamps in the bag's first and last message; of several topics in any order."""
+    entry = view.entry(bag) if len(topics) == 1 else None
+    edges = None if entry is None else entry[0].edges(topics[0]).get(entry[1])
+    if edges is not None:
+        return [each for each in (edges.first_stamp, edges.last_stamp) if each is not None]
+    everything = TimeWindow.everything()
+    return [
+        transform.stamp
+        for newest_first in (False, True)
+        for found in _first(
+            view.used(view.read(bag, topics, everything, newest_first=newest_first))
+        )
+        for transform in _decoded(view, found, static=False)
+    ]
 
 
 def _first(found: Iterator[Found]) -> Iterable[Found]:

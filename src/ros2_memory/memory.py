@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.recall import Recall
     from ros2_memory.recorder.index_manager import IndexManager
     from ros2_memory.storage.base import BagReader
     from ros2_memory.timebase import Clock, Ns
@@ -38,13 +39,17 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """The robot's past, as far as it lies in closed bags."""
+    """The robot's past, as far as it lies in closed bags.
+
+    Every answer is the same with `recall` and without.
+    """
 
     index: IndexManager
     reader: BagReader
     extractor: SchemaExtractor
     clock: Clock
     limits: Limits
+    recall: Recall | None = None
 
 
 class Stages:

@@ -21,14 +21,12 @@ from ros2_memory.absence import (
     require_bags,
     resolve_topic,
     seconds,
-    undecodable,
 )
 from ros2_memory.conditions import parse_condition
 from ros2_memory.errors import (
     InvalidArgumentsError,
     NoDataError,
     NoDataReason,
-    UndecodableError,
 )
 from ros2_memory.history import View, short_name
 from ros2_memory.model import BagState, Sample, SetAside, TimeWindow
@@ -43,7 +41,7 @@ from ros2_memory.timebase import (
     Ns,
     ns_from_unix,
 )
-from ros2_memory.trajectory import TrajectoryBuilder
+from ros2_memory.ways import carries_no, decoded, way_driven
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -161,7 +159,7 @@ def position(
     found = _found_at(view, name, at, tolerance_s)
     pose = _pose(view, found)
     if pose is None:
-        raise InvalidArgumentsError(_carries_no("position", found))
+        raise InvalidArgumentsError(carries_no("position", found))
     if not all(map(math.isfinite, pose.position)):
         view.note("the recorded position is not a number")
     if pose.orientation is None:
@@ -183,7 +181,7 @@ def velocity(
     found = _found_at(view, name, at, tolerance_s)
     twist = _twist(view, found)
     if twist is None:
-        raise InvalidArgumentsError(_carries_no("velocity", found))
+        raise InvalidArgumentsError(carries_no("velocity", found))
     return answers.Velocity(name, found.time, twist, view.notes, _age(found, now))
 
 
@@ -215,11 +213,15 @@ def find_last_match(
     *,
     field: str | None = None,
     fields: Sequence[str] = (),
+    before_s: float | None = None,
 ) -> answers.Match:
-    """The newest message of a topic, or of all topics of a glob, that meets a condition."""
+    """The newest message of a topic, or of all topics of a glob, that meets a condition.
+
+    With `before_s` (Unix seconds) only messages up to and including then are searched.
+    """
     condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
     view = View(memory, call, memory.clock.now())
-    found = last_match(view, topic, condition)
+    found = last_match(view, topic, condition, _before(before_s))
     if found is None:
         return answers.Match(None, unsearched(view))
     now = memory.clock.now() if memory.limits.now == "wall" else view.snapshot.latest
@@ -236,12 +238,16 @@ def value_when(
     value: JsonValue,
     field: str | None = None,
     fields: Sequence[str] = (),
+    before_s: float | None = None,
 ) -> answers.ValueWhen:
-    """What one topic held when another last met a condition: its value at or before the match."""
+    """What one topic held when another last met a condition: its value at or before the match.
+
+    With `before_s` (Unix seconds) the condition is looked for up to and including then.
+    """
     condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
     view = View(memory, call, memory.clock.now())
     name = resolve_topic(view, value_topic)
-    found = last_match(view, condition_topic, condition)
+    found = last_match(view, condition_topic, condition, _before(before_s))
     if found is None:
         return answers.ValueWhen(None, notes=unsearched(view))
     matched = _value(view, found, (), None)
@@ -263,25 +269,22 @@ def trajectory_summary(
     """The way driven in a window, from one pose topic in log-time order."""
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic or memory.limits.pose_topic)
-    builder = TrajectoryBuilder(max_plausible_speed_mps=memory.limits.max_plausible_speed_mps)
-    first = last = None
-    frame_ids: dict[str, None] = {}
-    for found in view.stream([name], window):
-        pose, twist = _pose(view, found), _twist(view, found)
-        if pose is None:
-            raise InvalidArgumentsError(_carries_no("position", found))
-        frame_ids[pose.frame_id] = None
-        builder.add(found.time, pose, None if twist is None else math.hypot(*twist.linear))
-        first = found.time if first is None else first
-        last = found.time
-    if first is None or last is None:
+    way = way_driven(view, name, window)
+    if way is None:
         raise nothing_between(view, (name,), window)
-    if len(frame_ids) > 1:
-        view.note(f"poses in several frames were joined: {', '.join(frame_ids)}")
+    if len(way.frames) > 1:
+        view.note(f"poses in several frames were joined: {', '.join(way.frames)}")
     _note_edges(view, window)
     return answers.TrajectorySummary(
-        name, next(iter(frame_ids)), first, last, builder.result(), view.notes
+        name, way.frames[0], way.first, way.last, way.trajectory, view.notes
     )
+
+
+def _before(before_s: float | None) -> Ns:
+    """Where a search begins: just after a moment, with the slack of its float of seconds."""
+    if before_s is None:
+        return MAX_NS
+    return min(ns_argument("before", before_s) + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
 
 
 def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Found:
@@ -299,18 +302,11 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Foun
     return found
 
 
-def _decode(view: View, found: Found) -> object:
-    try:
-        return view.memory.reader.decode(found.record)
-    except UndecodableError as error:
-        raise undecodable(error.topic, error.type_name, error) from error
-
-
 def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> answers.TopicValue:
     """A message as a reply shows it, with the notes of the whole view so far."""
     begin = time.perf_counter_ns()
     channel = found.record.channel
-    shown = view.memory.extractor.shown(_decode(view, found), channel.type, fields)
+    shown = view.memory.extractor.shown(decoded(view, found), channel.type, fields)
     view.call.stages.add("extract", time.perf_counter_ns() - begin)
     return answers.TopicValue(
         channel.topic,
@@ -350,39 +346,39 @@ def _samples(
 
 
 def _pose(view: View, found: Found) -> Pose | None:
-    return view.memory.extractor.pose(_decode(view, found), found.record.channel.type)
+    return view.memory.extractor.pose(decoded(view, found), found.record.channel.type)
 
 
 def _twist(view: View, found: Found) -> Twist | None:
-    return view.memory.extractor.twist(_decode(view, found), found.record.channel.type)
+    return view.memory.extractor.twist(decoded(view, found), found.record.channel.type)
 
 
 def _age(found: Found, now: Ns | None) -> Ns | None:
     return None if now is None else now - found.time
 
 
-def _carries_no(what: str, found: Found) -> str:
-    channel = found.record.channel
-    return (
-        f"topic: {channel.topic} is a {channel.type}, which carries no {what}; "
-        "give a topic that does, such as one of type nav_msgs/msg/Odometry"
-    )
-
-
 def _undecodable_types(view: View, topic: str) -> dict[str, str]:
     """Why messages of the topic cannot be decoded, by type; from one bag for each type."""
     reasons: dict[str, str] = {}
-    seen: set[str] = set()
-    for bag, summary in view.snapshot.holding(topic):
-        if summary.type in seen:
-            continue
-        seen.add(summary.type)
-        for channel in view.channels(bag):
-            if channel.topic == topic and channel.type == summary.type:
-                reason = view.memory.reader.undecodable(channel)
-                if reason:
-                    reasons[summary.type] = reason
+    for type_name in view.snapshot.types_of(topic):
+        reason = _why_undecodable(view, topic, type_name)
+        if reason:
+            reasons[type_name] = reason
     return reasons
+
+
+def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
+    bag = view.snapshot.first_with(topic, type_name)
+    entry = view.entry(bag)
+    known = None if entry is None else entry[0].undecodable(topic).get(entry[1])
+    if known is not None:
+        return known.get(type_name)
+    reasons = [
+        view.memory.reader.undecodable(channel)
+        for channel in view.channels(bag)
+        if channel.topic == topic and channel.type == type_name
+    ]
+    return next(filter(None, reversed(reasons)), None)
 
 
 def _note_odd_bags(view: View) -> None:

@@ -5,48 +5,104 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from ros2_memory.absence import damaged_note, matching_topics, undecodable
-from ros2_memory.errors import UndecodableError
+from ros2_memory.absence import damaged_note, matching_topics, moment, undecodable
+from ros2_memory.candidates import Candidates
+from ros2_memory.copies import COPY_HORIZON_NS
+from ros2_memory.errors import QueryTimeoutError, UndecodableError
 from ros2_memory.model import TimeWindow
+from ros2_memory.timebase import MIN_NS
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.candidates import Stretch
     from ros2_memory.conditions import Condition
     from ros2_memory.copies import Found
     from ros2_memory.history import View
+    from ros2_memory.timebase import Ns
 
 
-def last_match(view: View, pattern: str, condition: Condition) -> Found | None:
-    """The newest match; what could not be tested is noted and leaves the search incomplete."""
-    topics = matching_topics(view, pattern)
-    failures: dict[tuple[str, str], UndecodableError] = {}
-    tested = False
-    for found in view.stream(topics, TimeWindow.everything(), newest_first=True):
+def last_match(view: View, pattern: str, condition: Condition, until: Ns) -> Found | None:
+    """The newest match before a moment; what could not be tested is noted.
+
+    Raises:
+        QueryTimeoutError: the call's time is over; says how far back was searched.
+    """
+    return _Search(view, pattern, condition).newest(until)
+
+
+class _Search:
+    def __init__(self, view: View, pattern: str, condition: Condition) -> None:
+        self._view = view
+        self._condition = condition
+        self._topics = matching_topics(view, pattern)
+        self._failures: dict[tuple[str, str], UndecodableError] = {}
+        self._tested = False
+        self._back_to: Ns | None = None
+
+    def newest(self, until: Ns) -> Found | None:
+        candidates = Candidates(self._view, self._topics, self._condition, until)
+        try:
+            for stretch in candidates.stretches():
+                for found in self._messages(stretch):
+                    if self._matches(found):
+                        self._note_undecodable()
+                        return found
+                    self._back_to = found.time
+                self._back_to = stretch.window.start
+        except QueryTimeoutError as error:
+            if self._back_to is None:
+                raise
+            raise self._out_of_time(self._back_to) from error
+        if self._failures and not self._tested and not candidates.ruled_out:
+            (topic, type_name), failure = next(iter(self._failures.items()))
+            raise undecodable(topic, type_name, failure)
+        self._note_undecodable()
+        return None
+
+    def _messages(self, stretch: Stretch) -> Iterator[Found]:
+        """The messages of a stretch, newest first.
+
+        Of bags that are ruled out those are read which may hold the original of a copy.
+        """
+        window = stretch.window
+        wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
+        among = [
+            held
+            for held in self._view.holdings(self._topics, wider)
+            if held.bag.path in stretch.bags or stretch.recordings != {held.bag.recording}
+        ]
+        return self._view.stream(self._topics, window, newest_first=True, among=among)
+
+    def _matches(self, found: Found) -> bool:
         begin = time.perf_counter_ns()
         channel = found.record.channel
+        memory = self._view.memory
         try:
-            message = view.memory.reader.decode(found.record)
-            value = view.memory.extractor.exact(message, channel.type)
-            tested = True
-            matched = condition.matches(value)
+            message = memory.reader.decode(found.record)
+            value = memory.extractor.exact(message, channel.type)
+            self._tested = True
+            return self._condition.matches(value)
         except UndecodableError as error:
-            failures.setdefault((channel.topic, channel.type), error)
-            matched = False
+            self._failures.setdefault((channel.topic, channel.type), error)
+            return False
         finally:
-            view.call.stages.add("extract", time.perf_counter_ns() - begin)
-        if matched:
-            _note_undecodable(view, failures)
-            return found
-    if failures and not tested:
-        (topic, type_name), error = next(iter(failures.items()))
-        raise undecodable(topic, type_name, error)
-    _note_undecodable(view, failures)
-    return None
+            self._view.call.stages.add("extract", time.perf_counter_ns() - begin)
 
+    def _note_undecodable(self) -> None:
+        for (topic, type_name), error in self._failures.items():
+            self._view.complete = False
+            self._view.note(
+                f"messages of {topic} ({type_name}) could not be decoded: {error.reason}"
+            )
 
-def _note_undecodable(view: View, failures: dict[tuple[str, str], UndecodableError]) -> None:
-    for (topic, type_name), error in failures.items():
-        view.complete = False
-        view.note(f"messages of {topic} ({type_name}) could not be decoded: {error.reason}")
+    def _out_of_time(self, back_to: Ns) -> QueryTimeoutError:
+        budget_s = self._view.call.deadline.budget_s
+        return QueryTimeoutError(
+            f"no match back to {moment(back_to)}, and {budget_s:g} s are over; "
+            f"to go on from there, ask again with before={moment(back_to)}",
+            searched_back_to=back_to,
+        )
 
 
 def unsearched(view: View) -> tuple[str, ...]:

@@ -1,0 +1,160 @@
+"""One call's sight of single bags: what is read of them, and what is said of those that fail."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.copies import Found
+from ros2_memory.errors import BagError, BagVanishedError, QueryTimeoutError
+from ros2_memory.model import BagState, TimeWindow
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.memory import Call, Memory
+    from ros2_memory.model import BagFile
+    from ros2_memory.recall import RunNotes
+    from ros2_memory.recorder.timeline import Run
+    from ros2_memory.storage.base import Channel, Record
+    from ros2_memory.timebase import Ns
+
+_CHECK_EVERY: Final = 256
+
+
+class Reading:
+    """A snapshot, what the catalogue says of it, a deadline, and notes on the way."""
+
+    def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
+        self.memory = memory
+        self.call = call
+        with call.stages.timed("index"):
+            self.snapshot = memory.index.snapshot(reach)
+            self._as_of = 0 if memory.recall is None else memory.recall.as_of()
+        self._notes: dict[str, None] = {}
+        self.complete = True
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was skipped so far, each thing once."""
+        return tuple(self._notes)
+
+    def note(self, sentence: str) -> None:
+        """Adds a sentence for the reply."""
+        self._notes.setdefault(sentence)
+
+    def check_deadline(self) -> None:
+        """Gives up when the call's time is over.
+
+        Raises:
+            QueryTimeoutError: it is.
+        """
+        deadline = self.call.deadline
+        if deadline.expired():
+            raise QueryTimeoutError(
+                f"the question needs more than {deadline.budget_s:g} s; "
+                "ask about a shorter window or a single topic"
+            )
+
+    def recalled(self, run: Run) -> RunNotes | None:
+        """What the catalogue says of a run of the snapshot; None without a catalogue."""
+        recall = self.memory.recall
+        return None if recall is None else recall.notes(run, self._as_of)
+
+    def entry(self, bag: BagFile) -> tuple[RunNotes, int] | None:
+        """The notes that speak of a bag and the number of its entry; None where it has none."""
+        notes = self.recalled(self.snapshot.run_of(bag))
+        number = None if notes is None else notes.numbers.get(bag.path)
+        return None if notes is None or number is None else (notes, number)
+
+    def used(self, found: Iterator[Found]) -> Iterator[Found]:
+        """The messages, with a note where one stands in a bag that a crash left open."""
+        for each in found:
+            if each.bag.state is BagState.INCOMPLETE:
+                self.complete = False
+                self.note(
+                    f"{short_name(each.bag.path)} was left open by a crash; "
+                    "what is readable of it is used"
+                )
+            yield each
+
+    def log_times(self, bag: BagFile, topic: str, window: TimeWindow) -> Sequence[Ns]:
+        """The log times of one bag's messages; empty, with a note, where they cannot be read."""
+        self.check_deadline()
+        with self.call.stages.timed("read"):
+            try:
+                return self.memory.reader.log_times(bag.path, topic, window)
+            except BagError as error:
+                self.skip(bag, error)
+                return ()
+
+    def channels(self, bag: BagFile) -> Sequence[Channel]:
+        """The channels one bag declares; none, with a note, where they cannot be read."""
+        self.check_deadline()
+        try:
+            return self.memory.reader.channels(bag.path)
+        except BagError as error:
+            self.skip(bag, error)
+            return ()
+
+    def skip(self, bag: BagFile, error: BagError) -> None:
+        """Notes that a bag, or the rest of it, is not part of the answer."""
+        self.complete = False
+        name = short_name(bag.path)
+        if isinstance(error, BagVanishedError):
+            self.note(f"{name} was deleted before it could be read")
+        else:
+            self.note(f"{name} could not be read to its end: {error.reason}")
+
+    def read(
+        self,
+        bag: BagFile,
+        topics: Sequence[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Found]:
+        """One bag's messages; a bag that fails ends early with a note, and disturbs no other."""
+        self.check_deadline()
+        kept = self._kept(bag, topics)
+        if kept is not None:
+            for record in reversed(kept) if newest_first else kept:
+                if window.contains(record.log_time):
+                    yield Found(bag, record)
+            return
+        clock, spent, count = time.perf_counter_ns, 0, 0
+        begin = clock()
+        try:
+            for record in self.memory.reader.records(
+                bag.path, topics, window, newest_first=newest_first
+            ):
+                spent += clock() - begin
+                count += 1
+                if count % _CHECK_EVERY == 0:
+                    self.check_deadline()
+                yield Found(bag, record)
+                begin = clock()
+        except BagError as error:
+            self.skip(bag, error)
+        finally:
+            self.call.stages.add("read", spent)
+
+    def _kept(self, bag: BagFile, topics: Sequence[str]) -> Sequence[Record] | None:
+        """All the bag's messages of one topic of which the catalogue keeps them; else None."""
+        if self.memory.recall is None or len(topics) != 1:
+            return None
+        [topic] = topics
+        static = topic in self.memory.limits.tf_static_topics
+        if not static and not self.snapshot.is_latched(topic):
+            return None
+        entry = self.entry(bag)
+        if entry is None:
+            return None
+        notes, number = entry
+        return notes.kept(topic).get(number)
+
+
+def short_name(path: Path) -> str:
+    """A bag as a reply names it: recording and file, never a path of the machine."""
+    return f"{path.parent.name}/{path.name}"

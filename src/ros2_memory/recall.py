@@ -1,0 +1,142 @@
+"""What the catalogue says of the bags of a snapshot, worked out once for each run of bags.
+
+A run never changes, and no entry of the catalogue does, so what is said here of a run holds for as
+long as somebody has it; only a run with bags that have no entry yet is looked at again.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+from ros2_memory.catalogue import BagKey
+from ros2_memory.evidence import OPEN, united
+from ros2_memory.model import BagState
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.catalogue import Catalogue
+    from ros2_memory.digest import EdgeDigest
+    from ros2_memory.evidence import Evidence
+    from ros2_memory.model import BagFile
+    from ros2_memory.motion import PoseDigest
+    from ros2_memory.recorder.timeline import Run
+    from ros2_memory.storage.base import Record
+
+
+class RunNotes:
+    """What the catalogue says of one run. Bags without an entry are not spoken of."""
+
+    def __init__(self, catalogue: Catalogue, run: Run, bag_dir: Path, as_of: int) -> None:
+        self._catalogue = catalogue
+        self.as_of = as_of
+        closed = [bag for bag in run.bags if bag.state is BagState.CLOSED]
+        numbers = catalogue.find([BagKey.of(bag, bag_dir) for bag in closed])
+        self.numbers: dict[Path, int] = {
+            bag.path: number
+            for bag, number in zip(closed, numbers, strict=True)
+            if number is not None
+        }
+        self.whole = len(self.numbers) == len(run.bags)
+        self._holding: dict[str, list[int]] = {
+            topic: [
+                self.numbers[path]
+                for path in dict.fromkeys(bag.path for bag, _ in held)
+                if path in self.numbers
+            ]
+            for topic, held in run.held.items()
+        }
+        self._evidence: dict[str, Evidence] = {}
+        self._edges: dict[str, dict[int, EdgeDigest]] = {}
+        self._kept: dict[str, dict[int, tuple[Record, ...]]] = {}
+        self._undecodable: dict[str, dict[int, dict[str, str]]] = {}
+
+    def evidence_of_all(self, topic: str) -> Evidence:
+        """What can have stood in any message of the topic in the bags with an entry."""
+        if topic not in self._evidence:
+            self._evidence[topic] = united(self.evidence(topic).values())
+        return self._evidence[topic]
+
+    def evidence(self, topic: str) -> Mapping[int, Evidence]:
+        """For each entry that holds the topic what can have stood in it."""
+        numbers = self._of(topic)
+        known = self._catalogue.evidence(topic, numbers)
+        # Where the catalogue failed since the entries were found, nothing is ruled out.
+        return {number: known.get(number, OPEN) for number in numbers}
+
+    def poses(self, topic: str) -> Mapping[int, PoseDigest]:
+        """For each entry that has it the digest of its poses."""
+        return self._catalogue.poses(topic, self._of(topic))
+
+    def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
+        """For each entry that has them the frame edges."""
+        if topic not in self._edges:
+            self._edges[topic] = self._catalogue.edges(topic, self._of(topic))
+        return self._edges[topic]
+
+    def kept(self, topic: str) -> Mapping[int, tuple[Record, ...]]:
+        """For each entry that keeps them all messages of the topic."""
+        if topic not in self._kept:
+            self._kept[topic] = self._catalogue.kept(topic, self._of(topic))
+        return self._kept[topic]
+
+    def undecodable(self, topic: str) -> Mapping[int, Mapping[str, str]]:
+        """For each entry, by message type, why messages of the topic cannot be decoded."""
+        if topic not in self._undecodable:
+            self._undecodable[topic] = self._catalogue.undecodable(topic, self._of(topic))
+        return self._undecodable[topic]
+
+    def _of(self, topic: str) -> list[int]:
+        return self._holding.get(topic, [])
+
+
+class Recall:
+    """Gives the notes on runs. Safe for several threads at once."""
+
+    def __init__(self, catalogue: Catalogue, bag_dir: Path) -> None:
+        self.catalogue = catalogue
+        self._bag_dir = bag_dir
+        self._lock = threading.Lock()
+        self._runs: WeakKeyDictionary[Run, RunNotes] = WeakKeyDictionary()
+
+    def as_of(self) -> int:
+        """The state of the catalogue that one question should be answered by."""
+        return self.catalogue.newest()
+
+    def notes(self, run: Run, as_of: int) -> RunNotes:
+        """What is known of a run, at that state of the catalogue or a later one."""
+        with self._lock:
+            known = self._runs.get(run)
+        if known is None or (not known.whole and known.as_of != as_of):
+            known = RunNotes(self.catalogue, run, self._bag_dir, as_of)
+            with self._lock:
+                self._runs[run] = known
+        return known
+
+    def remembered(self, question: str, numbers: Sequence[int]) -> str | None:
+        """What was once worked out from these entries."""
+        return self.catalogue.remembered(_named(question, numbers))
+
+    def remember(self, question: str, numbers: Sequence[int], answer: str) -> None:
+        """Keeps what was worked out from these entries, for as long as they stand."""
+        self.catalogue.remember(_named(question, numbers), numbers, answer)
+
+
+def bags_without_entry(runs: Sequence[Run], recall: Recall) -> list[BagFile]:
+    """The closed bags of which the catalogue knows nothing, in order."""
+    as_of = recall.as_of()
+    return [
+        bag
+        for run in runs
+        if not (notes := recall.notes(run, as_of)).whole
+        for bag in run.bags
+        if bag.state is BagState.CLOSED and bag.path not in notes.numbers
+    ]
+
+
+def _named(question: str, numbers: Sequence[int]) -> str:
+    return json.dumps([question, *numbers])

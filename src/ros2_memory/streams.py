@@ -1,0 +1,202 @@
+"""Many bags read as one stream: in log-time order, each message once.
+
+Besides the overlap of recordings (see `copies`), a new recording receives the latched messages
+again: a new log time, the original publish time. Such a message counts once too, at its earliest
+log time, however long ago that is.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.copies import (
+    COPY_HORIZON_NS,
+    Copy,
+    Found,
+    Holding,
+    contested,
+    contested_spans,
+    copy_key,
+    once_backward,
+    once_forward,
+    united,
+)
+from ros2_memory.model import TimeWindow
+from ros2_memory.reading import Reading
+from ros2_memory.timebase import MIN_NS, NS_PER_S
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.memory import Call, Memory
+    from ros2_memory.model import BagFile
+    from ros2_memory.timebase import Ns
+
+RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
+"""A latched message logged this long after it was published may have been received before."""
+
+
+class Streams(Reading):
+    """One call's sight of all bags together."""
+
+    def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
+        super().__init__(memory, call, reach)
+        self._first_copies: dict[Copy, Ns] = {}
+
+    def holdings(self, topics: Collection[str], window: TimeWindow) -> list[Holding]:
+        """The bags that hold messages of these topics in the window, in order.
+
+        Each with the times of its first and last message of these topics, in the window or not.
+        """
+        found: dict[Path, Holding] = {}
+        for topic in topics:
+            for bag, _ in self.snapshot.holding(topic, window):
+                if bag.path not in found:
+                    found[bag.path] = holding_of(bag, topics)
+        return sorted(found.values(), key=lambda held: (held.first, held.last, held.bag.path))
+
+    def stream(
+        self,
+        topics: Sequence[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+        among: Sequence[Holding] | None = None,
+    ) -> Iterator[Found]:
+        """The messages of the topics in the window in log-time order, each one once.
+
+        `among` narrows the search to some of the bags.
+
+        Raises:
+            QueryTimeoutError: the deadline passed on the way.
+        """
+        if among is not None:
+            return self.used(self._part(topics, window, among, newest_first=newest_first))
+        parts = self._parts(topics, window)
+        return self.used(
+            chain.from_iterable(
+                self._part(topics, part, None, newest_first=newest_first)
+                for part in (reversed(parts) if newest_first else parts)
+            )
+        )
+
+    def spans_of_copies(self, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
+        """Where in the window the topic's messages may stand in two recordings, widened."""
+        recordings = self.snapshot.recordings(topic)
+        if len(recordings) < 2:
+            return []
+        # First by whole recordings, which are few; then by bags, where these overlap.
+        coarse = contested_spans((*span, folder) for folder, span in recordings.items())
+        near = [TimeWindow(*span) for span in coarse if window.overlaps(span[0], span[1] - 1)]
+        return united(span for each in near for span in contested(self.holdings([topic], each)))
+
+    def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
+        """The window cut where runs of bags begin: a stream then holds few of them at a time."""
+        cuts = [
+            run.bags[0].start
+            for run in self.snapshot.runs
+            if window.start < run.bags[0].start < window.stop
+            and any(topic in run.spans for topic in topics)
+        ]
+        edges = [window.start, *dict.fromkeys(cuts), window.stop]
+        return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
+
+    def _part(
+        self,
+        topics: Sequence[str],
+        window: TimeWindow,
+        among: Sequence[Holding] | None,
+        *,
+        newest_first: bool,
+    ) -> Iterator[Found]:
+        wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
+        holdings = self.holdings(topics, wider) if among is None else among
+        spans = contested(holdings)
+        found: Iterator[Found]
+        if spans:
+            merged = self.merged(holdings, topics, wider, newest_first=newest_first)
+            once = (once_backward if newest_first else once_forward)(merged, spans)
+            found = (each for each in once if window.contains(each.time))
+        else:
+            found = self.merged(holdings, topics, window, newest_first=newest_first)
+        if self.received_twice(topics):
+            return (each for each in found if not self._received_again(each))
+        return found
+
+    def received_twice(self, topics: Iterable[str]) -> bool:
+        """Whether a latched message of these topics may have been received by two recordings."""
+        return any(
+            self.snapshot.is_latched(topic) and len(self.snapshot.recordings(topic)) > 1
+            for topic in topics
+        )
+
+    def _received_again(self, found: Found) -> bool:
+        record = found.record
+        if not record.channel.latched or found.time - record.publish_time <= RECEIVED_AGAIN_NS:
+            return False
+        key = copy_key(record)
+        if key not in self._first_copies:
+            topic = record.channel.topic
+            window = TimeWindow(max(record.publish_time - COPY_HORIZON_NS, MIN_NS), found.time)
+            holdings = self.holdings([topic], window)
+            earlier = self.merged(holdings, [topic], window, newest_first=False)
+            self._first_copies[key] = next(
+                (
+                    each.time
+                    for each in earlier
+                    if each.bag.recording != found.bag.recording and copy_key(each.record) == key
+                ),
+                found.time,
+            )
+        return found.time > self._first_copies[key]
+
+    def merged(
+        self,
+        holdings: Sequence[Holding],
+        topics: Sequence[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool,
+    ) -> Iterator[Found]:
+        """All messages in order, copies too, opening a bag only when the stream reaches it."""
+        sign = -1 if newest_first else 1
+        waiting = deque(
+            sorted(
+                enumerate(holdings),
+                key=lambda held: (
+                    (-held[1].last, -held[0]) if newest_first else (held[1].first, held[0])
+                ),
+            )
+        )
+        heap: list[tuple[int, int, Found, Iterator[Found]]] = []
+
+        def push(rank: int, source: Iterator[Found]) -> None:
+            found = next(source, None)
+            if found is not None:
+                heapq.heappush(heap, (sign * found.time, rank, found, source))
+
+        while heap or waiting:
+            while waiting and (
+                not heap or _edge(waiting[0][1], newest_first=newest_first) <= heap[0][0]
+            ):
+                index, held = waiting.popleft()
+                push(sign * index, self.read(held.bag, topics, window, newest_first=newest_first))
+            if heap:
+                _, rank, found, source = heapq.heappop(heap)
+                yield found
+                push(rank, source)
+
+
+def holding_of(bag: BagFile, topics: Collection[str]) -> Holding:
+    """A bag with the times of its first and last message of these topics; it must hold some."""
+    spans = [(each.first, each.last) for each in bag.summary.topics if each.topic in topics]
+    return Holding(min(first for first, _ in spans), max(last for _, last in spans), bag)
+
+
+def _edge(held: Holding, *, newest_first: bool) -> Ns:
+    """The first moment at which a bag can have something for the stream, in the heap's sign."""
+    return -held.last if newest_first else held.first

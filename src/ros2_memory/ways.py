@@ -1,0 +1,127 @@
+"""The way driven in a window: whole bags by the digests of their poses, the others pose by pose.
+
+A digest is the same whether it comes from the catalogue or is made here from the bag, so an answer
+does not depend on what the catalogue knows.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ros2_memory.absence import undecodable
+from ros2_memory.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.model import BagState
+from ros2_memory.trajectory import PoseCollector, TrajectoryBuilder
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from ros2_memory.copies import Found
+    from ros2_memory.history import View
+    from ros2_memory.model import BagFile, TimeWindow
+    from ros2_memory.motion import PoseDigest
+    from ros2_memory.recall import RunNotes
+    from ros2_memory.timebase import Ns
+    from ros2_memory.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """The way, its frames in order of appearance, and the times of its first and last message."""
+
+    trajectory: Trajectory
+    frames: tuple[str, ...]
+    first: Ns
+    last: Ns
+
+
+def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
+    """The way in a window by the poses of one topic; None where there is no message.
+
+    Raises:
+        InvalidArgumentsError: a message of the topic carries no position.
+        NoDataError: a message cannot be decoded.
+    """
+    builder = TrajectoryBuilder(max_plausible_speed_mps=view.memory.limits.max_plausible_speed_mps)
+    digests = _Digests(view, topic)
+    first: Ns | None = None
+    last: Ns | None = None
+    for group in view.groups(topic, window):
+        bag = group.whole()
+        if bag is None or bag.state is not BagState.CLOSED:
+            span = _added(view, builder, group.once())
+        elif (digest := digests.of(bag)) is not None:
+            builder.join(digest)
+            held = group.holdings[0]
+            span = (held.first, held.last)
+        else:
+            collector = PoseCollector(view.memory.limits.max_plausible_speed_mps)
+            span = _added(view, collector, group.once())
+            builder.join(collector.digest())
+        if span is not None:
+            first, last = (span[0] if first is None else first), span[1]
+    if first is None or last is None:
+        return None
+    return Way(builder.result(), builder.frames, first, last)
+
+
+class _Digests:
+    """What the catalogue has of the poses of one topic; of one run of bags at a time."""
+
+    def __init__(self, view: View, topic: str) -> None:
+        self._view = view
+        self._topic = topic
+        self._notes: RunNotes | None = None
+        self._poses: Mapping[int, PoseDigest] = {}
+
+    def of(self, bag: BagFile) -> PoseDigest | None:
+        """The digest of a bag's poses; None where there is none, or not all messages have one."""
+        entry = self._view.entry(bag)
+        if entry is None:
+            return None
+        notes, number = entry
+        if notes is not self._notes:
+            self._view.check_deadline()
+            self._notes, self._poses = notes, notes.poses(self._topic)
+        return self._poses.get(number)
+
+
+def _added(
+    view: View, to: TrajectoryBuilder | PoseCollector, messages: Iterable[Found]
+) -> tuple[Ns, Ns] | None:
+    """Adds the poses of messages, and gives the times of the first and last; None without any."""
+    extractor = view.memory.extractor
+    first: Ns | None = None
+    last: Ns | None = None
+    for found in messages:
+        message, type_name = decoded(view, found), found.record.channel.type
+        pose, twist = extractor.pose(message, type_name), extractor.twist(message, type_name)
+        if pose is None:
+            raise InvalidArgumentsError(carries_no("position", found))
+        to.add(found.time, pose, None if twist is None else math.hypot(*twist.linear))
+        first = found.time if first is None else first
+        last = found.time
+    return None if first is None or last is None else (first, last)
+
+
+def decoded(view: View, found: Found) -> object:
+    """The message that was found.
+
+    Raises:
+        NoDataError: it cannot be decoded.
+    """
+    try:
+        return view.memory.reader.decode(found.record)
+    except UndecodableError as error:
+        raise undecodable(error.topic, error.type_name, error) from error
+
+
+def carries_no(what: str, found: Found) -> str:
+    """The sentence for a topic that is asked for what its type does not have."""
+    channel = found.record.channel
+    return (
+        f"topic: {channel.topic} is a {channel.type}, which carries no {what}; "
+        "give a topic that does, such as one of type nav_msgs/msg/Odometry"
+    )

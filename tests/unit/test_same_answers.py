@@ -1,0 +1,165 @@
+"""With a catalogue every question is answered as without one."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory import queries
+from ros2_memory.errors import EpisodicError
+from ros2_memory.memory import Call, Limits
+from ros2_memory.moments import Moment, Span
+from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.histories import S, write_history
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from random import Random
+
+    from ros2_memory.memory import Memory
+    from ros2_memory.model import JsonValue
+
+Question = tuple[str, "Callable[[Memory, Call], object]"]
+
+TOPICS = (
+    "/odom",
+    "/tf",
+    "/tf_static",
+    "/dock",
+    "/vision/*",
+    "/mixed",
+    "/chatter",
+    "/status",
+    "/foreign",
+    "/bumper",
+    "/*",
+    "/nowhere",
+)
+CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
+    ("contains", "scissors"),
+    ("contains", "person"),
+    ("contains", "-"),
+    ("contains", "never"),
+    ("contains", "docked"),
+    ("contains", 2),
+    ("equals", True),
+    ("equals", 0.4),
+    ("equals", "cup"),
+    ("equals", 3),
+    ("near_position", {"x": 0.5, "y": 0.5}),
+    ("near_position", {"x": 500.0, "y": 0.0}),
+    ("near_position", {"x": 80, "y": 0.5, "z": 1.0}),
+)
+
+
+def questions(moments: list[int], draw: Random) -> Iterator[Question]:
+    yield "topics", queries.list_recorded_topics
+    yield "range", queries.data_time_range
+    yield "frames", queries.frames
+    for at in [(each + draw.choice([0, S // 3])) / 1e9 for each in draw.sample(moments, 2)]:
+        moment = Moment(at_s=at)
+        for topic in ("/odom", "/dock", "/mixed", "/status"):
+            yield f"{topic} at {at}", partial(_value, topic, moment)
+        yield f"position {at}", partial(_position, moment)
+        yield f"velocity {at}", partial(_velocity, moment)
+        for child in ("laser", "base_link"):
+            yield f"{child} {at}", partial(_transform, child, moment)
+    for first, last in (sorted(draw.sample(moments, 2)), (min(moments), max(moments))):
+        span = Span(start_s=first / 1e9, end_s=last / 1e9)
+        for topic in ("/odom", "/chatter", "/dock"):
+            yield f"{topic} in {span}", partial(_range, topic, span)
+            yield f"way of {topic} in {span}", partial(_way, topic, span)
+    for topic in TOPICS:
+        for kind, wanted in draw.sample(CONDITIONS, 4):
+            for field in (None, draw.choice(["goal", "detections.label", "position", "nowhere"])):
+                before = draw.choice([None, None, draw.choice(moments) / 1e9])
+                yield (
+                    f"last {topic} {kind} {wanted} {field} {before}",
+                    partial(_match, topic, kind, wanted, field, before),
+                )
+    yield "odom when", partial(_when, "/chatter")
+
+
+def _value(topic: str, moment: Moment, memory: Memory, call: Call) -> object:
+    return queries.topic_value(memory, call, topic, moment, tolerance_s=2.0)
+
+
+def _position(moment: Moment, memory: Memory, call: Call) -> object:
+    return queries.position(memory, call, moment)
+
+
+def _velocity(moment: Moment, memory: Memory, call: Call) -> object:
+    return queries.velocity(memory, call, moment)
+
+
+def _transform(child: str, moment: Moment, memory: Memory, call: Call) -> object:
+    return queries.transform(memory, call, "odom", child, moment)
+
+
+def _range(topic: str, span: Span, memory: Memory, call: Call) -> object:
+    return queries.topic_range(memory, call, topic, span, max_samples=5)
+
+
+def _way(topic: str, span: Span, memory: Memory, call: Call) -> object:
+    return queries.trajectory_summary(memory, call, span, topic=topic)
+
+
+def _match(
+    topic: str,
+    kind: str,
+    wanted: JsonValue,
+    field: str | None,
+    before: float | None,
+    memory: Memory,
+    call: Call,
+) -> object:
+    return queries.find_last_match(
+        memory,
+        call,
+        topic,
+        kind,
+        wanted,
+        field=field,
+        before_s=before,
+    )
+
+
+def _when(topic: str, memory: Memory, call: Call) -> object:
+    return queries.value_when(
+        memory, call, "/odom", topic, condition_type="contains", value="scissors"
+    )
+
+
+def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
+    try:
+        return repr(ask(memory, Call()))
+    except EpisodicError as error:
+        return f"{type(error).__name__} {getattr(error, 'reason', '')}: {error}"
+
+
+@pytest.mark.parametrize("clock", ["auto", "stamp"])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 1.0, 0.5]))
+def test_every_question_is_answered_as_without_a_catalogue(
+    clock: str, seed: int, part: float
+) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        moments = write_history(bag_dir, draw).moments
+        limits = Limits(tf_clock=clock)  # type: ignore[arg-type]
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()), limits=limits)
+        recalled = recalling(replace(plain), bag_dir, part=part)
+        for asked, ask in questions(moments, draw):
+            assert answer(recalled, ask) == answer(plain, ask), (seed, part, asked)
