@@ -182,8 +182,8 @@ def test_a_signal_ends_it_and_every_file_is_complete(site: Site, number: int) ->
 
 def test_a_killed_recorder_is_replaced_by_a_new_recording(site: Site) -> None:
     daemon = site.run()
-    first = daemon.child
-    os.kill(first, signal.SIGKILL)
+    daemon.wait_for("split_closed")
+    os.kill(daemon.child, signal.SIGKILL)
     daemon.wait_for("recorder_started", 2)
     daemon.wait_for("recording", 2)
     (died,) = daemon.events("recorder_died")

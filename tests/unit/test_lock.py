@@ -57,6 +57,12 @@ def test_a_second_recorder_is_refused_at_once_and_told_who_holds_it(tmp_path: Pa
     assert str(tmp_path) in said
 
 
+def test_two_cannot_hold_it(tmp_path: Path) -> None:
+    lock = BagDirLock.acquire(tmp_path)
+    refusal(tmp_path)
+    lock.release()
+
+
 def test_a_holder_on_another_machine_counts_as_alive(tmp_path: Path) -> None:
     descriptor = held_by(tmp_path, json.dumps({"pid": 1, "host": "another-robot"}))
     assert "process 1 on another-robot" in refusal(tmp_path, patience_s=3600)
