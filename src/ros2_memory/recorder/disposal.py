@@ -88,13 +88,16 @@ class Disposal:
         free_bytes: Callable[[], int] | None = None,
         min_free_bytes: int | None = None,
     ) -> Disposed:
-        """Deletes what is too old, and then what is too much. Raises nothing: faults are reported.
+        """Deletes what is too old, and then what is too much. What cannot be deleted is reported.
 
         Args:
             known: what the index knows of files.
             snapshot: what it publishes of them.
             free_bytes: measures what the disk has left; where None, that does not count.
             min_free_bytes: what must be free, where that is not as the limits have it.
+
+        Raises:
+            OSError: what is free cannot be measured.
         """
         limits = self._limits
         if min_free_bytes is not None:
@@ -119,10 +122,11 @@ class Disposal:
             carried = self._carrier.carry(snapshot, leaving)
         except (EpisodicError, OSError) as error:
             # The others may go all the same, and make the room that was missing.
-            for bag in self._carrier.concerned(snapshot, leaving):
-                self._stays(
-                    str(bag.path), f"its latched messages cannot be kept: {error}", under_way
-                )
+            reason = f"its latched messages cannot be carried on: {error}"
+            concerned = {str(bag.path) for bag in self._carrier.concerned(snapshot, leaving)}
+            for each in doomed:
+                if each.path in concerned:
+                    self._stays(each.path, reason, under_way)
         else:
             under_way.done.carried = under_way.done.carried if carried is None else carried
         for each in doomed:

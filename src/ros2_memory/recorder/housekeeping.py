@@ -212,7 +212,7 @@ class Housekeeping:
         return self._repairer.repair(path)
 
     def _report(self, done: Disposed, begun: int, **values: object) -> None:
-        tell = _log.info if done.bags or done.failed else _log.debug
+        tell = _log.info if done.bags else _log.debug
         tell(
             "retention_applied",
             bags=done.bags,

@@ -274,7 +274,7 @@ class IndexManager:
                 empty += 1
                 silent.update(verdict.silent)
         return Snapshot(
-            bags=timeline.bags,
+            bags=timeline.recorded,
             active=_by_path(aside.get(Standing.ACTIVE, ())),
             damaged=_by_path([*aside.get(Standing.DAMAGED, ()), *self._odd.damaged]),
             unread=_by_path([*aside.get(Standing.UNREAD, ()), *self._odd.links]),

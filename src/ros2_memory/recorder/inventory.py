@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.recorder.latched import CARRY_FILE, is_carried
-from ros2_memory.recorder.layout import LOCK_FILE, OWN_FILES
+from ros2_memory.recorder.layout import CARRY_FILE, LOCK_FILE, OWN_FILES, is_carried
 from ros2_memory.recorder.removal import beside_bags
 from ros2_memory.recorder.retention import Span, Stock, StoredBag, StoredFile
 from ros2_memory.recorder.scan import other_form

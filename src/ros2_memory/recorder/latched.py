@@ -23,6 +23,7 @@ from __future__ import annotations
 import hashlib
 from bisect import bisect_left
 from collections import defaultdict
+from contextlib import suppress
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -30,6 +31,7 @@ import structlog
 
 from ros2_memory.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.layout import CARRY_FILE, CARRY_FOLDER, is_carried
 from ros2_memory.recorder.sync import flush
 from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
@@ -42,17 +44,10 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader, Record
     from ros2_memory.storage.writing import BagWriter
 
-CARRY_FOLDER: Final = "latched"
-CARRY_FILE: Final = "carried.mcap"
 RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
 """A latched message logged so long after it was published may have been received before."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
-
-
-def is_carried(path: Path) -> bool:
-    """Whether a bag file is the one of carried messages: it says nothing of what was recorded."""
-    return path.name == CARRY_FILE and path.parent.name == CARRY_FOLDER
 
 
 class Identity(NamedTuple):
@@ -258,9 +253,14 @@ class Carrier:
         if folder.is_symlink():
             raise BagError(str(folder), "a symbolic link, which is not followed: remove it")
         beside = folder / f".{CARRY_FILE}.tmp"
-        beside.unlink(missing_ok=True)
-        self._writer.write(beside, records)
-        beside.replace(self.path)
+        try:
+            beside.unlink(missing_ok=True)
+            self._writer.write(beside, records)
+            beside.replace(self.path)
+        except BaseException:
+            with suppress(OSError):
+                folder.rmdir()
+            raise
         flush(folder)
         flush(folder.parent)
 

@@ -9,6 +9,7 @@
         rec_20261120T043000Z_0.mcap, ...   its splits (distributions differ in the names)
         metadata.yaml                      written by it at a clean end
         handover.json                      which of it counts (see `handover`)
+      latched/carried.mcap         latched messages of bags that were deleted (see `latched`)
 
 The two YAML files stand beside the recordings, since a recording's own directory must not exist
 before `ros2 bag record` creates it, and it reads one of them again at every split. They say the
@@ -32,11 +33,18 @@ QOS_FILE: Final = "recorder.qos.yaml"
 STORAGE_FILE: Final = "recorder.storage.yaml"
 HANDOVER_FILE: Final = "handover.json"
 METADATA_FILE: Final = "metadata.yaml"
+CARRY_FOLDER: Final = "latched"
+CARRY_FILE: Final = "carried.mcap"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """What may be deleted from the bag directory itself, besides bags: it is written anew."""
 RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE})
 """What stands in a recording's directory besides its bags, and has no meaning without them."""
+
+
+def is_carried(bag: Path) -> bool:
+    """Whether a bag file is that of carried messages: it says nothing of what was recorded when."""
+    return bag.name == CARRY_FILE and bag.parent.name == CARRY_FOLDER
 
 
 def recording_name(now: Ns, bag_dir: Path) -> str:

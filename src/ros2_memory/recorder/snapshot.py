@@ -24,11 +24,13 @@ class Snapshot:
     """The bag directory at one moment. Never changes, so threads share it freely.
 
     `bags` answer questions: closed, or left incomplete by a crash, and never empty; sorted by
-    (start, end, path). Set aside, each with its reason and sorted by path: `active` files are still
-    being written; `damaged` ones cannot be read at all (among them directories that cannot be
-    listed); `unread` ones are of a kind that another storage reads, or symbolic links, which are
-    not followed. `empty` counts closed bags without a message. `silent_topics` are declared in some
-    bag and heard in none. `problem` says why the bag directory itself could not be read.
+    (start, end, path). The one of latched messages that outlive their own bags is not among them,
+    but found wherever a topic is asked for. Set aside, each with its reason and sorted by path:
+    `active` files are still being written; `damaged` ones cannot be read at all (among them
+    directories that cannot be listed); `unread` ones are of a kind that another storage reads, or
+    symbolic links, which are not followed. `empty` counts closed bags without a message.
+    `silent_topics` are declared in some bag and heard in none. `problem` says why the bag directory
+    itself could not be read.
     """
 
     bags: tuple[BagFile, ...] = ()

@@ -13,6 +13,7 @@ from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.model import BagFile, TopicSummary
+from ros2_memory.recorder.layout import is_carried
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -61,6 +62,11 @@ class Run:
     def latest(self) -> Ns:
         """Log time of the last message in any of the bags."""
         return max(bag.end for bag in self.bags)
+
+    @cached_property
+    def recorded(self) -> tuple[BagFile, ...]:
+        """The bags without that of carried messages."""
+        return tuple(bag for bag in self.bags if not is_carried(bag.path))
 
     @cached_property
     def held(self) -> dict[str, tuple[Held, ...]]:
@@ -213,10 +219,19 @@ class Timeline:
         """All bags, in order."""
         return tuple(chain.from_iterable(run.bags for run in self._runs))
 
+    @cached_property
+    def recorded(self) -> tuple[BagFile, ...]:
+        """The bags that tell when there was a recording, in order.
+
+        The bag of carried messages does not: it holds what is left of bags that were deleted. It
+        tells of itself where there is no other.
+        """
+        return tuple(chain.from_iterable(run.recorded for run in self._runs)) or self.bags
+
     @property
     def earliest(self) -> Ns | None:
-        """Log time of the first message; None without bags."""
-        return self._runs[0].bags[0].start if self._runs else None
+        """Log time of the first message that was recorded and is kept; None without bags."""
+        return self.recorded[0].start if self._runs else None
 
     @cached_property
     def latest(self) -> Ns | None:

@@ -1,0 +1,90 @@
+"""A housekeeper over a folder of bags, as the recorder's daemon has one."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from typing import TYPE_CHECKING
+
+from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.recorder.retention import RetentionLimits
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.mcap_writer import McapWriter
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.timebase import NS_PER_S
+from tests.memories import SettableClock
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from ros2_memory.storage.base import BagReader
+    from ros2_memory.storage.writing import BagWriter
+    from ros2_memory.timebase import Clock
+
+PLENTY = 10**15
+HOUR = 3600 * NS_PER_S
+
+
+def keeper_of(
+    bag_dir: Path,
+    *,
+    max_bytes: int = PLENTY,
+    max_age_h: float = 10**6,
+    clock: Clock | None = None,
+    reader: BagReader | None = None,
+    writer: BagWriter | None = None,
+    measure_free: Callable[[Path], int] = lambda _: PLENTY,
+) -> Housekeeping:
+    """A housekeeper. Unless a clock is given it is an hour later: nothing is being written."""
+    return Housekeeping(
+        bag_dir,
+        CountingReader(reader or McapReader()),
+        writer or McapWriter(),
+        clock or later(),
+        RetentionLimits(max_bytes, round(max_age_h * HOUR)),
+        split_duration_s=10.0,
+        static_topics=("/tf_static",),
+        measure_free=measure_free,
+    )
+
+
+def reader_of_both() -> BagReader:
+    """Reads either plugin's files."""
+    return Rosbag2Reader()
+
+
+def later(seconds: int = 3600) -> SettableClock:
+    return SettableClock(time.time_ns() + seconds * NS_PER_S)
+
+
+def recording_now(bag_dir: Path, *recordings: str, clock: Clock | None = None) -> None:
+    """Has a recorder say that it is writing these recordings."""
+    now = (clock or later()).now()
+    write_heartbeat(
+        bag_dir,
+        Heartbeat(1, now, RecorderState.RECORDING, recordings, now, 0, (), (), None, 2.0),
+    )
+
+
+def files_in(bag_dir: Path) -> list[str]:
+    """Every file and directory, relative to the bag directory."""
+    return sorted(path.relative_to(bag_dir).as_posix() for path in bag_dir.rglob("*"))
+
+
+def size_of(bag_dir: Path) -> int:
+    """The bytes of all files, each inode once."""
+    sizes = {
+        path.stat().st_ino: path.stat().st_size for path in bag_dir.rglob("*") if path.is_file()
+    }
+    return sum(sizes.values())
+
+
+def copied(source: Path, target: Path) -> Path:
+    """A copy of a folder that may be changed."""
+    shutil.copytree(source, target)
+    for path in (target, *target.rglob("*")):
+        path.chmod(0o755 if path.is_dir() else 0o644)
+    return target
