@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 SPLIT_S: Final = 10
 SPLIT_NS: Final = SPLIT_S * 1_000_000_000
 SPLITS_OF_A_RECORDING: Final = 60
-WEEK: Final = 60_480
+HOUR: Final = 3600 // SPLIT_S
+WEEK: Final = 168 * HOUR
+"""Splits of an hour, and of a week."""
 END_NS: Final = 1_768_176_000_000_000_000
 """Where every history ends: 2026-01-12 00:00 UTC."""
 

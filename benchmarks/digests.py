@@ -10,31 +10,46 @@ from typing import TYPE_CHECKING
 from benchmarks import ours
 from benchmarks.bags import ODOM
 from benchmarks.report import Figure
+from ros2_memory.catalogue import BagKey
 from ros2_memory.digest import Digester
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
+    from ros2_memory.catalogue import Catalogue
     from ros2_memory.digest import Digest, TopicDigest
+    from ros2_memory.memory import Memory
     from ros2_memory.model import BagSummary
     from ros2_memory.motion import PoseDigest, Stop
+    from ros2_memory.settings import Settings
 
 _MAX_MS = 10.0
 
 
-def digester(case: Case, *, fresh: bool = False) -> Digester:
-    """Makes digests as the server's index does; a fresh one has read no bag yet."""
-    memory = case.memory
-    if fresh:
-        memory = ours.forgetful(memory, case.settings, case.splits[0], ODOM.name)
-    limit = case.settings.data.max_plausible_speed_mps
-    return Digester(memory.reader, memory.extractor, limit)
+def digester_of(memory: Memory, settings: Settings) -> Digester:
+    """Makes digests as the server's index does."""
+    return Digester(memory.reader, memory.extractor, settings.data.max_plausible_speed_mps)
+
+
+def known(memory: Memory, settings: Settings) -> Catalogue | None:
+    """The memory's catalogue, told of every bag of the index; None where it has none."""
+    if memory.recall is None:
+        return None
+    catalogue, folder = memory.recall.catalogue, settings.recording.bag_dir
+    digester = digester_of(memory, settings)
+    bags = memory.index.refresh().bags
+    keys = [BagKey.of(bag, folder) for bag in bags]
+    for bag, key, number in zip(bags, keys, catalogue.find(keys), strict=True):
+        if number is None:
+            catalogue.put(key, digester.digest(bag.path))
+    return catalogue
 
 
 def cost(case: Case, runs: int) -> Figure:
     """The processor time of digesting one bag that was not read before, as a median."""
     spent = []
     for _ in range(runs):
-        fresh = digester(case, fresh=True)
+        unread = ours.forgetful(case.memory, case.settings, case.splits[0], ODOM.name)
+        fresh = digester_of(unread, case.settings)
         # The first one compiles the other topics' decoders, as it does once in a server's life.
         for nth, (split, _) in enumerate(case.moments(10)):
             begun = time.process_time()

@@ -11,8 +11,9 @@ from benchmarks import ours, plain
 from benchmarks.bags import ODOM, SCENE, History
 from benchmarks.motion import NOWHERE
 from benchmarks.payloads import NEVER_SEEN
-from benchmarks.questions import OURS, PLAIN, Case
+from benchmarks.questions import Case
 from benchmarks.report import Figure
+from benchmarks.timing import OURS, PLAIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from benchmarks import floor, ours, plain
-from benchmarks.bags import ODOM, SCENE, SPLIT_NS, SPLIT_S
+from benchmarks import digests, floor, ours, plain
+from benchmarks.bags import HOUR, ODOM, SCENE, SPLIT_NS
+from benchmarks.links import linked
 from benchmarks.motion import NOWHERE
 from benchmarks.payloads import NEVER_SEEN
+from benchmarks.timing import FLOOR, OURS, PLAIN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -20,11 +22,6 @@ if TYPE_CHECKING:
     from ros2_memory.memory import Memory
     from ros2_memory.settings import Settings
 
-OURS: Final = "ours"
-PLAIN: Final = "plain"
-FLOOR: Final = "floor"
-
-HOUR: Final = 3600 // SPLIT_S
 _SAMPLES: Final = 100
 _POINTS: Final = 20
 _POINTS_BY_TOOL: Final = 200
@@ -78,8 +75,9 @@ class Case:
 
     @cached_property
     def memory(self) -> Memory:
-        """A memory that knows the folder."""
+        """A memory that knows the folder, and whose catalogue knows every bag."""
         memory = ours.memory(self.settings)
+        digests.known(memory, self.settings)
         memory.index.refresh()
         return memory
 
@@ -124,7 +122,9 @@ def index(case: Case) -> Question:
     some = paths[-HOUR:]
 
     def mine() -> Sequence[Ask]:
-        memory = ours.memory(case.settings)
+        # Under another name, where no catalogue lies.
+        bare = linked(case.history, 1)
+        memory = ours.memory(ours.settings_for(bare.folder))
         return [lambda: ours.counts(memory)]
 
     return Question(

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from benchmarks.questions import FLOOR, OURS, PLAIN
+from benchmarks.timing import FLOOR, OURS, PLAIN
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -12,10 +12,15 @@ import math
 import statistics
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
+
+OURS: Final = "ours"
+PLAIN: Final = "plain"
+FLOOR: Final = "floor"
+"""The names of the sides."""
 
 Ask: TypeAlias = "Callable[[], object]"
 """What is timed; it gives its answer in a form that can be compared between sides."""

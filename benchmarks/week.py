@@ -8,24 +8,22 @@ newest hour.
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Final
 
 from benchmarks import digests, ours
-from benchmarks.bags import ODOM, SCENE, SPLIT_NS, WEEK
+from benchmarks.bags import HOUR, ODOM, SCENE, SPLIT_NS, WEEK
 from benchmarks.motion import NOWHERE
 from benchmarks.payloads import NEVER_SEEN
-from benchmarks.questions import FLOOR, HOUR, OURS, Case, Question, Target
+from benchmarks.questions import Question, Target
+from benchmarks.timing import FLOOR, OURS
 from ros2_memory.catalogue import BagKey, relative
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Mapping, Sequence
 
-    from benchmarks.bags import History
+    from benchmarks.links import Linked
     from benchmarks.timing import Ask
     from ros2_memory.catalogue import Catalogue
     from ros2_memory.digest import Digest
@@ -37,61 +35,37 @@ RECORDINGS: Final = WEEK // HOUR
 _BATCH: Final = 1_000
 
 
-@dataclass(frozen=True, slots=True)
-class Linked:
-    """Recordings in a folder, each of them links to the bags of one history."""
-
-    folder: Path
-    hour: History
-    recordings: int
-
-    @property
-    def bags(self) -> int:
-        """How many bag files there are."""
-        return self.hour.bags * self.recordings
-
-    def links(self) -> Iterator[tuple[Path, Path, int]]:
-        """Link, file, and by how many nanoseconds the link's bag is later; oldest first."""
-        for recording in range(self.recordings):
-            later = (recording - self.recordings + 1) * self.hour.bags * SPLIT_NS
-            name = f"rec_{recording:04}"
-            for split in self.hour.splits():
-                yield self.folder / name / f"{name}_{split.number}.mcap", split.path, later
-
-
-def linked(hour: History, recordings: int = RECORDINGS) -> Linked:
-    """The recordings beside the history that they are made of, made anew."""
-    folder = hour.folder.with_name(f"linked_{hour.bags}_{recordings}")
-    shutil.rmtree(folder, ignore_errors=True)
-    whole = Linked(folder, hour, recordings)
-    for link, file, _ in whole.links():
-        if not link.parent.is_dir():
-            link.parent.mkdir(parents=True)
-        link.hardlink_to(file)
-    # A folder that changed within the last two seconds is looked through again at every scan.
-    for place in (*folder.iterdir(), folder):
-        os.utime(place, ns=(hour.end, hour.end))
-    return whole
-
-
 @dataclass
 class Week:
-    """What the questions of a week are asked of; `made_of` is the hour that it consists of."""
+    """What the questions of a week are asked of."""
 
     whole: Linked
     settings: Settings
-    made_of: Case
 
     @cached_property
     def digests(self) -> list[Digest]:
         """Of the bags of the hour, oldest first."""
-        digester = digests.digester(self.made_of)
+        digester = digests.digester_of(ours.memory(self.settings), self.settings)
         return [digester.digest(split.path) for split in self.whole.hour.splits()]
 
     @cached_property
+    def filled(self) -> Settings:
+        """The settings, once the catalogue was told of every bag.
+
+        Raises:
+            RuntimeError: this build keeps no catalogue.
+        """
+        recall = ours.memory(self.settings).recall
+        if recall is None:
+            raise RuntimeError("the memory has no catalogue, so a week cannot be stood in for")
+        self._fill(recall.catalogue)
+        recall.catalogue.close()
+        return self.settings
+
+    @cached_property
     def memory(self) -> Memory:
-        """A memory that knows the folder."""
-        memory = ours.memory(self.settings)
+        """A memory that knows the folder, by its catalogue."""
+        memory = ours.memory(self.filled)
         memory.index.refresh()
         return memory
 
@@ -106,7 +80,7 @@ class Week:
         ]
         return "\n".join(words * self.whole.recordings)
 
-    def fill(self, catalogue: Catalogue) -> None:
+    def _fill(self, catalogue: Catalogue) -> None:
         """Tells the catalogue of every bag."""
         batch: list[tuple[BagKey, Digest]] = []
         for nth, (link, _, later) in enumerate(self.whole.links()):
@@ -144,10 +118,10 @@ def rescan(week: Week) -> Question:
 
 def start(week: Week) -> Question:
     """From a configuration to the first answer."""
-    newest = (week.whole.hour.end - SPLIT_NS // 2) / 1e9
+    newest, settings = (week.whole.hour.end - SPLIT_NS // 2) / 1e9, week.filled
 
     def first() -> object:
-        return ours.position_at(ours.memory(week.settings), ODOM.name, newest)
+        return ours.position_at(ours.memory(settings), ODOM.name, newest)
 
     words = f"start over {week.whole.bags} bags to the first answer, imports not counted"
     return Question(words, {OURS: lambda: [first]}, Target(seconds=0.5))
@@ -167,7 +141,13 @@ def _never(week: Week, words: str, topic: str, value: JsonValue) -> Question:
         f"{words}, {week.whole.bags} bags (floor: substring search over the digests' text)",
         {
             OURS: lambda: [partial(ours.last_match, week.memory, topic, condition, value)],
-            FLOOR: lambda: [lambda: None if NEVER_SEEN not in week.text else 0],
+            FLOOR: lambda: [partial(_searched, week.text)],
         },
         Target(floor=20),
     )
+
+
+def _searched(text: str) -> int | None:
+    """Where the label stands in the text."""
+    at = text.find(NEVER_SEEN)
+    return None if at < 0 else at

@@ -11,8 +11,8 @@ from benchmarks import ours, report
 from benchmarks.__main__ import main, measured
 from benchmarks.bags import MESSAGES_OF_A_SPLIT, ODOM, TOPICS, made
 from benchmarks.payloads import NEVER_SEEN, typestore
-from benchmarks.questions import FLOOR, OURS, PLAIN, QUESTIONS, Case, Target
-from benchmarks.timing import DisagreementError, Timed, agreed, timed
+from benchmarks.questions import QUESTIONS, Case, Target
+from benchmarks.timing import FLOOR, OURS, PLAIN, DisagreementError, Timed, agreed, timed
 from rosbags.rosbag2 import Reader
 
 if TYPE_CHECKING:
@@ -76,7 +76,8 @@ def test_a_history_without_bags_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("slug", QUESTIONS)
 def test_all_sides_agree_on_the_answer(history: History, slug: str) -> None:
-    (row,) = measured(history, [slug], runs=1)
+    case = Case(history, ours.settings_for(history.folder))
+    (row,) = measured({slug: QUESTIONS[slug]}, case, runs=1)
     assert row.slug == slug
     assert all(count for _, count in row.asks)
 
