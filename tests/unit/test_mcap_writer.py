@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import random
-import resource
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -20,11 +18,11 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.limits import files_limited_to
 from tests.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 from tests.shelves import LAYOUTS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
 S = 10**9
@@ -62,17 +60,6 @@ def raw_contents(path: Path) -> list[tuple[object, ...]]:
             )
             for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False)
         ]
-
-
-@contextmanager
-def files_limited_to(size: int) -> Iterator[None]:
-    """Writing past the limit fails, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def cut(whole: Path, size: int) -> Path:
