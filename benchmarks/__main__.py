@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from benchmarks import digests, footprint, ours, report, serving
+from benchmarks import backlog, digests, footprint, ours, report, serving
 from benchmarks.bags import HOUR, MESSAGES_OF_A_SPLIT, WEEK, made
 from benchmarks.links import linked
 from benchmarks.questions import QUESTIONS, Case
@@ -76,7 +76,9 @@ def _hour(
 ) -> tuple[list[Row], list[Figure]]:
     case = Case(history, ours.settings_for(history.folder))
     rows = measured({slug: QUESTIONS[slug] for slug in slugs}, case, runs)
-    return rows, [digests.cost(case, runs), *footprint.figures(history)] if whole else []
+    if not whole:
+        return rows, []
+    return rows, [digests.cost(case, runs), *backlog.figures(case), *footprint.figures(history)]
 
 
 def _week(

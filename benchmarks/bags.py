@@ -2,9 +2,9 @@
 
 The reference rates: 1,261 messages in a split of 10 s. Splits lie in recordings of 60, in zstd
 chunks of 16 KiB, with the publishers' QoS on every channel and, as rosbag2 does it, the tale of all
-earlier splits of the recording embedded in each; `metadata.yaml` closes a recording. Recordings
-follow each other without overlap. Everything is drawn from the split's number: the same command
-makes the same bytes.
+earlier splits of the recording embedded in each; `metadata.yaml` closes a recording. One recording
+takes over from the other at a cut, which this project's recorder wrote down, and none overlap.
+Everything is drawn from the split's number: the same command makes the same bytes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import os
 import shutil
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from textwrap import indent
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -22,6 +22,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from benchmarks import payloads
+from ros2_memory.recorder.handover import Handover, Overlap, write_handover
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -38,8 +39,9 @@ WEEK: Final = 168 * HOUR
 END_NS: Final = 1_768_176_000_000_000_000
 """Where every history ends: 2026-01-12 00:00 UTC."""
 
-_FORMAT: Final = 1  # of what is written here; folders of another one are made anew
+_FORMAT: Final = 2  # of what is written here; folders of another one are made anew
 _CHUNK_BYTES: Final = 16 * 1024
+_OVERLAP_NS: Final = 3_000_000_000
 _QOS: Final = """\
 - history: unknown
   depth: 0
@@ -107,7 +109,7 @@ class History:
         """The bag files, oldest first."""
         for number in range(self.bags):
             recording, nth = divmod(number, SPLITS_OF_A_RECORDING)
-            name = f"rec_{recording:04}"
+            name = _name(recording)
             path = self.folder / name / f"{name}_{nth}.mcap"
             yield Split(number, path, self.start + number * SPLIT_NS, nth)
 
@@ -132,17 +134,18 @@ def made(folder: Path, bags: int, *, jobs: int | None = None) -> History:
     recordings = [
         splits[at : at + SPLITS_OF_A_RECORDING] for at in range(0, bags, SPLITS_OF_A_RECORDING)
     ]
+    record = partial(_record, history)
     if len(recordings) == 1:
-        _record(recordings[0])
+        record(recordings[0])
     else:
         with ProcessPoolExecutor(jobs) as workers:
-            for _ in workers.map(_record, recordings):
+            for _ in workers.map(record, recordings):
                 pass
     seal.write_text(json.dumps(facts), encoding="utf-8")
     return history
 
 
-def _record(splits: list[Split]) -> None:
+def _record(history: History, splits: list[Split]) -> None:
     """Writes one recording."""
     splits[0].path.parent.mkdir(parents=True)
     for split in splits:
@@ -151,7 +154,33 @@ def _record(splits: list[Split]) -> None:
         closed = split.start + SPLIT_NS
         os.utime(split.path, ns=(closed, closed))
     text = "rosbag2_bagfile_information:\n" + indent(metadata(splits), "  ") + "\n"
-    (splits[0].path.parent / "metadata.yaml").write_text(text, encoding="utf-8")
+    folder = splits[0].path.parent
+    (folder / "metadata.yaml").write_text(text, encoding="utf-8")
+    write_handover(folder, _handover(history, splits))
+
+
+def _handover(history: History, splits: list[Split]) -> Handover:
+    """What this project's recorder writes down where one recording takes over from another."""
+    first, last = splits[0], splits[-1]
+    number = first.number // SPLITS_OF_A_RECORDING
+
+    def around(cut: int, split: Split) -> Overlap:
+        return Overlap(cut - _OVERLAP_NS, cut + _OVERLAP_NS, (split.path.name,))
+
+    begins, ends = first.number > 0, last.number < history.bags - 1
+    stop = last.start + SPLIT_NS
+    return Handover(
+        previous=_name(number - 1) if begins else None,
+        counts_from=first.start if begins else None,
+        begin=around(first.start, first) if begins else None,
+        next=_name(number + 1) if ends else None,
+        counts_until=stop if ends else None,
+        end=around(stop, last) if ends else None,
+    )
+
+
+def _name(recording: int) -> str:
+    return f"rec_{recording:04}"
 
 
 def _write(split: Split, so_far: Sequence[Split]) -> None:

@@ -64,6 +64,7 @@ def test_an_unfinished_folder_is_made_anew(tmp_path: Path) -> None:
     (tmp_path / "bags_1" / "rec_0000" / "half.mcap").touch()
     (split,) = made(tmp_path, 1).splits()
     assert [path.name for path in sorted(split.path.parent.iterdir())] == [
+        "handover.json",
         "metadata.yaml",
         split.path.name,
     ]
