@@ -496,7 +496,10 @@ class TestWatch:
         world.supervisor.start()
         world.run(18)
         world.silent = True
-        world.run(300)
+        with capture_logs() as logs:
+            world.run(300)
+        (told,) = events(logs, "no_growth")
+        assert world.heartbeat()["last_error"] == told["reason"]
         assert len(world.recorders) == 2
         assert world.recorders[0].status == 0
         world.silent = False

@@ -236,7 +236,11 @@ class Supervisor:
         if not (wanted and ready and self._is_due("rotate", 0.0, now)):
             return
         if silent:
-            self._journal.note("no_growth", recording=current.name)
+            sentence = (
+                f"{current.name} has stopped growing: the robot is silent, or its messages do not "
+                "arrive; what was recorded is closed"
+            )
+            self._journal.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = silent and not over
         self._rotate_now = False
         try:

@@ -1,0 +1,127 @@
+"""The contract of the port `Recorder`, held by both adapters."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.errors import ConfigError, RecorderError
+from ros2_memory.recorder.null import NullRecorder
+from ros2_memory.recorder.ros2bag import Ros2BagRecorder
+from ros2_memory.storage.mcap_reader import McapReader
+
+if TYPE_CHECKING:
+    from ros2_memory.recorder.base import Recorder
+
+STUB = Path(__file__).resolve().parents[1] / "stub_ros2.py"
+
+
+def ros2bag(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Ros2BagRecorder:
+    programs = folder / "bin"
+    programs.mkdir(exist_ok=True)
+    ros2 = programs / "ros2"
+    ros2.write_text(
+        f"#!{sys.executable}\nimport runpy\nrunpy.run_path({str(STUB)!r}, run_name='__main__')\n"
+    )
+    ros2.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    (folder / "topics.yaml").write_text("topics: [/odom]\n")
+    return Ros2BagRecorder(
+        McapReader(),
+        bag_dir=folder / "bags",
+        topics_file=folder / "topics.yaml",
+        split_duration_s=10,
+        session_duration_s=600,
+        use_sim_time=False,
+        min_free_gb=0.0,
+        setup_files=(),
+        latched_topics=("/tf_static",),
+        repeat_latched=(),
+        chunk_bytes=16384,
+    )
+
+
+@pytest.fixture(params=["none", "ros2bag"])
+def recorder(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Recorder]:
+    made: Recorder = NullRecorder()
+    if request.param == "ros2bag":
+        made = ros2bag(tmp_path, monkeypatch)
+    yield made
+    made.stop()
+
+
+def drive(recorder: Recorder) -> bool:
+    """Lets it work until it records; False for one that never does."""
+    if not isinstance(recorder, Ros2BagRecorder):
+        return False
+    give_up = time.monotonic() + 30
+    while not recorder.is_running():
+        assert time.monotonic() < give_up
+        recorder.tick()
+        time.sleep(0.02)
+    return True
+
+
+def children() -> set[str]:
+    return set(Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split())
+
+
+def test_before_it_is_started_it_does_not_run(recorder: Recorder) -> None:
+    assert not recorder.is_running()
+
+
+def test_stopping_what_does_not_run_does_nothing(recorder: Recorder) -> None:
+    recorder.stop()
+    recorder.stop()
+    assert not recorder.is_running()
+
+
+def test_started_twice_it_goes_on_as_it_is(recorder: Recorder) -> None:
+    recorder.start()
+    before = children()
+    recorder.start()
+    assert children() == before
+
+
+def test_when_stop_returns_nothing_of_it_runs(recorder: Recorder) -> None:
+    before = children()
+    recorder.start()
+    drive(recorder)
+    recorder.stop()
+    assert not recorder.is_running()
+    assert children() == before
+
+
+def test_after_a_stop_it_may_be_started_again_into_a_new_recording(
+    recorder: Recorder, tmp_path: Path
+) -> None:
+    recorder.start()
+    records = drive(recorder)
+    recorder.stop()
+    recorder.start()
+    assert drive(recorder) is records
+    recorder.stop()
+    assert len(list(tmp_path.glob("bags/rec_*"))) == 2 * records
+
+
+def test_one_that_cannot_begin_leaves_nothing_running(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = ros2bag(tmp_path, monkeypatch)
+    before = children()
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(RecorderError):
+        recorder.start()
+    (tmp_path / "topics.yaml").write_text("topics: []\n")
+    with pytest.raises(ConfigError):
+        recorder.start()
+    assert children() == before
+    assert not recorder.is_running()
