@@ -1,4 +1,4 @@
-"""Builds the adapters that the configuration chooses.
+"""Builds the adapters that the configuration chooses, and what is made of them.
 
 The only place that sees the configuration and the adapters together. Apart from `bootstrap`, so
 that the recorder daemon, which answers nobody, does without the libraries of the server.
@@ -6,17 +6,28 @@ that the recorder daemon, which answers nobody, does without the libraries of th
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 
 from ros2_memory.errors import ConfigError
 from ros2_memory.recorder.base import Recorder
+from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
+from ros2_memory.recorder.repair import Repairer
+from ros2_memory.recorder.retention import RetentionLimits
 from ros2_memory.storage.base import BagReader
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.mcap_writer import McapWriter
+from ros2_memory.timebase import WallClock, ns_from_unix
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.recorder.ports import Housekeeper
     from ros2_memory.settings import AdapterNode, Settings
+
+GB: Final = 10**9
 
 _Port = TypeVar("_Port")
 
@@ -39,6 +50,32 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
         ConfigError: it cannot be built.
     """
     return _built("recorder", settings.recorder, Recorder, **collaborators)  # type: ignore[type-abstract]
+
+
+def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> Housekeeper:
+    """What repairs and deletes in the bag directory of the recorder; nobody else may delete."""
+    kept = settings.retention
+    limits = RetentionLimits(
+        max_total_bytes=round(kept.max_total_gb * GB),
+        max_age_ns=ns_from_unix(kept.max_age_h * 3600),
+        min_free_bytes=round(kept.min_free_gb * GB),
+    )
+    return InBackground(
+        Housekeeping(
+            bag_dir,
+            reader,
+            McapWriter(),
+            WallClock(),
+            limits,
+            split_duration_s=settings.recording.split_duration_s,
+            static_topics=settings.data.tf_static_topics,
+        )
+    )
+
+
+def build_repairer() -> Repairer:
+    """What repairs single MCAP files."""
+    return Repairer(McapReader(), McapWriter())
 
 
 def _built(key: str, node: AdapterNode, port: type[_Port], **collaborators: object) -> _Port:

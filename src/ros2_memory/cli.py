@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.demo.run import DemoOptions, run_demo
 from ros2_memory.errors import EpisodicError
+from ros2_memory.recovery import recover
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from types import FrameType
 
+_NOT_REPAIRED: Final = 1
 _CANNOT_START: Final = 2
 _INTERRUPTED: Final = 130
 
@@ -23,10 +25,22 @@ _INTERRUPTED: Final = 130
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line (`sys.argv` unless given) and returns the exit code.
 
-    0: done and right; 1: an answer was wrong; 2: it could not run, and stderr says why;
-    130: interrupted before it was done.
+    0: done and right; 1: an answer was wrong, or a bag could not be repaired; 2: it could not run,
+    and stderr says why; 130: interrupted before it was done.
     """
     arguments = _parser().parse_args(argv)
+    run = _recover if arguments.command == "recover" else _demo
+    try:
+        with _ended_like_ctrl_c(signal.SIGTERM, signal.SIGHUP):
+            return run(arguments)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except (EpisodicError, OSError) as error:
+        print(f"ros2-memory {arguments.command}: {error}", file=sys.stderr)
+        return _CANNOT_START
+
+
+def _demo(arguments: argparse.Namespace) -> int:
     options = DemoOptions(
         once=arguments.once,
         port=arguments.port,
@@ -34,14 +48,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         duration_s=arguments.duration,
         verbose=arguments.verbose,
     )
-    try:
-        with _ended_like_ctrl_c(signal.SIGTERM, signal.SIGHUP):
-            return run_demo(options, _say)
-    except KeyboardInterrupt:
-        return _INTERRUPTED
-    except (EpisodicError, OSError) as error:
-        print(f"ros2-memory demo: {error}", file=sys.stderr)
-        return _CANNOT_START
+    return run_demo(options, _say)
+
+
+def _recover(arguments: argparse.Namespace) -> int:
+    outcome = recover(arguments.path, _say, force=arguments.force)
+    return _NOT_REPAIRED if outcome.failed else 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -77,6 +89,21 @@ def _parser() -> argparse.ArgumentParser:
         help="seconds of history that exist when the questions are asked (%(default)s)",
     )
     demo.add_argument("--verbose", action="store_true", help="show the server's log on stderr")
+    recovering = commands.add_parser(
+        "recover",
+        help="repair MCAP files that a crash, a full disk or a pulled plug left unfinished",
+        description="Rewrites each unfinished MCAP file from all that can be read of it, in place: "
+        "the original stays until the whole one has been read back and is on the disk. Files of 0 "
+        "bytes are removed. The exit code is 1 if a file could not be repaired.",
+    )
+    recovering.add_argument(
+        "path", type=Path, metavar="PATH", help="an MCAP file, or a directory of recordings"
+    )
+    recovering.add_argument(
+        "--force",
+        action="store_true",
+        help="also files that changed in the last half minute; nothing must be writing them",
+    )
     return parser
 
 

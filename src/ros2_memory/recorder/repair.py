@@ -48,6 +48,19 @@ class Repairer:
         self._reader = reader
         self._writer = writer
 
+    def is_whole(self, path: Path) -> bool:
+        """Whether the writer of a file finished it, so that there is nothing to repair.
+
+        Raises:
+            BagVanishedError: it is not there.
+            BagError: it cannot be opened, or is no MCAP file.
+        """
+        whole = self._reader.closing(path) is Closing.CLOSED
+        if whole:
+            # What is no bag at all counts as closed; here it is said to be none.
+            self._reader.channels(path)
+        return whole
+
     def repair(self, path: Path, progress: Callable[[int], None] | None = None) -> Repaired | None:
         """Repairs one file; None where its writer had finished it.
 
