@@ -312,10 +312,18 @@ def test_the_environment_of_the_recorder_is_the_robots(site: Site) -> None:
     assert {b"FROM_SETUP=yes", b"ROS_DOMAIN_ID=42"} <= set(environ)
     names = {entry.partition(b"=")[0] for entry in environ}
     assert {b"VIRTUAL_ENV", b"PYTHONHOME", b"BASH_ENV"}.isdisjoint(names)
-    (log_dir,) = [e.partition(b"=")[2] for e in environ if e.startswith(b"ROS_LOG_DIR=")]
-    assert Path(log_dir.decode()).is_dir()
+    assert f"ROS_LOG_DIR={site.bag_dir}/.ros_log".encode() in environ
     assert daemon.stop() == 0
-    assert not Path(log_dir.decode()).exists()
+
+
+def test_of_what_ros_logs_of_itself_only_the_newest_runs_are_kept(site: Site) -> None:
+    logs = site.bag_dir / ".ros_log"
+    logs.mkdir(parents=True)
+    for number in range(50):
+        (logs / f"ros2_{number}.log").touch()
+        os.utime(logs / f"ros2_{number}.log", (number, number))
+    assert site.run().stop() == 0
+    assert {path.name for path in logs.iterdir()} == {f"ros2_{n}.log" for n in range(30, 50)}
 
 
 def test_old_bags_are_cleared_only_when_that_is_asked_for(site: Site) -> None:

@@ -5,6 +5,7 @@
       recorder.lock                who records here
       recorder.qos.yaml            how latched topics are subscribed to
       recorder.storage.yaml        how MCAP files are written
+      .ros_log/                    what `ros2` logs of itself: the newest few runs
       rec_20261120T043000Z/        one recording: what one `ros2 bag record` wrote
         rec_20261120T043000Z_0.mcap, ...   its splits (distributions differ in the names)
         metadata.yaml                      written by it at a clean end
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 LOCK_FILE: Final = "recorder.lock"
 QOS_FILE: Final = "recorder.qos.yaml"
 STORAGE_FILE: Final = "recorder.storage.yaml"
+ROS_LOG_DIR: Final = ".ros_log"
 HANDOVER_FILE: Final = "handover.json"
 METADATA_FILE: Final = "metadata.yaml"
 CARRY_FOLDER: Final = "latched"

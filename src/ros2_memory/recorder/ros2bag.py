@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import RecorderError
@@ -19,7 +16,7 @@ from ros2_memory.recorder.command import (
     storage_config,
 )
 from ros2_memory.recorder.environment import find_ros2, robot_environment
-from ros2_memory.recorder.layout import QOS_FILE, STORAGE_FILE, node_name
+from ros2_memory.recorder.layout import QOS_FILE, ROS_LOG_DIR, STORAGE_FILE, node_name
 from ros2_memory.recorder.ports import NoHousekeeping
 from ros2_memory.recorder.supervisor import Orders, Supervisor
 from ros2_memory.recorder.sync import write_durably
@@ -28,6 +25,7 @@ from ros2_memory.timebase import WallClock
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
+    from pathlib import Path
 
     from ros2_memory.recorder.ports import Housekeeper
     from ros2_memory.storage.base import BagReader
@@ -89,7 +87,7 @@ class Ros2BagRecorder(Recorder):
         self._repeat_latched = tuple(repeat_latched)
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
-        self._log_dir: Path | None = None
+        self._started = False
         self._topics = TopicSelection(())
         self._env: dict[str, str] = {}
         self._ros2 = "ros2"
@@ -115,18 +113,14 @@ class Ros2BagRecorder(Recorder):
             ConfigError: the list of topics is refused.
             RecorderError: recording cannot begin.
         """
-        if self._log_dir is not None:
+        if self._started:
             return
         self._topics = load_topics(self._topics_file)
-        self._log_dir = Path(tempfile.mkdtemp(prefix="ros2-memory-log-"))
-        try:
-            self._env = robot_environment(self._setup_files, self._log_dir)
-            self._ros2 = find_ros2(self._env)
-            self._options = self._known_options()
-            self._supervisor.start()
-        except BaseException:
-            self._forget_logs()
-            raise
+        self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
+        self._ros2 = find_ros2(self._env)
+        self._options = self._known_options()
+        self._supervisor.start()
+        self._started = True
 
     def tick(self) -> None:
         """Does what supervision needs at this moment; does not wait, and raises nothing."""
@@ -135,7 +129,7 @@ class Ros2BagRecorder(Recorder):
     def stop(self) -> None:
         """Ends recording, within the bounded patience of its children."""
         self._supervisor.stop()
-        self._forget_logs()
+        self._started = False
 
     def is_running(self) -> bool:
         """Whether a recorder runs and has said that it records."""
@@ -163,8 +157,7 @@ class Ros2BagRecorder(Recorder):
                 f"{error.filename} cannot be written: {error.strerror}; the recorder must be able "
                 "to write into recording.bag_dir"
             ) from error
-        if self._log_dir is not None:
-            _prune(self._log_dir)
+        _prune(self._bag_dir / ROS_LOG_DIR)
         argv = record_argv(
             ros2=self._ros2,
             directory=directory,
@@ -178,11 +171,6 @@ class Ros2BagRecorder(Recorder):
             known_options=self._options,
         )
         return Child.start(argv, self._env, keep_open=self._keep_open)
-
-    def _forget_logs(self) -> None:
-        if self._log_dir is not None:
-            shutil.rmtree(self._log_dir, ignore_errors=True)
-            self._log_dir = None
 
 
 def _prune(log_dir: Path) -> None:
