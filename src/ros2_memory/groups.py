@@ -13,7 +13,8 @@ from ros2_memory.model import TimeWindow
 from ros2_memory.timebase import MIN_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from ros2_memory.copies import Found, Holding
     from ros2_memory.model import BagFile
@@ -27,13 +28,15 @@ def groups_of(view: Streams, topic: str, window: TimeWindow) -> list[Group]:
     if view.received_twice([topic]) and holdings:
         return [Group(view, topic, window, holdings, received_twice=True)]
     groups: list[list[Holding]] = []
-    reach = MIN_NS
+    reach: dict[Path, Ns] = {}
     for held in holdings:
-        if groups and _belongs(held, groups[-1], reach):
+        reach = {each: last for each, last in reach.items() if last + COPY_HORIZON_NS >= held.first}
+        if groups and _belongs(held, reach):
             groups[-1].append(held)
         else:
             groups.append([held])
-        reach = max(reach, held.last)
+        recording = held.bag.recording
+        reach[recording] = max(reach.get(recording, MIN_NS), held.last)
     return [Group(view, topic, window, group, received_twice=False) for group in groups]
 
 
@@ -120,11 +123,15 @@ def _numbered(times: Iterable[Ns]) -> Iterator[tuple[Ns, int]]:
         yield moment, nth
 
 
-def _belongs(held: Holding, group: Sequence[Holding], reach: Ns) -> bool:
-    """Whether a bag can hold messages before, or copies of, the end of a group.
+def _belongs(held: Holding, reach: Mapping[Path, Ns]) -> bool:
+    """Whether a bag can hold messages before, or copies of, what the bags before it hold.
 
-    Splits of one recording that only share a timestamp stay apart: bag order already orders them.
+    `reach` is the last log time so far of each recording. Splits of one recording that only share
+    a timestamp stay apart: bag order already orders them.
     """
-    if all(each.bag.recording == held.bag.recording for each in group):
-        return held.first < reach
-    return held.first <= reach + COPY_HORIZON_NS
+    return any(
+        held.first < last
+        if recording == held.bag.recording
+        else held.first <= last + COPY_HORIZON_NS
+        for recording, last in reach.items()
+    )

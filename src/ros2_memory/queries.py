@@ -75,9 +75,9 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, 
 
 def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
     """What the memory spans, where it has holes, and which files do not answer."""
-    view = View(memory, call, memory.clock.now() if memory.limits.now == "wall" else None)
-    snapshot = view.snapshot
     now = memory.clock.now()
+    view = View(memory, call, now if memory.limits.now == "wall" else None)
+    snapshot = view.snapshot
     if memory.limits.now == "latest" and snapshot.latest is not None:
         now = snapshot.latest
     incomplete = tuple(
@@ -220,12 +220,13 @@ def find_last_match(
     With `before_s` (Unix seconds) only messages up to and including then are searched.
     """
     condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
-    view = View(memory, call, memory.clock.now())
+    now = memory.clock.now()
+    view = View(memory, call, now)
     found = last_match(view, topic, condition, _before(before_s))
     if found is None:
         return answers.Match(None, unsearched(view))
-    now = memory.clock.now() if memory.limits.now == "wall" else view.snapshot.latest
-    return answers.Match(_value(view, found, fields, now), view.notes)
+    counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
+    return answers.Match(_value(view, found, fields, counted_from), view.notes)
 
 
 def value_when(
@@ -410,7 +411,12 @@ def _note_edges(view: View, window: TimeWindow) -> None:
     asked_from = window.start + START_SLACK_NS
     if snapshot.earliest is not None and asked_from < snapshot.earliest:
         view.note(f"the memory begins at {moment(snapshot.earliest)}")
-    if snapshot.latest is not None and window.stop - 1 > snapshot.latest and snapshot.active:
+    asked_to = window.stop - 1 - AT_OR_BEFORE_SLACK_NS
+    if snapshot.latest is None or asked_to <= snapshot.latest:
+        return
+    if snapshot.active:
         view.note(
             f"the split being written is not included: nothing after {moment(snapshot.latest)}"
         )
+    else:
+        view.note(f"the memory ends at {moment(snapshot.latest)}")

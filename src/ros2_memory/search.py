@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from ros2_memory.absence import damaged_note, matching_topics, moment, undecodable
 from ros2_memory.candidates import Candidates
 from ros2_memory.copies import COPY_HORIZON_NS
-from ros2_memory.errors import QueryTimeoutError, UndecodableError
+from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.model import TimeWindow
+from ros2_memory.testable import untestable
 from ros2_memory.timebase import MIN_NS
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def last_match(view: View, pattern: str, condition: Condition, until: Ns) -> Fou
     """The newest match before a moment; what could not be tested is noted.
 
     Raises:
+        InvalidArgumentsError: no value of the topics can meet the condition.
         QueryTimeoutError: the call's time is over; says how far back was searched.
     """
     return _Search(view, pattern, condition).newest(until)
@@ -58,7 +60,30 @@ class _Search:
             (topic, type_name), failure = next(iter(self._failures.items()))
             raise undecodable(topic, type_name, failure)
         self._note_undecodable()
+        self._require_testable()
         return None
+
+    def _require_testable(self) -> None:
+        """Refuses to call "never" what no value of these topics can meet.
+
+        Raises:
+            InvalidArgumentsError: the newest value of none of the topics has what is tested.
+        """
+        refusals = [self._refusal(topic) for topic in self._topics]
+        reasons = [reason for reason in refusals if reason is not None]
+        if reasons and len(reasons) == len(refusals):
+            raise InvalidArgumentsError(f"{self._topics[0]}: {reasons[0]}")
+
+    def _refusal(self, topic: str) -> str | None:
+        found = self._view.newest(topic, TimeWindow.everything())
+        if found is None:
+            return None
+        try:
+            message = self._view.memory.reader.decode(found.record)
+        except UndecodableError:
+            return None
+        value = self._view.memory.extractor.exact(message, found.record.channel.type)
+        return untestable(self._condition, value)
 
     def _messages(self, stretch: Stretch) -> Iterator[Found]:
         """The messages of a stretch, newest first.

@@ -8,7 +8,7 @@ log time, however long ago that is.
 from __future__ import annotations
 
 import heapq
-from collections import deque
+from collections import Counter, deque
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
 """A latched message logged this long after it was published may have been received before."""
+_FEW_SOUGHT: Final = 8
 
 
 class Streams(Reading):
@@ -45,7 +46,8 @@ class Streams(Reading):
 
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
         super().__init__(memory, call, reach)
-        self._first_copies: dict[Copy, Ns] = {}
+        self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
+        self._sought: Counter[str] = Counter()
 
     def holdings(self, topics: Collection[str], window: TimeWindow) -> list[Holding]:
         """The bags that hold messages of these topics in the window, in order.
@@ -138,21 +140,34 @@ class Streams(Reading):
         record = found.record
         if not record.channel.latched or found.time - record.publish_time <= RECEIVED_AGAIN_NS:
             return False
-        key = copy_key(record)
+        topic, key = record.channel.topic, copy_key(record)
         if key not in self._first_copies:
-            topic = record.channel.topic
-            window = TimeWindow(max(record.publish_time - COPY_HORIZON_NS, MIN_NS), found.time)
-            holdings = self.holdings([topic], window)
-            earlier = self.merged(holdings, [topic], window, newest_first=False)
-            self._first_copies[key] = next(
-                (
-                    each.time
-                    for each in earlier
-                    if each.bag.recording != found.bag.recording and copy_key(each.record) == key
-                ),
-                found.time,
-            )
-        return found.time > self._first_copies[key]
+            self._sought[topic] += 1
+            if self._sought[topic] > _FEW_SOUGHT:
+                self._seek_all(topic)
+            else:
+                self._seek(topic, key, TimeWindow(record.publish_time, found.time))
+        first = self._first_copies.get(key, (found.time, found.bag.recording))
+        return found.time > first[0] and found.bag.recording != first[1]
+
+    def _seek(self, topic: str, key: Copy, window: TimeWindow) -> None:
+        """Remembers where a message was received first, from its publish time on."""
+        wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop + 1)
+        for each in self.merged(self.holdings([topic], wider), [topic], wider, newest_first=False):
+            if copy_key(each.record) == key:
+                self._first_copies[key] = (each.time, each.bag.recording)
+                return
+
+    def _seek_all(self, topic: str) -> None:
+        """The same for every message of a topic that has many: one pass in place of one for each.
+
+        So it is where publish times say nothing, such as those of a simulated clock.
+        """
+        everything = TimeWindow.everything()
+        holdings = self.holdings([topic], everything)
+        for each in self.merged(holdings, [topic], everything, newest_first=False):
+            first = (each.time, each.bag.recording)
+            self._first_copies.setdefault(copy_key(each.record), first)
 
     def merged(
         self,

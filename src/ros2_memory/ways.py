@@ -40,10 +40,13 @@ class Way:
 def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     """The way in a window by the poses of one topic; None where there is no message.
 
+    Messages that cannot be decoded are left out, with a note.
+
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
-        NoDataError: a message cannot be decoded.
+        NoDataError: no message can be decoded.
     """
+    failures: list[UndecodableError] = []
     builder = TrajectoryBuilder(max_plausible_speed_mps=view.memory.limits.max_plausible_speed_mps)
     digests = _Digests(view, topic)
     first: Ns | None = None
@@ -51,17 +54,23 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     for group in view.groups(topic, window):
         bag = group.whole()
         if bag is None or bag.state is not BagState.CLOSED:
-            span = _added(view, builder, group.once())
+            span = _added(view, builder, group.once(), failures)
         elif (digest := digests.of(bag)) is not None:
             builder.join(digest)
             held = group.holdings[0]
             span = (held.first, held.last)
         else:
             collector = PoseCollector(view.memory.limits.max_plausible_speed_mps)
-            span = _added(view, collector, group.once())
+            span = _added(view, collector, group.once(), failures)
             builder.join(collector.digest())
         if span is not None:
             first, last = (span[0] if first is None else first), span[1]
+    if failures:
+        error = failures[0]
+        if first is None:
+            raise undecodable(error.topic, error.type_name, error) from error
+        view.complete = False
+        view.note(f"poses left out, since they cannot be decoded: {len(failures)} ({error.reason})")
     if first is None or last is None:
         return None
     return Way(builder.result(), builder.frames, first, last)
@@ -89,14 +98,22 @@ class _Digests:
 
 
 def _added(
-    view: View, to: TrajectoryBuilder | PoseCollector, messages: Iterable[Found]
+    view: View,
+    to: TrajectoryBuilder | PoseCollector,
+    messages: Iterable[Found],
+    failures: list[UndecodableError],
 ) -> tuple[Ns, Ns] | None:
     """Adds the poses of messages, and gives the times of the first and last; None without any."""
     extractor = view.memory.extractor
     first: Ns | None = None
     last: Ns | None = None
     for found in messages:
-        message, type_name = decoded(view, found), found.record.channel.type
+        type_name = found.record.channel.type
+        try:
+            message = view.memory.reader.decode(found.record)
+        except UndecodableError as error:
+            failures.append(error)
+            continue
         pose, twist = extractor.pose(message, type_name), extractor.twist(message, type_name)
         if pose is None:
             raise InvalidArgumentsError(carries_no("position", found))

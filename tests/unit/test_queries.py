@@ -1,0 +1,158 @@
+"""Questions whose honest answer takes care."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import queries
+from ros2_memory.errors import InvalidArgumentsError, NoDataError, NoDataReason
+from ros2_memory.groups import groups_of
+from ros2_memory.history import View
+from ros2_memory.memory import Call
+from ros2_memory.model import TimeWindow
+from ros2_memory.moments import Moment, Span
+from tests.bags import McapLayout, Msg, boolean, detections, odom, text, write_mcap
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.model import JsonValue
+
+T0 = 1_700_000_000 * 10**9
+S = 10**9
+
+
+def span(start: float, end: float) -> Span:
+    return Span(start_s=T0 / 1e9 + start, end_s=T0 / 1e9 + end)
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "value", "field"),
+    [
+        ("/bumper", "equals", True, "data"),
+        ("/odom", "near_position", {"x": 1, "y": 0}, "pose.pose.position"),
+        ("/bumper", "near_position", {"x": 1, "y": 0}, None),
+    ],
+)
+def test_what_no_value_can_meet_is_refused_and_not_answered_with_never(
+    tmp_path: Path, topic: str, kind: str, value: JsonValue, field: str | None
+) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [boolean(T0, True), odom(T0, 1.0, 0.0)])
+    with pytest.raises(InvalidArgumentsError, match=topic):
+        queries.find_last_match(memory_of(tmp_path), Call(), topic, kind, value, field=field)
+
+
+def test_a_glob_is_refused_only_where_none_of_its_topics_can_meet_the_condition(
+    tmp_path: Path,
+) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [detections(T0, ["cup"]), text(T0, "a", "/vision/log")])
+    answer = queries.find_last_match(
+        memory_of(tmp_path), Call(), "/vision/*", "equals", "knife", field="detections.label"
+    )
+    assert answer.found is None
+    assert answer.notes == ()
+
+
+def test_nothing_seen_in_the_newest_message_does_not_make_a_field_unknown(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [detections(T0, [])])
+    answer = queries.find_last_match(
+        memory_of(tmp_path),
+        Call(),
+        "/vision/scene/scene_objects",
+        "equals",
+        "cup",
+        field="detections.label",
+    )
+    assert (answer.found, answer.notes) == (None, ())
+
+
+def test_a_pose_that_cannot_be_decoded_is_left_out_of_the_way_and_counted(tmp_path: Path) -> None:
+    poses = [odom(T0 + n * S, n, 0.0) for n in range(10)]
+    poses[5] = Msg("/odom", poses[5].type, T0 + 5 * S, b"\x00\x01\x00\x00")
+    write_mcap(tmp_path / "a" / "a_0.mcap", poses)
+    answer = queries.trajectory_summary(memory_of(tmp_path), Call(), span(0, 10))
+    assert (answer.trajectory.poses, answer.trajectory.distance_m) == (9, 9.0)
+    assert any("cannot be decoded: 1 " in note for note in answer.notes)
+
+
+def test_a_way_of_which_nothing_can_be_decoded_has_no_answer(tmp_path: Path) -> None:
+    broken = Msg("/odom", odom(T0, 0, 0).type, T0, b"\x00\x01\x00\x00")
+    write_mcap(tmp_path / "a" / "a_0.mcap", [broken])
+    with pytest.raises(NoDataError) as caught:
+        queries.trajectory_summary(memory_of(tmp_path), Call(), span(0, 10))
+    assert caught.value.reason is NoDataReason.UNDECODABLE
+
+
+def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [odom(T0 + n * S, n, 0.0) for n in range(3)])
+    memory = memory_of(tmp_path)
+    inside = queries.topic_range(memory, Call(), "/odom", span(0, 2))
+    assert inside.notes == ()
+    wider = queries.topic_range(memory, Call(), "/odom", span(-5, 900))
+    assert [note.partition(" at ")[0] for note in wider.notes] == [
+        "the memory begins",
+        "the memory ends",
+    ]
+
+
+def test_a_latched_copy_in_a_later_window_does_not_count_there(tmp_path: Path) -> None:
+    latched = McapLayout(latched=frozenset({"/dock"}))
+    docked = text(T0, "docked", "/dock")
+    again = Msg(docked.topic, docked.type, T0 + 600 * S, docked.body, docked.published)
+    write_mcap(tmp_path / "a" / "a_0.mcap", [docked], latched)
+    write_mcap(tmp_path / "b" / "b_0.mcap", [again, odom(T0 + 601 * S, 0, 0)], latched)
+    memory = memory_of(tmp_path)
+    with pytest.raises(NoDataError):
+        queries.topic_range(memory, Call(), "/dock", span(590, 610))
+    held = queries.topic_value(memory, Call(), "/dock", Moment(at_s=T0 / 1e9 + 605))
+    assert held.sample.time == T0
+
+
+def test_many_latched_messages_of_a_simulated_clock_count_once_each(tmp_path: Path) -> None:
+    latched = McapLayout(latched=frozenset({"/log"}))
+
+    def line(number: int, log_time: int) -> Msg:
+        return Msg("/log", text(0, "", "/log").type, log_time, text(0, str(number)).body, number)
+
+    write_mcap(tmp_path / "a" / "a_0.mcap", [line(n, T0 + n * S) for n in range(30)], latched)
+    write_mcap(
+        tmp_path / "b" / "b_0.mcap", [line(n, T0 + (100 + n) * S) for n in range(20, 40)], latched
+    )
+    rows = queries.list_recorded_topics(memory_of(tmp_path), Call())
+    assert [(row.topic, row.count) for row in rows] == [("/log", 40)]
+
+
+def test_bags_that_stand_apart_stay_apart_after_a_takeover(tmp_path: Path) -> None:
+    for name, begin in (("a", 0), ("b", 58)):
+        for split in range(6):
+            start = T0 + (begin + split * 10) * S
+            write_mcap(
+                tmp_path / name / f"{name}_{split}.mcap",
+                [odom(start + n * S, n, 0.0) for n in range(10)],
+            )
+    view = View(memory_of(tmp_path), Call())
+    sizes = [len(each.holdings) for each in groups_of(view, "/odom", TimeWindow.everything())]
+    assert sizes == [1, 1, 1, 1, 1, 2, 1, 1, 1, 1, 1]
+
+
+def test_the_clock_is_read_once_for_each_call(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [odom(T0, 0, 0)])
+
+    class Counting(SettableClock):
+        reads = 0
+
+        def now(self) -> int:
+            Counting.reads += 1
+            return super().now()
+
+    memory = memory_of(tmp_path)
+    counted = type(memory)(
+        memory.index, memory.reader, memory.extractor, Counting(T0 + 9 * S), memory.limits
+    )
+    answer = queries.find_last_match(counted, Call(), "/odom", "near_position", {"x": 0, "y": 0})
+    assert answer.found is not None
+    assert answer.found.age == 9 * S
+    assert Counting.reads == 1
