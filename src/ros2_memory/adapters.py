@@ -13,6 +13,7 @@ from hydra.utils import instantiate
 
 from ros2_memory.errors import ConfigError
 from ros2_memory.recorder.base import Recorder
+from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
 from ros2_memory.recorder.repair import Repairer
 from ros2_memory.recorder.retention import RetentionLimits
@@ -63,7 +64,7 @@ def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> H
     return InBackground(
         Housekeeping(
             bag_dir,
-            reader,
+            CountingReader(reader),
             McapWriter(),
             WallClock(),
             limits,

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory.adapters import build_reader, build_recorder
+from ros2_memory.adapters import build_housekeeper, build_reader, build_recorder
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.errors import ConfigError, EpisodicError
 from ros2_memory.logs import configure_logging
 from ros2_memory.recorder.daemon import Ticking, lock_and_prepare, record_until_told
 from ros2_memory.recorder.notify import ServiceManager
-from ros2_memory.recorder.ports import NoHousekeeping
 from ros2_memory.settings import NullRecorderNode
 
 if TYPE_CHECKING:
@@ -58,7 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _record(settings: Settings) -> None:
     bag_dir = settings.recording.bag_dir.absolute()
-    reader, housekeeper = build_reader(settings), NoHousekeeping()
+    reader = build_reader(settings)
+    housekeeper = build_housekeeper(settings, bag_dir, reader)
     lock = lock_and_prepare(bag_dir, reader, housekeeper, clear=settings.recording.clear_on_startup)
     try:
         recorder = build_recorder(
