@@ -82,8 +82,9 @@ class TestRetention:
     ) -> None:
         first, *_ = recording(tmp_path, "a", 0)
         left_open(tmp_path / "b" / "b_0.mcap", 100)
-        (tmp_path / ".episodic").mkdir()
-        (tmp_path / ".episodic/catalogue.sqlite").write_bytes(bytes(5000))
+        for name in (".episodic/catalogue.sqlite", ".ros_log/ros2_1.log"):
+            (tmp_path / name).parent.mkdir()
+            (tmp_path / name).write_bytes(bytes(5000))
         recording_now(tmp_path, "b")
         total = size_of(tmp_path)
         keeper_of(tmp_path, max_bytes=total).apply(tmp_path)

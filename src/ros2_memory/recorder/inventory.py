@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.recorder.layout import CARRY_FILE, LOCK_FILE, OWN_FILES, is_carried
+from ros2_memory.recorder.layout import CARRY_FILE, LOCK_FILE, OWN_FILES, ROS_LOG_DIR, is_carried
 from ros2_memory.recorder.removal import beside_bags
 from ros2_memory.recorder.retention import Span, Stock, StoredBag, StoredFile
 from ros2_memory.recorder.scan import other_form
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.scan import Stamp
     from ros2_memory.recorder.standing import FileNotes, Verdict
 
-DERIVED_FOLDER: Final = ".episodic"
-"""Where what is derived from bags is kept."""
+OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
+"""What is derived from bags, and what `ros2` logs."""
 SETTLED_NS: Final[Ns] = 120 * NS_PER_S
 """A directory that changed longer ago holds what it will hold."""
 _BLOCK: Final = 4096
@@ -177,8 +177,9 @@ class Inventory:
     def _own_bytes(self) -> int:
         """The size of what this program keeps beside the recordings."""
         own = [self._root / name for name in (*OWN_FILES, LOCK_FILE)]
-        with suppress(OSError):
-            own += (self._root / DERIVED_FOLDER).iterdir()
+        for folder in OWN_FOLDERS:
+            with suppress(OSError):
+                own += (self._root / folder).iterdir()
         size = 0
         for path in own:
             with suppress(OSError):
