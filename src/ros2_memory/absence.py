@@ -100,8 +100,14 @@ def not_recorded(view: View, name: str) -> NoDataError:
     return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}")
 
 
-def nothing_at(view: View, topics: tuple[str, ...], at: Ns, tolerance: Ns | None) -> NoDataError:
-    """No message of these topics at or shortly before a moment.
+def nothing_at(
+    view: View,
+    topics: tuple[str, ...],
+    at: Ns,
+    tolerance: Ns | None,
+    around: Ns | None = None,
+) -> NoDataError:
+    """No message of these topics at or shortly before a moment; with `around`, nor shortly after.
 
     The sentence names the nearest older and newer message with their distances, and what to do.
     """
@@ -109,6 +115,8 @@ def nothing_at(view: View, topics: tuple[str, ...], at: Ns, tolerance: Ns | None
     newer = next(view.stream(topics, TimeWindow(at + 1, TimeWindow.everything().stop)), None)
     names = " or ".join(topics)
     when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
+    if around is not None:
+        when = f"within {seconds(around)} of"
     told = [f"no message of {names} {when} {moment(at)}"]
     if older:
         told.append(
@@ -120,7 +128,8 @@ def nothing_at(view: View, topics: tuple[str, ...], at: Ns, tolerance: Ns | None
             f"the nearest newer one is {seconds(newer.time - at)} after it, at {moment(newer.time)}"
         )
     reason = NoDataReason.GAP if older and newer else beyond(view, at)
-    told.append(_advice(view, reason, at, older.time if older else None))
+    acceptable = older.time if older and tolerance is not None else None
+    told.append(_advice(view, reason, at, acceptable))
     return NoDataError(reason, "; ".join(told))
 
 

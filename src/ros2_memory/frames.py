@@ -137,15 +137,19 @@ def _explained(view: View, failure: NoDataError, at: Ns, *, nothing_near: bool) 
     """The failure of a lookup in its neighbourhood, said of the whole memory."""
     topics = _recorded(view, view.memory.limits.tf_topics)
     if topics and nothing_near:
-        return nothing_at(view, topics, at, None)
+        return nothing_at(view, topics, at, None, around=TF_CACHE_NS)
     if failure.reason in _OF_ALL_TIMES:
         return _of_then(failure, at)
     if failure.reason is not NoDataReason.OUTSIDE_RANGE:
         return failure
-    after = TimeWindow(at + 1, MAX_NS)
-    later = next(view.stream(topics, after), None) if topics else None
-    reason = NoDataReason.GAP if later else beyond(view, at)
-    return NoDataError(reason, failure.detail)
+    between = topics and all(
+        next(view.stream(topics, side, newest_first=newest_first), None)
+        for side, newest_first in (
+            (TimeWindow.until(at), True),
+            (TimeWindow(at + 1, MAX_NS), False),
+        )
+    )
+    return NoDataError(NoDataReason.GAP if between else beyond(view, at), failure.detail)
 
 
 def _of_stamps(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:

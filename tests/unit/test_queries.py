@@ -13,7 +13,17 @@ from ros2_memory.history import View
 from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow
 from ros2_memory.moments import Moment, Span
-from tests.bags import McapLayout, Msg, boolean, detections, odom, text, write_mcap
+from tests.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    detections,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
 from tests.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
@@ -156,3 +166,35 @@ def test_the_clock_is_read_once_for_each_call(tmp_path: Path) -> None:
     assert answer.found is not None
     assert answer.found.age == 9 * S
     assert Counting.reads == 1
+
+
+@pytest.mark.parametrize(
+    ("at", "reason"),
+    [
+        (-3.0, "outside_range"),
+        (-60.0, "outside_range"),
+        (23.0, "gap"),
+        (50.0, "gap"),
+        (109.0, "outside_range"),
+    ],
+)
+def test_why_there_is_no_transform_is_said_of_the_whole_memory(
+    tmp_path: Path, at: float, reason: str
+) -> None:
+    for name, begin in (("a", 0), ("b", 80)):
+        write_mcap(
+            tmp_path / name / f"{name}_0.mcap",
+            [
+                tf(
+                    T0 + n * S // 10,
+                    transform(T0 + n * S // 10, "odom", "base_link", (n, 0.0, 0.0)),
+                )
+                for n in range(begin * 10, begin * 10 + 200)
+            ],
+        )
+    with pytest.raises(NoDataError) as caught:
+        queries.transform(
+            memory_of(tmp_path), Call(), "odom", "base_link", Moment(at_s=T0 / 1e9 + at)
+        )
+    assert caught.value.reason == reason
+    assert "tolerance_s" not in caught.value.detail
