@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.adapters import build_reader
+from ros2_memory.catalogue import FILE, FOLDER, Catalogue
 from ros2_memory.config import load_message_schemas
+from ros2_memory.digest import DIGEST_VERSION, Digester
 from ros2_memory.dispatch import Dispatcher, EpisodicServer
 from ros2_memory.extract import SchemaExtractor
+from ros2_memory.filling import Filler
 from ros2_memory.instructions import instructions
 from ros2_memory.memory import Limits, Memory
+from ros2_memory.recall import Recall
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.replies import Replies
+from ros2_memory.settings import NullRecorderNode
 from ros2_memory.timebase import WallClock
 from ros2_memory.tools import build_tools
 
@@ -31,14 +41,66 @@ def build_memory(settings: Settings) -> Memory:
     """
     reader, clock = CountingReader(build_reader(settings)), WallClock()
     extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
+    bag_dir = settings.recording.bag_dir
+    catalogue = Catalogue(catalogue_places(settings), way_of_reading(settings), waits_for=bag_dir)
     index = IndexManager(
-        settings.recording.bag_dir,
+        bag_dir,
         reader,
         clock,
         refresh_s=settings.reader.index_refresh_s,
         split_duration_s=settings.recording.split_duration_s,
+        known=partial(catalogue.summaries, bag_dir),
     )
-    return Memory(index, reader, extractor, clock, limits_of(settings))
+    recall = Recall(catalogue, bag_dir)
+    return Memory(index, reader, extractor, clock, limits_of(settings), recall)
+
+
+def catalogue_places(settings: Settings) -> tuple[Path, ...]:
+    """Where the catalogue may lie, best first: beside the bags only where they are recorded."""
+    bag_dir = settings.recording.bag_dir
+    beside = bag_dir / FOLDER / FILE
+    places = () if isinstance(settings.recorder, NullRecorderNode) else (beside,)
+    given = os.environ.get("XDG_CACHE_HOME")
+    try:
+        cache = Path(given) if given else Path.home() / ".cache"
+    except RuntimeError:  # a user without a home
+        return places
+    name = hashlib.sha256(os.fsencode(bag_dir.absolute())).hexdigest()[:16]
+    return (*places, cache / _PACKAGE / name / FILE) if cache.is_absolute() else places
+
+
+def way_of_reading(settings: Settings) -> str:
+    """A hash of all that digests depend on besides the bags: settings, definitions, this program.
+
+    Raises:
+        ConfigError: the schema map is refused.
+    """
+    folders = [str(folder) for folder in settings.storage.custom_msg_paths]
+    definitions = [
+        (str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns)
+        for folder in settings.storage.custom_msg_paths
+        for path in sorted(Path(folder).rglob("*.msg"))
+    ]
+    schemas = load_message_schemas(settings)
+    depends_on = (
+        package_version(),
+        DIGEST_VERSION,
+        settings.storage.target,
+        folders,
+        definitions,
+        {name: dict(fields) for name, fields in schemas.items()},
+        settings.data.max_array_length,
+        settings.data.max_plausible_speed_mps,
+    )
+    return hashlib.sha256(json.dumps(depends_on).encode()).hexdigest()[:16]
+
+
+def build_filler(settings: Settings, memory: Memory) -> Filler:
+    """What fills the catalogue of a memory."""
+    limit = memory.limits.max_plausible_speed_mps
+    return Filler(
+        memory, Digester(memory.reader, memory.extractor, limit), settings.recording.bag_dir
+    )
 
 
 def limits_of(settings: Settings) -> Limits:

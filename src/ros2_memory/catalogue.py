@@ -10,6 +10,7 @@ not used twice.
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import threading
 from contextlib import suppress
@@ -29,6 +30,7 @@ from ros2_memory.catalogue_sql import (
 from ros2_memory.digest import EdgeDigest
 from ros2_memory.logs import get_logger
 from ros2_memory.packing import Shape, unpacked_poses
+from ros2_memory.recorder.standing import FormerFile
 from ros2_memory.storage.base import Channel, Record, Schema
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.catalogue_file import Opened
     from ros2_memory.digest import Digest
     from ros2_memory.evidence import Evidence
-    from ros2_memory.model import BagFile, BagSummary
+    from ros2_memory.model import BagFile
     from ros2_memory.motion import PoseDigest
     from ros2_memory.timebase import Ns
 
@@ -64,13 +66,6 @@ class BagKey(NamedTuple):
         return cls(relative(bag.path, bag_dir), bag.size, bag.mtime_ns, bag.sidecar_ns)
 
 
-class KnownBag(NamedTuple):
-    """An entry's file and its summary."""
-
-    key: BagKey
-    summary: BagSummary
-
-
 class Catalogue:
     """Keeps digests under one configuration. Safe for several threads and several processes.
 
@@ -79,23 +74,31 @@ class Catalogue:
     Args:
         places: where the file may lie, in order of preference; memory where none can be written.
         config: what digests depend on besides the bag, as a hash.
+        waits_for: a directory; until it exists, nothing is opened or made.
     """
 
-    def __init__(self, places: Sequence[Path], config: str) -> None:
+    def __init__(
+        self, places: Sequence[Path], config: str, *, waits_for: Path | None = None
+    ) -> None:
         self._config = config
         self._lock = threading.Lock()
         self._places = tuple(places)
-        self._opened: Opened | None = open_base(self._places)
+        self._waits_for = waits_for
+        self._closed = False
+        self._opened: Opened | None = None
         self._channels: dict[int, Channel] = {}
 
     @property
     def path(self) -> Path | None:
-        """Where the file lies; None in memory."""
-        return None if self._opened is None else self._opened.path
+        """Where the file lies; None in memory, and before there is one."""
+        with self._lock:
+            opened = self._ready()
+        return None if opened is None else opened.path
 
     def close(self) -> None:
         """Ends; afterwards nothing is known of any bag."""
         with self._lock:
+            self._closed = True
             if self._opened is not None:
                 self._opened.base.close()
                 self._opened = None
@@ -108,22 +111,32 @@ class Catalogue:
 
         return self._read(ask, 0)
 
-    def summaries(self) -> dict[str, KnownBag]:
-        """What is known of every file, by path."""
+    def summaries(self, bag_dir: Path) -> dict[str, FormerFile]:
+        """What is known of every file below the bag directory, by its whole path."""
+        root = f"{bag_dir}{os.sep}"
 
-        def ask(base: sqlite3.Connection) -> dict[str, KnownBag]:
+        def ask(base: sqlite3.Connection) -> dict[str, FormerFile]:
             shapes = {
                 number: Shape(text) for number, text in base.execute("SELECT id, text FROM shapes")
             }
             return {
-                path: KnownBag(BagKey(path, *stamp), shapes[shape].filled(counts))
-                for path, *stamp, shape, counts in base.execute(
+                root + path: FormerFile(size, mtime, sidecar, shapes[shape].filled(counts))
+                for path, size, mtime, sidecar, shape, counts in base.execute(
                     "SELECT path, size, mtime, sidecar, shape, counts FROM bags WHERE config = ?",
                     (self._config,),
                 )
             }
 
         return self._read(ask, {})
+
+    def paths(self) -> list[str]:
+        """The files that have an entry, below the bag directory."""
+
+        def ask(base: sqlite3.Connection) -> list[str]:
+            rows = base.execute("SELECT path FROM bags WHERE config = ?", (self._config,))
+            return [row[0] for row in rows]
+
+        return self._read(ask, [])
 
     def find(self, keys: Sequence[BagKey]) -> list[int | None]:
         """The number of each file's entry; None where there is none, or it is of other bytes."""
@@ -266,10 +279,11 @@ class Catalogue:
     def _read(self, ask: Callable[[sqlite3.Connection], T], unknown: T) -> T:
         """What the base says; `unknown` where it cannot be asked."""
         with self._lock:
-            if self._opened is None:
+            opened = self._ready()
+            if opened is None:
                 return unknown
             try:
-                return ask(self._opened.base)
+                return ask(opened.base)
             # Rows of a damaged file hold anything.
             except (sqlite3.Error, ValueError, TypeError, LookupError) as error:
                 self._failed(error)
@@ -277,9 +291,10 @@ class Catalogue:
 
     def _write(self, write: Callable[[sqlite3.Connection], None]) -> bool:
         with self._lock:
-            if self._opened is None:
+            opened = self._ready()
+            if opened is None:
                 return False
-            base = self._opened.base
+            base = opened.base
             try:
                 base.execute("BEGIN IMMEDIATE")
                 write(base)
@@ -296,22 +311,36 @@ class Catalogue:
                 return False
             return True
 
+    def _ready(self) -> Opened | None:
+        """The open base; None where there is none yet, or no more."""
+        if self._opened is None and not self._closed:
+            if self._waits_for is not None and not self._waits_for.is_dir():
+                return None
+            self._opened = open_base(self._places)
+        return self._opened
+
     def _failed(self, error: Exception) -> None:
         """A base that is only busy or full is asked again; any other is set aside."""
+        opened = self._opened
+        path = None if opened is None else opened.path
         if isinstance(error, sqlite3.OperationalError):
-            log.warning("catalogue_failed", path=str(self.path), reason=str(error))
+            log.warning("catalogue_failed", path=str(path), reason=str(error))
             return
-        opened, self._opened = self._opened, None
+        self._opened = None
         self._channels = {}
         if opened is not None:
             opened.base.close()
             if opened.path is not None:
                 set_aside(opened.path, f"it is damaged: {error}")
-        self._opened = open_base(self._places)
 
 
 def relative(path: Path, bag_dir: Path) -> str:
     """A file as entries name it, so that the bag directory can be moved."""
-    below = str(path.relative_to(bag_dir)) if path.is_relative_to(bag_dir) else str(path)
+    return below(str(path), str(bag_dir))
+
+
+def below(path: str, bag_dir: str) -> str:
+    """As `relative`, of texts: of 60,000 at once."""
+    inner = path.removeprefix(f"{bag_dir.rstrip(os.sep)}{os.sep}")
     # A name that is no UTF-8 would be no text for SQLite.
-    return below.encode("utf-8", "backslashreplace").decode()
+    return inner if inner.isascii() else inner.encode("utf-8", "backslashreplace").decode()

@@ -9,8 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.config import load_settings
 from ros2_memory.demo.run import DemoOptions, run_demo
-from ros2_memory.errors import EpisodicError
+from ros2_memory.errors import ConfigError, EpisodicError
+from ros2_memory.indexing import Bar, fill, orphaned, step_back
+from ros2_memory.logs import configure_logging
 from ros2_memory.recovery import recover
 
 if TYPE_CHECKING:
@@ -29,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     and stderr says why; 130: interrupted before it was done.
     """
     arguments = _parser().parse_args(argv)
-    run = _recover if arguments.command == "recover" else _demo
+    run = {"demo": _demo, "index": _index, "recover": _recover}[arguments.command]
     try:
         with _ended_like_ctrl_c(signal.SIGTERM, signal.SIGHUP):
             return run(arguments)
@@ -54,6 +58,23 @@ def _demo(arguments: argparse.Namespace) -> int:
 def _recover(arguments: argparse.Namespace) -> int:
     outcome = recover(arguments.path, _say, force=arguments.force)
     return _NOT_REPAIRED if outcome.failed else 0
+
+
+def _index(arguments: argparse.Namespace) -> int:
+    settings = load_settings(arguments.overrides)
+    serving: bool = arguments.for_server
+    configure_logging(settings.logging.level if serving else "warning", settings.logging.format)
+    memory = build_memory(settings)
+    filler = build_filler(settings, memory)
+    if serving:
+        step_back()
+    elif filler.in_memory:
+        raise ConfigError(
+            "no catalogue can be written, neither beside the bags nor in the cache folder: "
+            "give XDG_CACHE_HOME a folder that can be"
+        )
+    fill(filler, None if serving else Bar(), orphaned() if serving else lambda: False)
+    return 0
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -89,6 +110,16 @@ def _parser() -> argparse.ArgumentParser:
         help="seconds of history that exist when the questions are asked (%(default)s)",
     )
     demo.add_argument("--verbose", action="store_true", help="show the server's log on stderr")
+    indexing = commands.add_parser(
+        "index",
+        help="look into every bag once, so that questions about a week take milliseconds",
+        description="Fills the catalogue of the bags at once, with the settings of the server. The "
+        "server does the same by itself, in the background; no answer depends on it.",
+    )
+    indexing.add_argument(
+        "overrides", nargs="*", metavar="key=value", help="settings, as for ros2-memory-server"
+    )
+    indexing.add_argument("--for-server", action="store_true", help=argparse.SUPPRESS)
     recovering = commands.add_parser(
         "recover",
         help="repair MCAP files that a crash, a full disk or a pulled plug left unfinished",
@@ -124,3 +155,7 @@ def _ended_like_ctrl_c(*signals: signal.Signals) -> Iterator[None]:
 
 def _say(line: str) -> None:
     print(line, flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

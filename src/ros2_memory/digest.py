@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader, Record
     from ros2_memory.timebase import Ns
 
+DIGEST_VERSION: Final = 1
+"""Of what is found in a bag and how; another one has every bag digested again."""
 MOST_KEPT: Final = 64
 """Messages that are kept whole of a topic that has few: latched ones, and transforms."""
 MOST_KEPT_BYTES: Final = 1 << 20

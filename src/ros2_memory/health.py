@@ -12,6 +12,7 @@ from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.timebase import Ns, unix_from_ns, unix_rounded_up
 
 if TYPE_CHECKING:
+    from ros2_memory.filling import Filler
     from ros2_memory.fitting import JsonObject
     from ros2_memory.memory import Memory
     from ros2_memory.recorder.heartbeat import Heartbeat
@@ -33,17 +34,24 @@ async def keep_fresh(memory: Memory, every_s: float) -> None:
         await anyio.sleep(every_s)
 
 
-async def health(memory: Memory, version: str, patience_s: float = PATIENCE_S) -> JsonObject:
+async def health(
+    memory: Memory,
+    version: str,
+    filler: Filler | None = None,
+    patience_s: float = PATIENCE_S,
+) -> JsonObject:
     """How the server is: `ok`, or `degraded` with the reasons in `problems`.
 
     An empty memory is no problem. Times are Unix seconds.
     """
     with anyio.move_on_after(patience_s):
-        return await anyio.to_thread.run_sync(_health, memory, version, abandon_on_cancel=True)
+        return await anyio.to_thread.run_sync(
+            _health, memory, version, filler, abandon_on_cancel=True
+        )
     return _status(version, ["the bag directory is being looked through"], {})
 
 
-def _health(memory: Memory, version: str) -> JsonObject:
+def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
     heartbeat = memory.index.heartbeat()
@@ -55,6 +63,13 @@ def _health(memory: Memory, version: str) -> JsonObject:
         "damaged": len(snapshot.damaged),
         "index_age_s": _seconds(now - snapshot.scanned_at),
     }
+    if filler is not None:
+        progress = filler.progress()
+        shown["catalogue"] = {
+            "bags": progress.closed - progress.waiting - progress.refused,
+            "waiting": progress.waiting,
+            "refused": progress.refused,
+        }
     if heartbeat is not None:
         shown["recorder"] = {
             "state": str(heartbeat.state),

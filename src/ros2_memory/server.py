@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Final, NoReturn
 import anyio
 import uvicorn
 
-from ros2_memory.bootstrap import build_memory, build_server, package_version
+from ros2_memory.bootstrap import build_filler, build_memory, build_server, package_version
 from ros2_memory.config import exit_on_config_error, load_settings
+from ros2_memory.filling import keep_filled
 from ros2_memory.health import health, keep_fresh
 from ros2_memory.http import STREAM_PATH, web_app
 from ros2_memory.logs import configure_logging, get_logger
@@ -31,7 +32,9 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from ros2_memory.dispatch import EpisodicServer
+    from ros2_memory.filling import Filler
     from ros2_memory.http import Background, WebApp
+    from ros2_memory.memory import Memory
     from ros2_memory.settings import ServerSettings
 
 PROGRAM: Final = "ros2-memory-server"
@@ -61,7 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         configure_logging(settings.logging.level, settings.logging.format)
         memory = build_memory(settings)
         server = build_server(settings, memory)
-    background = partial(keep_fresh, memory, settings.reader.index_refresh_s)
+    filler = build_filler(settings, memory)
+    background = partial(_in_background, memory, filler, settings.reader.index_refresh_s, overrides)
     log.info(
         "starting",
         version=package_version(),
@@ -76,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             app = web_app(
                 server,
                 host=settings.server.host,
-                health=partial(health, memory, package_version()),
+                health=partial(health, memory, package_version(), filler),
                 background=background,
             )
             _serve_http(server, app, settings.server)
@@ -130,6 +134,16 @@ def _left(code: int) -> int:
         sys.stderr.flush()
         os._exit(code)
     return code
+
+
+async def _in_background(
+    memory: Memory, filler: Filler, every_s: float, overrides: Sequence[str]
+) -> None:
+    """Keeps the index fresh and the catalogue full, until it is cancelled."""
+    helper = [sys.executable, "-m", "ros2_memory.cli", "index", "--for-server", "--", *overrides]
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(keep_fresh, memory, every_s)
+        tasks.start_soon(keep_filled, filler, helper, every_s)
 
 
 async def _serve_stdio(server: EpisodicServer, background: Background) -> None:

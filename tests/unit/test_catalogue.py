@@ -49,6 +49,12 @@ def catalogue_in(folder: Path, config: str = "config") -> Catalogue:
     return Catalogue([folder / FOLDER / FILE], config)
 
 
+def made(folder: Path) -> None:
+    catalogue = catalogue_in(folder)
+    assert catalogue.path is not None
+    catalogue.close()
+
+
 def holds(catalogue: Catalogue, key: BagKey = KEY) -> bool:
     return catalogue.find([key]) != [None]
 
@@ -60,7 +66,8 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     again = catalogue_in(tmp_path)
     [number] = again.find([KEY])
     assert number is not None
-    assert again.summaries() == {KEY.path: (KEY, DIGEST.summary)}
+    path = str(tmp_path / KEY.path)
+    assert again.summaries(tmp_path) == {path: (*KEY[1:], DIGEST.summary)}
     for held in DIGEST.topics:
         evidence = again.evidence(held.topic, [number])[number]
         assert set(evidence.numbers or ()) == set(held.evidence.numbers or ())
@@ -139,6 +146,7 @@ def test_a_damaged_file_is_set_aside_and_made_anew(tmp_path: Path, content: byte
     path.write_bytes(content)
     with structlog.testing.capture_logs() as logs:
         catalogue = catalogue_in(tmp_path)
+        assert catalogue.newest() == 0
     assert [event["event"] for event in logs] == ["catalogue_set_aside"]
     assert path.with_name(f"{FILE}.aside").read_bytes() == content
     assert catalogue.put(KEY, DIGEST)
@@ -160,12 +168,13 @@ def test_a_file_that_turns_out_damaged_while_it_is_asked_is_set_aside_then(tmp_p
 
 
 def test_a_file_of_a_newer_version_is_set_aside(tmp_path: Path) -> None:
-    catalogue_in(tmp_path).close()
+    made(tmp_path)
     path = tmp_path / FOLDER / FILE
     with closing(sqlite3.connect(path)) as base:
         base.execute("PRAGMA user_version = 99")
     with structlog.testing.capture_logs() as logs:
         catalogue = catalogue_in(tmp_path)
+        assert catalogue.newest() == 0
     assert [event["event"] for event in logs] == ["catalogue_set_aside"]
     assert "version 99" in logs[0]["reason"]
     assert catalogue.path == path
@@ -176,12 +185,13 @@ def test_a_locked_file_is_left_alone_and_memory_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ros2_memory.catalogue_file._BUSY_S", 0.01)
-    catalogue_in(tmp_path).close()
+    made(tmp_path)
     path = tmp_path / FOLDER / FILE
     with closing(sqlite3.connect(path, isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
         with structlog.testing.capture_logs() as logs:
             catalogue = catalogue_in(tmp_path)
+            assert catalogue.newest() == 0
         assert [event["event"] for event in logs] == ["catalogue_locked"]
         assert catalogue.path is None
         assert catalogue.put(KEY, DIGEST)
@@ -240,3 +250,14 @@ def test_a_name_that_is_no_text_can_be_kept(tmp_path: Path) -> None:
     catalogue = catalogue_in(tmp_path)
     assert catalogue.put(key, DIGEST)
     assert holds(catalogue, key)
+
+
+def test_nothing_is_made_before_the_bag_directory_exists(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    catalogue = Catalogue([bag_dir / FOLDER / FILE], "config", waits_for=bag_dir)
+    assert not catalogue.put(KEY, DIGEST)
+    assert catalogue.path is None
+    assert not bag_dir.exists()
+    bag_dir.mkdir()
+    assert catalogue.put(KEY, DIGEST)
+    assert holds(catalogue)

@@ -26,7 +26,7 @@ from ros2_memory.recorder.standing import FileNotes, Scene, Standing, judge
 from ros2_memory.timebase import ms_from_ns, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from structlog.typing import FilteringBoundLogger
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.disposal import Disposal
     from ros2_memory.recorder.heartbeat import Heartbeat
     from ros2_memory.recorder.scan import Stamp, Walked
-    from ros2_memory.recorder.standing import Verdict
+    from ros2_memory.recorder.standing import FormerFile, Verdict
     from ros2_memory.storage.base import BagReader
     from ros2_memory.timebase import Clock, Ns
 
@@ -59,7 +59,9 @@ class IndexManager:
 
     `refresh_s` is how old a snapshot may become before a question has it renewed;
     `split_duration_s` is how long the recorder writes one file. `disposal` deletes bags by its
-    limits when it is told to; without it nothing here deletes anything.
+    limits when it is told to; without it nothing here deletes anything. `known` tells, by path, of
+    closed files that were read earlier: a scan that begins anew does not read them again while they
+    look as they did.
     """
 
     def __init__(
@@ -71,8 +73,10 @@ class IndexManager:
         refresh_s: float,
         split_duration_s: float,
         disposal: Disposal | None = None,
+        known: Callable[[], Mapping[str, FormerFile]] | None = None,
     ) -> None:
         self._bag_dir = bag_dir
+        self._known = known
         self._disposal = disposal
         self._reader = reader
         self._clock = clock
@@ -198,11 +202,15 @@ class IndexManager:
     def _examine(self, stamps: dict[str, Stamp], scene: Scene) -> set[str]:
         """Judges these files; gives those of which the verdict changed."""
         changed = set()
+        known = self._known() if self._known is not None and not self._files else {}
         for path, stamp in stamps.items():
             notes = self._files.get(path)
             if notes is None:
                 notes = FileNotes.first(Path(path), stamp, scene.now)
                 self._files[path] = notes
+                file = known.get(path)
+                if file is not None and notes.trusted and file.looks_like(stamp):
+                    notes.recall(file.summary)
             elif not notes.look(stamp, scene.now) and path not in self._watched:
                 continue
             try:

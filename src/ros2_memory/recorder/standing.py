@@ -23,7 +23,7 @@ import sys
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.errors import BagError, BagVanishedError
 from ros2_memory.model import BagFile, BagState, BagSummary, SetAside, TopicSummary
@@ -99,6 +99,23 @@ class Scene:
         return path.name in self._finished[folder]
 
 
+class FormerFile(NamedTuple):
+    """A closed file as it looked when it was read, and what it held then."""
+
+    size: int
+    mtime_ns: Ns
+    sidecar_ns: Ns
+    summary: BagSummary
+
+    def looks_like(self, stamp: Stamp) -> bool:
+        """Whether a file still looks as it did."""
+        return (self.size, self.mtime_ns, self.sidecar_ns) == (
+            stamp.size,
+            stamp.mtime_ns,
+            stamp.sidecar_ns,
+        )
+
+
 @dataclass(slots=True)
 class FileNotes:
     """What is known of one bag file, from outside and, as far as it was read, from inside."""
@@ -117,6 +134,10 @@ class FileNotes:
     def first(cls, path: Path, stamp: Stamp, now: Ns) -> FileNotes:
         """The notes of a bag file that was not known before."""
         return cls(path, bag_kind(path.name) or "", stamp, now, settled(stamp.mtime_ns, now))
+
+    def recall(self, summary: BagSummary) -> None:
+        """Takes in what was found earlier in a closed file that looked just like this one."""
+        self.closing, self.summary = Closing.CLOSED, _shared(summary)
 
     def look(self, stamp: Stamp, now: Ns) -> bool:
         """Takes in how the file looks at this scan, and forgets what may not hold any more.

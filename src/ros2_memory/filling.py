@@ -1,0 +1,203 @@
+"""Fills the catalogue: every closed bag that has no entry is digested, the newest first.
+
+A kill at any moment loses at most the bag under way: entries are written whole or not at all.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import anyio
+import anyio.to_thread
+
+from ros2_memory.catalogue import BagKey
+from ros2_memory.errors import BagError
+from ros2_memory.logs import get_logger
+from ros2_memory.memory import Call
+from ros2_memory.model import BagState
+from ros2_memory.queries import list_recorded_topics
+from ros2_memory.recall import bags_without_entry
+from ros2_memory.recorder.layout import HANDOVER_FILE
+from ros2_memory.recorder.scan import settled
+from ros2_memory.timebase import ms_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from ros2_memory.digest import Digester
+    from ros2_memory.memory import Memory
+    from ros2_memory.model import BagFile
+    from ros2_memory.timebase import Ns
+
+log = get_logger(__name__)
+
+BACKLOG: Final = 8
+"""More bags than these are digested by a program of its own, so that answers stay fast."""
+TIDY_S: Final = 600.0
+"""How often entries are looked through for files that are gone."""
+
+_MOST_REFUSED: Final = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How many closed bags there are, and how many of them are still to be digested.
+
+    `refused` cannot be digested: they are read whenever a question is about them.
+    """
+
+    closed: int
+    waiting: int
+    refused: int
+
+    def after(self, more: int) -> Progress:
+        """When some more have been digested."""
+        return Progress(self.closed, self.waiting - more, self.refused)
+
+
+class Filler:
+    """Digests the bags of one memory. Not for several threads at once, but for `progress`."""
+
+    def __init__(self, memory: Memory, digester: Digester, bag_dir: Path) -> None:
+        self._memory = memory
+        self._digester = digester
+        self._bag_dir = bag_dir
+        self._refused: dict[BagKey, str] = {}
+
+    def waiting(self) -> list[BagFile]:
+        """The bags to be digested, the newest first."""
+        recall = self._memory.recall
+        if recall is None:
+            return []
+        missing = bags_without_entry(self._memory.index.snapshot().runs, recall)
+        return [bag for bag in reversed(missing) if self._key(bag) not in self._refused]
+
+    def progress(self) -> Progress:
+        """How far the catalogue is."""
+        bags = self._memory.index.snapshot().bags
+        closed = sum(bag.state is BagState.CLOSED for bag in bags)
+        return Progress(closed, len(self.waiting()), len(self._refused))
+
+    def digest(self, bag: BagFile) -> bool:
+        """Digests one bag; False where it must wait, was changed meanwhile, or is refused."""
+        recall = self._memory.recall
+        if recall is None or not self._looks_like_itself(bag):
+            return False
+        begun = time.perf_counter_ns()
+        try:
+            digest = self._digester.digest(bag.path)
+        except BagError as error:
+            self._refuse(bag, error.reason)
+            return False
+        except Exception as error:
+            log.exception("digest_failed", path=str(bag.path))
+            self._refuse(bag, type(error).__name__)
+            return False
+        if digest.summary != bag.summary or not self._looks_like_itself(bag):
+            return False
+        if not recall.catalogue.put(self._key(bag), digest):
+            return False
+        log.debug(
+            "bag_digested",
+            path=str(bag.path),
+            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+        )
+        return True
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether no other process could see what is written."""
+        recall = self._memory.recall
+        return recall is None or recall.catalogue.path is None
+
+    def warm(self) -> None:
+        """Counts each topic, so that where recordings overlap is known before somebody asks."""
+        list_recorded_topics(self._memory, Call())
+
+    def tidy(self) -> None:
+        """Drops the entries of files that are gone, and those of other configurations."""
+        recall = self._memory.recall
+        snapshot = self._memory.index.snapshot()
+        if recall is None or snapshot.problem is not None:
+            return
+        there = {self._key(bag).path for run in snapshot.runs for bag in run.bags}
+        recall.catalogue.forget([path for path in recall.catalogue.paths() if path not in there])
+        recall.catalogue.forget_other_configurations()
+
+    def _looks_like_itself(self, bag: BagFile) -> bool:
+        """Whether the file and its sidecar look as the index saw them, and long enough so."""
+        try:
+            stat = os.lstat(bag.path)
+        except OSError:
+            return False
+        sidecar_ns = _mtime_ns(bag.path.with_name(HANDOVER_FILE))
+        now = self._memory.clock.now()
+        return (stat.st_size, stat.st_mtime_ns, sidecar_ns) == (
+            bag.size,
+            bag.mtime_ns,
+            bag.sidecar_ns,
+        ) and (settled(stat.st_mtime_ns, now) and settled(sidecar_ns, now))
+
+    def _refuse(self, bag: BagFile, reason: str) -> None:
+        log.warning("bag_not_digested", path=str(bag.path), reason=reason)
+        if len(self._refused) >= _MOST_REFUSED:
+            self._refused.clear()
+        self._refused[self._key(bag)] = reason
+
+    def _key(self, bag: BagFile) -> BagKey:
+        return BagKey.of(bag, self._bag_dir)
+
+
+async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> None:
+    """Digests what has closed, every `every_s` seconds, until it is cancelled.
+
+    `helper` is the command line of the program that digests a backlog (`ros2-memory index`).
+    """
+    tidied = -math.inf
+    while True:
+        try:
+            waiting = await anyio.to_thread.run_sync(filler.waiting, abandon_on_cancel=True)
+            if len(waiting) <= BACKLOG or filler.in_memory or not await _helped(helper):
+                await _digest(filler, waiting[:BACKLOG])
+            if time.monotonic() - tidied > TIDY_S:
+                await anyio.to_thread.run_sync(filler.tidy, abandon_on_cancel=True)
+                tidied = time.monotonic()
+        except Exception:
+            log.exception("filling_failed")
+        await anyio.sleep(every_s)
+
+
+async def _digest(filler: Filler, bags: Sequence[BagFile]) -> None:
+    done = 0
+    for bag in bags:
+        done += await anyio.to_thread.run_sync(filler.digest, bag, abandon_on_cancel=True)
+    if done:
+        await anyio.to_thread.run_sync(filler.warm, abandon_on_cancel=True)
+
+
+async def _helped(helper: Sequence[str]) -> bool:
+    """Runs the helper to its end; whether it did its work. Cancelling ends it."""
+    try:
+        async with await anyio.open_process(
+            helper, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=None
+        ) as process:
+            code = await process.wait()
+    except OSError as error:
+        log.warning("filling_helper_failed", reason=str(error))
+        return False
+    if code:
+        log.warning("filling_helper_failed", reason=f"it ended with exit code {code}")
+    return code == 0
+
+
+def _mtime_ns(path: Path) -> Ns:
+    try:
+        return os.lstat(path).st_mtime_ns
+    except OSError:
+        return 0
