@@ -132,6 +132,9 @@ ConditionValue: TypeAlias = Annotated[
 SearchField: TypeAlias = Annotated[
     _Text, Field(description="Dot-path in value that alone is tested.")
 ]
+Before: TypeAlias = Annotated[
+    _Unix, Field(description="Unix seconds; search only up to then, e.g. to go on after a timeout.")
+]
 
 
 class Arguments(BaseModel):
@@ -247,6 +250,7 @@ class Search(Arguments):
     value: ConditionValue
     field: SearchField | None = None
     fields: Fields = ()
+    before: Before | None = None
 
 
 class Correlation(Arguments):
@@ -258,6 +262,7 @@ class Correlation(Arguments):
     value: ConditionValue
     field: SearchField | None = None
     fields: Fields = ()
+    before: Before | None = None
 
 
 class WayOver(Arguments):

@@ -16,11 +16,13 @@ from ros2_memory.errors import (
 )
 from ros2_memory.fitting import compact, fit
 from ros2_memory.shapes import Answer, file_name, shown
+from ros2_memory.timebase import unix_rounded_up
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.fitting import JsonObject
+    from ros2_memory.model import JsonValue
 
 _HOW_TO_NARROW: Final = "narrow the list with pattern, a glob such as /vision/*"
 
@@ -58,6 +60,10 @@ class Replies:
                 return self._no_data(error.reason, error.detail)
             case UndecodableError():
                 return self._no_data(NoDataReason.UNDECODABLE, str(error))
+            case QueryTimeoutError(searched_back_to=int(back_to)):
+                return self._failure(
+                    error.code, str(error), searched_back_to=unix_rounded_up(back_to)
+                )
             case InvalidArgumentsError() | QueryTimeoutError():
                 return self._failure(error.code, str(error))
             case BagError():
@@ -78,5 +84,6 @@ class Replies:
         shown: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
         return Reply(fit(shown, self.max_chars))
 
-    def _failure(self, code: str, detail: str) -> Reply:
-        return Reply(fit({"error": code, "detail": detail}, self.max_chars), is_error=True)
+    def _failure(self, code: str, detail: str, **more: JsonValue) -> Reply:
+        shown: JsonObject = {"error": code, **more, "detail": detail}
+        return Reply(fit(shown, self.max_chars), is_error=True)

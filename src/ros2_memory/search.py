@@ -10,7 +10,7 @@ from ros2_memory.candidates import Candidates
 from ros2_memory.copies import COPY_HORIZON_NS
 from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.model import TimeWindow
-from ros2_memory.testable import untestable
+from ros2_memory.testable import can_be_untestable, untestable
 from ros2_memory.timebase import MIN_NS
 
 if TYPE_CHECKING:
@@ -69,10 +69,15 @@ class _Search:
         Raises:
             InvalidArgumentsError: the newest value of none of the topics has what is tested.
         """
-        refusals = [self._refusal(topic) for topic in self._topics]
-        reasons = [reason for reason in refusals if reason is not None]
-        if reasons and len(reasons) == len(refusals):
-            raise InvalidArgumentsError(f"{self._topics[0]}: {reasons[0]}")
+        if not can_be_untestable(self._condition):
+            return
+        first: str | None = None
+        for topic in self._topics:
+            reason = self._refusal(topic)
+            if reason is None:
+                return
+            first = first or reason
+        raise InvalidArgumentsError(f"{self._topics[0]}: {first}")
 
     def _refusal(self, topic: str) -> str | None:
         found = self._view.newest(topic, TimeWindow.everything())

@@ -17,6 +17,11 @@ if TYPE_CHECKING:
 _LISTED_PATHS: Final = 16
 
 
+def can_be_untestable(condition: Condition) -> bool:
+    """Whether there are values of a shape that cannot meet the condition."""
+    return condition.field is not None or isinstance(condition.test, NearPosition)
+
+
 def untestable(condition: Condition, value: JsonValue) -> str | None:
     """Why no value of this shape can meet the condition; None where one may.
 

@@ -252,6 +252,7 @@ _LAST_MATCH = Entry(
         _condition_value(given),
         field=given.field,
         fields=given.fields,
+        before_s=given.before,
     ),
     blocking=True,
 )
@@ -270,6 +271,7 @@ _VALUE_WHEN = Entry(
         value=_condition_value(given),
         field=given.field,
         fields=given.fields,
+        before_s=given.before,
     ),
     blocking=True,
 )

@@ -54,8 +54,8 @@ OPTIONAL = {
     "get_position_seconds_ago": {"topic", "tolerance_s"},
     "get_velocity_at": {"topic", "tolerance_s"},
     "get_velocity_seconds_ago": {"topic", "tolerance_s"},
-    "find_last_match": {"field", "fields"},
-    "get_value_when": {"field", "fields"},
+    "find_last_match": {"field", "fields", "before"},
+    "get_value_when": {"field", "fields", "before"},
     "trajectory_summary": {"topic"},
     "recent_trajectory_summary": {"topic"},
 }
