@@ -36,6 +36,7 @@ def keeper_of(
     clock: Clock | None = None,
     reader: BagReader | None = None,
     writer: BagWriter | None = None,
+    grace_s: float = 0.0,
     measure_free: Callable[[Path], int] = lambda _: PLENTY,
 ) -> Housekeeping:
     """A housekeeper. Unless a clock is given it is an hour later: nothing is being written."""
@@ -47,6 +48,7 @@ def keeper_of(
         RetentionLimits(max_bytes, round(max_age_h * HOUR)),
         split_duration_s=10.0,
         static_topics=("/tf_static",),
+        grace_s=grace_s,
         measure_free=measure_free,
     )
 

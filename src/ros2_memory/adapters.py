@@ -70,6 +70,7 @@ def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> H
             limits,
             split_duration_s=settings.recording.split_duration_s,
             static_topics=settings.data.tf_static_topics,
+            grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
         )
     )
 

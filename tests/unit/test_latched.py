@@ -211,6 +211,40 @@ class TestTheBagOfCarriedMessages:
         keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
         assert held(memory_of(tmp_path), DOCK, T0 + 25 * S) == (T0, {"value": "home"})
 
+    def test_a_bag_stays_until_nobody_looks_for_latched_messages_in_it(
+        self, tmp_path: Path
+    ) -> None:
+        recording(
+            tmp_path,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+            drive(T0 + 20 * S, T0 + 30 * S),
+            drive(T0 + 30 * S, T0 + 40 * S),
+        )
+        budget = 3 * (tmp_path / "rec/rec_0.mcap").stat().st_size + 1
+        keeper_of(tmp_path, max_bytes=budget, grace_s=10**6).apply(tmp_path)
+        left = [name for name in files_in(tmp_path) if name.endswith(".mcap")]
+        assert left == [
+            "latched/carried.mcap",
+            "rec/rec_0.mcap",
+            "rec/rec_2.mcap",
+            "rec/rec_3.mcap",
+        ]
+        keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply(tmp_path)
+        assert "rec/rec_0.mcap" not in files_in(tmp_path)
+
+    def test_on_a_full_disk_nothing_is_waited_for(self, tmp_path: Path) -> None:
+        recording(
+            tmp_path,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+        )
+        keeper_of(tmp_path, grace_s=10**6, measure_free=lambda _: 0).make_room(tmp_path, 1)
+        assert "rec/rec_0.mcap" not in files_in(tmp_path)
+        assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
+
     @needs_recorded
     def test_frames_of_several_broadcasters_survive_all_splits_but_the_last(
         self, tmp_path: Path

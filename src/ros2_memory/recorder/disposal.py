@@ -1,7 +1,13 @@
-"""Deletes what the limits do not allow to keep, after what must outlive it was carried on."""
+"""Deletes what the limits do not allow to keep, after what must outlive it was carried on.
+
+Whoever asks a question holds what was known of the bags some seconds ago. So a bag with latched
+messages is deleted only when those have been carried for that long: until then somebody may look
+for them where they stood. Meanwhile the next oldest goes in its place.
+"""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -48,8 +54,12 @@ class Disposed:
 
 @dataclass(slots=True)
 class _Pass:
-    """One pass under way: bags that were deleted, and those that could not be."""
+    """One pass under way: bags that were deleted, and those that stay.
 
+    `urgent`: the disk is full, so that nothing is waited for.
+    """
+
+    urgent: bool
     done: Disposed = field(default_factory=Disposed)
     gone: set[str] = field(default_factory=set)
     staying: set[str] = field(default_factory=set)
@@ -63,6 +73,8 @@ class Disposal:
         limits: how much is kept.
         carrier: carries latched messages on.
         static_topics: topics that are latched whatever their publishers say.
+        grace_s: how long latched messages are carried before the bag goes that they stood in.
+        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
@@ -72,11 +84,16 @@ class Disposal:
         carrier: Carrier,
         *,
         static_topics: Collection[str] = (),
+        grace_s: float = 0.0,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bag_dir = bag_dir
         self._limits = limits
         self._carrier = carrier
         self._inventory = Inventory(bag_dir, static_topics)
+        self._grace_s = grace_s
+        self._monotonic = monotonic
+        self._carried_since: dict[str, float] = {}
         self._told: set[str] = set()
         self._untidy: set[Path] = set()
 
@@ -102,7 +119,7 @@ class Disposal:
         limits = self._limits
         if min_free_bytes is not None:
             limits = replace(limits, min_free_bytes=min_free_bytes)
-        under_way = _Pass()
+        under_way = _Pass(urgent=free_bytes is not None)
         while True:
             stock = self._inventory.stock(known, gone=under_way.gone, staying=under_way.staying)
             if free_bytes is not None:
@@ -118,20 +135,28 @@ class Disposal:
 
     def _dispose(self, doomed: Sequence[StoredBag], snapshot: Snapshot, under_way: _Pass) -> None:
         leaving = {Path(bag.path) for bag in doomed} | {Path(path) for path in under_way.gone}
+        latched = {str(bag.path) for bag in self._carrier.concerned(snapshot, leaving)}
         try:
             carried = self._carrier.carry(snapshot, leaving)
         except (EpisodicError, OSError) as error:
             # The others may go all the same, and make the room that was missing.
             reason = f"its latched messages cannot be carried on: {error}"
-            concerned = {str(bag.path) for bag in self._carrier.concerned(snapshot, leaving)}
             for each in doomed:
-                if each.path in concerned:
+                if each.path in latched:
                     self._stays(each.path, reason, under_way)
         else:
             under_way.done.carried = under_way.done.carried if carried is None else carried
         for each in doomed:
+            if each.path in latched and self._is_asked_for(each.path, under_way):
+                under_way.staying.add(each.path)
             if each.path not in under_way.staying:
                 self._delete(each, under_way)
+
+    def _is_asked_for(self, path: str, under_way: _Pass) -> bool:
+        """Whether latched messages are still looked for in a bag, though they are carried."""
+        now = self._monotonic()
+        since = self._carried_since.setdefault(path, now)
+        return not under_way.urgent and now - since < self._grace_s
 
     def _delete(self, bag: StoredBag, under_way: _Pass) -> None:
         size = 0
@@ -144,6 +169,7 @@ class Disposal:
                 self._stays(bag.path, str(error), under_way)
                 return
         self._told.discard(bag.path)
+        self._carried_since.pop(bag.path, None)
         under_way.gone.add(bag.path)
         under_way.done.bags += 1
         under_way.done.bytes += size

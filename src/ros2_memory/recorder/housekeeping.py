@@ -68,6 +68,7 @@ class Housekeeping:
         limits: how much is kept.
         split_duration_s: how long the recorder writes one file.
         static_topics: topics that are latched whatever their publishers say.
+        grace_s: for how long a question may hold what was known of the bags before.
         measure_free: measures what the disk has left.
     """
 
@@ -81,6 +82,7 @@ class Housekeeping:
         *,
         split_duration_s: float,
         static_topics: Collection[str] = (),
+        grace_s: float = 0.0,
         measure_free: Callable[[Path], int] = free_bytes,
     ) -> None:
         carrier = Carrier(bag_dir, reader, writer, static_topics)
@@ -90,7 +92,9 @@ class Housekeeping:
             clock,
             refresh_s=REFRESH_S,
             split_duration_s=split_duration_s,
-            disposal=Disposal(bag_dir, limits, carrier, static_topics=static_topics),
+            disposal=Disposal(
+                bag_dir, limits, carrier, static_topics=static_topics, grace_s=grace_s
+            ),
         )
         self._repairer = Repairer(reader, writer)
         self._clock = clock

@@ -10,10 +10,11 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.recorder.layout import CARRY_FILE, LOCK_FILE, OWN_FILES, ROS_LOG_DIR, is_carried
+from ros2_memory.recorder.layout import LOCK_FILE, OWN_FILES, ROS_LOG_DIR, is_carried
 from ros2_memory.recorder.removal import beside_bags
 from ros2_memory.recorder.retention import Span, Stock, StoredBag, StoredFile
 from ros2_memory.recorder.scan import other_form
@@ -55,12 +56,22 @@ class Known:
     now: Ns
 
 
+class _Fate(Enum):
+    """What may become of a bag."""
+
+    MAY_GO = auto()
+    MAY_GO_UNNAMED = auto()  # where the recorder does not name its recording
+    STAYS = auto()
+    FROM_ELSEWHERE = auto()  # stays, and does not count
+
+
 class _Entry(NamedTuple):
     """A bag, and what it was made from."""
 
     verdict: Verdict
     stamp: Stamp
     bag: StoredBag
+    fate: _Fate
 
 
 class _Folder(NamedTuple):
@@ -101,16 +112,26 @@ class Inventory:
         others = self._own_bytes()
         occupied: set[str] = set()
         named = {str(self._root / name) for name in known.named}
+        entries, files = self._entries, known.files
         for path, verdict in known.counted.items():
             if path in gone:
                 continue
-            entry = self._entry(path, verdict, known)
-            bag = entry.bag
-            if path not in staying and _is_deletable(verdict, bag, named):
+            entry = entries.get(path)
+            if (
+                entry is None
+                or entry.verdict is not verdict
+                or entry.stamp is not files[path].stamp
+            ):
+                entry = entries[path] = self._entered(path, verdict, known)
+            fate, bag = entry.fate, entry.bag
+            if (fate is _Fate.MAY_GO and path not in staying) or (
+                fate is _Fate.MAY_GO_UNNAMED and path not in staying and bag.recording not in named
+            ):
                 bags.append(bag)
-            elif _counts(verdict, bag):
-                others += sum(file.size for file in bag.files)
+            else:
                 occupied.add(bag.recording)
+                if fate is not _Fate.FROM_ELSEWHERE:
+                    others += sum(file.size for file in bag.files)
         self._forget(known)
         sidecars: dict[str, int] = {}
         for recording in {bag.recording for bag in bags} | occupied:
@@ -121,13 +142,9 @@ class Inventory:
                 sidecars[recording] = size
         return Stock(bags, known.now, sidecars, others)
 
-    def _entry(self, path: str, verdict: Verdict, known: Known) -> _Entry:
-        entry = self._entries.get(path)
-        stamp = known.files[path].stamp
-        if entry is None or entry.verdict is not verdict or entry.stamp is not stamp:
-            entry = _Entry(verdict, stamp, self._stored(path, verdict, known))
-            self._entries[path] = entry
-        return entry
+    def _entered(self, path: str, verdict: Verdict, known: Known) -> _Entry:
+        bag = self._stored(path, verdict, known)
+        return _Entry(verdict, known.files[path].stamp, bag, _fate(verdict, bag))
 
     def _stored(self, path: str, verdict: Verdict, known: Known) -> StoredBag:
         recording = str(known.files[path].path.parent)
@@ -187,19 +204,14 @@ class Inventory:
         return size
 
 
-def _is_deletable(verdict: Verdict, bag: StoredBag, named: Collection[str]) -> bool:
+def _fate(verdict: Verdict, bag: StoredBag) -> _Fate:
+    path = Path(bag.path)
     if verdict.standing is Standing.INCOMPLETE:
-        return bag.recording not in named
-    if verdict.standing not in _WHOLE:
-        return False
-    return not (bag.path.endswith(CARRY_FILE) and is_carried(Path(bag.path)))
-
-
-def _counts(verdict: Verdict, bag: StoredBag) -> bool:
-    """Whether the budget counts a bag that may not be deleted: not what came from elsewhere."""
-    if verdict.standing is Standing.UNREAD:
-        return False
-    return verdict.standing is not Standing.DAMAGED or is_own_recording(Path(bag.recording).name)
+        return _Fate.MAY_GO_UNNAMED
+    if verdict.standing in _WHOLE:
+        return _Fate.STAYS if is_carried(path) else _Fate.MAY_GO
+    foreign = verdict.standing is Standing.DAMAGED and not is_own_recording(path.parent.name)
+    return _Fate.FROM_ELSEWHERE if foreign or verdict.standing is Standing.UNREAD else _Fate.STAYS
 
 
 def _on_disk(size: int) -> int:

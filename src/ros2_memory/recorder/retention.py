@@ -114,21 +114,21 @@ def weighed(stock: Stock, limits: RetentionLimits) -> Weighed:
     aged = _aged(stock.bags, eras, limits.max_age_ns)
     if not aged and plan.fits(limits):
         return Weighed((), total, fits=True)
-    order = _oldest_first(stock.bags, eras[-1] if eras else [])
+    order = _oldest_first(stock.bags, eras[-1] if eras else [], shared=plan.shared)
+    # What shares a file with the bag that stays would free nothing.
     kept = _inodes(_newest(order, eras))
-    doomed: list[StoredBag] = []
+    doomed: set[str] = set()
     for bag in order:
         if bag.path in aged and kept.isdisjoint(_inodes(bag)):
-            doomed.append(bag)
+            doomed.add(bag.path)
             plan.delete(bag)
     for bag in order:
         if plan.fits(limits):
             break
-        # What shares a file with the bag that stays would free nothing.
         if bag.path not in aged and kept.isdisjoint(_inodes(bag)):
-            doomed.append(bag)
+            doomed.add(bag.path)
             plan.delete(bag)
-    return Weighed(tuple(doomed), total, plan.fits(limits))
+    return Weighed(tuple(bag for bag in order if bag.path in doomed), total, fits=plan.fits(limits))
 
 
 class _Plan:
@@ -137,9 +137,8 @@ class _Plan:
     def __init__(self, stock: Stock) -> None:
         files = [each for bag in stock.bags for each in bag.files]
         sizes = {each.inode: each.size for each in files}
-        self._links: Counter[tuple[int, int]] = Counter()
-        if len(sizes) < len(files):
-            self._links.update(each.inode for each in files)
+        self.shared = len(sizes) < len(files)
+        self._links = Counter(each.inode for each in files) if self.shared else Counter()
         self._bags_in = Counter(bag.recording for bag in stock.bags)
         self._sidecars = stock.sidecars
         self.total = stock.other_bytes + sum(sizes.values()) + sum(stock.sidecars.values())
@@ -182,15 +181,19 @@ def _eras(stock: Stock, limits: RetentionLimits) -> list[_Era]:
         and bag.span.end <= latest
         and bag.span.end - bag.span.start <= longest
     ]
+    if not dated:
+        return []
+    reach, end = min(span.start for span, _ in dated), max(span.end for span, _ in dated)
+    if end - reach <= longest:
+        return [dated]
     dated.sort()
-    eras: list[_Era] = []
-    reach: Ns = 0
+    eras: list[_Era] = [[]]
     for each in dated:
-        start, end = each[0]
-        if not eras or start - reach > longest:
+        span, _ = each
+        if span.start - reach > longest:
             eras.append([])
         eras[-1].append(each)
-        reach = max(reach, end)
+        reach = max(reach, span.end)
     return eras
 
 
@@ -204,25 +207,26 @@ def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> se
         oldest = max(span.end for span, _ in era) - max_age_ns
         aged.update(bag.path for span, bag in era if span.end < oldest)
         if era is eras[-1]:
-            begun = era[0][0].start
+            begun = min(span.start for span, _ in era)
             silent = (bag for bag in bags if bag.span is None)
             aged.update(bag.path for bag in silent if begun <= bag.written < oldest)
     return aged
 
 
-def _oldest_first(bags: Sequence[StoredBag], present: _Era) -> list[StoredBag]:
-    """All bags, oldest first. One whose bytes a newer one shares frees nothing before that goes."""
-    moments = {bag.path: bag.written for bag in bags}
-    moments.update((bag.path, span.end) for span, bag in present)
-    newest: dict[tuple[int, int], Ns] = {}
-    for bag in bags:
-        moment = moments[bag.path]
-        for each in bag.files:
-            if newest.setdefault(each.inode, moment) < moment:
-                newest[each.inode] = moment
-    for bag in bags:
-        moments[bag.path] = max(newest[each.inode] for each in bag.files)
-    return sorted(bags, key=lambda bag: (moments[bag.path], bag.path))
+def _oldest_first(bags: Sequence[StoredBag], present: _Era, *, shared: bool) -> list[StoredBag]:
+    """All bags, oldest first.
+
+    One that shares a file is as old as the newest that does: deleting it frees nothing before.
+    """
+    moments = {bag.path: span.end for span, bag in present}
+    if shared:
+        newest: dict[tuple[int, int], Ns] = {}
+        for bag in bags:
+            moment = moments.get(bag.path, bag.written)
+            for each in bag.files:
+                newest[each.inode] = max(moment, newest.get(each.inode, moment))
+        moments = {bag.path: max(newest[each.inode] for each in bag.files) for bag in bags}
+    return sorted(bags, key=lambda bag: (moments.get(bag.path, bag.written), bag.path))
 
 
 def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:
