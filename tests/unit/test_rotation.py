@@ -59,6 +59,20 @@ class TestSteps:
         assert waited(passage, 20.0, 21.9, ready=True, missing=("/gone",)) is Step.WAIT
         assert waited(passage, 22.0, ready=True, missing=("/gone",)) is Step.COMPLETE
 
+    def test_a_publisher_that_appears_while_both_record_is_waited_for_anew(self) -> None:
+        passage = Passage(at(0), subscribe_timeout_s=20)
+        assert waited(passage, 1.0, 2.5, ready=True) is Step.WAIT
+        assert waited(passage, 2.7, 3.9, ready=True, missing=("/late",)) is Step.WAIT
+        assert not passage.overlapping
+        assert waited(passage, 4.0, 5.9, ready=True) is Step.WAIT
+        assert waited(passage, 6.0, ready=True) is Step.COMPLETE
+
+    def test_one_that_appears_after_the_timeout_is_not(self) -> None:
+        passage = Passage(at(0), subscribe_timeout_s=20)
+        assert waited(passage, 19.0, ready=True) is Step.WAIT
+        assert waited(passage, 20.5, ready=True, missing=("/late",)) is Step.WAIT
+        assert waited(passage, 21.0, ready=True, missing=("/late",)) is Step.COMPLETE
+
     def test_the_clock_set_back_abandons_it(self) -> None:
         passage = Passage(at(0))
         waited(passage, 0.2, ready=True)

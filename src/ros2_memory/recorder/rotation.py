@@ -98,10 +98,14 @@ class Passage:
         before, self._last = self._last, now
         if set_back(before, now):
             return Step.ABANDON
+        age_s = now.monotonic_s - self.began.monotonic_s
+        if missing and age_s < self._timeout_s:
+            # Also of a publisher that appears while both run: what it sends before the new one has
+            # subscribed stands in the old one alone, and must not lie behind the cut.
+            self._both = None
+        elif self._both is None and ready:
+            self._both = now
         if self._both is None:
-            age_s = now.monotonic_s - self.began.monotonic_s
-            if ready and (age_s >= self._timeout_s or not missing):
-                self._both = now
             return Step.WAIT if ready or age_s < READY_TIMEOUT_S else Step.ABANDON
         over = now.monotonic_s - self._both.monotonic_s >= self._both_s
         return Step.COMPLETE if over else Step.WAIT
