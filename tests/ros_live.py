@@ -29,7 +29,7 @@ import pytest
 from tests.bags import VISION_DEFINITIONS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 SHARED_MEMORY: Final = Path("/dev/shm")  # noqa: S108
@@ -150,7 +150,11 @@ class Robot:
 
 @contextmanager
 def publishing_robot(
-    env: Mapping[str, str], truth: Path, *options: str, duration_s: float | None = None
+    env: Mapping[str, str],
+    truth: Path,
+    *options: str,
+    duration_s: float | None = None,
+    through: Sequence[str] = (),
 ) -> Iterator[Robot]:
     """A robot that publishes (`tests/robot_publishers.py`, whose options these are).
 
@@ -159,9 +163,10 @@ def publishing_robot(
         truth: file that is to hold T0 and the counts; it must not exist.
         options: such as `--hz 1`, `--topics /odom`, `--subscribers 1`.
         duration_s: seconds after which it stops by itself; None: never.
+        through: a program that becomes the robot, given as the end of its arguments.
     """
     assert not truth.exists(), f"{truth} is the truth of another drive"
-    argv = [str(ROS / "bin" / "python"), "-P", "-m", "tests.robot_publishers"]
+    argv = [*through, str(ROS / "bin" / "python"), "-P", "-m", "tests.robot_publishers"]
     argv += ["--truth", str(truth), *options]
     if duration_s is not None:
         argv += ["--duration", str(duration_s)]

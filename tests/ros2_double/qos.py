@@ -24,6 +24,9 @@ _POLICIES: Final = {
     "liveliness": LivelinessPolicy,
 }
 _DEPTH: Final = 10
+# Of volatile messages the real recorder's threads are never this far behind. One Python thread is,
+# on a busy machine, and what it then lost would be no behaviour of a recorder.
+_PATIENT_DEPTH: Final = 1000
 
 
 def offered(profile: Any) -> dict[str, str | int]:
@@ -54,7 +57,9 @@ def adapted(topic: str, offers: Sequence[Any], warn: Callable[[str], None]) -> A
                 f"RMW_QOS_POLICY_{policy.upper()}_{fallback.name} "
                 "as it will connect to all publishers."
             )
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=_DEPTH, **asked)
+    latched = asked["durability"] == DurabilityPolicy.TRANSIENT_LOCAL
+    depth = _DEPTH if latched else _PATIENT_DEPTH
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, **asked)
 
 
 def refused(topic: str, offers: Sequence[Any], asked: Any) -> str | None:
