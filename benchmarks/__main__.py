@@ -43,14 +43,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"{', '.join(strange)}: the questions here are {', '.join(known)}")
     history = made(asked.dir, HOUR if asked.catalogue else asked.bags)
     about = report.machine()
-    print(f"{_described(history)}\n{about}\n{_HOW}\n", flush=True)
+    linking = (
+        f"{RECORDINGS * HOUR} names in {RECORDINGS} recordings for " if asked.catalogue else ""
+    )
+    print(f"{linking}{_described(history)}\n{about}\n{_HOW}\n", flush=True)
     if asked.catalogue:
         rows, figures = _week(history, slugs, asked.runs, whole=not asked.only)
     else:
         rows, figures = _hour(history, slugs, asked.runs, whole=not asked.only)
     print("\n" + report.as_table(rows, figures))
     if asked.json is not None:
-        told = report.as_json(rows, figures, about) | {"bags": history.bags}
+        bags = RECORDINGS * HOUR if asked.catalogue else history.bags
+        told = report.as_json(rows, figures, about) | {"bags": bags}
         asked.json.write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
     return 0
 
@@ -78,7 +82,7 @@ def _hour(
     rows = measured({slug: QUESTIONS[slug] for slug in slugs}, case, runs)
     if not whole:
         return rows, []
-    return rows, [digests.cost(case, runs), *backlog.figures(case), *footprint.figures(history)]
+    return rows, [digests.cost(case, runs), *backlog.figures(history), *footprint.figures(history)]
 
 
 def _week(

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from benchmarks import ours
 from benchmarks.bags import ODOM
 from benchmarks.report import Figure
-from ros2_memory.catalogue import BagKey
+from ros2_memory.bootstrap import build_filler
 from ros2_memory.digest import Digester
+from ros2_memory.indexing import fill
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
-    from ros2_memory.catalogue import Catalogue
     from ros2_memory.digest import Digest, TopicDigest
     from ros2_memory.memory import Memory
     from ros2_memory.model import BagSummary
@@ -30,18 +30,9 @@ def digester_of(memory: Memory, settings: Settings) -> Digester:
     return Digester(memory.reader, memory.extractor, settings.data.max_plausible_speed_mps)
 
 
-def known(memory: Memory, settings: Settings) -> Catalogue | None:
-    """The memory's catalogue, told of every bag of the index; None where it has none."""
-    if memory.recall is None:
-        return None
-    catalogue, folder = memory.recall.catalogue, settings.recording.bag_dir
-    digester = digester_of(memory, settings)
-    bags = memory.index.refresh().bags
-    keys = [BagKey.of(bag, folder) for bag in bags]
-    for bag, key, number in zip(bags, keys, catalogue.find(keys), strict=True):
-        if number is None:
-            catalogue.put(key, digester.digest(bag.path))
-    return catalogue
+def made_known(memory: Memory, settings: Settings) -> None:
+    """Has the memory's catalogue know every bag, as `ros2-memory index` does."""
+    fill(build_filler(settings, memory), None, lambda: False)
 
 
 def cost(case: Case, runs: int) -> Figure:

@@ -29,9 +29,17 @@ if TYPE_CHECKING:
 
 
 def settings_for(bag_dir: Path) -> Settings:
-    """The shipped configuration over a folder of bags; logs below a warning are dropped."""
-    configure_logging("warning", "json")
-    return load_settings([f"recording.bag_dir='{bag_dir}'", "recorder=none"], env={})
+    """The shipped configuration over a folder of bags; logs below an error are dropped.
+
+    It is that of a robot that records, so the catalogue lies beside the bags.
+    """
+    configure_logging("error", "json")
+    return load_settings(overrides(bag_dir), env={})
+
+
+def overrides(bag_dir: Path) -> list[str]:
+    """What of the configuration is not as shipped."""
+    return [f"recording.bag_dir='{bag_dir}'", "logging.level=error"]
 
 
 def memory(settings: Settings) -> Memory:

@@ -68,17 +68,19 @@ class Question:
 
 @dataclass
 class Case:
-    """What the questions are asked of."""
+    """What the questions are asked of; `known` says whether the catalogue is to know every bag."""
 
     history: History
     settings: Settings
+    known: bool = True
 
     @cached_property
     def memory(self) -> Memory:
-        """A memory that knows the folder, and whose catalogue knows every bag."""
+        """A memory that knows the folder."""
         memory = ours.memory(self.settings)
-        digests.known(memory, self.settings)
         memory.index.refresh()
+        if self.known:
+            digests.made_known(memory, self.settings)
         return memory
 
     @cached_property

@@ -9,6 +9,7 @@ import sys
 import time
 from typing import IO, TYPE_CHECKING, Final, Self
 
+from benchmarks import ours
 from benchmarks.bags import ODOM, SCENE, SPLIT_NS
 from benchmarks.footprint import resident_mb
 from benchmarks.motion import NOWHERE
@@ -31,15 +32,15 @@ _HELLO: Final = {
 class Served:
     """`ros2-memory-server` over stdio, from its start to its end."""
 
-    def __init__(self, bag_dir: Path, *overrides: str) -> None:
-        argv = [sys.executable, "-m", "ros2_memory.server", "recorder=none", "logging.level=error"]
+    def __init__(self, bag_dir: Path) -> None:
+        argv = [sys.executable, "-m", "ros2_memory.server", *ours.overrides(bag_dir)]
         environment = {
             name: text
             for name, text in os.environ.items()
             if not name.startswith(("MEMORY_", "MCP_"))
         }
         self._process = subprocess.Popen(
-            [*argv, f"recording.bag_dir='{bag_dir}'", *overrides],
+            argv,
             env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

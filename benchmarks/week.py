@@ -18,6 +18,7 @@ from benchmarks.motion import NOWHERE
 from benchmarks.payloads import NEVER_SEEN
 from benchmarks.questions import Question, Target
 from benchmarks.timing import FLOOR, OURS
+from ros2_memory.bootstrap import build_filler
 from ros2_memory.catalogue import BagKey, relative
 
 if TYPE_CHECKING:
@@ -53,13 +54,17 @@ class Week:
         """The settings, once the catalogue was told of every bag.
 
         Raises:
-            RuntimeError: this build keeps no catalogue.
+            RuntimeError: it did not take one of them for the file that lies there.
         """
-        recall = ours.memory(self.settings).recall
-        if recall is None:
+        memory = ours.memory(self.settings)
+        if memory.recall is None:
             raise RuntimeError("the memory has no catalogue, so a week cannot be stood in for")
-        self._fill(recall.catalogue)
-        recall.catalogue.close()
+        self._fill(memory.recall.catalogue)
+        filler = build_filler(self.settings, ours.memory(self.settings))
+        progress = filler.progress()
+        if progress.waiting or progress.closed != self.whole.bags:
+            raise RuntimeError(f"not every bag of the week is in the catalogue: {progress}")
+        filler.warm()
         return self.settings
 
     @cached_property

@@ -10,9 +10,11 @@ import pytest
 from benchmarks import ours, report
 from benchmarks.__main__ import main, measured
 from benchmarks.bags import MESSAGES_OF_A_SPLIT, ODOM, TOPICS, made
+from benchmarks.links import linked
 from benchmarks.payloads import NEVER_SEEN, typestore
 from benchmarks.questions import QUESTIONS, Case, Target
 from benchmarks.timing import FLOOR, OURS, PLAIN, DisagreementError, Timed, agreed, timed
+from benchmarks.week import WEEK_QUESTIONS, Week
 from rosbags.rosbag2 import Reader
 
 if TYPE_CHECKING:
@@ -139,3 +141,33 @@ def test_the_command_prints_a_table_and_writes_json(
     assert "| point query, asked before" in capsys.readouterr().out
     found = json.loads(told.read_text(encoding="utf-8"))
     assert found["questions"][0]["plain_aim"] == Target(plain=300).plain
+
+
+def test_a_week_is_made_of_one_hour_and_its_catalogue_knows_every_bag(history: History) -> None:
+    links = linked(history, 3)
+    week = Week(links, ours.settings_for(links.folder))
+    snapshot = week.memory.index.snapshot()
+    assert len(snapshot.bags) == links.bags == 6
+    assert snapshot.latest is not None
+    assert snapshot.earliest is not None
+    assert snapshot.latest - snapshot.earliest > 5 * 10_000_000_000
+    # The newest hour is what its bags say; an older one is what the catalogue was told.
+    newest, oldest = snapshot.bags[-1], snapshot.bags[1]
+    assert newest.summary == week.memory.reader.summarize(newest.path)
+    assert oldest.end == newest.end - 2 * 2 * 10_000_000_000
+
+
+@pytest.mark.parametrize("slug", WEEK_QUESTIONS)
+def test_both_sides_agree_on_what_a_week_never_held(history: History, slug: str) -> None:
+    links = linked(history, 3)
+    week = Week(links, ours.settings_for(links.folder))
+    (row,) = measured({slug: WEEK_QUESTIONS[slug]}, week, runs=1)
+    assert row.ours_s > 0
+
+
+def test_the_substring_search_goes_through_what_the_digests_hold(history: History) -> None:
+    links = linked(history, 3)
+    week = Week(links, ours.settings_for(links.folder))
+    label = next(word for word in week.text.split() if word.isalpha())
+    assert week.text.count(f"{label}\n") >= 3
+    assert NEVER_SEEN not in week.text
