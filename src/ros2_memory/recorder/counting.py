@@ -8,10 +8,11 @@ count, sum, search or answer has to think of it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.model import BagSummary, TimeWindow, TopicSummary
-from ros2_memory.recorder.handover import read_handover
+from ros2_memory.recorder.handover import HandoverReading, read_handover
+from ros2_memory.recorder.layout import HANDOVER_FILE
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
@@ -19,8 +20,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.recorder.handover import Exclusion, Handover
-    from ros2_memory.storage.base import Channel, Closing, Record
+    from ros2_memory.storage.base import Channel, Closing, Layout, Record
     from ros2_memory.timebase import Ns
+
+_KNOWN_SIDECARS: Final = 4096
 
 
 class CountingReader(BagReader):
@@ -31,6 +34,7 @@ class CountingReader(BagReader):
 
     def __init__(self, reader: BagReader) -> None:
         self._reader = reader
+        self._known: dict[Path, tuple[tuple[int, int, int], HandoverReading]] = {}
 
     def reads(self, path: Path) -> bool:
         """As the reader beneath."""
@@ -52,6 +56,10 @@ class CountingReader(BagReader):
         """As the reader beneath."""
         return self._reader.decode(record)
 
+    def layout(self, record: Record) -> Layout | None:
+        """As the reader beneath."""
+        return self._reader.layout(record)
+
     def summarize(self, path: Path) -> BagSummary:
         """Counts and times of the messages that count.
 
@@ -59,7 +67,7 @@ class CountingReader(BagReader):
             BagError: as the reader beneath.
         """
         summary = self._reader.summarize(path)
-        handover, problem = read_handover(path.parent)
+        handover, problem = self._handover(path.parent)
         if problem is not None:
             summary = replace(summary, notes=(*summary.notes, problem))
         if handover.hides_all:
@@ -85,7 +93,7 @@ class CountingReader(BagReader):
         Raises:
             BagError: as the reader beneath.
         """
-        handover = read_handover(path.parent).handover
+        handover = self._handover(path.parent).handover
         if handover.hides_all:
             return
         records = self._reader.records(path, topics, window, newest_first=newest_first)
@@ -100,12 +108,28 @@ class CountingReader(BagReader):
         Raises:
             BagError: as the reader beneath.
         """
-        handover = read_handover(path.parent).handover
+        handover = self._handover(path.parent).handover
         if handover.hides_all:
             return ()
         if not _touching(handover, path, window):
             return self._reader.log_times(path, topic, window)
         return [record.log_time for record in self.records(path, [topic], window)]
+
+    def _handover(self, recording: Path) -> HandoverReading:
+        """The recording's sidecar; parsed again when the file is another one than before."""
+        try:
+            stat = (recording / HANDOVER_FILE).stat()
+        except OSError:
+            return read_handover(recording)
+        stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+        known = self._known.get(recording)
+        if known is not None and known[0] == stamp:
+            return known[1]
+        reading = read_handover(recording)
+        if len(self._known) >= _KNOWN_SIDECARS:
+            self._known.clear()
+        self._known[recording] = (stamp, reading)
+        return reading
 
     def _counted(self, path: Path, topic: TopicSummary, handover: Handover) -> TopicSummary | None:
         """The topic without what counts elsewhere; None where nothing of it is left."""
