@@ -100,7 +100,8 @@ class IndexManager:
         with self._lock:
             if self._published is not None and self._published is not current:
                 return self._published
-            return self._scan()
+            # What a question has to wait for is what changes by itself: the newest bags.
+            return self._scan(patrolling=current is None or self._is_stale(current, None))
 
     def refresh(self) -> Snapshot:
         """Scans now, and gives the result."""
@@ -152,11 +153,12 @@ class IndexManager:
         self._odd = _Oddities()
         self._timeline = Timeline()
 
-    def _scan(self) -> Snapshot:
+    def _scan(self, *, patrolling: bool = True) -> Snapshot:
         begun = time.perf_counter_ns()
         scene = self._scene()
         try:
-            walked = self._tree.walk(scene.now, [*self._watched, *self._next_on_patrol()])
+            patrol = self._next_on_patrol() if patrolling else ()
+            walked = self._tree.walk(scene.now, [*self._watched, *patrol])
             changed = self._forget(walked.gone) | self._examine(walked.looked_at, scene)
             hidden = frozenset(self._hidden)
             removed, added = self._recount(changed | hidden, scene)

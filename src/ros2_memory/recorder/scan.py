@@ -63,9 +63,9 @@ class Stamp:
     sidecar_ns: Ns = 0
 
     @classmethod
-    def of(cls, stat: os.stat_result) -> Stamp:
+    def of(cls, stat: os.stat_result, sidecar_ns: Ns = 0) -> Stamp:
         """The stamp in a stat result."""
-        return cls(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino)
+        return cls(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino, sidecar_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class Walked:
 class _Folder:
     mtime_ns: Ns
     trusted: bool
-    folders: list[Path] = field(default_factory=list)
+    folders: list[str] = field(default_factory=list)
     files: set[str] = field(default_factory=set)
     links: list[Path] = field(default_factory=list)
     odd: list[SetAside] = field(default_factory=list)
@@ -104,8 +104,8 @@ class Tree:
     """
 
     def __init__(self, root: Path) -> None:
-        self._root = root
-        self._folders: dict[Path, _Folder] = {}
+        self._root = str(root)
+        self._folders: dict[str, _Folder] = {}
 
     def walk(self, now: Ns, watched: Iterable[str]) -> Walked:
         """Looks for what is new, changed or gone since the last walk, and at the `watched` files.
@@ -129,11 +129,11 @@ class Tree:
 
     def distrust(self, path: str) -> None:
         """Has the folder of a file listed again in the next walk, whatever its mtime says."""
-        folder = self._folders.get(Path(path).parent)
+        folder = self._folders.get(_folder_of(path))
         if folder is not None:
             folder.trusted = False
 
-    def _descend(self, before: dict[Path, _Folder], now: Ns, walked: Walked) -> str | None:
+    def _descend(self, before: dict[str, _Folder], now: Ns, walked: Walked) -> str | None:
         """Visits every folder; says what is wrong where the root cannot be listed."""
         waiting = [self._root]
         while waiting:
@@ -146,7 +146,7 @@ class Tree:
                 # A folder that went since its parent was listed changes that parent's mtime.
                 if not isinstance(error, FileNotFoundError):
                     reason = f"the directory cannot be listed: {error.strerror or error}"
-                    walked.damaged.append(SetAside(path, reason))
+                    walked.damaged.append(SetAside(Path(path), reason))
                 continue
             self._folders[path] = folder
             waiting.extend(folder.folders)
@@ -161,22 +161,21 @@ class Tree:
     def _look(self, path: str, walked: Walked) -> None:
         if path in walked.looked_at or path in walked.gone:
             return
-        folder = self._folders.get(Path(path).parent)
+        folder = self._folders.get(_folder_of(path))
         try:
-            stamp = Stamp.of(os.lstat(path))
-            walked.looked_at[path] = replace(stamp, sidecar_ns=folder.sidecar_ns if folder else 0)
+            walked.looked_at[path] = Stamp.of(os.lstat(path), folder.sidecar_ns if folder else 0)
         except OSError:
             # Its folder looks as before, and may soon look the same with the file back in it.
             walked.gone.add(path)
             self.distrust(path)
 
 
-def _visit(path: Path, known: _Folder | None, now: Ns, looked_at: dict[str, Stamp]) -> _Folder:
+def _visit(path: str, known: _Folder | None, now: Ns, looked_at: dict[str, Stamp]) -> _Folder:
     """The folder as it is known where nothing came or went; otherwise as it is listed.
 
     Its mtime is taken first: what changes during the listing is then found by the next walk.
     """
-    mtime_ns = path.stat().st_mtime_ns
+    mtime_ns = os.stat(path).st_mtime_ns  # noqa: PTH116  a Path for each of 1,000 folders costs more
     if known is not None and known.trusted and known.mtime_ns == mtime_ns:
         return known
     folder = _Folder(mtime_ns, trusted=settled(mtime_ns, now))
@@ -196,7 +195,7 @@ def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]
             folder.links.append(Path(entry.path))
     elif entry.is_dir(follow_symlinks=False):
         if not hidden and entry.name != LOST_AND_FOUND:
-            folder.folders.append(Path(entry.path))
+            folder.folders.append(entry.path)
     elif entry.name == HANDOVER_FILE:
         folder.sidecar_ns = _mtime_ns(entry)
     elif bag_kind(entry.name):
@@ -224,6 +223,10 @@ def _mtime_ns(entry: os.DirEntry[str]) -> Ns:
         return entry.stat(follow_symlinks=False).st_mtime_ns
     except OSError:
         return 0
+
+
+def _folder_of(path: str) -> str:
+    return path.rpartition("/")[0] or "/"
 
 
 def _is_folder(link: Path) -> bool:
