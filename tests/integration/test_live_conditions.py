@@ -1,0 +1,238 @@
+"""The recorder under conditions that a robot meets: no room, another user, publishers amiss."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState
+from tests.live_recorder import (
+    NS_PER_S,
+    LiveRecorder,
+    Machine,
+    answering,
+    bag_files,
+    machine,
+    moment_of,
+    ticks,
+)
+from tests.ros_live import Robot, needs_ros, publishing_robot, ros_environment, wait_for
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = needs_ros
+
+HZ: Final = 20.0
+DISK_BYTES: Final = 8_000_000
+NOBODY: Final = "65534"
+TOLD_WITHIN_S: Final = 10.0
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    folder = tmp_path_factory.mktemp("conditions")
+    with ros_environment(folder) as env, machine(folder, env) as site:
+        yield site
+
+
+@pytest.fixture(scope="module")
+def robot(site: Machine) -> Iterator[Robot]:
+    """It drives all the time, whoever records it."""
+    with publishing_robot(site.env, site.folder / "truth.json", "--hz", f"{HZ:g}") as robot:
+        yield robot
+
+
+@contextmanager
+def small_disk(at: Path) -> Iterator[Path]:
+    at.mkdir()
+    option = f"size={DISK_BYTES}"
+    mount = ["mount", "-t", "tmpfs", "-o", option, "tmpfs", str(at)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("this user may not mount a small disk")
+    try:
+        yield at
+    finally:
+        subprocess.run(["umount", "--lazy", str(at)], check=True)
+
+
+def fill(disk: Path) -> Path:
+    """The file that takes all that was left."""
+    ballast = disk / "ballast"
+    with ballast.open("wb", buffering=0) as stream:
+        try:
+            while stream.write(bytes(4096)):
+                pass
+        except OSError:
+            return ballast
+    raise AssertionError("the disk did not fill up")
+
+
+@pytest.mark.parametrize("least", ["0.001", "0"])
+def test_a_full_disk_is_told_within_10_s_and_recording_resumes_when_there_is_room(
+    site: Machine, robot: Robot, tmp_path: Path, least: str
+) -> None:
+    guarded = least != "0"
+    with small_disk(tmp_path / "disk") as disk:
+        recorder = site.record(
+            f"full{least}",
+            "recording.split_duration_s=1",
+            f"retention.min_free_gb={least}",
+            bag_dir=disk / "bags",
+        )
+        try:
+            recorder.wait_for("split_closed")
+            full_at = time.time_ns()
+            ballast = fill(disk)
+            told = wait_for_error(recorder)
+            assert moment_of(told) - full_at <= TOLD_WITHIN_S * NS_PER_S
+            if guarded:
+                recorder.wait_for("recording_paused")
+            ballast.unlink()
+            room_at = time.time_ns()
+            if guarded:
+                recorder.wait_for("recording_resumed")
+            wait_for_ticks_after(recorder, robot, room_at)
+            recorder.wait_for_state(RecorderState.RECORDING)
+            recorder.stop()
+        finally:
+            recorder.discard()
+
+
+def test_while_the_disk_is_full_the_server_says_that_recording_is_paused(
+    site: Machine, robot: Robot, tmp_path: Path
+) -> None:
+    recorder = site.record("paused", "retention.min_free_gb=1e9")
+    with answering(recorder.bag_dir, tmp_path / "server.log") as served:
+        recorder.wait_for_state(RecorderState.PAUSED)
+        health = json.loads(served.get("/health")[1])
+    assert health["status"] == "degraded"
+    assert any("paused" in problem for problem in health["problems"])
+    recorder.stop()
+
+
+@contextmanager
+def own_network() -> Iterator[list[str]]:
+    """A machine's network without a way out; what to start programs through to be on it."""
+    hold = "ip link set lo up && echo up && exec sleep infinity"
+    holder = subprocess.Popen(["unshare", "--net", "sh", "-c", hold], stdout=subprocess.PIPE)
+    try:
+        assert holder.stdout is not None
+        if holder.stdout.readline() != b"up\n":
+            pytest.skip("this user may not make a network of its own")
+        yield ["nsenter", f"--net=/proc/{holder.pid}/ns/net"]
+    finally:
+        holder.kill()
+        holder.communicate()
+
+
+def as_nobody() -> list[str]:
+    """What becomes another user's program.
+
+    Interpreter and checkout may lie where only their owner may look, so it may look everywhere, and
+    write nowhere; without that bit access(2) denies what open(2) allows.
+    """
+    become = ["setpriv", "--reuid", NOBODY, "--regid", NOBODY, "--clear-groups"]
+    become += [f"--{which}-caps=+dac_read_search" for which in ("inh", "ambient")]
+    # The folder for logs is not its own, nor is the one for what was covered.
+    ours = ["ROS_LOG_DIR", *(name for name in os.environ if name.startswith("COVERAGE_"))]
+    return [*become, "--securebits=+no_setuid_fixup", "env", *(f"--unset={n}" for n in ours)]
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0 or not all(map(shutil.which, ("setpriv", "nsenter", "unshare", "ip"))),
+    reason="root alone may run the recorder as another user (with util-linux and iproute2)",
+)
+def test_a_recorder_under_another_user_than_the_publishers_records(
+    site: Machine, tmp_path: Path
+) -> None:
+    """In the default discovery range, where the transports are those of the environment."""
+    bags = tmp_path / "bags"
+    bags.mkdir()
+    os.chown(bags, int(NOBODY), int(NOBODY))
+    reach = "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"
+    with (
+        own_network() as network,
+        publishing_robot(
+            site.env, tmp_path / "truth.json", through=[*network, "env", reach]
+        ) as robot,
+    ):
+        transports = "FASTDDS_BUILTIN_TRANSPORTS=UDPv4"
+        recorder = site.record(
+            "others",
+            "recording.split_duration_s=1",
+            bag_dir=bags,
+            through=[*network, *as_nobody(), reach, transports],
+        )
+        recorder.wait_for("split_closed", 2)
+        recorder.stop()
+        t0 = robot.t0
+    files = bag_files(bags)
+    assert {file.stat().st_uid for file in files} == {int(NOBODY)}
+    found = [tick.number for tick in ticks(files, t0, HZ)]
+    assert found == list(range(found[0], found[-1] + 1))
+    assert len(found) > HZ
+
+
+def test_what_is_amiss_with_publishers_shows_in_the_heartbeat_and_in_health(
+    site: Machine, robot: Robot, tmp_path: Path
+) -> None:
+    """A topic without messages, one that does not fit, one of an unknown type, one of nobody."""
+    # A workspace that does not know the robot's own messages.
+    env = {name: text for name, text in site.env.items() if name != "AMENT_PREFIX_PATH"}
+    listed = ["/odom", "/bumper", "/clock", "/vision/*/scene_objects", "/nobody"]
+    quiet = ("--topics", "/clock", "--subscribers", "99")
+    with (
+        publishing_robot(env, tmp_path / "quiet.json", *quiet),
+        answering(site.folder / "amiss" / "bags", tmp_path / "server.log") as served,
+    ):
+        recorder = site.record(
+            "amiss",
+            "recording.split_duration_s=1",
+            # Asks of the bumper, whose messages are not latched, what it does not offer.
+            "data.tf_static_topics=[/bumper]",
+            topics=listed,
+            env=env,
+        )
+        recorder.wait_for("subscribed", topic="/clock")
+        recorder.wait_for("split_closed")
+        wait_for(lambda: beat(recorder).silent, "silent topics", alive=recorder.process)
+        told = beat(recorder)
+        health = json.loads(served.get("/health")[1])["recorder"]
+        recorder.stop()
+    assert set(told.subscribed) == {"/odom", "/bumper", "/clock"}
+    assert set(told.silent) == {"/bumper", "/clock"}
+    assert health["silent_topics"] == ["/bumper", "/clock"]
+    assert health["last_error"]
+    warnings = {e["reason"].partition(":")[0] for e in recorder.all_events() if "reason" in e}
+    assert {"/bumper", "/vision/scene/scene_objects"} <= warnings
+
+
+def beat(recorder: LiveRecorder) -> Heartbeat:
+    heartbeat = recorder.heartbeat.heartbeat
+    assert heartbeat is not None
+    return heartbeat
+
+
+def wait_for_error(recorder: LiveRecorder) -> dict[str, object]:
+    def errors() -> list[dict[str, object]]:
+        return [event for event in recorder.all_events() if event["level"] == "error"]
+
+    wait_for(errors, "an error event", timeout_s=40, alive=recorder.process)
+    return errors()[0]
+
+
+def wait_for_ticks_after(recorder: LiveRecorder, robot: Robot, moment: int) -> None:
+    def are_there() -> bool:
+        found = ticks(bag_files(recorder.bag_dir), robot.t0, HZ)
+        return any(tick.publish_time > moment for tick in found)
+
+    wait_for(are_there, "messages after there was room", timeout_s=40, alive=recorder.process)

@@ -1,0 +1,109 @@
+"""SIGKILL at random moments, over real DDS: what is closed answers, and little is lost.
+
+Ten kills at each rate; EPISODIC_LONG=1 makes it 50. EPISODIC_SEED chooses other moments. What was
+lost is logged: `--log-cli-level=INFO` shows it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import statistics
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from tests.live_faults import KINDS, Campaign, Terms, place_is_right, run_campaign
+from tests.ros_live import needs_ros
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = needs_ros
+
+KILLS: Final = 50 if os.environ.get("EPISODIC_LONG") == "1" else 10
+SEED: Final = int(os.environ.get("EPISODIC_SEED", "20261120"))
+CHUNK_BYTES: Final = 16384  # recorder.chunk_bytes
+PROMISED_S: Final = 2.0
+TERMS: Final = {
+    "reference": Terms("reference", 50.0, 2, 6, KILLS, 3.0, SEED),
+    "slow": Terms("slow", 1.0, 2, 9, KILLS, 4.5, SEED + 1),
+}
+
+_log = logging.getLogger(__name__)
+
+
+@pytest.fixture(scope="module")
+def campaigns(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Campaign]:
+    folder: Path = tmp_path_factory.mktemp("faults")
+    with ThreadPoolExecutor(len(TERMS)) as pool:
+        running = {
+            name: pool.submit(run_campaign, terms, folder / name) for name, terms in TERMS.items()
+        }
+        found = {name: future.result() for name, future in running.items()}
+    for campaign in found.values():
+        _log_losses(campaign)
+    return found
+
+
+def _log_losses(campaign: Campaign) -> None:
+    for kind in KINDS:
+        lost = [loss.seconds for loss in campaign.losses() if loss.kind == kind]
+        kills = sum(fault.kind == kind for fault in campaign.faults)
+        figures = (statistics.median(lost), max(lost)) if lost else (0.0, 0.0)
+        _log.info(
+            "%s, %s: %d kills, %d of a recording under way; lost in s: median %.2f, most %.2f",
+            *(campaign.terms.name, kind, kills, len(lost), *figures),
+        )
+
+
+@pytest.fixture(params=list(TERMS))
+def campaign(campaigns: dict[str, Campaign], request: pytest.FixtureRequest) -> Campaign:
+    return campaigns[request.param]
+
+
+def test_every_closed_split_answers_right_after_the_kill(campaign: Campaign) -> None:
+    for fault in campaign.faults:
+        counts = {row["topic"]: row["count"] for row in fault.topics.told if "topic" in row}
+        assert counts.get("/odom", 0) >= len(fault.closed)
+        assert place_is_right(fault), fault
+
+
+def test_what_was_closed_before_a_kill_counts_for_good(campaign: Campaign) -> None:
+    there = {tick.number for tick in campaign.found}
+    assert all(fault.closed <= there for fault in campaign.faults)
+
+
+def test_the_next_starts_leave_no_file_that_does_not_answer(campaign: Campaign) -> None:
+    aside = ("active", "damaged", "incomplete", "unread")
+    assert {kind: campaign.after[kind] for kind in aside} == {key: [] for key in aside}
+
+
+def test_no_message_counts_twice_and_none_is_moved(campaign: Campaign) -> None:
+    numbers = [tick.number for tick in campaign.found]
+    assert numbers == sorted(set(numbers))
+    assert campaign.counted_by_server == len(numbers)
+
+
+def test_nothing_is_lost_but_at_the_kills(campaign: Campaign) -> None:
+    assert not any(campaign.holes().values())
+    assert campaign.unexplained() == []
+
+
+def test_whatever_stands_anywhere_counts(campaign: Campaign) -> None:
+    standing = {tick.number for held in campaign.held.values() for tick in held}
+    assert {tick.number for tick in campaign.found} == standing
+
+
+def test_at_the_reference_rates_at_most_2_s_are_lost(campaigns: dict[str, Campaign]) -> None:
+    assert max(loss.seconds for loss in campaigns["reference"].losses()) <= PROMISED_S
+
+
+def test_at_1_hz_at_most_an_open_split_is_lost_and_not_more_than_a_chunk(
+    campaigns: dict[str, Campaign],
+) -> None:
+    campaign = campaigns["slow"]
+    most = max(loss.ticks for loss in campaign.losses())
+    assert most <= campaign.terms.split_s + 1
+    assert most * campaign.bytes_of_a_tick <= CHUNK_BYTES
