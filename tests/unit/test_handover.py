@@ -20,6 +20,7 @@ from ros2_memory.recorder.handover import (
     Overlap,
     read_handover,
     write_handover,
+    write_handovers,
 )
 from ros2_memory.recorder.layout import HANDOVER_FILE
 from ros2_memory.timebase import MAX_NS, MIN_NS
@@ -182,3 +183,12 @@ class TestFile:
     def test_a_fifo_in_its_place_is_not_waited_for(self, tmp_path: Path) -> None:
         os.mkfifo(tmp_path / HANDOVER_FILE)
         assert read_handover(tmp_path).problem is not None
+
+    def test_a_pair_is_written_whole_or_not_at_all(self, tmp_path: Path) -> None:
+        old, new = tmp_path / "old", tmp_path / "new"
+        new.mkdir()
+        write_handover(new, Handover(state=Counting.PENDING))
+        # The old one cannot be written: its directory is not there.
+        with pytest.raises(RecorderError):
+            write_handovers({new: Handover(counts_from=5), old: Handover(counts_until=5)})
+        assert read_handover(new).handover == Handover(state=Counting.PENDING)

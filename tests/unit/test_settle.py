@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -187,3 +188,17 @@ class TestCutClock:
         (tmp_path / "broken.mcap").write_bytes(b"broken")
         assert cut_clock(tmp_path / "empty.mcap", READER) is CutClock.PUBLISH
         assert cut_clock(tmp_path / "broken.mcap", READER) is CutClock.PUBLISH
+
+
+def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: Path) -> None:
+    first = recording(tmp_path, "a", 0, 10, delay=5)
+    second = recording(tmp_path, "b", 8, 20, delay=9)
+    third = recording(tmp_path, "c", 18, 25, delay=2)
+    write_handover(first, intended(Handover(), "b"))
+    end = Overlap(T0 + 18 * S, None, ("b_0.mcap",))
+    handed_over = replace(pending("a"), next="c", counts_until=T0 + 19 * S, end=end)
+    write_handover(second, handed_over)
+    begin = Overlap(T0 + 17 * S, T0 + 21 * S, ("c_0.mcap",))
+    write_handover(third, Handover(previous="b", counts_from=T0 + 19 * S, begin=begin))
+    settle_all(tmp_path, READER)
+    assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(250)), 1)

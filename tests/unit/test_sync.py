@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.recorder import sync
-from ros2_memory.recorder.sync import flush_bags, read_small_file, write_durably
+from ros2_memory.recorder.sync import flush_bags, read_small_file, write_all_durably, write_durably
 
 
 @pytest.fixture
@@ -82,3 +82,17 @@ def test_only_a_small_regular_file_is_read(tmp_path: Path) -> None:
         read_small_file(tmp_path / "large")
     with pytest.raises(ValueError, match="not a regular file"):
         read_small_file(tmp_path / "pipe")
+
+
+def test_of_several_files_none_is_replaced_where_one_cannot_be_written(tmp_path: Path) -> None:
+    first, second = tmp_path / "a.json", tmp_path / "b.json"
+    first.write_text("before")
+    second.write_text("before")
+    (tmp_path / ".b.json.tmp").mkdir()  # in the way, as a full disk is
+    with pytest.raises(IsADirectoryError):
+        write_all_durably({first: "after", second: "after"})
+    assert (first.read_text(), second.read_text()) == ("before", "before")
+    assert not (tmp_path / ".a.json.tmp").exists()
+    (tmp_path / ".b.json.tmp").rmdir()
+    write_all_durably({first: "after", second: "after"})
+    assert (first.read_text(), second.read_text()) == ("after", "after")

@@ -28,10 +28,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.layout import HANDOVER_FILE
-from ros2_memory.recorder.sync import read_small_file, write_durably
+from ros2_memory.recorder.sync import read_small_file, write_all_durably
 from ros2_memory.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from ros2_memory.timebase import Ns
@@ -148,6 +149,26 @@ def write_handover(recording: Path, handover: Handover) -> None:
     Raises:
         RecorderError: it cannot be written; the one before stands.
     """
+    write_handovers({recording: handover})
+
+
+def write_handovers(handovers: Mapping[Path, Handover]) -> None:
+    """Replaces the sidecars of recordings, in this order; where the disk is full none of them.
+
+    Raises:
+        RecorderError: one cannot be written.
+    """
+    texts = {
+        recording / HANDOVER_FILE: _text(handover) for recording, handover in handovers.items()
+    }
+    try:
+        write_all_durably(texts)
+    except OSError as error:
+        targets = ", ".join(str(target) for target in texts)
+        raise RecorderError(f"{targets} cannot be written: {error.strerror or error}") from error
+
+
+def _text(handover: Handover) -> str:
     content = {
         "format": FORMAT,
         "state": handover.state,
@@ -160,11 +181,7 @@ def write_handover(recording: Path, handover: Handover) -> None:
         "end": _written(handover.end),
         "notes": list(handover.notes),
     }
-    target = recording / HANDOVER_FILE
-    try:
-        write_durably(target, json.dumps(content, indent=1) + "\n")
-    except OSError as error:
-        raise RecorderError(f"{target} cannot be written: {error.strerror or error}") from error
+    return json.dumps(content, indent=1) + "\n"
 
 
 def _exclusion(overlap: Overlap, file_name: str, start: Ns, stop: Ns) -> list[Exclusion]:

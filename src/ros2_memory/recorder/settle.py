@@ -18,12 +18,11 @@ from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.handover import (
     Counting,
     CutClock,
-    Handover,
     Overlap,
     read_handover,
     write_handover,
 )
-from ros2_memory.recorder.rotation import withdrawn
+from ros2_memory.recorder.rotation import Sidecars, withdrawn
 from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -89,7 +88,7 @@ def _settle(old: Path, new: Path, reader: BagReader) -> None:
         end = Overlap(start, None, files)
         write_handover(old, replace(before, counts_until=after.counts_from, end=end))
     else:
-        _cut_at_the_end(old, new, before, reader)
+        _cut_at_the_end(old, new, Sidecars(before, after), reader)
 
 
 def cut_clock(bag: Path, reader: BagReader) -> CutClock:
@@ -107,11 +106,16 @@ class _Reach(NamedTuple):
     log_time: Ns
 
 
-def _cut_at_the_end(old: Path, new: Path, before: Handover, reader: BagReader) -> None:
-    """The old recording counts as far as it reaches, the new one from there."""
+def _cut_at_the_end(old: Path, new: Path, found: Sidecars, reader: BagReader) -> None:
+    """The old recording counts as far as it reaches, the new one from there.
+
+    The new one may have handed over itself since, where this could not be written down at once:
+    what its sidecar says of its own end stands.
+    """
+    before, after = found
     reach = _reach(old, reader)
     if reach is None:
-        write_handover(new, Handover(previous=old.name))
+        write_handover(new, replace(after, state=Counting.COUNTS, previous=old.name))
         write_handover(old, withdrawn(before))
         return
     bags = _bags(new, reader)
@@ -121,7 +125,8 @@ def _cut_at_the_end(old: Path, new: Path, before: Handover, reader: BagReader) -
     # One that cannot be read yet is still being written.
     files = tuple(path.name for path in _files(new, reader) if path.name not in later)
     begin = Overlap(None, until, files)
-    write_handover(new, Handover(previous=old.name, counts_from=cut, begin=begin))
+    start = replace(after, state=Counting.COUNTS, previous=old.name, counts_from=cut, begin=begin)
+    write_handover(new, start)
     write_handover(old, replace(before, counts_until=cut, end=Overlap(None, None, ())))
 
 

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
 MAX_SMALL_FILE: Final = 1 << 20
@@ -23,18 +23,32 @@ def write_durably(target: Path, text: str) -> None:
     Raises:
         OSError: it cannot be written; what was there stands.
     """
-    beside = target.with_name(f".{target.name}.tmp")
+    write_all_durably({target: text})
+
+
+def write_all_durably(texts: Mapping[Path, str]) -> None:
+    """Replaces the files one after the other, each at once, and none before all texts are on disk.
+
+    So a full disk leaves all of them as they are; a power cut may come between two of them.
+
+    Raises:
+        OSError: a text cannot be written, and `filename` says which.
+    """
+    waiting = {target: target.with_name(f".{target.name}.tmp") for target in texts}
     try:
-        with beside.open("w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        beside.replace(target)
+        for target, beside in waiting.items():
+            with beside.open("w", encoding="utf-8") as stream:
+                stream.write(texts[target])
+                stream.flush()
+                os.fsync(stream.fileno())
+        for target, beside in waiting.items():
+            beside.replace(target)
+            flush(target.parent)
     except OSError:
-        with suppress(OSError):
-            beside.unlink(missing_ok=True)
+        for beside in waiting.values():
+            with suppress(OSError):
+                beside.unlink(missing_ok=True)
         raise
-    flush(target.parent)
 
 
 def read_small_file(path: Path) -> str:

@@ -10,7 +10,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ros2_memory.recorder.handover import CutClock, Handover, read_handover, write_handover
+from ros2_memory.recorder.handover import (
+    CutClock,
+    Handover,
+    read_handover,
+    write_handover,
+    write_handovers,
+)
 from ros2_memory.recorder.rotation import handed_over, intended, pending, void, withdrawn
 from ros2_memory.recorder.settle import cut_clock, settle
 
@@ -94,8 +100,12 @@ class Takeover:
             simulated=self._simulated,
             clock=self._clock(),
         )
-        write_handover(self.new.splits.directory, sidecars.new)
-        write_handover(self.old.splits.directory, sidecars.old)
+        write_handovers(
+            {
+                self.new.splits.directory: sidecars.new,
+                self.old.splits.directory: sidecars.old,
+            }
+        )
         return True
 
     def abandon(self) -> None:
