@@ -322,8 +322,11 @@ def test_of_what_ros_logs_of_itself_only_the_newest_runs_are_kept(site: Site) ->
     for number in range(50):
         (logs / f"ros2_{number}.log").touch()
         os.utime(logs / f"ros2_{number}.log", (number, number))
+    (logs / "a_directory").mkdir()
+    os.utime(logs / "a_directory", (0, 0))
     assert site.run().stop() == 0
-    assert {path.name for path in logs.iterdir()} == {f"ros2_{n}.log" for n in range(30, 50)}
+    left = {path.name for path in logs.iterdir()}
+    assert left == {"a_directory", *(f"ros2_{n}.log" for n in range(30, 50))}
 
 
 def test_old_bags_are_cleared_only_when_that_is_asked_for(site: Site) -> None:

@@ -110,3 +110,24 @@ def test_a_directory_that_may_not_be_read_is_told(splits: Splits) -> None:
     splits.directory.chmod(0)
     assert len(splits.look(0).faults) == 1
     splits.directory.chmod(0o755)
+
+
+class Seconds(float):
+    """A moment that counts how often it is compared with another."""
+
+    compared = 0
+
+    def __gt__(self, other: float) -> bool:
+        Seconds.compared += 1
+        return float(self) > float(other)
+
+
+def test_a_look_does_not_compare_each_split_with_each(splits: Splits) -> None:
+    """A recording of a day has 8640 of them, and is looked at twice a second."""
+    splits.directory.mkdir()
+    for number in range(100):
+        (splits.directory / f"rec_1_{number}.mcap").touch()
+    splits.look(Seconds(0))
+    Seconds.compared = 0
+    splits.look(Seconds(1))
+    assert 0 < Seconds.compared <= 300

@@ -178,4 +178,5 @@ def _prune(log_dir: Path) -> None:
     with suppress(OSError):
         logs = sorted(log_dir.iterdir(), key=lambda path: path.lstat().st_mtime_ns)
         for path in logs[:-LOGS_KEPT]:
-            path.unlink()
+            with suppress(OSError):  # a directory; the others may go all the same
+                path.unlink()

@@ -76,7 +76,11 @@ class Splits:
             split.size = max(split.size, size)
         faults: list[str] = []
         closed = tuple(name for name in sizes if self._has_closed(name, faults))
-        empty = tuple(name for name, size in sizes.items() if self._is_empty(name, size, now_s))
+        newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
+        overdue = now_s - newest_s >= EMPTY_GRACE_S
+        empty = tuple(
+            name for name, size in sizes.items() if overdue and self._is_empty(name, size, newest_s)
+        )
         return Changes(closed, empty, faults=tuple(faults))
 
     @property
@@ -122,12 +126,10 @@ class Splits:
         self.messages += summary.count
         return True
 
-    def _is_empty(self, name: str, size: int, now_s: float) -> bool:
-        """Whether the split is empty though a newer one has been there for a while; said once."""
+    def _is_empty(self, name: str, size: int, newest_s: float) -> bool:
+        """Whether the split is empty though a newer one was seen; said once."""
         split = self._files[name]
-        newest_s = max(other.first_seen_s for other in self._files.values())
-        overdue = newest_s > split.first_seen_s and now_s - newest_s >= EMPTY_GRACE_S
-        if size > 0 or split.reported_empty or not overdue:
+        if size > 0 or split.reported_empty or newest_s <= split.first_seen_s:
             return False
         split.reported_empty = True
         return True
