@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from ros2_memory.conditions import leaves, positions
 from ros2_memory.errors import UndecodableError
@@ -24,15 +26,18 @@ from ros2_memory.evidence import (
     rounded,
     words_of,
 )
-from ros2_memory.model import TimeWindow
+from ros2_memory.model import Pose, TimeWindow
+from ros2_memory.mould import mould_of
 from ros2_memory.trajectory import PoseCollector
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.model import BagSummary, JsonValue, StampedTransform
     from ros2_memory.motion import PoseDigest
+    from ros2_memory.mould import Bytes, Mould
     from ros2_memory.storage.base import BagReader, Record
     from ros2_memory.timebase import Ns
 
@@ -47,6 +52,12 @@ MOST_TEXTS: Final = 2_000
 MOST_EDGES: Final = 1_000
 
 _LARGEST: Final = 1e300
+_FEW: Final = 24
+"""So many messages are decoded one by one: looking for their mould costs as much."""
+_MOST_MOULDS: Final = 8
+_WORTH_IT: Final = 8
+"""A mould of fewer messages than these costs more than it saves."""
+_MOST_WAITING_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +130,14 @@ class Digester:
         for each in summary.topics:
             topics[each.topic] |= each.latched
         collectors = {
-            topic: _Collector(topic, self._reader, self._extractor, limit, latched=latched)
-            for limit in (self._max_plausible_speed_mps,)
+            topic: _Collector(
+                topic,
+                self._reader,
+                self._extractor,
+                self._max_plausible_speed_mps,
+                latched=latched,
+                many=sum(each.count for each in summary.topics if each.topic == topic) > _FEW,
+            )
             for topic, latched in topics.items()
         }
         for record in self._reader.records(path, tuple(topics), TimeWindow.everything()):
@@ -141,8 +158,18 @@ class Digester:
         return reasons
 
 
+class _Seen(NamedTuple):
+    """What one message that could be decoded says of the robot's motion."""
+
+    pose: Pose | None
+    speed_mps: float | None
+
+
 class _Collector:
-    """Takes the messages of one topic, in order."""
+    """Takes the messages of one topic, in order.
+
+    `many`: it is worth looking for moulds.
+    """
 
     def __init__(
         self,
@@ -152,6 +179,7 @@ class _Collector:
         max_plausible_speed_mps: float,
         *,
         latched: bool,
+        many: bool,
     ) -> None:
         self._topic = topic
         self._reader = reader
@@ -159,41 +187,34 @@ class _Collector:
         self._latched = latched
         self._evidence = EvidenceCollector()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
-        self._edges: _Edges | None = _Edges()
+        self._pairs: set[tuple[str, str]] | None = set()
+        self._ends: tuple[Record, Record] | None = None
         self._kept: list[Record] | None = []
         self._kept_bytes = 0
+        self._moulds: list[tuple[Mould, Record]] = []
+        self._more_moulds = _MOST_MOULDS if many else 0
+        self._waiting: list[Record] = []
+        self._waiting_bytes = 0
 
     def add(self, record: Record) -> None:
         self._keep(record)
-        type_name = record.channel.type
-        try:
-            message = self._reader.decode(record)
-        except UndecodableError:
-            self._evidence.give_up()
-            self._poses = self._edges = None
+        self._ends = (record if self._ends is None else self._ends[0], record)
+        if not self._moulds and not self._more_moulds:
+            self._take(record, self._decoded(record))
             return
-        self._evidence.add(self._extractor.exact(message, type_name))
-        if self._poses is not None:
-            pose = self._extractor.pose(message, type_name)
-            if pose is None:
-                self._poses = None
-            else:
-                twist = self._extractor.twist(message, type_name)
-                speed = None if twist is None else math.hypot(*twist.linear)
-                self._poses.add(record.log_time, pose, speed)
-        if self._edges is not None and not self._edges.add(
-            self._extractor.transforms(message, record.log_time, static=False)
-        ):
-            self._edges = None
+        self._waiting.append(record)
+        self._waiting_bytes += len(record.payload)
+        if self._waiting_bytes > _MOST_WAITING_BYTES:
+            self._flush()
 
     def digest(self, undecodable: dict[str, str]) -> TopicDigest:
-        edges = None if self._edges is None else self._edges.digest()
-        few = self._kept is not None and (self._latched or bool(edges and edges.pairs))
+        self._flush()
+        few = self._kept is not None and (self._latched or bool(self._pairs))
         return TopicDigest(
             topic=self._topic,
             evidence=self._evidence.evidence(),
             poses=None if self._poses is None else self._poses.digest(),
-            edges=edges,
+            edges=self._edges(),
             kept=tuple(self._kept) if self._kept is not None and few else None,
             undecodable=tuple(undecodable.items()),
         )
@@ -207,28 +228,98 @@ class _Collector:
         else:
             self._kept.append(record)
 
-
-class _Edges:
-    """Takes the transforms of one topic, message by message."""
-
-    def __init__(self) -> None:
-        self._pairs: set[tuple[str, str]] = set()
-        self._first: list[Ns] | None = None
-        self._last: list[Ns] = []
-
-    def add(self, transforms: tuple[StampedTransform, ...]) -> bool:
-        """Takes one message's; False where they are too many to keep."""
-        self._pairs.update((each.parent, each.child) for each in transforms)
-        self._last = [each.stamp for each in transforms]
-        if self._first is None:
-            self._first = self._last
-        return len(self._pairs) <= MOST_EDGES
-
-    def digest(self) -> EdgeDigest:
-        stamps = [*(self._first or ()), *self._last]
+    def _edges(self) -> EdgeDigest | None:
+        if self._pairs is None:
+            return None
+        ends = self._ends if self._pairs else None
+        stamps = [each.stamp for end in ends or () for each in self._transforms(end)]
         return EdgeDigest(
             tuple(sorted(self._pairs)), min(stamps, default=None), max(stamps, default=None)
         )
+
+    def _transforms(self, record: Record) -> tuple[StampedTransform, ...]:
+        message = self._reader.decode(record)
+        return self._extractor.transforms(message, record.log_time, static=False)
+
+    def _decoded(self, record: Record) -> _Seen | None:
+        """Takes a message but for its pose, which it gives; None where it cannot be decoded."""
+        type_name = record.channel.type
+        try:
+            message = self._reader.decode(record)
+        except UndecodableError:
+            self._evidence.give_up()
+            self._pairs = None
+            return None
+        self._evidence.add(self._extractor.exact(message, type_name))
+        if self._pairs is not None:
+            edges = self._extractor.transforms(message, record.log_time, static=False)
+            self._pairs.update((each.parent, each.child) for each in edges)
+            if len(self._pairs) > MOST_EDGES:
+                self._pairs = None
+        twist = self._extractor.twist(message, type_name)
+        speed = None if twist is None else math.hypot(*twist.linear)
+        return _Seen(self._extractor.pose(message, type_name), speed)
+
+    def _take(self, record: Record, seen: _Seen | None) -> None:
+        """Takes the pose of the next message."""
+        if seen is None or seen.pose is None:
+            self._poses = None
+        elif self._poses is not None:
+            self._poses.add(record.log_time, seen.pose, seen.speed_mps)
+
+    def _flush(self) -> None:
+        """Takes the waiting messages: those of one mould together, the others one by one."""
+        records, self._waiting, self._waiting_bytes = self._waiting, [], 0
+        seen: list[_Seen | None] = [None] * len(records)
+        rest: Sequence[int] = range(len(records))
+        for mould, first in self._moulds:
+            rest = self._cast(mould, first, records, rest, seen)
+        while rest:
+            at, rest = rest[0], rest[1:]
+            seen[at] = self._decoded(records[at])
+            made = self._new_mould(records[at]) if seen[at] is not None else None
+            if made is not None:
+                before = len(rest)
+                rest = self._cast(made, records[at], records, rest, seen)
+                if before - len(rest) >= _WORTH_IT:
+                    self._moulds.append((made, records[at]))
+                else:
+                    self._more_moulds = 0
+        for record, each in zip(records, seen, strict=True):
+            self._take(record, each)
+
+    def _new_mould(self, record: Record) -> Mould | None:
+        """The mould of a message that could be decoded; one failure is the last try."""
+        if not self._more_moulds:
+            return None
+        self._more_moulds -= 1
+        mould = mould_of(self._reader, self._extractor, record)
+        if mould is None or mould.pairs != {
+            (each.parent, each.child) for each in self._transforms(record)
+        }:
+            # Where a transform of this one is not valid, it may be in others.
+            self._more_moulds = 0
+            return None
+        return mould
+
+    def _cast(
+        self,
+        mould: Mould,
+        first: Record,
+        records: Sequence[Record],
+        rest: Sequence[int],
+        seen: list[_Seen | None],
+    ) -> Sequence[int]:
+        """Takes those of `rest` that are of a mould; gives the others."""
+        chosen, rows = mould.those_like(first, records, rest)
+        if not chosen:
+            return rest
+        self._evidence.add_rows(mould, rows)
+        speeds = [None if v is None else math.hypot(*v) for v in mould.velocities(rows)]
+        for at, pose, speed in zip(chosen, mould.poses(rows), speeds, strict=True):
+            seen[at] = _Seen(pose, speed)
+        taken = set(chosen)
+        return [at for at in rest if at not in taken]
 
 
 class EvidenceCollector:
@@ -265,6 +356,26 @@ class EvidenceCollector:
             self._add_numbers(numbers)
             for x, y, z in positions(value):
                 self._add_place(x, y, z)
+
+    def add_rows(self, mould: Mould, rows: Bytes) -> None:
+        """Takes many messages of a mould of which one was added as a value."""
+        if self._open:
+            return
+        for offset in mould.numbers:
+            column = mould.column(rows, offset)
+            numbers = column[~np.isnan(column)]
+            if numbers.size:
+                self._add_numbers(np.unique(numbers).tolist())
+        for offset in mould.times:
+            self._add_numbers(mould.seconds(rows, offset))
+        if mould.angles:
+            self._add_numbers([-180.0, 180.0])
+            self._numbers = None
+        for place in mould.places:
+            points = np.array(mould.points(rows, place), dtype=np.float64)
+            here = points[np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])]
+            if here.size:
+                self._add_places(here)
 
     def evidence(self) -> Evidence:
         """What the values so far can have held."""
@@ -306,6 +417,14 @@ class EvidenceCollector:
             huge = max(abs(low), abs(high)) > _LARGEST
             if huge or len(numbers) > MOST_NUMBERS or len(self._numbers) > MOST_NUMBERS:
                 self._numbers = None
+
+    def _add_places(self, points: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:
+        heights = points[np.isfinite(points[:, 2]), 2]
+        low_z, high_z = (heights.min(), heights.max()) if heights.size else (math.inf, -math.inf)
+        (min_x, min_y, _), (max_x, max_y, _) = points.min(axis=0), points.max(axis=0)
+        bounds = (min_x, max_x, min_y, max_y, low_z, high_z)
+        box = Box(*(float(bound) for bound in bounds))
+        self._box = box if self._box is None else self._box.united(box)
 
     def _add_place(self, x: float, y: float, z: float) -> None:
         if not (math.isfinite(x) and math.isfinite(y)):

@@ -11,6 +11,7 @@ or memory on some inputs.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import threading
 from dataclasses import dataclass
@@ -51,12 +52,14 @@ class MessageType:
     """How one schema is deserialized, or the reason why it cannot be (one of both is None).
 
     `fieldless`: the definition has no field, so any payload of more than a byte contradicts it.
+    `definitions` are those of the type and of all that it is made of; None with a reason.
     """
 
     name: str
     deserialize: Callable[[bytes], object] | None
     reason: str | None
     fieldless: bool = False
+    definitions: Typesdict | None = dataclasses.field(default=None, repr=False, compare=False)
 
 
 class _UnusableError(Exception):
@@ -106,7 +109,7 @@ class Typestores:
             return self._types.setdefault(key, self._build(name, encoding, text))
 
     def _build(self, name: str, encoding: str, text: bytes) -> MessageType:
-        root = _full_name(name)
+        root = full_name(name)
         try:
             definitions = self._closure(root, _sections(root, encoding, text))
             store = _compiled(definitions, root)
@@ -116,7 +119,7 @@ class Typestores:
         def deserialize(payload: bytes) -> object:
             return store.deserialize_cdr(payload, root)
 
-        return MessageType(name, deserialize, None, fieldless=not definitions[root][1])
+        return MessageType(name, deserialize, None, not definitions[root][1], definitions)
 
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
         """The definitions of `root` and of all that it is made of, checked to be bounded."""
@@ -187,11 +190,11 @@ def _sections(name: str, encoding: str, text: bytes) -> dict[str, _Section]:
         sections[name] = _Section(root, pieces[0])
     for kind, named, body in zip(pieces[1::3], pieces[2::3], pieces[3::3], strict=True):
         section = _Section("ros2idl" if kind == "IDL" else "ros2msg", body)
-        sections.setdefault(_full_name(named), section)
+        sections.setdefault(full_name(named), section)
     return sections
 
 
-def _full_name(name: str) -> str:
+def full_name(name: str) -> str:
     """`package/Name` as `package/msg/Name`."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name

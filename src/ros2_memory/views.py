@@ -127,8 +127,11 @@ def _floats(*values: object) -> list[float] | None:
 def rotation(node: object) -> Quaternion | None:
     """The unit quaternion of a node; None where it is no rotation: zero, not finite, no numbers."""
     numbers = xyzw(node)
-    if numbers is None:
-        return None
+    return None if numbers is None else unit(numbers)
+
+
+def unit(numbers: Quaternion) -> Quaternion | None:
+    """The unit quaternion of four numbers; None where they are no rotation."""
     x, y, z, w = numbers
     # Nearly every quaternion of a robot is a unit one; this door is passed for each pose.
     if abs(x * x + y * y + z * z + w * w - 1) < 1e-12:

@@ -72,6 +72,25 @@ class Record(NamedTuple):
     payload: bytes
 
 
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the numbers of a message lie: offsets in its payload, little-endian.
+
+    It is of every payload of `size` bytes that is the same outside of these numbers.
+
+    Attributes:
+        size: bytes of the payload.
+        doubles: of each float64.
+        singles: of each float32.
+        times: of each time or duration: int32 seconds, then uint32 nanoseconds.
+    """
+
+    size: int
+    doubles: tuple[int, ...]
+    singles: tuple[int, ...]
+    times: tuple[int, ...]
+
+
 class BagReader(ABC):
     """Reads bag files of the kinds that `reads` accepts."""
 
@@ -158,3 +177,8 @@ class BagReader(ABC):
         Raises:
             UndecodableError: no definition, a foreign encoding, or bytes that do not fit it.
         """
+
+    def layout(self, record: Record) -> Layout | None:
+        """Where the numbers of this message lie; None where that is not told: then decode it."""
+        del record
+        return None

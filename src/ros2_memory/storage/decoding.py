@@ -6,15 +6,16 @@ import json
 from typing import TYPE_CHECKING
 
 from ros2_memory.errors import UndecodableError
+from ros2_memory.storage.cdr import layout_of
 from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.zstd import FRAME_MAGIC
-from ros2_memory.typestore import Typestores
+from ros2_memory.typestore import Typestores, full_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.storage.base import Channel, Record
+    from ros2_memory.storage.base import Channel, Layout, Record
 
 _MAX_KNOWN = 10_000
 _EMPTY_MESSAGE_BYTES = 8
@@ -58,6 +59,17 @@ class Decoding:
         except Exception as error:
             reason = _why(record, error)
             raise UndecodableError(channel.topic, channel.type, reason) from error
+
+    def layout(self, record: Record) -> Layout | None:
+        """Where the numbers of a message lie; None where only decoding tells."""
+        channel = record.channel
+        if channel.encoding != "cdr":
+            return None
+        schema = channel.schema
+        definitions = self._typestores.lookup(schema.name, schema.encoding, schema.text).definitions
+        if definitions is None:
+            return None
+        return layout_of(definitions, full_name(schema.name), record.payload)
 
     def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
         known = self._known.get(id(channel))

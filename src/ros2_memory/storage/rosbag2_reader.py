@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.model import BagSummary, TimeWindow
-    from ros2_memory.storage.base import Channel, Closing, Record
+    from ros2_memory.storage.base import Channel, Closing, Layout, Record
     from ros2_memory.timebase import Ns
 
 _KINDS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
@@ -124,6 +124,10 @@ class Rosbag2Reader(BagReader):
     def decode(self, record: Record) -> object:
         """The message of a record."""
         return self._decoding.decode(record)
+
+    def layout(self, record: Record) -> Layout | None:
+        """Where the numbers of a record lie, or None."""
+        return self._decoding.layout(record)
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[_Opened]:
