@@ -88,6 +88,8 @@ class Group:
             return
         places = self._located()
         for index in indices:
+            if index >= len(places):
+                return  # a bag was deleted since its messages were counted
             place = places[index]
             moment = TimeWindow(place.time, place.time + 1)
             bag = self.holdings[place.rank].bag

@@ -134,7 +134,7 @@ def topic_range(
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, chosen = view.pick(name, window, max_samples)
-    if not total:
+    if not chosen:
         raise nothing_between(view, (name,), window)
     samples, types = _samples(view, chosen, fields)
     if len(types) > 1:
