@@ -37,6 +37,7 @@ def keeper_of(
     reader: BagReader | None = None,
     writer: BagWriter | None = None,
     grace_s: float = 0.0,
+    monotonic: Callable[[], float] = time.monotonic,
     measure_free: Callable[[Path], int] = lambda _: PLENTY,
 ) -> Housekeeping:
     """A housekeeper. Unless a clock is given it is an hour later: nothing is being written."""
@@ -49,6 +50,7 @@ def keeper_of(
         split_duration_s=10.0,
         static_topics=("/tf_static",),
         grace_s=grace_s,
+        monotonic=monotonic,
         measure_free=measure_free,
     )
 

@@ -9,8 +9,10 @@ import structlog
 import zstandard
 
 from ros2_memory import queries
-from ros2_memory.memory import Call
+from ros2_memory.errors import NoDataError
+from ros2_memory.memory import Call, Limits, Memory
 from ros2_memory.model import TimeWindow
+from ros2_memory.moments import Span
 from ros2_memory.recorder.housekeeping import InBackground
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.ports import Housekeeper
@@ -27,7 +29,7 @@ from tests.keeping import (
     recording_now,
     size_of,
 )
-from tests.memories import memory_of
+from tests.memories import extractor, memory_of
 from tests.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
@@ -457,15 +459,35 @@ class TestQuestionsMeanwhile:
         rest = list(records)
         assert (begun.log_time, len(rest)) == (T0, 19)
 
-    def test_a_snapshot_taken_before_answers_with_a_note_of_what_is_gone(
-        self, tmp_path: Path
+    @pytest.mark.parametrize("kept", [1, 0])
+    def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
+        self, tmp_path: Path, kept: int
     ) -> None:
-        recording(tmp_path, "a", 0)
-        memory = memory_of(tmp_path, clock=later())
-        memory.index.snapshot()
-        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
-        rows = queries.list_recorded_topics(memory, Call())
-        assert [row.topic for row in rows] == ["/odom"]
+        paths = recording(tmp_path, "a", 0)
+        memory = stale_memory(tmp_path)
+        span = Span(start_s=T0 / S, end_s=T0 / S + 24.5)
+        assert queries.topic_range(memory, Call(), "/odom", span).total == 59
+        for path in paths[: 3 - kept]:
+            path.unlink()
+        if kept:
+            told = queries.topic_range(memory, Call(), "/odom", span)
+            assert len(told.samples) == 19
+            assert any("deleted before it could be read" in note for note in told.notes)
+            assert queries.trajectory_summary(memory, Call(), span).start == T0 + 20 * S
+        else:
+            with pytest.raises(NoDataError):
+                queries.topic_range(memory, Call(), "/odom", span)
+            with pytest.raises(NoDataError):
+                queries.trajectory_summary(memory, Call(), span)
+        queries.list_recorded_topics(memory, Call())
+
+
+def stale_memory(bag_dir: Path) -> Memory:
+    """A memory that looked at the bags once, and does not look again."""
+    clock, reader = later(), McapReader()
+    index = IndexManager(bag_dir, reader, clock, refresh_s=10**6, split_duration_s=10.0)
+    index.refresh()
+    return Memory(index, reader, extractor(), clock, Limits(now="latest"))
 
 
 class TestRemoval:

@@ -234,6 +234,17 @@ class TestTheBagOfCarriedMessages:
         keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply(tmp_path)
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
 
+    def test_where_no_other_bag_can_go_in_its_place_it_goes_at_once(self, tmp_path: Path) -> None:
+        recording(
+            tmp_path,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+        )
+        keeper_of(tmp_path, max_bytes=1, grace_s=10**6).apply(tmp_path)
+        assert "rec/rec_0.mcap" not in files_in(tmp_path)
+        assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
+
     def test_on_a_full_disk_nothing_is_waited_for(self, tmp_path: Path) -> None:
         recording(
             tmp_path,

@@ -2,7 +2,8 @@
 
 Whoever asks a question holds what was known of the bags some seconds ago. So a bag with latched
 messages is deleted only when those have been carried for that long: until then somebody may look
-for them where they stood. Meanwhile the next oldest goes in its place.
+for them where they stood. Meanwhile the next oldest goes in its place; where there is none, the
+limits come first.
 """
 
 from __future__ import annotations
@@ -56,13 +57,21 @@ class Disposed:
 class _Pass:
     """One pass under way: bags that were deleted, and those that stay.
 
-    `urgent`: the disk is full, so that nothing is waited for.
+    Of these some are `waiting`: they could be deleted, and should be some moments later. When it is
+    `urgent` nothing is waited for.
     """
 
     urgent: bool
+    waiting: set[str] = field(default_factory=set)
     done: Disposed = field(default_factory=Disposed)
     gone: set[str] = field(default_factory=set)
     staying: set[str] = field(default_factory=set)
+
+    def hurry(self) -> None:
+        """Waits no more."""
+        self.urgent = True
+        self.staying -= self.waiting
+        self.waiting.clear()
 
 
 class Disposal:
@@ -127,9 +136,12 @@ class Disposal:
             found = weighed(stock, limits)
             under_way.done.total_bytes, under_way.done.fits = found.total_bytes, found.fits
             doomed = found.doomed[: MOST_AT_ONCE - len(under_way.gone)]
-            if not doomed:
+            if doomed:
+                self._dispose(doomed, snapshot, under_way)
+            elif found.fits or not under_way.waiting:
                 break
-            self._dispose(doomed, snapshot, under_way)
+            else:
+                under_way.hurry()
         self._tidy(known, under_way)
         return under_way.done
 
@@ -149,6 +161,7 @@ class Disposal:
         for each in doomed:
             if each.path in latched and self._is_asked_for(each.path, under_way):
                 under_way.staying.add(each.path)
+                under_way.waiting.add(each.path)
             if each.path not in under_way.staying:
                 self._delete(each, under_way)
 

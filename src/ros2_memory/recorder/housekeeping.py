@@ -70,6 +70,7 @@ class Housekeeping:
         static_topics: topics that are latched whatever their publishers say.
         grace_s: for how long a question may hold what was known of the bags before.
         measure_free: measures what the disk has left.
+        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
@@ -84,17 +85,23 @@ class Housekeeping:
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
         measure_free: Callable[[Path], int] = free_bytes,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        carrier = Carrier(bag_dir, reader, writer, static_topics)
+        disposal = Disposal(
+            bag_dir,
+            limits,
+            Carrier(bag_dir, reader, writer, static_topics),
+            static_topics=static_topics,
+            grace_s=grace_s,
+            monotonic=monotonic,
+        )
         self._index = IndexManager(
             bag_dir,
             reader,
             clock,
             refresh_s=REFRESH_S,
             split_duration_s=split_duration_s,
-            disposal=Disposal(
-                bag_dir, limits, carrier, static_topics=static_topics, grace_s=grace_s
-            ),
+            disposal=disposal,
         )
         self._repairer = Repairer(reader, writer)
         self._clock = clock

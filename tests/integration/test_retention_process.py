@@ -1,0 +1,273 @@
+"""Retention while a recorder records and questions are asked; and none where nothing is recorded.
+
+30 splits; EPISODIC_LONG=1 makes it 200.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+from mcp import Client
+
+from ros2_memory import queries
+from ros2_memory.errors import NoDataError
+from ros2_memory.memory import Call, Limits
+from ros2_memory.moments import Moment, Span
+from ros2_memory.recorder.layout import is_carried
+from ros2_memory.timebase import NS_PER_S, WallClock
+from tests.bags import McapLayout, odom, write_mcap
+from tests.integration.test_server_process import serving
+from tests.keeping import keeper_of, size_of
+from tests.memories import memory_of
+from tests.questions import ask_everything, write_run
+from tests.split_writer import DOCK
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+SPLITS: Final = 200 if os.environ.get("EPISODIC_LONG") == "1" else 30
+KEPT_SPLITS: Final = 6
+SLACK: Final = 8192
+"""Bytes of the heartbeat, of metadata and of carried messages that are about to be counted."""
+
+
+@dataclass
+class Asker:
+    """Asks one question after the other in a thread of its own, and keeps what went wrong."""
+
+    bag_dir: Path
+    begin: int
+    rounds: int = 0
+    no_data: int = 0
+    wrong: list[str] = field(default_factory=list)
+    _stop: threading.Event = field(default_factory=threading.Event)
+    _round: threading.Condition = field(default_factory=threading.Condition)
+
+    def __post_init__(self) -> None:
+        limits = Limits(now="latest", split_duration_s=10.0)
+        self.memory = memory_of(self.bag_dir, clock=WallClock(), limits=limits)
+
+    @contextmanager
+    def asking(self) -> Iterator[None]:
+        thread = threading.Thread(target=self._ask, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            thread.join()
+
+    def _ask(self) -> None:
+        now = Moment(ago_s=0.0)
+        questions: list[Callable[[], object]] = [
+            lambda: queries.list_recorded_topics(self.memory, Call()),
+            lambda: queries.data_time_range(self.memory, Call()),
+            lambda: queries.position(self.memory, Call(), Moment(ago_s=40.0)),
+            lambda: queries.topic_range(self.memory, Call(), "/odom", Span(last_s=60.0)),
+            lambda: queries.trajectory_summary(self.memory, Call(), Span(last_s=100.0)),
+            lambda: queries.find_last_match(self.memory, Call(), "/chatter", "contains", "no such"),
+            lambda: queries.frames(self.memory, Call()),
+        ]
+        while not self._stop.is_set():
+            for question in questions:
+                self._answered(question, may_lack=True)
+            self._answered(lambda: self._is_docked(now), may_lack=False)
+            self._answered(lambda: self._is_placed(now), may_lack=False)
+            with self._round:
+                self.rounds += 1
+                self._round.notify_all()
+
+    def wait_for_a_round(self) -> None:
+        """Waits until every question was asked once more, by what is there at this moment."""
+        with self._round:
+            before = self.rounds
+            assert self._round.wait_for(lambda: self.rounds >= before + 2, timeout=20), self.wrong
+
+    def _answered(self, question: Callable[[], object], *, may_lack: bool) -> None:
+        try:
+            question()
+        except NoDataError as error:
+            self.no_data += 1
+            if not may_lack:
+                self.wrong.append(error.detail)
+        except Exception as error:
+            self.wrong.append(repr(error))
+            raise
+
+    def _is_docked(self, moment: Moment) -> None:
+        told = queries.topic_value(self.memory, Call(), DOCK, moment)
+        if (told.sample.time, told.sample.value) != (self.begin + 1, {"value": "home"}):
+            self.wrong.append(f"{told.sample}")
+
+    def _is_placed(self, moment: Moment) -> None:
+        told = queries.transform(self.memory, Call(), "base_link", "laser", moment)
+        if told.transform.translation != (0.1, 0.0, 0.2):
+            self.wrong.append(f"{told.transform}")
+
+
+@contextmanager
+def writer(bag_dir: Path, begin: int) -> Iterator[Callable[[], dict[str, Any]]]:
+    """A process that records; each call takes it a split further."""
+    command = [sys.executable, "-m", "tests.split_writer", str(bag_dir), f"--begin={begin}"]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        orders, answers = process.stdin, process.stdout
+        assert orders is not None
+        assert answers is not None
+
+        def step() -> dict[str, Any]:
+            orders.write("\n")
+            orders.flush()
+            told: dict[str, Any] = json.loads(answers.readline())
+            return told
+
+        try:
+            yield step
+            orders.close()
+            assert process.wait(timeout=60) == 0
+        finally:
+            process.kill()
+
+
+def test_the_budget_is_held_while_it_is_recorded_and_asked(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    bag_dir.mkdir()
+    begin = WallClock().now() - (SPLITS + 10) * 10 * NS_PER_S
+    asker = Asker(bag_dir, begin)
+    with writer(bag_dir, begin) as step:
+        split = max(step()["size"], step()["size"])
+        budget = KEPT_SPLITS * split
+        keeper = keeper_of(
+            bag_dir,
+            max_bytes=budget,
+            clock=WallClock(),
+            grace_s=2.0,
+            monotonic=lambda: float(asker.rounds),
+        )
+        deleted: set[str] = set()
+        seen: set[str] = set()
+        with asker.asking():
+            for _ in range(SPLITS - 2):
+                seen.add(step()["opened"])
+                assert size_of(bag_dir) <= budget + split + SLACK
+                keeper.apply(bag_dir)
+                assert size_of(bag_dir) <= budget + SLACK
+                asker.wait_for_a_round()
+                deleted = {path for path in seen if not Path(path).exists()}
+        assert asker.wrong == []
+        assert asker.rounds > 0
+    keeper.apply(bag_dir)
+    left = sorted(path for path in bag_dir.rglob("*.mcap") if not is_carried(path))
+    assert len(deleted) > SPLITS // 2
+    assert len(left) >= KEPT_SPLITS - 2
+    assert str(left[-1]) == max(seen)
+    assert {path.parent for path in left} == {
+        path for path in bag_dir.iterdir() if path.is_dir() and path.name.startswith("rec_")
+    }
+    asker._is_docked(Moment(ago_s=0.0))
+    asker._is_placed(Moment(ago_s=0.0))
+    assert asker.wrong == []
+
+
+def state(folder: Path) -> dict[str, tuple[object, ...]]:
+    """Everything of every file and directory but when it was last read."""
+    found: dict[str, tuple[object, ...]] = {}
+    for path in (folder, *sorted(folder.rglob("*"))):
+        status = path.lstat()
+        content = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        found[str(path.relative_to(folder))] = (
+            status.st_mode,
+            status.st_ino,
+            status.st_size,
+            status.st_mtime_ns,
+            status.st_ctime_ns,
+            content,
+        )
+    return found
+
+
+@pytest.fixture
+def old_bags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What somebody recorded long ago, some of it cut short; caches lie elsewhere."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    bag_dir = tmp_path / "bags"
+    write_run(bag_dir)
+    long_ago = 1_700_000_000 * NS_PER_S
+    messages = [odom(long_ago + n, 1.0, 2.0) for n in range(200)]
+    write_mcap(bag_dir / "old/old_0.mcap", messages)
+    write_mcap(bag_dir / "old/old_1.mcap", messages, McapLayout(chunk_size=999, finish=False))
+    (bag_dir / "old/old_2.mcap").write_bytes(b"")
+    (bag_dir / "old/metadata.yaml").write_text("")
+    return bag_dir
+
+
+GREEDY: Final = (
+    "recorder=none",
+    "retention.max_total_gb=0.000001",
+    "retention.max_age_h=0.001",
+    "reader.index_refresh_s=0.01",
+)
+"""Limits that nothing there would keep, if anybody applied them."""
+
+
+async def test_where_nothing_is_recorded_nothing_is_written_or_deleted(
+    old_bags: Path, tmp_path: Path
+) -> None:
+    before = state(old_bags)
+    with serving(old_bags, tmp_path / "log", *GREEDY) as served:
+        async with Client(served.url("/mcp")) as client:
+            await ask_everything(client)
+    assert state(old_bags) == before
+
+
+def test_a_recorder_that_records_nothing_touches_nothing(old_bags: Path) -> None:
+    before = state(old_bags)
+    command = [sys.executable, "-m", "ros2_memory.recorder", *GREEDY]
+    env = os.environ | {"MEMORY_BAG_DIR": str(old_bags)}
+    ran = subprocess.run(
+        [*command, "recording.clear_on_startup=true"], env=env, timeout=60, check=False
+    )
+    assert ran.returncode == 0
+    assert state(old_bags) == before
+
+
+@contextmanager
+def read_only(folder: Path, at: Path) -> Iterator[Path]:
+    """The folder mounted so that nobody can write, which rights alone do not do for root."""
+    at.mkdir()
+    made = [
+        subprocess.run(command, capture_output=True, text=True, check=False)
+        for command in (
+            ["mount", "--bind", str(folder), str(at)],
+            ["mount", "-o", "remount,ro,bind", str(at)],
+        )
+    ]
+    try:
+        if any(each.returncode for each in made):
+            pytest.skip(f"no read-only mount can be made here: {made[0].stderr or made[1].stderr}")
+        yield at
+    finally:
+        subprocess.run(["umount", str(at)], capture_output=True, check=False)
+
+
+async def test_bags_on_a_read_only_mount_are_served(old_bags: Path, tmp_path: Path) -> None:
+    before = state(old_bags)
+    with read_only(old_bags, tmp_path / "mount") as mount:
+        with pytest.raises(OSError, match="Read-only"):
+            (mount / "probe").write_text("x")
+        with serving(mount, tmp_path / "log", *GREEDY) as served:
+            async with Client(served.url("/mcp")) as client:
+                await ask_everything(client)
+    assert state(old_bags) == before
