@@ -101,3 +101,55 @@ def test_the_lock_is_not_inherited_unless_it_is_handed_on(tmp_path: Path) -> Non
     lock = BagDirLock.acquire(tmp_path)
     assert not os.get_inheritable(lock.descriptor)
     lock.release()
+
+
+def test_a_full_disk_keeps_nobody_from_taking_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_descriptor: int, _data: bytes, _offset: int) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "pwrite", full)
+    lock = BagDirLock.acquire(tmp_path)
+    assert "left no name" in refusal(tmp_path)
+    lock.release()
+
+
+class TestRenewal:
+    def test_a_lock_that_stands_is_left_alone(self, tmp_path: Path) -> None:
+        lock = BagDirLock.acquire(tmp_path)
+        assert not lock.renew()
+        lock.release()
+
+    def test_a_lock_whose_file_was_deleted_keeps_others_out_again(self, tmp_path: Path) -> None:
+        lock = BagDirLock.acquire(tmp_path)
+        number = lock.descriptor
+        (tmp_path / LOCK_FILE).unlink()
+        assert lock.renew()
+        assert lock.descriptor == number
+        assert not os.get_inheritable(number)
+        assert not lock.renew()
+        assert f"process {os.getpid()} on" in refusal(tmp_path)
+        lock.release()
+        BagDirLock.acquire(tmp_path).release()
+
+    def test_a_directory_that_has_gone_is_locked_once_it_is_there_again(
+        self, tmp_path: Path
+    ) -> None:
+        bag_dir = tmp_path / "bags"
+        bag_dir.mkdir()
+        lock = BagDirLock.acquire(bag_dir)
+        bag_dir.rename(tmp_path / "elsewhere")
+        assert not lock.renew()
+        bag_dir.mkdir()
+        assert lock.renew()
+        lock.release()
+
+    def test_what_another_has_taken_since_is_not_recorded_into(self, tmp_path: Path) -> None:
+        lock = BagDirLock.acquire(tmp_path)
+        (tmp_path / LOCK_FILE).unlink()
+        descriptor = held_by(tmp_path, json.dumps({"pid": 1, "host": socket.gethostname()}))
+        with pytest.raises(RecorderError, match="process 1 on"):
+            lock.renew()
+        os.close(descriptor)
+        lock.release()

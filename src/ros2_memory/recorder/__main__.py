@@ -67,7 +67,7 @@ def _record(settings: Settings) -> None:
         if not isinstance(recorder, Ticking):
             raise ConfigError(f"recorder: {settings.recorder.target} cannot be run by {PROGRAM}")
         _log.info("starting", bag_dir=str(bag_dir))
-        record_until_told(recorder, ServiceManager())
+        record_until_told(recorder, ServiceManager(), lock)
         _log.info("stopped")
     finally:
         lock.release()

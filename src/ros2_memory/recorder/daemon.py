@@ -78,13 +78,13 @@ def lock_and_prepare(
     return lock
 
 
-def record_until_told(recorder: Ticking, manager: ServiceManager) -> None:
+def record_until_told(recorder: Ticking, manager: ServiceManager, lock: BagDirLock) -> None:
     """Records until SIGTERM, SIGINT or SIGHUP comes, and ends what it started.
 
     It must be called from the main thread, which the recorder's processes die with.
 
     Raises:
-        EpisodicError: recording cannot begin.
+        EpisodicError: recording cannot begin, or another recorder took the bag directory.
     """
     interval_s = watchdog_interval_s()
     next_sign_s = 0.0
@@ -94,6 +94,8 @@ def record_until_told(recorder: Ticking, manager: ServiceManager) -> None:
             manager.tell(READY)
             while signals.wait(TICK_S):
                 recorder.tick()
+                if lock.renew():
+                    _log.warning("lock_renewed", reason="its file had gone from the bag directory")
                 if interval_s is not None and time.monotonic() >= next_sign_s:
                     manager.tell(WATCHDOG)
                     next_sign_s = time.monotonic() + interval_s / 2

@@ -29,8 +29,9 @@ _MAX_TEXT: Final = 1000
 class BagDirLock:
     """The lock of one bag directory, held until `release` and by children that inherit it."""
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, path: Path) -> None:
         self.descriptor = descriptor
+        self._path = path
 
     @classmethod
     def acquire(cls, bag_dir: Path, patience_s: float = CHILD_PATIENCE_S) -> BagDirLock:
@@ -50,12 +51,35 @@ class BagDirLock:
             ) from error
         try:
             _take(descriptor, path, patience_s)
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, _signature().encode(), 0)
         except BaseException:
             os.close(descriptor)
             raise
-        return cls(descriptor)
+        _sign(descriptor)
+        return cls(descriptor, path)
+
+    def renew(self) -> bool:
+        """Takes the lock anew where its file is not in the bag directory any more.
+
+        Somebody emptied the directory, moved it, or mounted another: what is locked then keeps
+        nobody out. The descriptor stays the same number, so that children inherit what it holds.
+        Gives whether it was taken anew. Where that cannot be done, this time nothing is.
+
+        Raises:
+            RecorderError: another recorder has taken it since, and the sentence says who.
+        """
+        if not self._path.parent.is_dir() or _is_file(self._path, self.descriptor):
+            return False
+        try:
+            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError:
+            return False
+        try:
+            _take(descriptor, self._path, 0.0)
+            os.dup2(descriptor, self.descriptor, inheritable=False)
+        finally:
+            os.close(descriptor)
+        _sign(self.descriptor)
+        return True
 
     def release(self) -> None:
         """Lets go of it; the file stays, since deleting it would let two in."""
@@ -93,8 +117,23 @@ def _refusal(path: Path, pid: int | None, host: str | None, *, alive: bool) -> s
     )
 
 
-def _signature() -> str:
-    return json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
+def _sign(descriptor: int) -> None:
+    """Says in the file who holds it. A full disk keeps nobody from that who may make room."""
+    text = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
+    with suppress(OSError):
+        # In place, and shortened then: what is there already needs no room.
+        written = os.pwrite(descriptor, text.encode(), 0)
+        os.ftruncate(descriptor, written)
+
+
+def _is_file(path: Path, descriptor: int) -> bool:
+    """Whether the path still names the open file; also where that cannot be told."""
+    try:
+        return os.path.samestat(path.lstat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
 
 
 def _holder(descriptor: int) -> tuple[int | None, str | None]:
