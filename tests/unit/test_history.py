@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from ros2_memory.storage.mcap_reader import McapReader
 
 from ros2_memory.errors import BagError, QueryTimeoutError
 from ros2_memory.history import View
 from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow
 from ros2_memory.sampling import evenly
+from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import Deadline
 from tests.bags import McapLayout, Msg, boolean, odom, text, write_mcap
 from tests.memories import memory_of
