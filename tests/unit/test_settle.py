@@ -13,6 +13,7 @@ from structlog.testing import capture_logs
 
 from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.recorder.daemon import Upkeep
 from ros2_memory.recorder.handover import (
     Counting,
     CutClock,
@@ -21,6 +22,8 @@ from ros2_memory.recorder.handover import (
     read_handover,
     write_handover,
 )
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.recorder.lock import BagDirLock
 from ros2_memory.recorder.rotation import intended, pending, void
 from ros2_memory.recorder.settle import cut_clock, settle_all, unsettled
 from ros2_memory.storage.mcap_reader import McapReader
@@ -202,3 +205,31 @@ def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: 
     write_handover(third, Handover(previous="b", counts_from=T0 + 19 * S, begin=begin))
     settle_all(tmp_path, READER)
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(250)), 1)
+
+
+class TestWhileSomethingIsRecorded:
+    @pytest.fixture
+    def bag_dir(self, tmp_path: Path) -> Path:
+        """A handover that was cut short, and could not be settled when the recorder started."""
+        old = recording(tmp_path, "a", 0, 10, delay=5)
+        new = recording(tmp_path, "b", 8, 12, delay=9)
+        write_handover(old, intended(Handover(), "b"))
+        write_handover(new, pending("a"))
+        return tmp_path
+
+    def settle_beside(self, bag_dir: Path, running: str) -> None:
+        names = (running,)
+        beat = Heartbeat(1, T0, RecorderState.RECORDING, names, T0, 0, (), (), None, 5.0)
+        write_heartbeat(bag_dir, beat)
+        lock = BagDirLock.acquire(bag_dir)
+        Upkeep(bag_dir, READER, lock).settle()
+        lock.release()
+
+    def test_what_nobody_writes_is_settled(self, bag_dir: Path) -> None:
+        self.settle_beside(bag_dir, "c")
+        assert counted(bag_dir) == dict.fromkeys((T0 + n * S // 10 for n in range(120)), 1)
+
+    def test_a_recording_that_still_hands_over_is_left_alone(self, bag_dir: Path) -> None:
+        self.settle_beside(bag_dir, "a")
+        assert unsettled(bag_dir / "a") == "b"
+        assert read_handover(bag_dir / "b").handover == pending("a")

@@ -12,7 +12,7 @@ from ros2_memory.adapters import build_housekeeper, build_reader, build_recorder
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.errors import ConfigError, EpisodicError
 from ros2_memory.logs import configure_logging
-from ros2_memory.recorder.daemon import Ticking, lock_and_prepare, record_until_told
+from ros2_memory.recorder.daemon import Ticking, Upkeep, lock_and_prepare, record_until_told
 from ros2_memory.recorder.notify import ServiceManager
 from ros2_memory.settings import NullRecorderNode
 
@@ -67,7 +67,7 @@ def _record(settings: Settings) -> None:
         if not isinstance(recorder, Ticking):
             raise ConfigError(f"recorder: {settings.recorder.target} cannot be run by {PROGRAM}")
         _log.info("starting", bag_dir=str(bag_dir))
-        record_until_told(recorder, ServiceManager(), lock)
+        record_until_told(recorder, ServiceManager(), Upkeep(bag_dir, reader, lock))
         _log.info("stopped")
     finally:
         lock.release()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
 import structlog
 
 from ros2_memory.errors import EpisodicError, RecorderError
+from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.lock import BagDirLock
 from ros2_memory.recorder.notify import READY, STOPPING, WATCHDOG, watchdog_interval_s
 from ros2_memory.recorder.settle import settle_all
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 TICK_S: Final = 0.2
+SETTLE_EVERY_S: Final = 60.0
 ENDING: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -78,7 +80,41 @@ def lock_and_prepare(
     return lock
 
 
-def record_until_told(recorder: Ticking, manager: ServiceManager, lock: BagDirLock) -> None:
+class Upkeep:
+    """What is seen to while the bag directory is recorded into, in the thread that records.
+
+    The lock is taken anew where its file has gone. A handover that could not be brought to its end,
+    as on a full disk, is tried again: until then what its new recording holds does not count.
+    """
+
+    def __init__(self, bag_dir: Path, reader: BagReader, lock: BagDirLock) -> None:
+        self._bag_dir = bag_dir
+        self._reader = reader
+        self._lock = lock
+        self._settle_at_s = time.monotonic() + SETTLE_EVERY_S
+
+    def tick(self) -> None:
+        """Does what is due.
+
+        Raises:
+            RecorderError: another recorder took the bag directory.
+        """
+        if self._lock.renew():
+            _log.warning("lock_renewed", reason="its file had gone from the bag directory")
+        if time.monotonic() >= self._settle_at_s:
+            self._settle_at_s = time.monotonic() + SETTLE_EVERY_S
+            self.settle()
+
+    def settle(self) -> None:
+        """Settles what is left of recordings that nobody writes any more."""
+        heartbeat = read_heartbeat(self._bag_dir).heartbeat
+        running = heartbeat.recordings if heartbeat else ()
+        # A directory that cannot be listed is the recorder's to report.
+        with suppress(OSError):
+            settle_all(self._bag_dir, self._reader, running)
+
+
+def record_until_told(recorder: Ticking, manager: ServiceManager, upkeep: Upkeep) -> None:
     """Records until SIGTERM, SIGINT or SIGHUP comes, and ends what it started.
 
     It must be called from the main thread, which the recorder's processes die with.
@@ -94,8 +130,7 @@ def record_until_told(recorder: Ticking, manager: ServiceManager, lock: BagDirLo
             manager.tell(READY)
             while signals.wait(TICK_S):
                 recorder.tick()
-                if lock.renew():
-                    _log.warning("lock_renewed", reason="its file had gone from the bag directory")
+                upkeep.tick()
                 if interval_s is not None and time.monotonic() >= next_sign_s:
                     manager.tell(WATCHDOG)
                     next_sign_s = time.monotonic() + interval_s / 2

@@ -26,7 +26,7 @@ from ros2_memory.recorder.rotation import Sidecars, withdrawn
 from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from ros2_memory.model import BagSummary
@@ -42,10 +42,16 @@ SAMPLE: Final = 2000
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-def settle_all(bag_dir: Path, reader: BagReader) -> None:
-    """Brings every handover below the bag directory to its end. Reports what it cannot settle."""
+def settle_all(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) -> None:
+    """Brings every handover below the bag directory to its end. Reports what it cannot settle.
+
+    `running` are recordings that are being written: those may yet come to the end of theirs.
+
+    Raises:
+        OSError: the bag directory cannot be listed.
+    """
     for directory in sorted(each for each in bag_dir.iterdir() if each.is_dir()):
-        new_name = unsettled(directory)
+        new_name = None if directory.name in running else unsettled(directory)
         if new_name is None:
             continue
         try:
