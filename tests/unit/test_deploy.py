@@ -87,6 +87,8 @@ def test_the_recorder_writes_where_it_records_and_nowhere_else() -> None:
     said = settings_of(RECORDER)
     assert said["ReadWritePaths"] == ["/var/lib/ros2-memory/bags"]
     assert f"MEMORY_BAG_DIR={said['ReadWritePaths'][0]}" in said["Environment"]
+    # Not below the mount point of a disk that is not there.
+    assert said["RequiresMountsFor"] == said["ReadWritePaths"]
     assert said["MemoryDenyWriteExecute"] == ["yes"]
 
 
