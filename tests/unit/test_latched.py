@@ -23,7 +23,7 @@ from tests.memories import memory_of
 from tests.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Collection, Iterable, Iterator
     from pathlib import Path
 
     from ros2_memory.storage.base import Record
@@ -276,6 +276,36 @@ class TestTheBagOfCarriedMessages:
         keep_only(tmp_path, "session_mcap/session_mcap_6.mcap")
         assert [looked_up(memory, moment) for moment in moments] == before
         assert held(memory, "/tf_static", latest)[0] < latest - 50 * S  # type: ignore[operator]
+
+    def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(self, tmp_path: Path) -> None:
+        class Unlucky(McapReader):
+            def records(
+                self,
+                path: Path,
+                topics: Collection[str],
+                window: TimeWindow,
+                *,
+                newest_first: bool = False,
+            ) -> Iterator[Record]:
+                if is_carried(path):
+                    raise BagError(str(path), "it cannot be opened: Input/output error")
+                return super().records(path, topics, window, newest_first=newest_first)
+
+        recording(
+            tmp_path,
+            "rec",
+            [frame(T0, "laser", 0.1), *drive(T0, T0 + 10 * S)],
+            [frame(T0 + 10 * S, "camera", 0.2), *drive(T0 + 10 * S, T0 + 20 * S)],
+            drive(T0 + 20 * S, T0 + 30 * S),
+            drive(T0 + 30 * S, T0 + 40 * S),
+        )
+        keep_only(tmp_path, *(f"rec/rec_{number}.mcap" for number in (1, 2, 3)))
+        keeper_of(tmp_path, max_bytes=1, reader=Unlucky()).apply(tmp_path)
+        assert [each.log_time for each in records(tmp_path)] == [T0]
+        assert not (tmp_path / "rec/rec_2.mcap").exists()
+        assert (tmp_path / "rec/rec_1.mcap").exists()
+        keep_only(tmp_path, "rec/rec_3.mcap")
+        assert [each.log_time for each in records(tmp_path)] == [T0, T0 + 10 * S]
 
 
 def looked_up(memory: Memory, moment: int) -> object:

@@ -166,7 +166,10 @@ class Carrier:
         if {each[:2] for each in wanted} == {each[:2] for each in before}:
             return None
         sources = [self.path, *(bag.path for bag in leaving)]
-        self._write(sorted(self._fetched(sources, topics, wanted), key=lambda each: each.log_time))
+        fetched = sorted(self._fetched(sources, topics, wanted), key=lambda each: each.log_time)
+        if len(fetched) < len({each[:2] for each in wanted}):
+            raise BagError(str(self.path), "a latched message could not be read a second time")
+        self._write(fetched)
         return len(wanted)
 
     def _topics(self, snapshot: Snapshot) -> tuple[str, ...]:
@@ -182,11 +185,20 @@ class Carrier:
             yield latched_message(record, self._frames(record))
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
+        """The messages of these topics.
+
+        Raises:
+            BagError: the bag of carried messages cannot be read. What it holds stands nowhere
+                else, so it must not be replaced by one without it.
+        """
         try:
             yield from self._reader.records(path, topics, TimeWindow.everything())
         except BagVanishedError:
             return
         except BagError as error:
+            if path == self.path:
+                reason = f"{error.reason}; move it away to give up what it holds"
+                raise BagError(str(path), reason) from error
             _log.warning("latched_not_read", path=str(path), reason=error.reason)
 
     def _fetched(
