@@ -349,6 +349,23 @@ class TestRefusals:
         assert code == 2
         assert f"{site.topics}: 'odom' cannot be recorded" in said
 
+    def test_a_refused_list_of_topics_touches_no_bag(self, site: Site) -> None:
+        old = site.bag_dir / "rec_old" / "rec_old_0.mcap"
+        old.parent.mkdir(parents=True)
+        old.write_bytes(b"old")
+        site.topics.write_text("topics: []\n")
+        code, _ = site.refusal("recording.clear_on_startup=true")
+        assert code == 2
+        assert [path.name for path in site.bag_dir.rglob("*")] == ["rec_old", old.name]
+
+    def test_nothing_is_written_where_clearing_is_refused(self, site: Site) -> None:
+        site.bag_dir.mkdir(parents=True)
+        site.env["HOME"] = str(site.bag_dir)
+        code, said = site.refusal("recording.clear_on_startup=true")
+        assert code == 1
+        assert "refuses to delete bags" in said
+        assert list(site.bag_dir.iterdir()) == []
+
     def test_without_a_ros2_it_says_what_to_do(self, site: Site) -> None:
         site.env["PATH"] = os.defpath
         code, said = site.refusal()

@@ -14,6 +14,7 @@ from ros2_memory.errors import ConfigError, EpisodicError
 from ros2_memory.logs import configure_logging
 from ros2_memory.recorder.daemon import Ticking, Upkeep, lock_and_prepare, record_until_told
 from ros2_memory.recorder.notify import ServiceManager
+from ros2_memory.recorder.topics import load_topics
 from ros2_memory.settings import NullRecorderNode
 
 if TYPE_CHECKING:
@@ -56,6 +57,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _record(settings: Settings) -> None:
+    # A list that is refused stops it before anything is deleted.
+    load_topics(settings.recording.topics_file)
     bag_dir = settings.recording.bag_dir.absolute()
     reader = build_reader(settings)
     housekeeper = build_housekeeper(settings, bag_dir, reader)

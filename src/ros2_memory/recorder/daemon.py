@@ -16,7 +16,7 @@ from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.lock import BagDirLock
 from ros2_memory.recorder.notify import READY, STOPPING, WATCHDOG, watchdog_interval_s
 from ros2_memory.recorder.settle import settle_all
-from ros2_memory.recorder.wipe import clear_bags
+from ros2_memory.recorder.wipe import clear_bags, refuse_homes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,6 +60,8 @@ def lock_and_prepare(
         RecorderError: another recorder holds the directory, it cannot be written into, or it must
             not be cleared.
     """
+    if clear:
+        refuse_homes(bag_dir)
     try:
         bag_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:

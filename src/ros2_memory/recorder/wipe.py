@@ -41,12 +41,30 @@ def clear_bags(bag_dir: Path) -> Wiped:
     Raises:
         RecorderError: the directory is `/`, a home directory or above one: a mistake, surely.
     """
+    refuse_homes(bag_dir)
     root = bag_dir.resolve()
-    _refuse_homes(root)
     wiped = Wiped()
     with suppress(FileNotFoundError):
         _clear(root, root.stat().st_dev, wiped, is_root=True)
     return wiped
+
+
+def refuse_homes(bag_dir: Path) -> None:
+    """Says whether bags may be deleted below a directory, before anything is written there.
+
+    Raises:
+        RecorderError: the directory is `/`, a home directory or above one.
+    """
+    root = bag_dir.resolve()
+    homes = {Path(entry.pw_dir) for entry in pwd.getpwall() if entry.pw_dir.startswith("/")}
+    with suppress(RuntimeError):
+        homes.add(Path.home())
+    for home in (Path("/"), *sorted(homes)):
+        if home.resolve().is_relative_to(root):
+            raise RecorderError(
+                f"recording.clear_on_startup refuses to delete bags below {root}, which holds "
+                f"{home}; let recording.bag_dir be a directory of its own"
+            )
 
 
 def remove_if_empty(recording: Path) -> bool:
@@ -74,18 +92,6 @@ def _is_nothing(entry: os.DirEntry[str]) -> bool:
     return entry.name == HANDOVER_FILE or (
         empty and (_is_bag(entry) or entry.name == METADATA_FILE)
     )
-
-
-def _refuse_homes(root: Path) -> None:
-    homes = {Path(entry.pw_dir) for entry in pwd.getpwall() if entry.pw_dir.startswith("/")}
-    with suppress(RuntimeError):
-        homes.add(Path.home())
-    for home in (Path("/"), *sorted(homes)):
-        if home.resolve().is_relative_to(root):
-            raise RecorderError(
-                f"recording.clear_on_startup refuses to delete bags below {root}, which holds "
-                f"{home}; let recording.bag_dir be a directory of its own"
-            )
 
 
 def _clear(directory: Path, device: int, wiped: Wiped, *, is_root: bool) -> None:
