@@ -9,6 +9,7 @@ import math
 import os
 import subprocess
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -16,11 +17,12 @@ import anyio
 import anyio.to_thread
 
 from ros2_memory.catalogue import BagKey
-from ros2_memory.errors import BagError
+from ros2_memory.errors import BagError, EpisodicError
 from ros2_memory.logs import get_logger
 from ros2_memory.memory import Call
 from ros2_memory.model import BagState
-from ros2_memory.queries import list_recorded_topics
+from ros2_memory.moments import Span
+from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from ros2_memory.recall import bags_without_entry
 from ros2_memory.recorder.layout import HANDOVER_FILE
 from ros2_memory.recorder.scan import settled
@@ -41,6 +43,9 @@ BACKLOG: Final = 8
 """More bags than these are digested by a program of its own, so that answers stay fast."""
 TIDY_S: Final = 600.0
 """How often entries are looked through for files that are gone."""
+
+LAST_S: Final = 9.2e9
+"""Unix seconds after everything that was ever recorded."""
 
 _MOST_REFUSED: Final = 10_000
 
@@ -117,8 +122,10 @@ class Filler:
         return recall is None or recall.catalogue.path is None
 
     def warm(self) -> None:
-        """Counts each topic, so that where recordings overlap is known before somebody asks."""
+        """Works out what recordings that overlap hold together, before somebody asks."""
         list_recorded_topics(self._memory, Call())
+        with suppress(EpisodicError):
+            trajectory_summary(self._memory, Call(), Span(start_s=0.0, end_s=LAST_S))
 
     def tidy(self) -> None:
         """Drops the entries of files that are gone, and those of other configurations."""

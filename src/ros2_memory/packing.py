@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import sys
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -113,8 +114,12 @@ class Shape:
 
     def __init__(self, text: str) -> None:
         topics, silent, complete, notes = json.loads(text)
-        self._topics = [tuple(each) for each in topics]
-        self._silent = tuple(silent)
+        intern = sys.intern
+        self._topics = [
+            (intern(topic), intern(type_name), intern(encoding), bool(latched))
+            for topic, type_name, encoding, latched in topics
+        ]
+        self._silent = tuple(intern(name) for name in silent)
         self._complete = bool(complete)
         self._notes = tuple(notes)
         self._numbers = struct.Struct(f"<{3 * len(topics)}q")

@@ -6,6 +6,7 @@ does not depend on what the catalogue knows.
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,14 +14,16 @@ from typing import TYPE_CHECKING
 from ros2_memory.absence import undecodable
 from ros2_memory.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.model import BagState
+from ros2_memory.packing import packed_poses, unpacked_poses
 from ros2_memory.trajectory import PoseCollector, TrajectoryBuilder
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from ros2_memory.copies import Found
+    from ros2_memory.groups import Group
     from ros2_memory.history import View
-    from ros2_memory.model import BagFile, TimeWindow
+    from ros2_memory.model import TimeWindow
     from ros2_memory.motion import PoseDigest
     from ros2_memory.recall import RunNotes
     from ros2_memory.timebase import Ns
@@ -52,17 +55,20 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     first: Ns | None = None
     last: Ns | None = None
     for group in view.groups(topic, window):
-        bag = group.whole()
-        if bag is None or bag.state is not BagState.CLOSED:
+        span: tuple[Ns, Ns] | None
+        if not _is_whole(group, window):
             span = _added(view, builder, group.once(), failures)
-        elif (digest := digests.of(bag)) is not None:
+        elif (known := digests.of(group)) is not None:
+            digest, span = known
             builder.join(digest)
-            held = group.holdings[0]
-            span = (held.first, held.last)
         else:
             collector = PoseCollector(view.memory.limits.max_plausible_speed_mps)
+            failed = len(failures)
             span = _added(view, collector, group.once(), failures)
-            builder.join(collector.digest())
+            digest = collector.digest()
+            builder.join(digest)
+            if span is not None and failed == len(failures):
+                digests.keep(group, digest, span)
         if span is not None:
             first, last = (span[0] if first is None else first), span[1]
     if failures:
@@ -76,6 +82,14 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     return Way(builder.result(), builder.frames, first, last)
 
 
+def _is_whole(group: Group, window: TimeWindow) -> bool:
+    """Whether all messages of the group's bags lie in the window, and no crash cut a bag short."""
+    return all(
+        window.covers(held.first, held.last) and held.bag.state is BagState.CLOSED
+        for held in group.holdings
+    )
+
+
 class _Digests:
     """What the catalogue has of the poses of one topic; of one run of bags at a time."""
 
@@ -85,16 +99,47 @@ class _Digests:
         self._notes: RunNotes | None = None
         self._poses: Mapping[int, PoseDigest] = {}
 
-    def of(self, bag: BagFile) -> PoseDigest | None:
-        """The digest of a bag's poses; None where there is none, or not all messages have one."""
-        entry = self._view.entry(bag)
+    def of(self, group: Group) -> tuple[PoseDigest, tuple[Ns, Ns]] | None:
+        """The digest of a group's poses, and the times of its first and last message.
+
+        None where there is none yet, or not all messages have a pose.
+        """
+        if len(group.holdings) > 1:
+            return self._remembered(group)
+        [held] = group.holdings
+        entry = self._view.entry(held.bag)
         if entry is None:
             return None
         notes, number = entry
         if notes is not self._notes:
             self._view.check_deadline()
             self._notes, self._poses = notes, notes.poses(self._topic)
-        return self._poses.get(number)
+        digest = self._poses.get(number)
+        return None if digest is None else (digest, (held.first, held.last))
+
+    def keep(self, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> None:
+        """Keeps the digest of bags that hold copies of each other, for the next time."""
+        recall, numbers = self._view.memory.recall, self._numbers(group)
+        if recall is None or numbers is None or len(numbers) < 2 or not self._view.complete:
+            return
+        answer = json.dumps([packed_poses(digest).hex(), *span])
+        recall.remember(f"poses {self._topic}", numbers, answer)
+
+    def _remembered(self, group: Group) -> tuple[PoseDigest, tuple[Ns, Ns]] | None:
+        recall, numbers = self._view.memory.recall, self._numbers(group)
+        if recall is None or numbers is None:
+            return None
+        answer = recall.remembered(f"poses {self._topic}", numbers)
+        if answer is None:
+            return None
+        packed, first, last = json.loads(answer)
+        return unpacked_poses(bytes.fromhex(packed)), (first, last)
+
+    def _numbers(self, group: Group) -> list[int] | None:
+        """The entries of the group's bags; None where one has none."""
+        entries = [self._view.entry(held.bag) for held in group.holdings]
+        numbers = [entry[1] for entry in entries if entry is not None]
+        return numbers if len(numbers) == len(entries) else None
 
 
 def _added(

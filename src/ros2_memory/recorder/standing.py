@@ -136,8 +136,11 @@ class FileNotes:
         return cls(path, bag_kind(path.name) or "", stamp, now, settled(stamp.mtime_ns, now))
 
     def recall(self, summary: BagSummary) -> None:
-        """Takes in what was found earlier in a closed file that looked just like this one."""
-        self.closing, self.summary = Closing.CLOSED, _shared(summary)
+        """Takes in what was found earlier in a closed file that looked just like this one.
+
+        Its names should be shared with the other summaries.
+        """
+        self.closing, self.summary = Closing.CLOSED, summary
 
     def look(self, stamp: Stamp, now: Ns) -> bool:
         """Takes in how the file looks at this scan, and forgets what may not hold any more.
