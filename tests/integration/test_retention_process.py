@@ -24,8 +24,10 @@ from ros2_memory.errors import NoDataError
 from ros2_memory.memory import Call, Limits
 from ros2_memory.moments import Moment, Span
 from ros2_memory.recorder.layout import is_carried
+from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import NS_PER_S, WallClock
 from tests.bags import McapLayout, odom, write_mcap
+from tests.integration.test_recorder_daemon import Site
 from tests.integration.test_server_process import serving
 from tests.keeping import keeper_of, size_of
 from tests.memories import memory_of
@@ -179,6 +181,43 @@ def test_the_budget_is_held_while_it_is_recorded_and_asked(tmp_path: Path) -> No
     asker._is_docked(Moment(ago_s=0.0))
     asker._is_placed(Moment(ago_s=0.0))
     assert asker.wrong == []
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path)
+    yield site
+    for daemon in site.daemons:
+        if daemon.process.poll() is None:
+            daemon.stop()
+
+
+def test_the_daemon_repairs_what_a_crash_left_and_keeps_its_budget(site: Site) -> None:
+    hour_ago = WallClock().now() - 3600 * NS_PER_S
+    for number in range(10):
+        times = [hour_ago + number * 10 * NS_PER_S + n for n in range(20)]
+        write_mcap(
+            site.bag_dir / "rec_20260101T000000Z" / f"{number}.mcap",
+            [odom(time, 1.0, 2.0) for time in times],
+        )
+    times = [hour_ago + 200 * NS_PER_S + n for n in range(20)]
+    crashed = write_mcap(
+        site.bag_dir / "rec_20260101T010000Z" / "0.mcap",
+        [odom(time, 1.0, 2.0) for time in times],
+        McapLayout(chunk_size=999, finish=False),
+    )
+    daemon = site.run("retention.max_total_gb=0.0001")
+    (repaired,) = daemon.wait_for("bag_repaired")
+    applied = daemon.wait_for("retention_applied")[0]
+    assert daemon.stop() == 0
+    assert repaired["path"] == str(crashed)
+    assert repaired["messages"] > 0
+    assert applied["bags"] > 0
+    assert applied["total_bytes"] <= 100_000
+    assert McapReader().summarize(crashed).complete
+    left = {path.name for path in (site.bag_dir / "rec_20260101T000000Z").glob("*.mcap")}
+    assert left == {f"{number}.mcap" for number in range(10 - len(left), 10)}
+    assert 0 < len(left) < 10
 
 
 def state(folder: Path) -> dict[str, tuple[object, ...]]:

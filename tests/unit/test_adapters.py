@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ros2_memory.adapters import build_housekeeper, build_reader, build_repairer
+from ros2_memory.config import load_settings
+from ros2_memory.recorder.housekeeping import InBackground
+from ros2_memory.timebase import NS_PER_S, WallClock
+from tests.bags import McapLayout, odom, write_mcap
+from tests.keeping import files_in
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def kept(bag_dir: Path, *overrides: str) -> list[str]:
+    """What is left of five bags, one of every hour, after the recorder's housekeeper was there."""
+    now = WallClock().now()
+    for ago in range(5):
+        at = now - ago * 3600 * NS_PER_S - NS_PER_S
+        write_mcap(bag_dir / "rec" / f"h{ago}.mcap", [odom(at - n, 1.0, 2.0) for n in range(9)])
+    settings = load_settings(overrides, {"MEMORY_BAG_DIR": str(bag_dir)})
+    keeper = build_housekeeper(settings, bag_dir, build_reader(settings))
+    assert isinstance(keeper, InBackground)
+    keeper.apply(bag_dir)
+    keeper.wait()
+    return files_in(bag_dir)
+
+
+def test_the_budget_of_the_configuration_is_kept(tmp_path: Path) -> None:
+    size = (
+        2.5
+        * write_mcap(tmp_path / "probe.mcap", [odom(n, 1.0, 2.0) for n in range(9)]).stat().st_size
+    )
+    left = kept(tmp_path / "bags", f"retention.max_total_gb={size / 1e9}")
+    assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap"]
+
+
+def test_the_age_of_the_configuration_is_kept(tmp_path: Path) -> None:
+    left = kept(tmp_path / "bags", "retention.max_age_h=2.5")
+    assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap", "rec/h2.mcap"]
+
+
+def test_by_default_a_week_within_5_gb_is_kept(tmp_path: Path) -> None:
+    assert len(kept(tmp_path / "bags")) == 6
+
+
+def test_files_are_repaired_without_any_configuration(tmp_path: Path) -> None:
+    messages = [odom(n, 1.0, 2.0) for n in range(50)]
+    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=999, finish=False))
+    assert build_repairer().repair(path) is not None
+    assert build_repairer().is_whole(path)
