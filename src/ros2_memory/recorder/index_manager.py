@@ -8,8 +8,10 @@ unless it was built to dispose of bags, as the recorder's daemon alone does.
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -26,7 +28,7 @@ from ros2_memory.recorder.standing import FileNotes, Scene, Standing, judge
 from ros2_memory.timebase import ms_from_ns, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from structlog.typing import FilteringBoundLogger
 
@@ -154,6 +156,12 @@ class IndexManager:
         self._timeline = Timeline()
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
+        if self._published is not None:
+            return self._look_through(patrolling=patrolling)
+        with _collector_resting():
+            return self._look_through(patrolling=patrolling)
+
+    def _look_through(self, *, patrolling: bool = True) -> Snapshot:
         begun = time.perf_counter_ns()
         scene = self._scene()
         try:
@@ -315,6 +323,23 @@ class IndexManager:
             problem=after.problem,
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
         )
+
+
+@contextmanager
+def _collector_resting() -> Iterator[None]:
+    """Within the block no garbage is looked for.
+
+    What the first scan makes of a week's files stays, and looking through all of it again and
+    again takes longer than making it.
+    """
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 def _oddities(walked: Walked) -> _Oddities:
