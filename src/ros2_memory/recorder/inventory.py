@@ -124,22 +124,18 @@ class Inventory:
             ):
                 entry = entries[path] = self._entered(path, verdict, known)
             fate, bag = entry.fate, entry.bag
-            if (fate is _Fate.MAY_GO and path not in staying) or (
-                fate is _Fate.MAY_GO_UNNAMED and path not in staying and bag.recording not in named
-            ):
+            unnamed = fate is _Fate.MAY_GO_UNNAMED and bag.recording not in named
+            if (fate is _Fate.MAY_GO or unnamed) and path not in staying:
                 bags.append(bag)
             else:
                 occupied.add(bag.recording)
                 if fate is not _Fate.FROM_ELSEWHERE:
                     others += sum(file.size for file in bag.files)
         self._forget(known)
-        sidecars: dict[str, int] = {}
-        for recording in {bag.recording for bag in bags} | occupied:
-            size = self._folder(recording, known.now).size
-            if recording in occupied or recording in named or recording == str(self._root):
-                others += size
-            else:
-                sidecars[recording] = size
+        emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
+        sidecars = {each: self._folder(each, known.now).size for each in emptied}
+        occupied.update(bag.recording for bag in bags)
+        others += sum(self._folder(each, known.now).size for each in occupied - emptied)
         return Stock(bags, known.now, sidecars, others)
 
     def _entered(self, path: str, verdict: Verdict, known: Known) -> _Entry:

@@ -94,13 +94,10 @@ def worth_carrying(
         recorded_in: whether anything is kept that was recorded in `[start, stop)`.
         repeated: late messages that stand in kept bags, and their earliest log time there.
     """
-    earliest: dict[Identity, Latched] = {}
-    for each in messages:
-        known = earliest.get(each.identity)
-        if known is None or each.log_time < known.log_time:
-            earliest[each.identity] = each
     missing = [
-        each for each in earliest.values() if repeated.get(each.identity, MAX_NS) > each.log_time
+        each
+        for each in _earliest_copies(messages)
+        if repeated.get(each.identity, MAX_NS) > each.log_time
     ]
     needed = {each for each in missing if each.identity in repeated}
     by_hold: defaultdict[tuple[str, str], list[Latched]] = defaultdict(list)
@@ -116,6 +113,15 @@ def worth_carrying(
                 needed.add(message)
             since = following.log_time
     return needed
+
+
+def _earliest_copies(messages: Iterable[Latched]) -> Collection[Latched]:
+    earliest: dict[Identity, Latched] = {}
+    for each in messages:
+        known = earliest.get(each.identity)
+        if known is None or each.log_time < known.log_time:
+            earliest[each.identity] = each
+    return earliest.values()
 
 
 class Carrier:
