@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -152,4 +153,18 @@ class TestRenewal:
         with pytest.raises(RecorderError, match="process 1 on"):
             lock.renew()
         os.close(descriptor)
+        lock.release()
+
+    def test_a_directory_that_cannot_be_looked_at_is_locked_as_before(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        lock = BagDirLock.acquire(tmp_path)
+
+        def fails(_path: Path, **_: object) -> os.stat_result:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+        with monkeypatch.context() as disk:
+            disk.setattr(os, "stat", fails)
+            assert not lock.renew()
+        assert f"process {os.getpid()} on" in refusal(tmp_path)
         lock.release()

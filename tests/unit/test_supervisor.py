@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from structlog.testing import capture_logs
 from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.handover import read_handover
 from ros2_memory.recorder.settle import settle_all
+from ros2_memory.storage.base import Closing
 from tests.recorder_world import PERIOD, World
 
 
@@ -350,6 +352,111 @@ class TestClock:
         world.set_clock(365 * 86400)
         world.run(20)
         assert len(world.recorders) == 1
+
+
+class FailingDisk:
+    """Lets whatever asks for the status of some paths fail, as a disk or a server that is gone."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, fails: Callable[[Path], bool]) -> None:
+        self.failing = True
+        stat = os.stat
+
+        def failing(path: Any, **options: Any) -> os.stat_result:
+            if self.failing and isinstance(path, Path) and fails(path):
+                raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+            return stat(path, **options)
+
+        monkeypatch.setattr(os, "stat", failing)
+
+
+class TestFailingDisk:
+    def test_a_restart_whose_name_cannot_be_looked_up_is_tried_again(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+        world.recorders[0].die()
+        known = [recorder.directory for recorder in world.recorders]
+        disk = FailingDisk(
+            monkeypatch, lambda path: path.name.startswith("rec_") and path not in known
+        )
+        with capture_logs() as logs:
+            world.run(3)
+        assert "Input/output error" in events(logs, "recorder_not_started")[0]["reason"]
+        assert "Input/output error" in world.heartbeat()["last_error"]
+        disk.failing = False
+        world.run(10)
+        assert world.supervisor.is_recording
+
+    def test_a_rotation_whose_name_cannot_be_looked_up_is_tried_again(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(18)
+        known = [recorder.directory for recorder in world.recorders]
+        disk = FailingDisk(
+            monkeypatch, lambda path: path.name.startswith("rec_") and path not in known
+        )
+        with capture_logs() as logs:
+            world.run(4)
+        assert events(logs, "rotation_failed")
+        disk.failing = False
+        world.run(15)
+        world.supervisor.stop()
+        assert len(world.recorders) == 2
+        assert_each_counts_once(world)
+
+    def test_a_handover_is_given_up_where_the_new_directory_cannot_be_told(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(20.75)
+        old, new = world.recorders
+        new.die()
+        FailingDisk(monkeypatch, lambda path: path == new.directory)
+        with capture_logs() as logs:
+            world.run(1)
+        assert "Input/output error" in events(logs, "rotation_failed")[0]["reason"]
+        assert world.running == [old]
+
+    def test_a_recorder_that_dies_is_replaced_though_its_splits_cannot_be_read(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+
+        def fails(_path: Path) -> Closing:
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+
+        monkeypatch.setattr(world.reader, "closing", fails)
+        world.recorders[0].die()
+        with capture_logs() as logs:
+            world.run(6)
+        assert len(world.running) == 1
+        assert "Stale file handle" in events(logs, "unreadable")[0]["reason"]
+
+    def test_one_task_that_fails_keeps_no_other_from_being_done(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        keeper = Housekeeping()
+        world = World(tmp_path, housekeeper=keeper)
+        world.supervisor.start()
+        world.run(3)
+
+        def fails() -> list[str]:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+        monkeypatch.setattr(world.recorders[0], "take_lines", fails)
+        with capture_logs() as logs:
+            world.run(30)
+        (told,) = events(logs, "supervision_failed")
+        assert (told["task"], told["reason"]) == ("look", "[Errno 5] Input/output error")
+        world.run(40)
+        assert "apply" in keeper.asked
 
 
 class Housekeeping:

@@ -23,6 +23,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.heartbeat import HEARTBEAT_FILE
 from ros2_memory.timebase import NS_PER_S, Ns
 
@@ -53,13 +54,19 @@ def recording_name(now: Ns, bag_dir: Path) -> str:
     """A name for a recording that begins `now`: its UTC time, and a number where that is taken.
 
     It is taken where two begin within one second, or where the clock was set back.
+
+    Raises:
+        RecorderError: what is in the bag directory cannot be told, as on a disk that fails.
     """
     moment = datetime.fromtimestamp(now // NS_PER_S, tz=UTC)
     stem = f"rec_{moment:%Y%m%dT%H%M%SZ}"
     name, number = stem, 1
-    while (bag_dir / name).exists():
-        number += 1
-        name = f"{stem}_{number}"
+    try:
+        while (bag_dir / name).exists():
+            number += 1
+            name = f"{stem}_{number}"
+    except OSError as error:
+        raise RecorderError(f"{bag_dir / name}: {error.strerror or error}") from error
     return name
 
 

@@ -67,9 +67,9 @@ class BagDirLock:
         Raises:
             RecorderError: another recorder has taken it since, and the sentence says who.
         """
-        if not self._path.parent.is_dir() or _is_file(self._path, self.descriptor):
-            return False
         try:
+            if not self._path.parent.is_dir() or _is_file(self._path, self.descriptor):
+                return False
             descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError:
             return False

@@ -122,6 +122,9 @@ class Splits:
             if split.closed:
                 faults.append(str(error))
             return split.closed
+        except OSError as error:
+            faults.append(f"{path}: {error.strerror or error}")
+            return split.closed
         self.heard.update(topic.topic for topic in summary.topics)
         self.messages += summary.count
         return True

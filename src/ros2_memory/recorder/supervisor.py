@@ -34,6 +34,8 @@ SPACE_S: Final = 1.0
 HOUSE_S: Final = 10.0
 QUIET_HOUSE_S: Final = 60.0
 """How often the house is kept when no split is closed: what is there grows old all the same."""
+FAULT_S: Final = 60.0
+"""How often it is told that a task fails, which is tried again with every tick."""
 SETTLE_S: Final = 5.0
 """A young recording writes its headers and the latched messages; the robot has said nothing yet."""
 
@@ -144,15 +146,7 @@ class Supervisor:
             self._rotate_now = True
             self._journal.warn("clock_set_back", "the clock was set back: a new recording begins")
         self._last = now
-        if self._is_due("look", LOOK_S, now):
-            self._splits_closed |= self._crew.look(now)
-        self._mind_deaths(now)
-        self._mind_space(now)
-        self._mind_takeover(now)
-        self._mind_rotation(now)
-        self._mind_restart(now)
-        self._crew.reap(now)
-        self._keep_house(now)
+        self._mind_all(now)
         if self._is_due("beat", self._orders.heartbeat_s, now):
             self._beat()
         else:
@@ -167,6 +161,29 @@ class Supervisor:
         self._crew.end(self._now())
         self._paused = False
         self._pulse.beat(RecorderState.STOPPED, self._crew)
+
+    def _mind_all(self, now: Moment) -> None:
+        tasks: dict[str, Callable[[Moment], object]] = {
+            "look": self._look,
+            "deaths": self._mind_deaths,
+            "space": self._mind_space,
+            "takeover": self._mind_takeover,
+            "rotation": self._mind_rotation,
+            "restart": self._mind_restart,
+            "reap": self._crew.reap,
+            "house": self._keep_house,
+        }
+        for task, mind in tasks.items():
+            try:
+                mind(now)
+            except OSError as error:
+                # Of a disk or a server that fails at any touch: the next tick tries again.
+                if self._is_due(f"tell {task}", FAULT_S, now):
+                    self._journal.fail("supervision_failed", str(error), task=task)
+
+    def _look(self, now: Moment) -> None:
+        if self._is_due("look", LOOK_S, now):
+            self._splits_closed |= self._crew.look(now)
 
     def _mind_deaths(self, now: Moment) -> None:
         before = self._crew.current

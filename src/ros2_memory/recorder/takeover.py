@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.handover import (
     CutClock,
     Handover,
@@ -21,6 +22,8 @@ from ros2_memory.recorder.rotation import handed_over, intended, pending, void, 
 from ros2_memory.recorder.settle import cut_clock, settle
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ros2_memory.recorder.rotation import Moment, Passage, Step
     from ros2_memory.recorder.session import Session
     from ros2_memory.storage.base import BagReader
@@ -61,7 +64,7 @@ class Takeover:
             RecorderError: it cannot be written.
         """
         directory = old.splits.directory
-        if directory.is_dir():
+        if _is_there(directory):
             write_handover(directory, withdrawn(read_handover(directory).handover))
 
     @property
@@ -114,7 +117,7 @@ class Takeover:
         Raises:
             RecorderError: a sidecar cannot be written.
         """
-        if self.new.splits.directory.is_dir():
+        if _is_there(self.new.splits.directory):
             write_handover(self.new.splits.directory, void(self.old.name))
         self.withdraw(self.old)
 
@@ -136,9 +139,9 @@ class Takeover:
         Raises:
             RecorderError: a sidecar cannot be written.
         """
-        if self.old.splits.directory.is_dir():
+        if _is_there(self.old.splits.directory):
             settle(self.old.splits.directory, self.new.splits.directory, self._reader)
-        elif self.new.splits.directory.is_dir():
+        elif _is_there(self.new.splits.directory):
             write_handover(self.new.splits.directory, Handover())
 
     def _old_files(self) -> frozenset[str]:
@@ -149,3 +152,11 @@ class Takeover:
         if not closed:
             return CutClock.PUBLISH
         return cut_clock(self.old.splits.directory / closed[-1], self._reader)
+
+
+def _is_there(recording: Path) -> bool:
+    """Whether the directory of a recording is there; an error where that cannot be told."""
+    try:
+        return recording.is_dir()
+    except OSError as error:
+        raise RecorderError(f"{recording}: {error.strerror or error}") from error
