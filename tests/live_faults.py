@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ros2_memory.errors import BagError
 from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.closed_form import position
 from tests.live_recorder import (
@@ -32,9 +33,10 @@ from tests.live_recorder import (
     bag_files,
     closed_files,
     machine,
+    moment_of,
     ticks,
 )
-from tests.ros_live import publishing_robot, ros_environment
+from tests.ros_live import end, publishing_robot, ros_environment
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -96,6 +98,10 @@ class Campaign:
     faults: list[Fault] = field(default_factory=list)
     subscribed: dict[str, int] = field(default_factory=dict)
     """When each recording had subscribed to everything (ns); those that did."""
+    started: dict[str, int] = field(default_factory=dict)
+    """When the recorder of each recording was started (ns)."""
+    reached: list[int] = field(default_factory=list)
+    """When the robot first reached a further recorder (ns)."""
     held: dict[str, list[Tick]] = field(default_factory=dict)
     """What stands in each recording, counting or not; those that hold something."""
     found: list[Tick] = field(default_factory=list)
@@ -109,17 +115,24 @@ class Campaign:
         return self.t0 + round(tick / self.terms.hz * NS_PER_S)
 
     def losses(self) -> list[Loss]:
-        """What each killed recording lost that had subscribed to everything before."""
+        """What each killed recording lost that was receiving everything before."""
         found: list[Loss] = []
         for fault in self.faults:
             for name in fault.victims:
-                since = self.subscribed.get(name, fault.at)
-                if since >= fault.at:
+                since = self._received_since(name)
+                if since is None or since >= fault.at:
                     continue
                 last = max([since, *(t.publish_time for t in self.held.get(name, []))])
                 lost_s = max(0, fault.at - last) / NS_PER_S
                 found.append(Loss(fault.kind, name, lost_s, math.floor(lost_s * self.terms.hz)))
         return found
+
+    def _received_since(self, name: str) -> int | None:
+        """When a recording had subscribed to everything, and the robot reached it; None: never."""
+        reached = next((at for at in self.reached if at >= self.started[name]), None)
+        if reached is None or name not in self.subscribed:
+            return None
+        return max(reached, self.subscribed[name])
 
     def holes(self) -> dict[str, list[int]]:
         """Ticks missing between the first and the last of a recording, since it had subscribed."""
@@ -162,7 +175,14 @@ def run_campaign(terms: Terms, folder: Path) -> Campaign:
                 if kind != "child":
                     recorder = _record(site, terms)
             recorder.wait_for_subscriptions()
-            await_moment(time.time_ns() + 2 * terms.split_s * NS_PER_S)
+            await_moment(time.time_ns() + terms.split_s * NS_PER_S)
+            recorder.stop()
+            campaign.reached = robot.reached()
+            end(robot.process)
+            # The recorder that was killed last may have been replaced by the same daemon, which
+            # repairs what is left in its own time. The next start does it at once.
+            recorder = _record(site, terms)
+            recorder.wait_for_state(RecorderState.RECORDING)
             recorder.stop()
             _look_back(campaign, site, served)
     return campaign
@@ -220,6 +240,8 @@ def _look_back(campaign: Campaign, site: Machine, served: Served) -> None:
             campaign.held[folder.name] = held
     for recorder in site.recorders:
         campaign.subscribed |= recorder.subscribed_all()
+        started = recorder.events("recorder_started")
+        campaign.started |= {event["recording"]: moment_of(event) for event in started}
     listed, after = answers(served, ("list_recorded_topics", {}), ("data_time_range", {}))
     campaign.counted_by_server = {row["topic"]: row["count"] for row in listed.told}["/odom"]
     campaign.after = after.told

@@ -16,6 +16,8 @@ With T0 the clock's time (whole milliseconds) at the start and tick k at t = k /
 
 Below 2 Hz every topic comes with every tick. Run as a program, it first waits for its subscribers,
 then writes T0 to the truth file, and at the end how many messages were published on each topic.
+While it drives it adds when the number of subscribers that its first topic reaches has changed: one
+that says it has subscribed may be reached some seconds later.
 """
 
 from __future__ import annotations
@@ -205,6 +207,7 @@ class Robot:
         self._node = rclpy.create_node("robot", enable_rosout=False, start_parameter_services=False)
         self._truth = truth
         self._stop = False
+        self._matched = [(0, 0)]
         reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         self._publishers = {}
         for topic in topics:
@@ -233,8 +236,12 @@ class Robot:
         messages, published = Messages(t0), Counter[str]()
         self._tell(t0, published, 0)
         tick = 0
+        first = next(iter(self._publishers.values()))
         while tick / hz < duration_s and not self._stop:
             time.sleep(max(0.0, begin + tick / hz - time.monotonic()))
+            if first.get_subscription_count() != self._matched[-1][1]:
+                self._matched.append((time.time_ns(), first.get_subscription_count()))
+                self._tell(t0, published, tick)
             for topic, out in self._publishers.items():
                 if is_due(topic, tick, hz):
                     out.publish(messages.payload(topic, tick / hz))
@@ -247,7 +254,8 @@ class Robot:
 
     def _tell(self, t0: int, published: Counter[str], ticks: int) -> None:
         fresh = self._truth.with_suffix(".new")
-        fresh.write_text(json.dumps({"t0_ns": t0, "ticks": ticks, "published": published}))
+        told = {"t0_ns": t0, "ticks": ticks, "published": published, "matched": self._matched}
+        fresh.write_text(json.dumps(told))
         fresh.replace(self._truth)
 
 

@@ -21,6 +21,7 @@ import subprocess
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -130,6 +131,11 @@ class Robot:
         """T0 in ns; waits until the robot drives."""
         wait_for(self.truth_file.is_file, "the robot's start", alive=self.process)
         return int(self._truth()["t0_ns"])
+
+    def reached(self) -> list[int]:
+        """When it first reached each further subscriber of its first topic (ns)."""
+        matched = [(int(at), int(count)) for at, count in self._truth()["matched"]]
+        return [at for (_, before), (at, count) in pairwise(matched) if count > before]
 
     def finish(self) -> dict[str, int]:
         """How many messages were published on each topic; waits for the end of the drive."""

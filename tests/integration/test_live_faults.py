@@ -27,8 +27,8 @@ SEED: Final = int(os.environ.get("EPISODIC_SEED", "20261120"))
 CHUNK_BYTES: Final = 16384  # recorder.chunk_bytes
 PROMISED_S: Final = 2.0
 TERMS: Final = {
-    "reference": Terms("reference", 50.0, 2, 6, KILLS, 3.0, SEED),
-    "slow": Terms("slow", 1.0, 2, 9, KILLS, 4.5, SEED + 1),
+    "reference": Terms("reference", 50.0, 2, 6, KILLS, 2.5, SEED),
+    "slow": Terms("slow", 1.0, 2, 9, KILLS, 3.5, SEED + 1),
 }
 
 _log = logging.getLogger(__name__)
