@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import sys
 import time
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 import anyio
 import anyio.lowlevel
 import pytest
+import structlog
 
 from ros2_memory import queries
 from ros2_memory.catalogue import FILE, FOLDER, Catalogue
@@ -30,6 +32,8 @@ from tests.bags import McapLayout, odom, text, write_mcap
 from tests.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from ros2_memory.digest import Digest
     from ros2_memory.memory import Memory
 
@@ -194,6 +198,18 @@ async def test_health_tells_how_far_the_catalogue_is(tmp_path: Path) -> None:
 # The command
 
 
+@pytest.fixture
+def own_logging() -> Iterator[None]:
+    """Logging as it was before a command set it up."""
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    root.handlers = []
+    yield
+    root.level, root.handlers = level, handlers
+    logging.captureWarnings(capture=False)
+    structlog.reset_defaults()
+
+
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
@@ -211,6 +227,7 @@ def test_on_a_terminal_one_line_moves_and_elsewhere_only_its_end_is_shown() -> N
     assert "0 of 0" in line(Progress(0, 0, 0))
 
 
+@pytest.mark.usefixtures("own_logging")
 def test_the_command_fills_the_catalogue_beside_the_bags(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -223,6 +240,7 @@ def test_the_command_fills_the_catalogue_beside_the_bags(
     assert (tmp_path / FOLDER / FILE).is_file()
 
 
+@pytest.mark.usefixtures("own_logging")
 def test_where_no_catalogue_can_be_written_the_command_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
