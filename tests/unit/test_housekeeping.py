@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -311,19 +312,38 @@ class TestInTheBackground:
         keeper.wait()
         assert not first.exists()
 
-    def test_repair_and_making_room_are_waited_for(self, tmp_path: Path) -> None:
+    def test_repair_is_waited_for(self, tmp_path: Path) -> None:
         open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
-        first, *_ = recording(tmp_path, "a", 0)
-        keeper = InBackground(keeper_of(tmp_path, measure_free=lambda _: 0))
+        keeper = InBackground(keeper_of(tmp_path))
         keeper.repair(tmp_path)
         assert McapReader().summarize(open_one).complete
+
+    def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
+        first, *_ = recording(tmp_path, "a", 0)
+        held, asked = threading.Event(), []
+
+        def measured(_directory: Path) -> int:
+            asked.append(held.wait(30))
+            return 0
+
+        keeper = InBackground(keeper_of(tmp_path, measure_free=measured))
         keeper.make_room(tmp_path, PLENTY)
+        keeper.make_room(tmp_path, PLENTY)
+        assert keeper.making_room()
+        assert first.exists()
+        held.set()
+        keeper.wait()
+        assert not keeper.making_room()
         assert not first.exists()
+        assert all(asked)
 
     def test_a_failure_is_reported(self, tmp_path: Path) -> None:
         class Failing:
             def repair(self, bag_dir: Path) -> None: ...
             def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None: ...
+            def making_room(self) -> bool:
+                return False
+
             def apply(self, bag_dir: Path) -> None:
                 raise OSError("the disk is gone")
 

@@ -467,6 +467,7 @@ class Housekeeping:
         self.world: World | None = None
         self.frees_to = 0
         self.fails = False
+        self.making = False
 
     def repair(self, bag_dir: Path) -> None:
         self.asked.append("repair")
@@ -475,6 +476,9 @@ class Housekeeping:
         self.asked.append(f"room {free_bytes_wanted}")
         if self.world is not None:
             self.world.free = max(self.world.free, self.frees_to)
+
+    def making_room(self) -> bool:
+        return self.making
 
     def apply(self, bag_dir: Path) -> None:
         self.asked.append("apply")
@@ -514,6 +518,34 @@ class TestSpace:
         beat = world.heartbeat()
         assert (beat["state"], beat["recordings"]) == ("paused", [])
         assert beat["last_error"] == paused["reason"]
+
+    def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
+        self, tmp_path: Path
+    ) -> None:
+        housekeeping = Housekeeping()
+        housekeeping.making = True
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(3)
+        world.free = 600
+        world.run(200)
+        assert housekeeping.asked.count("room 1200") == 1
+        assert world.supervisor.is_recording
+        world.free = 400
+        world.run(2)
+        assert world.heartbeat()["state"] == "paused"
+
+    def test_room_that_was_made_too_little_has_recording_pause(self, tmp_path: Path) -> None:
+        housekeeping = Housekeeping()
+        housekeeping.making = True
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(3)
+        world.free = 600
+        world.run(3)
+        housekeeping.making = False
+        world.run(2)
+        assert world.heartbeat()["state"] == "paused"
 
     def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
         world, _ = self.world(tmp_path)

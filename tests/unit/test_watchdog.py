@@ -35,6 +35,21 @@ class TestSpace:
     ) -> None:
         assert space(free, 1000, paused=paused, room_made=room_made) is expected
 
+    @pytest.mark.parametrize(
+        ("free", "paused", "expected"),
+        [
+            (999, False, Space.WAIT),
+            (500, False, Space.WAIT),
+            (499, False, Space.PAUSE),
+            (1000, False, Space.ENOUGH),
+            (1199, True, Space.STAY_PAUSED),
+        ],
+    )
+    def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
+        self, free: int, paused: bool, expected: Space
+    ) -> None:
+        assert space(free, 1000, paused=paused, room_made=True, making=True) is expected
+
     @given(st.integers(0, 10**13), st.integers(0, 10**12))
     def test_what_it_resumes_with_is_never_what_it_pauses_for(self, free: int, least: int) -> None:
         if space(free, least, paused=True, room_made=True) is Space.RESUME:

@@ -135,6 +135,10 @@ class Housekeeping:
         )
         self._report(done, begun, free_bytes_wanted=free_bytes_wanted)
 
+    def making_room(self) -> bool:
+        """Never: it is made when `make_room` returns."""
+        return False
+
     def apply(self, bag_dir: Path) -> None:
         """Deletes what is beyond the budget or too old; repairs what nobody writes any more."""
         begun = time.perf_counter_ns()
@@ -249,43 +253,56 @@ class Housekeeping:
 
 
 class InBackground:
-    """Has another housekeeper apply its limits in a thread of its own.
+    """Has another housekeeper delete in threads of its own.
 
-    The first look at a week of bags takes seconds, in which the robot shall be recorded. Repair
-    and making room are waited for.
+    The first look at a week of bags takes from seconds to minutes, in which the robot shall be
+    recorded and the service manager hear of it. Repair is waited for: nothing is recorded yet.
     """
 
     def __init__(self, housekeeper: Housekeeper) -> None:
         self._housekeeper = housekeeper
-        self._thread: threading.Thread | None = None
+        self._threads: dict[str, threading.Thread] = {}
 
     def repair(self, bag_dir: Path) -> None:
         """Puts right what a crash left, and returns when that is done."""
         self._housekeeper.repair(bag_dir)
 
     def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
-        """Deletes until so much of the disk is free, and returns when that is done."""
-        self._housekeeper.make_room(bag_dir, free_bytes_wanted)
+        """Begins to delete until so much of the disk is free, unless that is under way."""
+        self._begin("make_room", lambda: self._housekeeper.make_room(bag_dir, free_bytes_wanted))
+
+    def making_room(self) -> bool:
+        """Whether room is being made."""
+        return self._is_under_way("make_room")
 
     def apply(self, bag_dir: Path) -> None:
         """Begins to apply the limits, unless that is still under way."""
-        if self._thread is not None and self._thread.is_alive():
-            return
-        self._thread = threading.Thread(
-            target=self._apply, args=(bag_dir,), name="housekeeping", daemon=True
-        )
-        self._thread.start()
+        self._begin("apply", lambda: self._housekeeper.apply(bag_dir))
 
     def wait(self) -> None:
         """Waits until nothing is under way."""
-        if self._thread is not None:
-            self._thread.join()
+        for thread in self._threads.values():
+            thread.join()
 
-    def _apply(self, bag_dir: Path) -> None:
-        try:
-            self._housekeeper.apply(bag_dir)
-        except (EpisodicError, OSError) as error:
-            _log.error("housekeeping_failed", task="apply", reason=str(error))
+    def _begin(self, task: str, do: Callable[[], None]) -> None:
+        if self._is_under_way(task):
+            return
+        thread = threading.Thread(
+            target=_reported, args=(task, do), name=f"housekeeping {task}", daemon=True
+        )
+        self._threads[task] = thread
+        thread.start()
+
+    def _is_under_way(self, task: str) -> bool:
+        thread = self._threads.get(task)
+        return thread is not None and thread.is_alive()
+
+
+def _reported(task: str, do: Callable[[], None]) -> None:
+    try:
+        do()
+    except (EpisodicError, OSError) as error:
+        _log.error("housekeeping_failed", task=task, reason=str(error))
 
 
 def _named(bag_dir: Path) -> frozenset[Path]:

@@ -32,8 +32,8 @@ class RecorderProcess(Protocol):
 class Housekeeper(Protocol):
     """Repairs what a crash left, and deletes what the limits do not allow to keep.
 
-    All of it happens between two looks at the running recorder: it should not take long, and what
-    it raises from the error tree is reported and stops nothing.
+    It is asked between two looks at the running recorder, so it should return at once, and may go
+    on in the background. What it raises from the error tree is reported and stops nothing.
     """
 
     def repair(self, bag_dir: Path) -> None:
@@ -44,6 +44,9 @@ class Housekeeper(Protocol):
 
         Where that cannot be reached it deletes what it may.
         """
+
+    def making_room(self) -> bool:
+        """Whether room that was asked for is still being made."""
 
     def apply(self, bag_dir: Path) -> None:
         """Deletes what is beyond the budget or too old. Called when splits have been closed."""
@@ -57,6 +60,10 @@ class NoHousekeeping:
 
     def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
         """Does nothing."""
+
+    def making_room(self) -> bool:
+        """Never."""
+        return False
 
     def apply(self, bag_dir: Path) -> None:
         """Does nothing."""

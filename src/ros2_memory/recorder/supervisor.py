@@ -203,13 +203,12 @@ class Supervisor:
         free = self._free_bytes()
         if free is None:
             return
-        least = self._orders.min_free_bytes
-        action = space(free, least, paused=self._paused, room_made=self._room_made)
+        action = self._space(free)
         if action is Space.MAKE_ROOM:
             self._room_made = True
             self._make_room()
             free = self._free_bytes() or 0
-            action = space(free, least, paused=False, room_made=True)
+            action = self._space(free)
         if action is Space.STAY_PAUSED and self._is_due("room", QUIET_HOUSE_S, now):
             # What was being written when recording was paused may be deleted since.
             self._make_room()
@@ -221,6 +220,15 @@ class Supervisor:
             self._journal.note("recording_resumed", free_bytes=free)
         elif action is Space.ENOUGH:
             self._room_made = False
+
+    def _space(self, free: int) -> Space:
+        return space(
+            free,
+            self._orders.min_free_bytes,
+            paused=self._paused,
+            room_made=self._room_made,
+            making=self._housekeeper.making_room(),
+        )
 
     def _pause(self, now: Moment, free: int) -> None:
         self._paused = True

@@ -22,6 +22,7 @@ class Space(Enum):
 
     ENOUGH = auto()
     MAKE_ROOM = auto()  # delete more than the budget asks
+    WAIT = auto()  # for room that is being made
     PAUSE = auto()
     STAY_PAUSED = auto()
     RESUME = auto()
@@ -32,20 +33,30 @@ def resume_bytes(min_free_bytes: int) -> int:
     return round(min_free_bytes * RESUME_FACTOR)
 
 
-def space(free_bytes: int, min_free_bytes: int, *, paused: bool, room_made: bool) -> Space:
+def space(
+    free_bytes: int,
+    min_free_bytes: int,
+    *,
+    paused: bool,
+    room_made: bool,
+    making: bool = False,
+) -> Space:
     """What to do.
 
     Args:
         free_bytes: what the file system of the bag directory has left for this user.
         min_free_bytes: what it must have for recording to go on.
         paused: whether recording is paused.
-        room_made: whether deleting was tried for this shortage already.
+        room_made: whether deleting was tried, or begun, for this shortage already.
+        making: whether that is still under way; it is waited for while half the least is free.
     """
     if paused:
         return Space.RESUME if free_bytes >= resume_bytes(min_free_bytes) else Space.STAY_PAUSED
     if free_bytes >= min_free_bytes:
         return Space.ENOUGH
-    return Space.PAUSE if room_made else Space.MAKE_ROOM
+    if not room_made:
+        return Space.MAKE_ROOM
+    return Space.WAIT if making and free_bytes >= min_free_bytes // 2 else Space.PAUSE
 
 
 def time_was_set_back(before: Moment, now: Moment) -> bool:
