@@ -144,6 +144,7 @@ class World:
         self.silent = False
         self.disk_full = False
         self.free = 10**12
+        self.device = 1
         self.refuse = ""
         self.recorders: list[PlayedRecorder] = []
         self.named_at_start: list[list[str]] = []
@@ -164,6 +165,7 @@ class World:
             WorldClock(self),
             monotonic=lambda: self.mono,
             free_bytes_of=lambda _directory: self.free,
+            device=lambda _directory: self.device,
         )
 
     def _start(self, name: str, directory: Path) -> PlayedRecorder:

@@ -602,6 +602,66 @@ class TestSpace:
         assert len({each["reason"] for each in told}) == len(told)
 
 
+class TestUnmounted:
+    """The disk is unmounted: its recordings are not there, and an empty directory is."""
+
+    @staticmethod
+    def unmounted(world: World) -> Path:
+        aside = world.bag_dir.with_name("aside")
+        world.bag_dir.rename(aside)
+        world.bag_dir.mkdir()
+        world.device = 2
+        return aside
+
+    def test_nothing_is_recorded_onto_another_disk_and_that_is_told(self, tmp_path: Path) -> None:
+        housekeeping = Housekeeping()
+        world = World(tmp_path / "bags", housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(3)
+        self.unmounted(world)
+        with capture_logs() as logs:
+            world.run(200)
+        assert len(events(logs, "disk_gone")) == 1
+        assert world.running == []
+        assert len(world.recorders) == 1
+        assert housekeeping.asked == []
+        assert [path.name for path in world.bag_dir.iterdir()] == ["recorder.json"]
+        beat = world.heartbeat()
+        assert beat["state"] == "paused"
+        assert "has been unmounted" in beat["last_error"]
+
+    def test_it_goes_on_by_itself_when_the_disk_is_back(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags")
+        world.supervisor.start()
+        world.run(3)
+        aside = self.unmounted(world)
+        world.run(20)
+        shutil.rmtree(world.bag_dir)
+        aside.rename(world.bag_dir)
+        world.device = 1
+        with capture_logs() as logs:
+            world.run(0.5)
+            assert len(world.recorders) == 1
+            world.run(5)
+        assert len(events(logs, "disk_back")) == 1
+        assert world.supervisor.is_recording
+        assert world.heartbeat()["state"] == "recording"
+
+    def test_one_that_comes_and_goes_is_waited_for_longer_each_time(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags")
+        world.supervisor.start()
+        world.run(3)
+        for _ in range(5):
+            aside = self.unmounted(world)
+            world.run(1)
+            shutil.rmtree(world.bag_dir)
+            aside.rename(world.bag_dir)
+            world.device = 1
+            world.run(1)
+        world.run(10)
+        assert len(world.recorders) <= 3
+
+
 class TestHouse:
     def test_it_is_kept_after_splits_were_closed(self, tmp_path: Path) -> None:
         housekeeping = Housekeeping()

@@ -120,7 +120,7 @@ class Crew:
             changes = session.splits.look(now.monotonic_s)
             closed = closed or bool(changes.closed)
             self._report(session, changes)
-            if changes.gone:
+            if changes.gone and session not in self._leaving:
                 self._has_vanished(session)
         return closed
 

@@ -35,7 +35,7 @@ class RecorderState(StrEnum):
 
     STARTING = "starting"
     RECORDING = "recording"
-    PAUSED = "paused"  # alive, and not recording on purpose: the disk is nearly full
+    PAUSED = "paused"  # alive, and not recording on purpose: the disk is nearly full, or gone
     STOPPING = "stopping"
     STOPPED = "stopped"
 

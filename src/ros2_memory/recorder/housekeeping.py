@@ -7,7 +7,6 @@ found unfinished later on, when nothing writes it, is repaired then.
 
 from __future__ import annotations
 
-import shutil
 import threading
 import time
 from contextlib import suppress
@@ -17,6 +16,7 @@ import structlog
 
 from ros2_memory.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.model import BagState
+from ros2_memory.recorder.disk import free_bytes
 from ros2_memory.recorder.disposal import Disposal
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
@@ -46,15 +46,6 @@ MOST_REPAIRED_BYTES: Final = 1 << 30
 
 _MCAP: Final = ".mcap"
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
-
-
-def free_bytes(bag_dir: Path) -> int:
-    """What the file system of a directory has left for this user.
-
-    Raises:
-        OSError: it cannot be measured.
-    """
-    return shutil.disk_usage(bag_dir).free
 
 
 class Housekeeping:

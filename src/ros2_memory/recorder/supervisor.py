@@ -7,13 +7,13 @@ elsewhere (`crew`); here the two meet.
 
 from __future__ import annotations
 
-import shutil
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import EpisodicError, RecorderError
 from ros2_memory.recorder.crew import Crew
+from ros2_memory.recorder.disk import HomeDisk, device_of, free_bytes
 from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.recorder.journal import Journal
 from ros2_memory.recorder.plan import Backoff, SilenceWatch, session_over
@@ -61,11 +61,6 @@ class Orders:
     stable_s: float = 60.0
 
 
-def _free_bytes_of(directory: Path) -> int:
-    """What the file system has left for this user."""
-    return shutil.disk_usage(directory).free
-
-
 class Supervisor:
     """Keeps one recording going, two during a handover.
 
@@ -81,13 +76,16 @@ class Supervisor:
         clock: Clock,
         *,
         monotonic: Callable[[], float] = time.monotonic,
-        free_bytes_of: Callable[[Path], int] = _free_bytes_of,
+        free_bytes_of: Callable[[Path], int] = free_bytes,
+        device: Callable[[Path], int] = device_of,
     ) -> None:
         self._orders = orders
         self._housekeeper = housekeeper
         self._clock = clock
         self._monotonic = monotonic
         self._free_bytes_of = free_bytes_of
+        self._home = HomeDisk(orders.bag_dir, device)
+        self._away = False
         self._journal = Journal()
         self._pulse = Pulse(orders.bag_dir, orders.heartbeat_s, clock, self._journal)
         self._crew = Crew(
@@ -131,6 +129,7 @@ class Supervisor:
         self._last = now = self._now()
         self._due_s.clear()
         self._make_bag_dir()
+        self._remember_disk()
         self._mind_space(now)
         if not self._paused:
             self._begin(now)
@@ -164,6 +163,7 @@ class Supervisor:
 
     def _mind_all(self, now: Moment) -> None:
         tasks: dict[str, Callable[[Moment], object]] = {
+            "disk": self._mind_disk,
             "look": self._look,
             "deaths": self._mind_deaths,
             "space": self._mind_space,
@@ -185,6 +185,23 @@ class Supervisor:
         if self._is_due("look", LOOK_S, now):
             self._splits_closed |= self._crew.look(now)
 
+    def _mind_disk(self, now: Moment) -> None:
+        """Ends recording while another disk lies under the bag directory than at the start."""
+        there = [each.name for each in self._crew.sessions if each.splits.exists]
+        before, self._away = self._away, self._home.is_away(there)
+        if self._away and not before:
+            self._crew.dismiss(now)
+            self._journal.fail(
+                "disk_gone",
+                f"recording is paused: the disk of {self._bag_dir} has been unmounted, and another "
+                "lies there; recording resumes by itself when it is mounted again (to record onto "
+                "the other one, start the recorder anew)",
+            )
+            self._beat()
+        elif before and not self._away:
+            self._put_off("restart", self._backoff.failed(0.0), now)
+            self._journal.note("disk_back", bag_dir=str(self._bag_dir))
+
     def _mind_deaths(self, now: Moment) -> None:
         before = self._crew.current
         for lived_s in self._crew.bury(now):
@@ -198,7 +215,7 @@ class Supervisor:
 
     def _mind_space(self, now: Moment) -> None:
         """Deletes more, pauses and resumes, by what the disk has left."""
-        if not self._is_due("space", SPACE_S, now):
+        if self._away or not self._is_due("space", SPACE_S, now):
             return
         free = self._free_bytes()
         if free is None:
@@ -275,7 +292,7 @@ class Supervisor:
             self._put_off("rotate", self._rotation_backoff.failed(0.0), now)
 
     def _mind_restart(self, now: Moment) -> None:
-        if self._crew.current is not None or self._paused:
+        if self._crew.current is not None or self._paused or self._away:
             return
         if not self._is_due("restart", 0.0, now):
             return
@@ -289,6 +306,13 @@ class Supervisor:
         self._make_bag_dir()
         self._crew.begin(now)
         self._silence.began(now.monotonic_s, SETTLE_S)
+
+    def _remember_disk(self) -> None:
+        try:
+            self._home.remember()
+        except OSError as error:
+            raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
+        self._away = False
 
     def _make_bag_dir(self) -> None:
         try:
@@ -304,7 +328,7 @@ class Supervisor:
 
     def _keep_house(self, now: Moment) -> None:
         every_s = HOUSE_S if self._splits_closed else QUIET_HOUSE_S
-        if now.monotonic_s - self._house_kept_s < every_s:
+        if self._away or now.monotonic_s - self._house_kept_s < every_s:
             return
         self._house_kept_s = now.monotonic_s
         self._splits_closed = False
@@ -330,7 +354,7 @@ class Supervisor:
 
     @property
     def _state(self) -> RecorderState:
-        if self._paused:
+        if self._paused or self._away:
             return RecorderState.PAUSED
         return RecorderState.RECORDING if self.is_recording else RecorderState.STARTING
 
