@@ -102,8 +102,8 @@ class IndexManager:
         with self._lock:
             if self._published is not None and self._published is not current:
                 return self._published
-            # What a question has to wait for is what changes by itself: the newest bags.
-            return self._scan(patrolling=current is None or self._is_stale(current, None))
+            # A question waits for what changes by itself, the newest bags; `refresh` patrols.
+            return self._scan(patrolling=False)
 
     def refresh(self) -> Snapshot:
         """Scans now, and gives the result."""

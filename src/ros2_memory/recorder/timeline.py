@@ -16,7 +16,7 @@ from ros2_memory.model import BagFile, TopicSummary
 from ros2_memory.recorder.layout import is_carried
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.model import TimeWindow
@@ -57,6 +57,7 @@ class Run:
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
+        self._extents: dict[str, tuple[list[Ns], list[Ns]]] = {}
 
     @cached_property
     def latest(self) -> Ns:
@@ -99,6 +100,19 @@ class Run:
                 spans = recordings.setdefault(each.topic, {})
                 spans[folder] = _wider(spans.get(folder), (each.first, each.last))
         return recordings
+
+    def between(self, topic: str, window: TimeWindow) -> Iterator[Held]:
+        """The entries of the topic in `held` that may hold a message in the window."""
+        if topic not in self._extents:
+            held = [each for _, each in self.held[topic]]
+            self._extents[topic] = ([each.first for each in held], [each.last for each in held])
+        firsts, lasts = self._extents[topic]
+        start, stop = window.start, window.stop
+        return (
+            entry
+            for entry, first, last in zip(self.held[topic], firsts, lasts, strict=True)
+            if first < stop and last >= start
+        )
 
     @cached_property
     def spans(self) -> dict[str, Span]:
@@ -287,11 +301,10 @@ class Timeline:
         if window.empty:
             return ()
         return tuple(
-            (bag, held)
+            entry
             for run in self._runs_in(window)
             if topic in run.spans and window.overlaps(*run.spans[topic])
-            for bag, held in run.held[topic]
-            if window.overlaps(held.first, held.last)
+            for entry in run.between(topic, window)
         )
 
 
