@@ -372,6 +372,20 @@ class TestRefusals:
         assert code == 1
         assert "recorder.setup_files" in said
 
+    @pytest.mark.parametrize("cause", ["no ros2", "no setup file"])
+    def test_a_start_that_is_refused_clears_nothing(self, site: Site, cause: str) -> None:
+        old = site.bag_dir / "rec_old" / "rec_old_0.mcap"
+        old.parent.mkdir(parents=True)
+        old.write_bytes(b"old")
+        setup = []
+        if cause == "no ros2":
+            site.env["PATH"] = os.defpath
+        else:
+            setup = [f"recorder.setup_files=[{site.folder}/none.bash]"]
+        code, said = site.refusal("recording.clear_on_startup=true", *setup)
+        assert (code, "recorder.setup_files" in said) == (1, True)
+        assert old.read_bytes() == b"old"
+
     def test_a_setup_file_that_is_missing_is_named(self, site: Site) -> None:
         code, said = site.refusal(f"recorder.setup_files=[{site.folder}/none.bash]")
         assert code == 1

@@ -12,7 +12,13 @@ from ros2_memory.adapters import build_housekeeper, build_reader, build_recorder
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.errors import ConfigError, EpisodicError
 from ros2_memory.logs import configure_logging
-from ros2_memory.recorder.daemon import Ticking, Upkeep, lock_and_prepare, record_until_told
+from ros2_memory.recorder.daemon import (
+    Ticking,
+    Upkeep,
+    lock_bag_dir,
+    put_in_order,
+    record_until_told,
+)
 from ros2_memory.recorder.notify import ServiceManager
 from ros2_memory.recorder.topics import load_topics
 from ros2_memory.settings import NullRecorderNode
@@ -62,13 +68,17 @@ def _record(settings: Settings) -> None:
     bag_dir = settings.recording.bag_dir.absolute()
     reader = build_reader(settings)
     housekeeper = build_housekeeper(settings, bag_dir, reader)
-    lock = lock_and_prepare(bag_dir, reader, housekeeper, clear=settings.recording.clear_on_startup)
+    clear = settings.recording.clear_on_startup
+    lock = lock_bag_dir(bag_dir, clear=clear)
     try:
         recorder = build_recorder(
             settings, reader=reader, housekeeper=housekeeper, keep_open=(lock.descriptor,)
         )
         if not isinstance(recorder, Ticking):
             raise ConfigError(f"recorder: {settings.recorder.target} cannot be run by {PROGRAM}")
+        # So does an environment in which nothing can be recorded.
+        recorder.check()
+        put_in_order(bag_dir, reader, housekeeper, clear=clear)
         _log.info("starting", bag_dir=str(bag_dir))
         record_until_told(recorder, ServiceManager(), Upkeep(bag_dir, reader, lock))
         _log.info("stopped")

@@ -38,6 +38,9 @@ _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 class Ticking(Protocol):
     """A recorder that works while it is ticked."""
 
+    def check(self) -> None:
+        """Raises an error of the tree where recording cannot begin; touches no bag."""
+
     def start(self) -> None:
         """Begins to record."""
 
@@ -48,13 +51,10 @@ class Ticking(Protocol):
         """Ends."""
 
 
-def lock_and_prepare(
-    bag_dir: Path, reader: BagReader, housekeeper: Housekeeper, *, clear: bool
-) -> BagDirLock:
-    """Takes the bag directory, which is made where it does not exist, and puts it in order.
+def lock_bag_dir(bag_dir: Path, *, clear: bool) -> BagDirLock:
+    """Takes the bag directory, which is made where it does not exist.
 
-    Bags that a crash left open are repaired, and handovers that it cut short are settled. What
-    fails of that is reported, and recording begins all the same.
+    `clear`: whether its bags are to be deleted.
 
     Raises:
         RecorderError: another recorder holds the directory, it cannot be written into, or it must
@@ -68,18 +68,26 @@ def lock_and_prepare(
         raise RecorderError(
             f"{bag_dir} cannot be made: {error.strerror}; correct recording.bag_dir"
         ) from error
-    lock = BagDirLock.acquire(bag_dir)
-    try:
-        if clear:
-            wiped = clear_bags(bag_dir)
-            _log.warning("bags_cleared", files=wiped.files, bytes=wiped.bytes)
-            for fault in wiped.faults:
-                _log.error("not_cleared", reason=fault)
-        _prepare(bag_dir, reader, housekeeper)
-    except BaseException:
-        lock.release()
-        raise
-    return lock
+    return BagDirLock.acquire(bag_dir)
+
+
+def put_in_order(
+    bag_dir: Path, reader: BagReader, housekeeper: Housekeeper, *, clear: bool
+) -> None:
+    """Puts a bag directory in order whose lock the caller holds; clears it before, where asked to.
+
+    Bags that a crash left open are repaired, and handovers that it cut short are settled. What
+    fails of that is reported, and recording begins all the same.
+
+    Raises:
+        RecorderError: it must not be cleared.
+    """
+    if clear:
+        wiped = clear_bags(bag_dir)
+        _log.warning("bags_cleared", files=wiped.files, bytes=wiped.bytes)
+        for fault in wiped.faults:
+            _log.error("not_cleared", reason=fault)
+    _prepare(bag_dir, reader, housekeeper)
 
 
 class Upkeep:

@@ -88,6 +88,7 @@ class Ros2BagRecorder(Recorder):
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
         self._started = False
+        self._checked = False
         self._topics = TopicSelection(())
         self._env: dict[str, str] = {}
         self._ros2 = "ros2"
@@ -106,6 +107,19 @@ class Ros2BagRecorder(Recorder):
             clock or WallClock(),
         )
 
+    def check(self) -> None:
+        """Makes the environment of `ros2` and asks it what it can do; touches no bag.
+
+        Raises:
+            ConfigError: the list of topics is refused.
+            RecorderError: there is no `ros2` that can record, or a setup file fails.
+        """
+        self._topics = load_topics(self._topics_file)
+        self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
+        self._ros2 = find_ros2(self._env)
+        self._options = self._known_options()
+        self._checked = True
+
     def start(self) -> None:
         """Begins to record; from then on `tick` must be called some times a second.
 
@@ -115,10 +129,9 @@ class Ros2BagRecorder(Recorder):
         """
         if self._started:
             return
-        self._topics = load_topics(self._topics_file)
-        self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
-        self._ros2 = find_ros2(self._env)
-        self._options = self._known_options()
+        if not self._checked:
+            self.check()
+        self._checked = False
         self._supervisor.start()
         self._started = True
 
