@@ -9,13 +9,12 @@ file of a recording that is not named counts as left behind by a crash.
 from __future__ import annotations
 
 import json
-import os
-import stat
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.errors import RecorderError
+from ros2_memory.recorder.sync import read_small_file, write_durably
 from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ns_from_unix
 
 if TYPE_CHECKING:
@@ -27,7 +26,6 @@ MAX_INTERVAL_S: Final = 3600.0
 
 _PATIENCE_INTERVALS: Final = 3
 _PATIENCE_AT_LEAST_NS: Final[Ns] = 15 * NS_PER_S
-_MAX_BYTES: Final = 1 << 20
 
 
 class RecorderState(StrEnum):
@@ -82,7 +80,7 @@ class HeartbeatReading(NamedTuple):
 def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
     """What the recorder last wrote into `recorder.json`, live or not. Raises nothing."""
     try:
-        text = _text(bag_dir / HEARTBEAT_FILE)
+        text = read_small_file(bag_dir / HEARTBEAT_FILE)
         return HeartbeatReading(_parsed(text), None)
     except FileNotFoundError:
         return HeartbeatReading(None, f"there is no {HEARTBEAT_FILE}: no recorder has written here")
@@ -100,35 +98,14 @@ def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
         RecorderError: it cannot be written, e.g. because the disk is full; the old one stands.
     """
     target = bag_dir / HEARTBEAT_FILE
-    beside = bag_dir / f".{HEARTBEAT_FILE}.tmp"
     text = json.dumps(asdict(heartbeat), allow_nan=False, separators=(",", ":"))
     try:
-        try:
-            with beside.open("w", encoding="utf-8") as stream:
-                stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-            beside.replace(target)
-        except OSError:
-            beside.unlink(missing_ok=True)
-            raise
+        write_durably(target, text)
     except OSError as error:
         raise RecorderError(
             f"{target} cannot be written: {error.strerror or error}; "
             "free disk space or correct the permissions of the bag directory"
         ) from error
-
-
-def _text(path: Path) -> str:
-    """The text of a small regular file; never waits, as opening a FIFO would."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with os.fdopen(descriptor, "rb") as stream:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise ValueError("it is not a regular file")
-        data = stream.read(_MAX_BYTES + 1)
-    if len(data) > _MAX_BYTES:
-        raise ValueError(f"it is larger than {_MAX_BYTES} bytes")
-    return data.decode("utf-8")
 
 
 def _parsed(text: str) -> Heartbeat:

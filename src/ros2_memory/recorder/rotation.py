@@ -36,14 +36,14 @@ class Moment(NamedTuple):
     wall: Ns
 
 
-def set_back(earlier: Moment, later: Moment) -> bool:
-    """Whether the wall clock was set back between two moments that lie close together.
+def set_back(earlier: Moment, later: Moment, by_ns: Ns = STEP_NS) -> bool:
+    """Whether the wall clock was set back by more between two moments that lie close together.
 
     A clock that is set forward does no harm: what was published before and after it still falls on
     either side of one cut.
     """
     passed = round((later.monotonic_s - earlier.monotonic_s) * NS_PER_S)
-    return passed - (later.wall - earlier.wall) > STEP_NS
+    return passed - (later.wall - earlier.wall) > by_ns
 
 
 class Step(Enum):

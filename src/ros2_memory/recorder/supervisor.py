@@ -18,7 +18,7 @@ from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.recorder.journal import Journal
 from ros2_memory.recorder.plan import Backoff, SilenceWatch, session_over
 from ros2_memory.recorder.pulse import Pulse
-from ros2_memory.recorder.rotation import Moment, Step
+from ros2_memory.recorder.rotation import BOTH_S, SUBSCRIBE_TIMEOUT_S, Moment, Step
 from ros2_memory.recorder.watchdog import Space, resume_bytes, space, time_was_set_back
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ class Orders:
     min_free_bytes: int
     simulated: bool = False
     heartbeat_s: float = 5.0
-    subscribe_timeout_s: float = 20.0
-    both_s: float = 2.0
+    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
+    both_s: float = BOTH_S
     first_backoff_s: float = 1.0
     longest_backoff_s: float = 60.0
     stable_s: float = 60.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.recorder.rotation import set_back
 from ros2_memory.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -65,8 +66,7 @@ def time_was_set_back(before: Moment, now: Moment) -> bool:
     A split is closed by the time of a message that comes long enough after its first, so it would
     stay open until the clock has caught up. Setting it back by less is waited out.
     """
-    passed = round((now.monotonic_s - before.monotonic_s) * NS_PER_S)
-    return passed - (now.wall - before.wall) > SET_BACK_NS
+    return set_back(before, now, SET_BACK_NS)
 
 
 def silence_told(subscribed: Collection[str], heard: Collection[str]) -> str | None:
