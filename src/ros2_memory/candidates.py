@@ -7,22 +7,21 @@ searched; in it everything that can bear on what counts is read, as it is withou
 from __future__ import annotations
 
 import heapq
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.evidence import Evidence
 from ros2_memory.model import TimeWindow
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.conditions import Condition
     from ros2_memory.history import View
     from ros2_memory.model import BagFile
+    from ros2_memory.recall import RunNotes
     from ros2_memory.recorder.timeline import Run
     from ros2_memory.timebase import Ns
 
-_NOTHING: Final = Evidence()
 """Of a bag of a run that is ruled out as a whole."""
 
 
@@ -93,10 +92,10 @@ class Candidates:
     def _in_run(self, run: Run, topic: str) -> Iterator[_Candidate]:
         notes = self._view.recalled(run)
         known = {} if notes is None else notes.numbers
-        said: Mapping[int, Evidence] = {}
+        possible: Collection[int] = ()
         if notes is not None and known:
             if self._condition.may_match(notes.evidence_of_all(topic)):
-                said = notes.evidence(topic)
+                possible = self._possible(notes, topic)
             elif notes.whole:
                 self.ruled_out = True
                 return
@@ -104,10 +103,19 @@ class Candidates:
             if summary.first >= self._until:
                 continue
             number = known.get(bag.path)
-            if number is None or self._condition.may_match(said.get(number, _NOTHING)):
+            if number is None or number in possible:
                 yield _Candidate(summary.first, summary.last, bag)
             else:
                 self.ruled_out = True
+
+    def _possible(self, notes: RunNotes, topic: str) -> Collection[int]:
+        """The entries that may hold a match."""
+        place = self._condition.place
+        if place is not None:
+            boxes = notes.boxes(topic)
+            return boxes.meeting(place.x, place.y, place.z, place.tolerance_m)
+        said = notes.evidence(topic)
+        return {number for number, each in said.items() if self._condition.may_match(each)}
 
 
 def _stretch(group: Sequence[_Candidate], start: Ns, until: Ns) -> Stretch:

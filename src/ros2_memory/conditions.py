@@ -167,6 +167,11 @@ class Condition:
             return self.test.may_match_elsewhere(evidence)
         return self.test.may_match(evidence)
 
+    @property
+    def place(self) -> NearPosition | None:
+        """The place that alone decides what may match; None where something else does."""
+        return self.test if self.field is None and isinstance(self.test, NearPosition) else None
+
 
 def parse_condition(
     condition_type: str, value: JsonValue, tolerance_m: float, field: str | None = None

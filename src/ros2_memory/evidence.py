@@ -11,8 +11,12 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
 
 MOST_WORDS: Final = 400
 """Distinct words that are kept of one topic in one bag; a topic of logs or UUIDs passes it."""
@@ -113,6 +117,27 @@ class Evidence:
         return self.open or (self.box is not None and self.box.meets(x, y, z, reach))
 
 
+class Boxes:
+    """The boxes of many pieces of evidence, to be asked of one place all at once."""
+
+    def __init__(self, evidence: Mapping[int, Evidence]) -> None:
+        self._numbers = list(evidence)
+        boxes = [_EVERYWHERE if each.open else each.box or _NOWHERE for each in evidence.values()]
+        self._bounds: NDArray[np.float64] = np.array(boxes, dtype=np.float64).reshape(-1, 6).T
+
+    def meeting(self, x: float, y: float, z: float | None, reach: float) -> set[int]:
+        """The numbers of the evidence that may hold a place within `reach` (m) of this one."""
+        within = np.ones(len(self._numbers), dtype=np.bool_)
+        for axis, value in enumerate((x, y) if z is None else (x, y, z)):
+            slack = _slack(value, reach)
+            within &= self._bounds[2 * axis] <= value + reach + slack
+            within &= self._bounds[2 * axis + 1] >= value - reach - slack
+        return {self._numbers[at] for at in np.flatnonzero(within)}
+
+
+_EVERYWHERE: Final = Box(-math.inf, math.inf, -math.inf, math.inf, -math.inf, math.inf)
+_NOWHERE: Final = Box(math.inf, -math.inf, math.inf, -math.inf, math.inf, -math.inf)
+
 OPEN: Final = Evidence(words=None, texts=True, numbers=None, open=True)
 """Of messages of which nothing is known."""
 
@@ -162,5 +187,10 @@ def rounded(number: float, *, up: bool) -> float:
 
 
 def _near(low: float, high: float, value: float, reach: float) -> bool:
-    slack = 1e-9 * (1 + abs(value) + reach)
+    slack = _slack(value, reach)
     return low <= value + reach + slack and high >= value - reach - slack
+
+
+def _slack(value: float, reach: float) -> float:
+    """More than any rounding of a distance."""
+    return 1e-9 * (1 + abs(value) + reach)

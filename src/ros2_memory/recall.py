@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 from ros2_memory.catalogue import BagKey
-from ros2_memory.evidence import OPEN, united
+from ros2_memory.evidence import OPEN, Boxes, united
 from ros2_memory.model import BagState
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ class RunNotes:
             for topic, held in run.held.items()
         }
         self._evidence: dict[str, Evidence] = {}
+        self._boxes: dict[str, Boxes] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._kept: dict[str, dict[int, tuple[Record, ...]]] = {}
         self._undecodable: dict[str, dict[int, dict[str, str]]] = {}
@@ -67,6 +68,12 @@ class RunNotes:
         known = self._catalogue.evidence(topic, numbers)
         # Where the catalogue failed since the entries were found, nothing is ruled out.
         return {number: known.get(number, OPEN) for number in numbers}
+
+    def boxes(self, topic: str) -> Boxes:
+        """The places in the evidence; kept, since they are few numbers and asked for often."""
+        if topic not in self._boxes:
+            self._boxes[topic] = Boxes(self.evidence(topic))
+        return self._boxes[topic]
 
     def poses(self, topic: str) -> Mapping[int, PoseDigest]:
         """For each entry that has it the digest of its poses."""
