@@ -19,8 +19,6 @@ from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_chunk import Column, joined, walk
 from ros2_memory.storage.mcap_file import begins_as_mcap, closing_of
 from ros2_memory.storage.mcap_index import (
-    Chunk,
-    DoubtError,
     McapIndex,
     chunk_columns,
     chunk_data,
@@ -28,6 +26,7 @@ from ros2_memory.storage.mcap_index import (
 )
 from ros2_memory.storage.mcap_records import MESSAGE, RECORD
 from ros2_memory.storage.mcap_scan import index_by_scan
+from ros2_memory.storage.mcap_summary import Chunk, DoubtError
 from ros2_memory.storage.merge import Rows, Run, merged
 from ros2_memory.storage.open_file import OpenFile
 from ros2_memory.storage.summary import Held, bag_summary
@@ -147,7 +146,7 @@ class McapBags:
             else:
                 missing.append(channel)
         if missing:
-            if chunk.index_offsets is not None:
+            if chunk.index_places is not None:
                 read = chunk_columns(file, chunk, missing)
             else:
                 read = walk(self._chunk_data(file, chunk)).columns

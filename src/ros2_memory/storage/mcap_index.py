@@ -8,11 +8,9 @@ messages themselves.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
-
-from mcap.opcode import Opcode
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.storage.faults import UnreadableError, damage
 from ros2_memory.storage.mcap_chunk import (
@@ -24,17 +22,8 @@ from ros2_memory.storage.mcap_chunk import (
     unpacked,
     unpacked_in_part,
 )
-from ros2_memory.storage.mcap_records import (
-    FOOTER,
-    MAGIC_SIZE,
-    RECORD,
-    ChunkIndex,
-    Declarations,
-    Statistics,
-    chunk_index,
-    framed,
-    statistics,
-)
+from ros2_memory.storage.mcap_records import RECORD, Statistics
+from ros2_memory.storage.mcap_summary import MAX_SECTION_BYTES, Chunk, DoubtError, read_summary
 from ros2_memory.timebase import MAX_NS, unix_from_ns
 
 if TYPE_CHECKING:
@@ -44,24 +33,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.open_file import OpenFile
     from ros2_memory.timebase import Ns
 
-MAX_SECTION_BYTES = 256 << 20
-
-
-class Chunk(NamedTuple):
-    """One chunk of a file (a tuple: indexing a week makes millions). `start`, `end`: inclusive.
-
-    `index_offsets` says where each channel's message index lies, None where there is none to
-    rely on. `usable` is how many of its decompressed bytes count where the file ends inside it.
-    """
-
-    offset: int
-    length: int
-    start: Ns
-    end: Ns
-    channels: frozenset[int]
-    index_offsets: Mapping[int, int] | None = None
-    index_length: int = 0
-    usable: int | None = None
+_NEVER: Final = 1 << 64
+"""Later than any time that a file can state."""
 
 
 @dataclass(slots=True)
@@ -90,19 +63,15 @@ class McapIndex:
     @property
     def bytes_held(self) -> int:
         """About how much memory it takes."""
-        places = sum(len(chunk.index_offsets or ()) for chunk in self.chunks)
+        places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
         loose = sum(column.times.nbytes * 2 for column in self.loose.values())
-        return 1000 + 300 * (len(self.channels) + len(self.chunks)) + 100 * places + loose
-
-
-class DoubtError(UnreadableError):
-    """The summary section cannot be relied on; the text is a note on it, or empty."""
+        return 1000 + 300 * len(self.channels) + 400 * len(self.chunks) + places + loose
 
 
 def chunk_columns(
     file: OpenFile, chunk: Chunk, wanted: Collection[int] | None = None
 ) -> dict[int, Column]:
-    """The messages of a chunk by its message indexes. Only where it has `index_offsets`.
+    """The messages of a chunk by its message indexes. Only where it has `index_places`.
 
     Args:
         file: the open file.
@@ -112,7 +81,7 @@ def chunk_columns(
     Raises:
         UnreadableError: the indexes are damaged, or disagree with the chunk's stated span.
     """
-    offsets = chunk.index_offsets or {}
+    offsets = chunk.index_offsets
     if wanted is not None:
         offsets = {channel: offset for channel, offset in offsets.items() if channel in wanted}
     columns = columns_from_index(_index_region(file, chunk), offsets, chunk.offset + chunk.length)
@@ -124,7 +93,7 @@ def chunk_columns(
 
 def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
     """What `chunk_columns` amounts to, for less."""
-    offsets, base = chunk.index_offsets or {}, chunk.offset + chunk.length
+    offsets, base = chunk.index_offsets, chunk.offset + chunk.length
     extents = extents_from_index(_index_region(file, chunk), offsets, base)
     for extent in extents.values():
         _require_inside(chunk, extent.first, extent.last)
@@ -171,69 +140,30 @@ def index_from_summary(file: OpenFile) -> McapIndex:
 
 
 def _index_from_summary(file: OpenFile) -> McapIndex:
-    declarations, indexes, stated = _summary(file)
-    channels = declarations.channels()
-    chunks = tuple(_chunk(index) for index in indexes)
-    if stated is None or not declarations.resolved or stated.channels > len(channels):
+    channels, resolved, chunks, stated = read_summary(file)
+    if stated is None or not resolved or stated.channels > len(channels):
         raise DoubtError
     if not stated.counts.keys() <= channels.keys():
         raise DoubtError
-    if stated.counts and not all(chunk.index_offsets for chunk in chunks):
+    if stated.counts and not all(chunk.index_places for chunk in chunks):
         raise DoubtError
     exact = _agrees(stated, chunks)
     totals = totals_of(file, chunks, stated.counts if exact else None)
     found = {channel: total.count for channel, total in totals.items()}
     if found != stated.counts or sum(found.values()) != stated.messages:
         raise DoubtError
-    held = tuple(chunk for chunk in chunks if chunk.channels)
+    held = tuple([chunk for chunk in chunks if chunk.channels])
     return McapIndex(channels, held, totals, notes=disagreements(stated, totals))
 
 
-def _summary(file: OpenFile) -> tuple[Declarations, list[ChunkIndex], Statistics | None]:
-    footer_at = file.size - MAGIC_SIZE - FOOTER.size
-    footer = file.read(footer_at, FOOTER.size)
-    opcode, _, summary_at, _, crc = FOOTER.unpack(footer)
-    if opcode != Opcode.FOOTER or not summary_at:
-        raise DoubtError
-    if footer_at - summary_at > MAX_SECTION_BYTES:
-        raise DoubtError("its summary section is too large to be one")
-    section = file.read(summary_at, footer_at - summary_at)
-    if crc and zlib.crc32(footer[:-4], zlib.crc32(section)) != crc:
-        raise DoubtError("its summary section does not match its checksum")
-    declarations = Declarations()
-    indexes: list[ChunkIndex] = []
-    stated: Statistics | None = None
-    for opcode, body in framed(section):
-        if opcode == Opcode.CHUNK_INDEX:
-            indexes.append(chunk_index(body))
-        elif opcode == Opcode.STATISTICS:
-            stated = statistics(body)
-        else:
-            declarations.add(opcode, body)
-    return declarations, indexes, stated
-
-
-def _chunk(index: ChunkIndex) -> Chunk:
-    offsets = index.index_offsets
-    return Chunk(
-        index.offset,
-        index.length,
-        index.start,
-        index.end,
-        frozenset(offsets),
-        offsets or None,
-        index.index_length,
-    )
-
-
-def _agrees(stated: Statistics, chunks: tuple[Chunk, ...]) -> bool:
+def _agrees(stated: Statistics, chunks: list[Chunk]) -> bool:
     """Whether the statistics agree with themselves and with the chunk indexes."""
     held = [chunk for chunk in chunks if chunk.channels]
     if sum(stated.counts.values()) != stated.messages or stated.chunks != len(chunks):
         return False
     if not held:
         return not stated.messages
-    start, end = min(chunk.start for chunk in held), max(chunk.end for chunk in held)
+    start, end = min([chunk.start for chunk in held]), max([chunk.end for chunk in held])
     return (start, end) == (stated.start, stated.end) and end < MAX_NS
 
 
@@ -249,36 +179,62 @@ def totals_of(
             hold a channel's earliest or latest message.
     """
     totals: dict[int, Total] = {}
-    unread = {chunk.offset: chunk for chunk in chunks if chunk.channels}
-
-    def read(chunk: Chunk) -> None:
-        del unread[chunk.offset]
-        for channel, extent in _chunk_extents(file, chunk).items():
-            _add(totals, channel, extent)
-
-    for chunk in sorted(unread.values(), key=lambda chunk: chunk.start):
-        if counts is None or _may_extend(chunk, counts, totals, before=True):
-            read(chunk)
-    for chunk in sorted(unread.values(), key=lambda chunk: -chunk.end):
-        if _may_extend(chunk, counts or {}, totals, before=False):
-            read(chunk)
-    if counts is not None:
-        for channel, total in totals.items():
-            total.count = counts.get(channel, 0)
+    held = [chunk for chunk in chunks if chunk.channels]
+    if counts is None:
+        for chunk in held:
+            _take_in(file, chunk, totals)
+        return totals
+    read: set[int] = set()
+    # By the set of channels, since the chunks of a file mostly hold the same ones.
+    edges: dict[frozenset[int], Ns] = {}
+    for chunk in sorted(held, key=attrgetter("start")):
+        edge = edges.get(chunk.channels)
+        if edge is None:
+            edge = edges[chunk.channels] = _latest_first(chunk.channels, counts, totals)
+        if chunk.start < edge:
+            _take_in(file, chunk, totals)
+            read.add(chunk.offset)
+            edges.clear()
+    edges.clear()
+    for chunk in sorted(held, key=attrgetter("end"), reverse=True):
+        edge = edges.get(chunk.channels)
+        if edge is None:
+            edge = edges[chunk.channels] = _earliest_last(chunk.channels, counts, totals)
+        if chunk.end > edge and chunk.offset not in read:
+            _take_in(file, chunk, totals)
+            edges.clear()
+    for channel, total in totals.items():
+        total.count = counts.get(channel, 0)
     return totals
 
 
-def _may_extend(
-    chunk: Chunk, counts: Mapping[int, int], totals: Mapping[int, Total], *, before: bool
-) -> bool:
-    """Whether a chunk can hold an earlier (or later) message of a channel than those seen."""
-    for channel in chunk.channels:
-        if channel not in counts:
-            continue
-        total = totals.get(channel)
-        if total is None or (chunk.start < total.first if before else chunk.end > total.last):
-            return True
-    return False
+def _take_in(file: OpenFile, chunk: Chunk, totals: dict[int, Total]) -> None:
+    for channel, extent in _chunk_extents(file, chunk).items():
+        _add(totals, channel, extent)
+
+
+def _latest_first(
+    channels: Iterable[int], counts: Mapping[int, int], totals: Mapping[int, Total]
+) -> Ns:
+    """A chunk of these channels that begins before it can hold an earlier message of one."""
+    firsts = [
+        totals[channel].first if channel in totals else _NEVER
+        for channel in channels
+        if channel in counts
+    ]
+    return max(firsts, default=-1)
+
+
+def _earliest_last(
+    channels: Iterable[int], counts: Mapping[int, int], totals: Mapping[int, Total]
+) -> Ns:
+    """A chunk of these channels that ends after it can hold a later message of one."""
+    lasts = [
+        totals[channel].last if channel in totals else -1
+        for channel in channels
+        if channel in counts
+    ]
+    return min(lasts, default=_NEVER)
 
 
 def add_column(totals: dict[int, Total], channel: int, column: Column) -> None:

@@ -1,8 +1,8 @@
 """The records of an MCAP file, from bytes (https://mcap.dev/spec).
 
 A file is magic, records, magic; a record is an opcode (1 byte), a length (8 bytes, little endian)
-and a body. Messages and chunk indexes are read with `struct`, since there are many of them; what
-stands once in a file is read by the `mcap` package.
+and a body. What is read of every file is read with `struct`; what the bags of one robot have in
+common, and what is seldom read, by the `mcap` package.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import struct
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
@@ -35,11 +35,9 @@ __all__ = [
     "MESSAGE",
     "MESSAGE_FIELDS",
     "RECORD",
-    "ChunkIndex",
     "Declarations",
     "Opcode",
     "Statistics",
-    "chunk_index",
     "framed",
     "offered_as_latched",
     "statistics",
@@ -56,9 +54,10 @@ CHUNK_TIMES: Final = struct.Struct("<QQQI")
 """A chunk's first and last log time, uncompressed size and CRC; compression and data follow."""
 FOOTER: Final = struct.Struct("<BQQQI")
 """Opcode, length, start of the summary section, start of the summary offsets, summary CRC."""
-_CHUNK_INDEX: Final = struct.Struct("<QQQQI")
-_INDEX_OFFSET: Final = struct.Struct("<HQ")
-_SIZE: Final = struct.Struct("<Q")
+_STATISTICS: Final = struct.Struct("<QHIIIIQQI")
+"""Messages, schemas, channels, attachments, metadata, chunks, first and last log time, and the
+bytes of the counts by channel."""
+_COUNT: Final = struct.Struct("<HQ")
 _MOST_REMEMBERED: Final = 256
 _LONGEST_REMEMBERED: Final = 16 * 1024
 
@@ -90,27 +89,6 @@ def framed(section: bytes) -> Iterator[tuple[int, bytes]]:
         position += length
 
 
-class ChunkIndex(NamedTuple):
-    """Where a chunk lies, what time it spans (inclusive), and where its message indexes lie."""
-
-    start: Ns
-    end: Ns
-    offset: int
-    length: int
-    index_offsets: dict[int, int]
-    index_length: int
-
-
-def chunk_index(body: bytes) -> ChunkIndex:
-    """A chunk index record."""
-    start, end, offset, length, offsets_size = _CHUNK_INDEX.unpack_from(body)
-    position = _CHUNK_INDEX.size
-    stop = position + offsets_size
-    (index_length,) = _SIZE.unpack_from(body, stop)
-    offsets = dict(_INDEX_OFFSET.iter_unpack(body[position:stop]))
-    return ChunkIndex(start, end, offset, length, offsets, index_length)
-
-
 @dataclass(frozen=True, slots=True)
 class Statistics:
     """What a file says of itself: how much it holds, and its first and last log time."""
@@ -125,16 +103,13 @@ class Statistics:
 
 def statistics(body: bytes) -> Statistics:
     """A statistics record."""
-    found: mcap_records.Statistics = mcap_records.Statistics.read(_stream(body))
-    counts = {channel: count for channel, count in found.channel_message_counts.items() if count}
-    return Statistics(
-        counts,
-        found.message_count,
-        found.message_start_time,
-        found.message_end_time,
-        found.chunk_count,
-        found.channel_count,
-    )
+    messages, _, channels, _, _, chunks, start, end, size = _STATISTICS.unpack_from(body)
+    stop = _STATISTICS.size + size
+    if stop > len(body) or size % _COUNT.size:
+        raise UnreadableError("damaged: the statistics are shorter than they state")
+    pairs = _COUNT.iter_unpack(body[_STATISTICS.size : stop])
+    counts = {channel: count for channel, count in dict(pairs).items() if count}
+    return Statistics(counts, messages, start, end, chunks, channels)
 
 
 @dataclass(slots=True)

@@ -23,8 +23,8 @@ from ros2_memory.storage.mcap_chunk import (
     walk,
 )
 from ros2_memory.storage.mcap_file import require_mcap
-from ros2_memory.storage.mcap_index import MAX_SECTION_BYTES
 from ros2_memory.storage.mcap_records import MAGIC_SIZE, MESSAGE_FIELDS, RECORD, Opcode
+from ros2_memory.storage.mcap_summary import MAX_SECTION_BYTES
 from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:

@@ -24,8 +24,6 @@ from ros2_memory.storage.mcap_chunk import (
 )
 from ros2_memory.storage.mcap_file import closing_of, require_mcap
 from ros2_memory.storage.mcap_index import (
-    MAX_SECTION_BYTES,
-    Chunk,
     McapIndex,
     Total,
     add_column,
@@ -40,6 +38,7 @@ from ros2_memory.storage.mcap_records import (
     Statistics,
     statistics,
 )
+from ros2_memory.storage.mcap_summary import MAX_SECTION_BYTES, Chunk
 
 if TYPE_CHECKING:
     from ros2_memory.storage.mcap_chunk import ChunkHead, Column

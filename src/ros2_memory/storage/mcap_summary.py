@@ -1,0 +1,153 @@
+"""The summary section of an MCAP file: its channels, its chunks and its statistics, as stated.
+
+Indexing a week reads sixty thousand of them, a query of an unread bag one: both wait for this.
+What is the same in the bags of one robot is therefore remembered by its bytes, and of a chunk index
+only what tells whether the chunk is wanted is unpacked.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from mcap.opcode import Opcode
+
+from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.mcap_records import (
+    FOOTER,
+    MAGIC_SIZE,
+    RECORD,
+    Declarations,
+    Statistics,
+    framed,
+    statistics,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from ros2_memory.storage.base import Channel
+    from ros2_memory.storage.open_file import OpenFile
+    from ros2_memory.timebase import Ns
+
+MAX_SECTION_BYTES = 256 << 20
+_CHUNK_INDEX: Final = struct.Struct("<QQQQI")
+"""A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
+_INDEX_OFFSET: Final = struct.Struct("<HQ")
+_SIZE: Final = struct.Struct("<Q")
+_DECLARING: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL))
+_MOST_REMEMBERED: Final = 32
+_LONGEST_REMEMBERED: Final = 128 * 1024
+
+
+class Chunk(NamedTuple):
+    """One chunk of a file (a tuple: indexing a week makes millions). `start`, `end`: inclusive.
+
+    `index_places` says where each channel's message index lies, as it stands in the file; None
+    where there is none to rely on. `usable` is how many of its decompressed bytes count where the
+    file ends inside it.
+    """
+
+    offset: int
+    length: int
+    start: Ns
+    end: Ns
+    channels: frozenset[int]
+    index_places: bytes | None = None
+    index_length: int = 0
+    usable: int | None = None
+
+    @property
+    def index_offsets(self) -> dict[int, int]:
+        """Where each channel's message index lies in the file."""
+        return dict(_INDEX_OFFSET.iter_unpack(self.index_places or b""))
+
+
+class DoubtError(UnreadableError):
+    """The summary section cannot be relied on; the text is a note on it, or empty."""
+
+
+class Summary(NamedTuple):
+    """What a summary section states. `resolved` says whether every channel's schema is there."""
+
+    channels: Mapping[int, Channel]
+    resolved: bool
+    chunks: list[Chunk]
+    statistics: Statistics | None
+
+
+def read_summary(file: OpenFile) -> Summary:
+    """The summary section of a file.
+
+    Raises:
+        DoubtError: there is none, or not the one that its writer wrote.
+        UnreadableError, struct.error and others: it is damaged.
+    """
+    section = _section(file)
+    declaring: list[bytes] = []
+    chunks: list[Chunk] = []
+    stated: Statistics | None = None
+    position, end = 0, len(section)
+    record, size = RECORD.unpack_from, RECORD.size
+    while position < end:
+        if position + size > end:
+            raise UnreadableError("damaged: a section ends inside a record")
+        opcode, length = record(section, position)
+        following = position + size + length
+        if following > end:
+            raise UnreadableError("damaged: a record is longer than its section")
+        if opcode == Opcode.CHUNK_INDEX:
+            chunks.append(_chunk(section, position + size, following))
+        elif opcode in _DECLARING:
+            declaring.append(section[position:following])
+        elif opcode == Opcode.STATISTICS:
+            stated = statistics(section[position + size : following])
+        position = following
+    declared = b"".join(declaring)
+    short = len(declared) <= _LONGEST_REMEMBERED
+    channels, resolved = (_declared if short else _declared.__wrapped__)(declared)
+    return Summary(channels, resolved, chunks, stated)
+
+
+def _section(file: OpenFile) -> bytes:
+    footer_at = file.size - MAGIC_SIZE - FOOTER.size
+    footer = file.read(footer_at, FOOTER.size)
+    opcode, _, summary_at, _, crc = FOOTER.unpack(footer)
+    if opcode != Opcode.FOOTER or not summary_at:
+        raise DoubtError
+    if footer_at - summary_at > MAX_SECTION_BYTES:
+        raise DoubtError("its summary section is too large to be one")
+    section = file.read(summary_at, footer_at - summary_at)
+    if crc and zlib.crc32(footer[:-4], zlib.crc32(section)) != crc:
+        raise DoubtError("its summary section does not match its checksum")
+    return section
+
+
+def _chunk(section: bytes, at: int, end: int) -> Chunk:
+    """The chunk of the chunk index record whose body lies from `at` to `end`."""
+    start, last, offset, length, places_size = _CHUNK_INDEX.unpack_from(section, at)
+    at += _CHUNK_INDEX.size
+    stop = at + places_size
+    step = _INDEX_OFFSET.size
+    if stop + _SIZE.size > end or places_size % step:
+        raise UnreadableError("damaged: a chunk index is shorter than it states")
+    (index_length,) = _SIZE.unpack_from(section, stop)
+    channels = _numbers(section[at:stop:step], section[at + 1 : stop : step])
+    return Chunk(offset, length, start, last, channels, section[at:stop], index_length)
+
+
+@lru_cache(1024)
+def _numbers(low: bytes, high: bytes) -> frozenset[int]:
+    """The channels whose numbers have these low and high bytes; one set for all equal ones."""
+    return frozenset(one | other << 8 for one, other in zip(low, high, strict=True))
+
+
+@lru_cache(_MOST_REMEMBERED)
+def _declared(records: bytes) -> tuple[Mapping[int, Channel], bool]:
+    """The channels of schema and channel records, and whether their schemas are all among them."""
+    declarations = Declarations()
+    for opcode, body in framed(records):
+        declarations.add(opcode, body)
+    return declarations.channels(), declarations.resolved
