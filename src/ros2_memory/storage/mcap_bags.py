@@ -7,7 +7,6 @@ file's own indexes are missing or wrong (see `mcap_index`).
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +16,7 @@ from ros2_memory.storage.base import Channel, Closing, Record
 from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_chunk import Column, joined, walk
-from ros2_memory.storage.mcap_file import begins_as_mcap, closing_of
+from ros2_memory.storage.mcap_file import closing_of, is_finished
 from ros2_memory.storage.mcap_index import (
     McapIndex,
     chunk_columns,
@@ -132,7 +131,7 @@ class McapBags:
         if not isinstance(index, McapIndex):
             index = _index_of(file, self._max_chunk_bytes)
             shared = {number: self._shared.of(each) for number, each in index.channels.items()}
-            index = replace(index, channels=shared)
+            index = index._replace(channels=shared)
             self._found.put(file.key, index, index.bytes_held)
         return index
 
@@ -165,7 +164,7 @@ class McapBags:
 
 
 def _index_of(file: OpenFile, max_chunk_bytes: int) -> McapIndex:
-    if closing_of(file) is Closing.OPEN or not begins_as_mcap(file):
+    if not is_finished(file):
         return index_by_scan(file, max_chunk_bytes)
     try:
         return index_from_summary(file)

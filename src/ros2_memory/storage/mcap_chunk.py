@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -31,7 +32,9 @@ Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
 """A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
+_INDEX_HEAD_BYTES: Final = _INDEX_HEAD.size
 _PAIR_BYTES: Final = 16
+_MESSAGE_INDEX: Final = int(Opcode.MESSAGE_INDEX)
 _IMPOSSIBLE_TIMES: Final = "damaged: a message index holds impossible log times"
 _EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
 
@@ -65,8 +68,11 @@ class Column(NamedTuple):
 
     def between(self, start: int, stop: int) -> Column:
         """The part with log time in `[start, stop)`."""
-        first, last = (int(at) for at in np.searchsorted(self.times, (start, stop)))
-        return Column(self.times[first:last], self.places[first:last])
+        times = self.times
+        first, last = times.searchsorted(start), times.searchsorted(stop)
+        if not first and last == times.size:
+            return self
+        return Column(times[first:last], self.places[first:last])
 
 
 def joined(columns: list[Column]) -> Column:
@@ -113,25 +119,31 @@ def extents_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> 
     extents: dict[int, Extent] = {}
     for channel, offset in offsets.items():
         at, count = _index_at(region, channel, offset - base)
-        if not count:
-            continue
-        # Few numbers: an array would cost more than it saves.
-        times = struct.unpack_from(f"<{2 * count}Q", region, at)[::2]
-        extents[channel] = extent = Extent(count, min(times), max(times))
-        if extent.last >= MAX_NS:
-            raise UnreadableError(_IMPOSSIBLE_TIMES)
+        if count:
+            # Few numbers: an array would cost more than it saves.
+            times = _times_of(count).unpack_from(region, at)
+            extents[channel] = Extent(count, min(times), max(times))
+    if extents and max([extent.last for extent in extents.values()]) >= MAX_NS:
+        raise UnreadableError(_IMPOSSIBLE_TIMES)
     return extents
+
+
+@lru_cache(256)
+def _times_of(count: int) -> struct.Struct:
+    """The log times of so many pairs of log time and offset."""
+    return struct.Struct("<" + "Q8x" * count)
 
 
 def _index_at(region: bytes, channel: int, at: int) -> tuple[int, int]:
     """Where the pairs of log time and offset of a message index begin, and how many there are."""
-    if at < 0 or at + _INDEX_HEAD.size > len(region):
+    pairs_at = at + _INDEX_HEAD_BYTES
+    if at < 0 or pairs_at > len(region):
         raise UnreadableError("damaged: a message index is not where its chunk index says")
     opcode, length, number, size = _INDEX_HEAD.unpack_from(region, at)
-    known = opcode == Opcode.MESSAGE_INDEX and number == channel
+    known = opcode == _MESSAGE_INDEX and number == channel
     if not known or length != size + 6 or size % _PAIR_BYTES:
         raise UnreadableError("damaged: a message index is not what its chunk index says")
-    return at + _INDEX_HEAD.size, size // _PAIR_BYTES
+    return pairs_at, size // _PAIR_BYTES
 
 
 @dataclass(slots=True)

@@ -17,10 +17,17 @@ def closing_of(file: OpenFile) -> Closing:
     """Open while the closing magic is missing; what is not MCAP at all counts as closed."""
     if file.size and not begins_as_mcap(file):
         return Closing.CLOSED
+    return Closing.CLOSED if _ends_as_mcap(file) else Closing.OPEN
+
+
+def is_finished(file: OpenFile) -> bool:
+    """Whether it is MCAP and its writer finished it."""
+    return _ends_as_mcap(file) and begins_as_mcap(file)
+
+
+def _ends_as_mcap(file: OpenFile) -> bool:
     whole = file.size >= 2 * MAGIC_SIZE
-    if whole and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC:
-        return Closing.CLOSED
-    return Closing.OPEN
+    return whole and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
 
 
 def begins_as_mcap(file: OpenFile) -> bool:

@@ -8,11 +8,12 @@ messages themselves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.storage.faults import UnreadableError, damage
+from ros2_memory.storage.faults import UnreadableError, reason_of
 from ros2_memory.storage.mcap_chunk import (
     Column,
     Extent,
@@ -46,8 +47,7 @@ class Total:
     last: Ns
 
 
-@dataclass(frozen=True, slots=True)
-class McapIndex:
+class McapIndex(NamedTuple):
     """What is known of a file without its payloads.
 
     `loose` are the messages outside chunks, by channel, at their places in the file.
@@ -56,7 +56,7 @@ class McapIndex:
     channels: Mapping[int, Channel]
     chunks: tuple[Chunk, ...]
     totals: Mapping[int, Total]
-    loose: Mapping[int, Column] = field(default_factory=dict)
+    loose: Mapping[int, Column] = MappingProxyType({})
     complete: bool = True
     notes: tuple[str, ...] = ()
 
@@ -95,8 +95,9 @@ def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
     """What `chunk_columns` amounts to, for less."""
     offsets, base = chunk.index_offsets, chunk.offset + chunk.length
     extents = extents_from_index(_index_region(file, chunk), offsets, base)
-    for extent in extents.values():
-        _require_inside(chunk, extent.first, extent.last)
+    if extents:
+        first = min([extent.first for extent in extents.values()])
+        _require_inside(chunk, first, max([extent.last for extent in extents.values()]))
     return extents
 
 
@@ -131,12 +132,11 @@ def index_from_summary(file: OpenFile) -> McapIndex:
         DoubtError: there is none to rely on; scan the file.
     """
     try:
-        with damage():
-            return _index_from_summary(file)
-    except DoubtError:
+        return _index_from_summary(file)
+    except (DoubtError, OSError):
         raise
-    except UnreadableError as error:
-        raise DoubtError(f"its summary section is not used ({error})") from error
+    except Exception as error:
+        raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
 
 
 def _index_from_summary(file: OpenFile) -> McapIndex:

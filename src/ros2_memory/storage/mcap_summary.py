@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 MAX_SECTION_BYTES = 256 << 20
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
+_CHUNK_INDEX_BYTES: Final = _CHUNK_INDEX.size
 _INDEX_OFFSET: Final = struct.Struct("<HQ")
-_SIZE: Final = struct.Struct("<Q")
+_INDEX_OFFSET_BYTES: Final = _INDEX_OFFSET.size
+_SIZE_BYTES: Final = 8
 _DECLARING: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL))
 _MOST_REMEMBERED: Final = 32
 _LONGEST_REMEMBERED: Final = 128 * 1024
@@ -90,7 +92,7 @@ def read_summary(file: OpenFile) -> Summary:
     chunks: list[Chunk] = []
     stated: Statistics | None = None
     position, end = 0, len(section)
-    record, size = RECORD.unpack_from, RECORD.size
+    record, size, chunk_index = RECORD.unpack_from, RECORD.size, int(Opcode.CHUNK_INDEX)
     while position < end:
         if position + size > end:
             raise UnreadableError("damaged: a section ends inside a record")
@@ -98,7 +100,7 @@ def read_summary(file: OpenFile) -> Summary:
         following = position + size + length
         if following > end:
             raise UnreadableError("damaged: a record is longer than its section")
-        if opcode == Opcode.CHUNK_INDEX:
+        if opcode == chunk_index:
             chunks.append(_chunk(section, position + size, following))
         elif opcode in _DECLARING:
             declaring.append(section[position:following])
@@ -128,14 +130,16 @@ def _section(file: OpenFile) -> bytes:
 def _chunk(section: bytes, at: int, end: int) -> Chunk:
     """The chunk of the chunk index record whose body lies from `at` to `end`."""
     start, last, offset, length, places_size = _CHUNK_INDEX.unpack_from(section, at)
-    at += _CHUNK_INDEX.size
+    at += _CHUNK_INDEX_BYTES
     stop = at + places_size
-    step = _INDEX_OFFSET.size
-    if stop + _SIZE.size > end or places_size % step:
+    if stop + _SIZE_BYTES > end or places_size % _INDEX_OFFSET_BYTES:
         raise UnreadableError("damaged: a chunk index is shorter than it states")
-    (index_length,) = _SIZE.unpack_from(section, stop)
-    channels = _numbers(section[at:stop:step], section[at + 1 : stop : step])
-    return Chunk(offset, length, start, last, channels, section[at:stop], index_length)
+    places = section[at:stop]
+    channels = _numbers(places[::_INDEX_OFFSET_BYTES], places[1::_INDEX_OFFSET_BYTES])
+    index_length = int.from_bytes(section[stop : stop + _SIZE_BYTES], "little")
+    # As a tuple is made, past the function that a named tuple's fields go through.
+    fields = (offset, length, start, last, channels, places, index_length, None)
+    return tuple.__new__(Chunk, fields)
 
 
 @lru_cache(1024)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING, Final
 
 import zstandard
@@ -18,6 +19,16 @@ _HEADER_BYTES: Final = 18
 _RLE_BLOCK: Final = 1
 
 
+class _Own(threading.local):
+    """One for each thread, since it is not safe to share, and costs more than a chunk to make."""
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor()
+
+
+_OWN: Final = _Own()
+
+
 def unpacked_zstd(packed: bytes, max_bytes: int) -> bytes:
     """One zstd frame, decompressed.
 
@@ -27,11 +38,9 @@ def unpacked_zstd(packed: bytes, max_bytes: int) -> bytes:
     stated = zstandard.frame_content_size(packed)
     if stated > max_bytes:
         raise UnreadableError(f"compressed data is larger than the {max_bytes >> 20} MiB allowed")
-    # A decompressor is not safe to share between threads; one costs a few microseconds.
-    decompressor = zstandard.ZstdDecompressor()
     if stated >= 0:
-        return decompressor.decompress(packed)
-    with decompressor.stream_reader(packed) as stream:
+        return _OWN.decompressor.decompress(packed)
+    with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
         data = stream.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise UnreadableError(f"compressed data is larger than the {max_bytes >> 20} MiB allowed")
