@@ -1,0 +1,70 @@
+"""What is read of a summary section, held against what the MCAP library reads of it."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.opcode import Opcode
+
+from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.mcap_index import index_from_summary
+from ros2_memory.storage.mcap_summary import DoubtError, read_summary
+from ros2_memory.storage.open_file import OpenFile
+from tests.bags import boolean, text, write_mcap
+from tests.mcap_surgery import SMALL, chunks_of, edit_summary
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def bag(path: Path) -> Path:
+    """Several chunks, of one topic and of two."""
+    messages = [text(time, f"{time:0100d}") for time in range(12)]
+    return write_mcap(path, [messages[0], boolean(0, data=True), *messages[1:]], SMALL)
+
+
+def test_chunks_are_those_that_the_library_reads(tmp_path: Path) -> None:
+    path = bag(tmp_path / "a.mcap")
+    with OpenFile(path) as file:
+        found = read_summary(file).chunks
+    assert [
+        (chunk.offset, chunk.length, chunk.start, chunk.end, chunk.index_offsets) for chunk in found
+    ] == [
+        (
+            chunk.chunk_start_offset,
+            chunk.chunk_length,
+            chunk.message_start_time,
+            chunk.message_end_time,
+            chunk.message_index_offsets,
+        )
+        for chunk in chunks_of(path)
+    ]
+    assert all(chunk.channels == chunk.index_offsets.keys() for chunk in found)
+    assert {len(chunk.channels) for chunk in found} == {1, 2}
+
+
+@pytest.mark.parametrize(
+    ("opcode", "size_at", "reason"),
+    [
+        (Opcode.CHUNK_INDEX, 32, "a chunk index is shorter than it states"),
+        (Opcode.STATISTICS, 42, "the statistics are shorter than they state"),
+    ],
+)
+@pytest.mark.parametrize("more", [1, 30, 1 << 30])
+def test_a_record_that_states_more_than_it_holds_is_not_believed(
+    tmp_path: Path, opcode: Opcode, size_at: int, reason: str, more: int
+) -> None:
+    path = bag(tmp_path / "a.mcap")
+
+    def state_more(body: bytearray) -> None:
+        (size,) = struct.unpack_from("<I", body, size_at)
+        struct.pack_into("<I", body, size_at, size + more)
+
+    edit_summary(path, opcode, state_more)
+    with OpenFile(path) as file:
+        with pytest.raises(UnreadableError, match=reason):
+            read_summary(file)
+        with pytest.raises(DoubtError, match=f"its summary section is not used .*{reason}"):
+            index_from_summary(file)
