@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 
 def bag(path: Path) -> Path:
     """Several chunks, of one topic and of two."""
-    messages = [text(time, f"{time:0100d}") for time in range(12)]
-    return write_mcap(path, [messages[0], boolean(0, data=True), *messages[1:]], SMALL)
+    messages = [text(time, f"{time:0100d}") for time in range(11)]
+    return write_mcap(
+        path, [text(0, ""), boolean(0, data=True), *messages, boolean(12, data=True)], SMALL
+    )
 
 
 def test_chunks_are_those_that_the_library_reads(tmp_path: Path) -> None:
