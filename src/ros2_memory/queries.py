@@ -55,7 +55,7 @@ _ODD_BAGS: Final = 5
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, ...]:
     """Every topic that was heard, under each of its types; empty for an empty memory."""
-    view = View(memory, call)
+    view = View(memory, call, memory.clock.now())
     rows = []
     for topic in view.snapshot.topics():
         reasons = _undecodable_types(view, topic)
@@ -199,7 +199,7 @@ def transform(
 
 def frames(memory: Memory, call: Call) -> answers.Frames:
     """Every frame and parent-child pair that was recorded."""
-    view = View(memory, call)
+    view = View(memory, call, memory.clock.now())
     require_bags(view)
     return answers.Frames(frame_history.edges(view), view.notes)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,6 +14,7 @@ from ros2_memory.history import View
 from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow
 from ros2_memory.moments import Moment, Span
+from ros2_memory.recorder.index_manager import IndexManager
 from tests.bags import (
     McapLayout,
     Msg,
@@ -198,3 +200,15 @@ def test_why_there_is_no_transform_is_said_of_the_whole_memory(
         )
     assert caught.value.reason == reason
     assert "tolerance_s" not in caught.value.detail
+
+
+def test_what_is_listed_reaches_to_the_bag_that_closed_last(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [odom(T0, 0, 0)])
+    patient = memory_of(tmp_path)
+    index = IndexManager(
+        tmp_path, patient.reader, patient.clock, refresh_s=3600.0, split_duration_s=10.0
+    )
+    memory = replace(patient, index=index)
+    assert [row.count for row in queries.list_recorded_topics(memory, Call())] == [1]
+    write_mcap(tmp_path / "b" / "b_0.mcap", [odom(T0 + 60 * S, 0, 0), boolean(T0 + 60 * S, True)])
+    assert [row.count for row in queries.list_recorded_topics(memory, Call())] == [1, 2]
