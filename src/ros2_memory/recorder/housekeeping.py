@@ -213,7 +213,7 @@ class Housekeeping:
     def _repaired(self, path: Path) -> Repaired | None:
         size = path.lstat().st_size
         if size > MOST_REPAIRED_BYTES:
-            reason = f"{size} bytes are too many for now: run ros2-memory recover {path}"
+            reason = f"{size} bytes are too many to repair while recording: run ros2-memory recover {path}"
             raise BagError(str(path), reason)
         return self._repairer.repair(path)
 
