@@ -213,8 +213,10 @@ class Housekeeping:
     def _repaired(self, path: Path) -> Repaired | None:
         size = path.lstat().st_size
         if size > MOST_REPAIRED_BYTES:
-            reason = f"{size} bytes are too many to repair while recording: run ros2-memory recover {path}"
-            raise BagError(str(path), reason)
+            remedy = f"run ros2-memory recover {path}"
+            raise BagError(
+                str(path), f"{size} bytes are too many to repair while recording: {remedy}"
+            )
         return self._repairer.repair(path)
 
     def _report(self, done: Disposed, begun: int, **values: object) -> None:
