@@ -29,9 +29,9 @@ from ros2_memory.timebase import Deadline, ms_from_ns
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from ros2_memory.entries import Question, Tool
     from ros2_memory.memory import Memory
     from ros2_memory.replies import Replies, Reply
-    from ros2_memory.tools import Question, Tool
 
 QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2

@@ -1,4 +1,4 @@
-"""The 17 tools: names, what the planner reads of them, arguments, and the query behind each.
+"""The specification's 17 tools: names, what the planner reads, and the query behind each.
 
 A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declared once; only the
 `Variant`s differ. The order here is the order in which clients see them.
@@ -6,15 +6,12 @@ A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import partial
-from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING
 
 from ros2_memory import answers, queries
 from ros2_memory.arguments import (
     Ago,
-    Arguments,
     At,
     Between,
     Correlation,
@@ -29,76 +26,13 @@ from ros2_memory.arguments import (
     WayOver,
     from_json,
 )
+from ros2_memory.entries import Entry, Variant
 from ros2_memory.errors import NoDataError, NoDataReason
-from ros2_memory.fitting import compact
-from ros2_memory.signatures import Signature
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
-
-    from ros2_memory.arguments import When
-    from ros2_memory.fitting import JsonObject
+    from ros2_memory.entries import Tool
     from ros2_memory.memory import Call, Limits, Memory
     from ros2_memory.model import JsonValue
-    from ros2_memory.shapes import Answer
-
-Question: TypeAlias = "Callable[[Memory, Call], Answer]"
-
-A = TypeVar("A", bound=Arguments)
-
-
-@dataclass(frozen=True, slots=True)
-class Tool:
-    """One tool as clients see it; `question` checks what is given and binds it to its query."""
-
-    name: str
-    title: str
-    description: str
-    schema: JsonObject
-    blocking: bool
-    question: Callable[[Mapping[str, object]], Question]
-
-
-@dataclass(frozen=True, slots=True)
-class Variant:
-    """One name of a question. `said` takes the place of {when} in the description."""
-
-    name: str
-    title: str
-    when: type[When] | None = None
-    said: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Entry(Generic[A]):
-    """A question and all its names."""
-
-    variants: tuple[Variant, ...]
-    description: str
-    arguments: type[A]
-    ask: Callable[[Memory, Call, A], Answer]
-    blocking: bool = False
-
-    def tools(self, facts: Mapping[str, object]) -> Iterator[Tool]:
-        """The tools; `facts` fill the description's placeholders."""
-        for variant in self.variants:
-            signature = Signature(self.arguments, variant.when)
-            what = self.description.format(when=variant.said, **facts)
-            text = f"{what} Example: {compact(signature.example)}"
-            if self.blocking:
-                text = f"Blocking: may take up to {facts['timeout']} s. {text}"
-            yield Tool(
-                variant.name,
-                variant.title,
-                text,
-                signature.json_schema(),
-                self.blocking,
-                partial(self._question, signature),
-            )
-
-    def _question(self, signature: Signature[A], given: Mapping[str, object]) -> Question:
-        arguments = signature.read(given)
-        return lambda memory, call: self.ask(memory, call, arguments)
 
 
 def build_tools(limits: Limits, call_timeout_s: float) -> tuple[Tool, ...]:

@@ -14,11 +14,11 @@ from structlog.testing import LogCapture
 
 from ros2_memory import answers
 from ros2_memory.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher, EpisodicServer
+from ros2_memory.entries import Tool
 from ros2_memory.errors import InvalidArgumentsError, NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.memory import Memory
 from ros2_memory.model import Sample
 from ros2_memory.replies import Replies
-from ros2_memory.tools import Tool
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

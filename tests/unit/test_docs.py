@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, get_type_hints
 
 import pytest
 
+from ros2_memory.entries import Tool
 from ros2_memory.memory import Limits
 from ros2_memory.settings import Ros2BagNode, Settings
-from ros2_memory.tools import Tool, build_tools
+from ros2_memory.tools import build_tools
 from tests.memories import ROOT
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ import pytest
 
 from ros2_memory import answers
 from ros2_memory.dispatch import Dispatcher, EpisodicServer
+from ros2_memory.entries import Tool
 from ros2_memory.http import GRACE_S, Guard, WebApp, web_app
 from ros2_memory.memory import Memory
 from ros2_memory.model import Sample
 from ros2_memory.replies import Replies
-from ros2_memory.tools import Tool
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 
 from ros2_memory.arguments import At, Search
+from ros2_memory.entries import Tool
 from ros2_memory.errors import InvalidArgumentsError
 from ros2_memory.instructions import instructions
 from ros2_memory.memory import Limits
 from ros2_memory.moments import Moment
 from ros2_memory.signatures import Signature
-from ros2_memory.tools import Tool, build_tools
+from ros2_memory.tools import build_tools
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"
 TOOLS = {tool.name: tool for tool in build_tools(Limits(), 25.0)}

@@ -1,0 +1,77 @@
+"""What a tool is, and how one question is declared under all its names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+
+from ros2_memory.arguments import Arguments
+from ros2_memory.fitting import compact
+from ros2_memory.signatures import Signature
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from ros2_memory.arguments import When
+    from ros2_memory.fitting import JsonObject
+    from ros2_memory.memory import Call, Memory
+    from ros2_memory.shapes import Answer
+
+Question: TypeAlias = "Callable[[Memory, Call], Answer]"
+
+A = TypeVar("A", bound=Arguments)
+
+
+@dataclass(frozen=True, slots=True)
+class Tool:
+    """One tool as clients see it; `question` checks what is given and binds it to its query."""
+
+    name: str
+    title: str
+    description: str
+    schema: JsonObject
+    blocking: bool
+    question: Callable[[Mapping[str, object]], Question]
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """One name of a question. `said` takes the place of {when} in the description."""
+
+    name: str
+    title: str
+    when: type[When] | None = None
+    said: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry(Generic[A]):
+    """A question and all its names."""
+
+    variants: tuple[Variant, ...]
+    description: str
+    arguments: type[A]
+    ask: Callable[[Memory, Call, A], Answer]
+    blocking: bool = False
+
+    def tools(self, facts: Mapping[str, object]) -> Iterator[Tool]:
+        """The tools; `facts` fill the description's placeholders."""
+        for variant in self.variants:
+            signature = Signature(self.arguments, variant.when)
+            what = self.description.format(when=variant.said, **facts)
+            text = f"{what} Example: {compact(signature.example)}"
+            if self.blocking:
+                text = f"Blocking: may take up to {facts['timeout']} s. {text}"
+            yield Tool(
+                variant.name,
+                variant.title,
+                text,
+                signature.json_schema(),
+                self.blocking,
+                partial(self._question, signature),
+            )
+
+    def _question(self, signature: Signature[A], given: Mapping[str, object]) -> Question:
+        arguments = signature.read(given)
+        return lambda memory, call: self.ask(memory, call, arguments)
