@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from difflib import get_close_matches
-from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
+from ros2_memory.globs import matching
 from ros2_memory.model import TimeWindow
 from ros2_memory.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -53,7 +53,7 @@ def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
     """
     if not any(mark in pattern for mark in "*?["):
         return (resolve_topic(view, pattern),)
-    matched = tuple(name for name in view.snapshot.topics() if fnmatchcase(name, pattern))
+    matched = tuple(matching(view.snapshot.topics(), pattern))
     if not matched:
         raise not_recorded(view, pattern)
     return matched

@@ -28,16 +28,26 @@ LATEST_MOMENT_S: Final = 9_223_372_036.0
 """The last second that a 64-bit clock of nanoseconds can tell; more is another unit."""
 
 
+LONGEST_NAME: Final = 500
+"""Characters: twice what DDS takes for a topic."""
+LONGEST_VALUE: Final = 2_000
+MOST_FIELDS: Final = 100
+
+
 def _as_list(value: object) -> object:
     """A list as planners send it: as such, as JSON text, or as one bare name."""
     if isinstance(value, str):
         parsed = from_json(value)
-        return parsed if isinstance(parsed, list) else [value]
+        value = parsed if isinstance(parsed, list) else [value]
+    if isinstance(value, list) and len(value) > MOST_FIELDS:
+        raise ValueError(f"has more than {MOST_FIELDS} elements")
     return value
 
 
 def from_json(text: str) -> object:
-    """What a JSON text says; None where it is none."""
+    """What a JSON text says; None where it is none, or longer than an argument may be."""
+    if len(text) > MOST_FIELDS * LONGEST_NAME:
+        return None
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -49,10 +59,20 @@ def _whole(value: object) -> object:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _not_blank(value: str) -> str:
+def _sound(value: str, longest: int) -> str:
+    if len(value) > longest:
+        raise ValueError(f"is longer than {longest} characters")
+    if not value.isascii() and any("\ud800" <= char <= "\udfff" for char in value):
+        raise ValueError("has half a character (a lone surrogate), which no recorded text has")
+    return value
+
+
+def _name(value: str) -> str:
     if not value.strip():
         raise ValueError("is empty")
-    return value
+    if "\0" in value:
+        raise ValueError("has a NUL character, which no name has")
+    return _sound(value, LONGEST_NAME)
 
 
 def _reachable(seconds: float) -> float:
@@ -61,16 +81,18 @@ def _reachable(seconds: float) -> float:
     return seconds
 
 
-def _finite(value: JsonValue) -> JsonValue:
+def _testable(value: JsonValue) -> JsonValue:
     if value is None:
         raise ValueError("is null")
+    if isinstance(value, str):
+        return _sound(value, LONGEST_VALUE)
     for part in (value, *(value.values() if isinstance(value, dict) else ())):
         if isinstance(part, float) and not math.isfinite(part):
             raise ValueError("is not a finite number")
     return value
 
 
-_Text: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_not_blank)]
+_Text: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_name)]
 _Duration: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Unix: TypeAlias = Annotated[_Duration, AfterValidator(_reachable)]
 
@@ -121,7 +143,7 @@ ConditionType: TypeAlias = Annotated[
 ]
 ConditionValue: TypeAlias = Annotated[
     JsonValue,
-    AfterValidator(_finite),
+    AfterValidator(_testable),
     WithJsonSchema(
         {
             "anyOf": [{"type": kind} for kind in ("string", "number", "boolean", "object")],

@@ -6,7 +6,6 @@ match nothing.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import struct
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.errors import InvalidArgumentsError
 from ros2_memory.geometry import distance
+from ros2_memory.glimpse import glimpse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -256,7 +256,7 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
         )
     if unknown := sorted(value.keys() - {"x", "y", "z"}):
         raise InvalidArgumentsError(
-            f"'near_position' knows x, y and z only, not {', '.join(unknown)}; {example}"
+            f"'near_position' knows x, y and z only, not {glimpse(unknown)}; {example}"
         )
     for axis in ("x", "y", "z") if value.get("z") is not None else ("x", "y"):
         if not math.isfinite(_coordinate(value.get(axis))):
@@ -281,7 +281,7 @@ def _kind(value: JsonValue) -> str:
     """A value as it is named in a sentence."""
     if isinstance(value, list):
         return "a list"
-    return "an object" if isinstance(value, dict) else json.dumps(value)
+    return "an object" if isinstance(value, dict) else glimpse(value)
 
 
 def _step(held: JsonValue, segment: str) -> Iterator[JsonValue]:

@@ -22,6 +22,7 @@ from mcp.types import CallToolResult, TextContent, ToolAnnotations
 from mcp.types import Tool as ListedTool
 
 from ros2_memory.errors import EpisodicError, InvalidArgumentsError, NoDataError, QueryTimeoutError
+from ros2_memory.glimpse import glimpse
 from ros2_memory.logs import get_logger
 from ros2_memory.memory import Call
 from ros2_memory.timebase import Deadline, ms_from_ns
@@ -44,6 +45,7 @@ _SOONER_S: Final = 0.5
 """How much before the call a query gives up, so that its own sentence is what the client reads."""
 
 _LOGGED_CHARS: Final = 300
+_LONGEST_NAME: Final = 64
 
 log = get_logger(__name__)
 
@@ -81,8 +83,8 @@ class Dispatcher:
                 over.set()
                 log.info(
                     "tool_call",
-                    tool=name[:_LOGGED_CHARS],
-                    arguments=repr(given)[:_LOGGED_CHARS],
+                    tool=name if name in self._tools else glimpse(name),
+                    arguments=glimpse(given, _LOGGED_CHARS),
                     outcome=outcome,
                     duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
                     stages_ms=call.stages.as_ms(),
@@ -116,11 +118,11 @@ class Dispatcher:
     def _tool(self, name: str) -> Tool:
         if name in self._tools:
             return self._tools[name]
-        near = get_close_matches(name, self._tools, n=3)
+        near = get_close_matches(name[:_LONGEST_NAME], self._tools, n=3)
         hint = (
             f"do you mean {' or '.join(near)}?" if near else f"there are: {', '.join(self._tools)}"
         )
-        raise InvalidArgumentsError(f'there is no tool "{name[:_LOGGED_CHARS]}"; {hint}')
+        raise InvalidArgumentsError(f"there is no tool {glimpse(name)}; {hint}")
 
     def _ask(self, question: Question, call: Call) -> tuple[str, Reply]:
         """Runs in a worker thread: the query, and the rendering of what it gives."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from difflib import get_close_matches
+from itertools import islice
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from pydantic import ValidationError
@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from ros2_memory.arguments import Arguments
 from ros2_memory.errors import InvalidArgumentsError
 from ros2_memory.fitting import compact
+from ros2_memory.glimpse import glimpse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 
 A = TypeVar("A", bound=Arguments)
 
-_LONGEST_SHOWN: Final = 80
+_MOST_UNKNOWN_NAMED: Final = 5
+_LONGEST_NAME: Final = 64
 _KINDS: Final = {
     "string": "a text",
     "number": "a number",
@@ -99,12 +101,14 @@ class Signature(Generic[A]):
         raise InvalidArgumentsError("; ".join(problems))
 
     def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
-        for name in given:
-            if name in self._properties:
-                continue
-            near = get_close_matches(name, self._properties, n=1)
+        unknown = (name for name in given if name not in self._properties)
+        for name in islice(unknown, _MOST_UNKNOWN_NAMED):
+            near = get_close_matches(name[:_LONGEST_NAME], self._properties, n=1)
             hint = f"do you mean {near[0]}?" if near else f"there are: {', '.join(self.names)}"
-            yield f"there is no argument {_short(name)}; {hint if self.names else 'there are none'}"
+            hint = hint if self.names else "there are none"
+            yield f"there is no argument {glimpse(name)}; {hint}"
+        if more := sum(1 for _ in unknown):
+            yield f"and {more} more that there are not"
 
     def _missing(self, present: Mapping[str, object]) -> Iterator[str]:
         for name in self._required:
@@ -113,7 +117,7 @@ class Signature(Generic[A]):
 
     def _wrong(self, error: ValidationError, given: Mapping[str, object]) -> Iterator[str]:
         told: set[str] = set()
-        for fault in error.errors(include_url=False, include_context=False):
+        for fault in error.errors(include_url=False, include_context=False, include_input=False):
             name = str(fault["loc"][0])
             if fault["type"] == "missing" or name in told or name not in self._properties:
                 continue
@@ -121,7 +125,7 @@ class Signature(Generic[A]):
             own = fault["msg"].removeprefix("Value error, ")
             why = f", which {own}" if fault["type"] == "value_error" else ""
             expected = _expected(self._properties[name])
-            yield f"{name} was {_short(given[name])}{why}; expected {expected}"
+            yield f"{name} was {glimpse(given[name])}{why}; expected {expected}"
 
 
 def _properties(arguments: type[Arguments]) -> dict[str, JsonObject]:
@@ -170,9 +174,3 @@ def _kind(schema: JsonObject) -> str:
 def _example(schema: JsonObject) -> JsonValue:
     examples = schema.get("examples")
     return examples[0] if isinstance(examples, list) and examples else schema.get("default")
-
-
-def _short(value: object) -> str:
-    """A given value, short enough for a sentence."""
-    text = json.dumps(value, ensure_ascii=False, default=repr)
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"

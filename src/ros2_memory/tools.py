@@ -6,7 +6,6 @@ A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declar
 
 from __future__ import annotations
 
-from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 from ros2_memory import answers, queries
@@ -28,6 +27,7 @@ from ros2_memory.arguments import (
 )
 from ros2_memory.entries import Entry, Variant
 from ros2_memory.errors import NoDataError, NoDataReason
+from ros2_memory.globs import matching
 
 if TYPE_CHECKING:
     from ros2_memory.entries import Tool
@@ -62,7 +62,8 @@ def _list_topics(memory: Memory, call: Call, given: Listing) -> tuple[answers.To
     rows = queries.list_recorded_topics(memory, call)
     if given.pattern is None or not rows:
         return rows
-    named = tuple(row for row in rows if fnmatchcase(row.topic, given.pattern))
+    matched = {*matching([row.topic for row in rows], given.pattern)}
+    named = tuple(row for row in rows if row.topic in matched)
     if not named:
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,

@@ -331,7 +331,7 @@ def test_a_blank_field_is_no_field() -> None:
         ("near_position", {"x": math.inf, "y": 2}, "'x' of 'near_position'"),
         ("near_position", {"x": 10**400, "y": 2}, "'x' of 'near_position'"),
         ("near_position", {"x": 1, "y": 2, "z": "up"}, "'z' of 'near_position'"),
-        ("near_position", {"x": 1, "y": 2, "radius": 3}, "not radius"),
+        ("near_position", {"x": 1, "y": 2, "radius": 3}, 'not ["radius"]'),
     ],
 )
 def test_arguments_that_mean_nothing_are_refused_with_an_example(

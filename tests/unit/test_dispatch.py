@@ -178,7 +178,7 @@ async def test_each_call_is_logged_once_with_its_outcome_and_times(log: LogCaptu
     assert asked["outcome"] == "ok"
     assert asked["stages_ms"] == {"read": 2.5}
     assert asked["duration_ms"] > 0
-    assert len(asked["arguments"]) == 300
+    assert 0 < len(asked["arguments"]) <= 300
     assert none["outcome"] == "no_data: gap"
     assert bad["outcome"] == "invalid_arguments"
     assert len({entry["correlation_id"] for entry in log.entries}) == 3
