@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.model import JsonValue
+from ros2_memory.stories import (
+    NOTHING,
+    Fault,
+    Flip,
+    Presence,
+    State,
+    Story,
+    StoryBuilder,
+    state_of,
+)
+from ros2_memory.timebase import NS_PER_S
+
+Messages = list[tuple[int, State]]
+
+
+def told(messages: Messages, at_most: int | None = None) -> Story | None:
+    builder = StoryBuilder()
+    for time, state in messages:
+        builder.add(time, state)
+    return builder.story(at_most)
+
+
+def seeing(*labels: str) -> State:
+    return State(labels) if labels else NOTHING
+
+
+def each_second(*states: State) -> Messages:
+    return [(nth * NS_PER_S, state) for nth, state in enumerate(states)]
+
+
+STATES = st.builds(
+    lambda labels, flags, faults: State(tuple(sorted(labels)), flags, faults),
+    st.sets(st.sampled_from("abc")),
+    st.sampled_from([(), (("x", True),), (("x", False),), (("x", True), ("y", False))]),
+    st.sampled_from([(), ("hot",), ("cold",), ("hot", "cold")]),
+).map(lambda state: NOTHING if state.says_nothing else state)
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> tuple[Messages, list[int]]:
+    """Messages with silences and equal times, and where they are cut into bags."""
+    time = 0
+    messages: Messages = []
+    for wait, state in draw(
+        st.lists(
+            st.tuples(st.sampled_from([0, 1, NS_PER_S, 10 * NS_PER_S, 11 * NS_PER_S]), STATES),
+            min_size=1,
+            max_size=30,
+        )
+    ):
+        time += wait
+        messages.append((time, state))
+    return messages, sorted(draw(st.sets(st.integers(1, len(messages)), max_size=6)))
+
+
+def _comparable(story: Story | None) -> object:
+    """Flips of several booleans at one time stand in no order."""
+    assert story is not None
+    flips = sorted(story.flips, key=lambda flip: (flip.time, flip.path))
+    known = sorted(story.known)
+    return (story.first, story.last, story.seen, story.to_end, known, flips, story.faults)
+
+
+@given(histories())
+def test_where_a_history_is_cut_into_bags_changes_nothing(
+    history: tuple[Messages, list[int]],
+) -> None:
+    messages, cuts = history
+    builder = StoryBuilder()
+    for begin, end in zip([0, *cuts], [*cuts, len(messages)], strict=True):
+        part = told(messages[begin:end])
+        if part is not None:
+            builder.join(part)
+    assert _comparable(builder.story()) == _comparable(told(messages))
+
+
+@given(histories())
+def test_every_message_with_a_thing_is_counted_in_one_presence(
+    history: tuple[Messages, list[int]],
+) -> None:
+    messages, _ = history
+    story = told(messages)
+    assert story is not None
+    for label in "abc":
+        counted = sum(each.messages for each in story.seen if each.label == label)
+        assert counted == sum(label in state.labels for _, state in messages)
+
+
+def test_a_thing_that_comes_and_goes_is_told_by_its_first_and_last_message() -> None:
+    story = told(each_second(seeing(), seeing("cup"), seeing("cup"), seeing(), seeing("cup")))
+    assert story is not None
+    assert story.seen == (
+        Presence("cup", NS_PER_S, 2 * NS_PER_S, 2),
+        Presence("cup", 4 * NS_PER_S, 4 * NS_PER_S, 1),
+    )
+    assert story.from_start == ()
+    assert story.to_end == ("cup",)
+
+
+def test_a_detector_that_falls_silent_saw_the_thing_go() -> None:
+    story = told([(0, seeing("cup")), (11 * NS_PER_S, seeing("cup"))])
+    assert story is not None
+    assert [each.messages for each in story.seen] == [1, 1]
+
+
+def test_a_boolean_that_flips_is_told_with_its_new_value() -> None:
+    flags = [State(flags=(("value", value),)) for value in (False, False, True, False)]
+    story = told(each_second(*flags))
+    assert story is not None
+    assert story.flips == (
+        Flip("value", 2 * NS_PER_S, True),
+        Flip("value", 3 * NS_PER_S, False),
+    )
+
+
+def test_an_error_that_is_reported_again_is_told_once_with_its_count() -> None:
+    hot = State(faults=("motor: hot",))
+    story = told(each_second(hot, NOTHING, hot, hot))
+    assert story is not None
+    assert story.faults == (Fault("motor: hot", 0, 3 * NS_PER_S, 3),)
+
+
+def test_what_is_beyond_the_limit_is_counted() -> None:
+    blinking = [seeing("cup") if nth % 2 else seeing() for nth in range(20)]
+    story = told(each_second(*blinking), at_most=3)
+    assert story is not None
+    assert len(story.seen) == 3
+    assert story.left_out == 7
+
+
+def test_messages_that_say_nothing_make_a_story_that_says_nothing() -> None:
+    story = told(each_second(NOTHING, NOTHING))
+    assert story is not None
+    assert story.says_nothing
+    assert told([]) is None
+
+
+def test_labels_booleans_and_errors_are_found_in_values() -> None:
+    assert state_of({"detections": [{"label": "cup"}, {"label": "cup"}]}, "x/msg/Y") == State(
+        ("cup",)
+    )
+    assert state_of({"value": True}, "std_msgs/msg/Bool").flags == (("value", True),)
+    assert state_of({"a": {"b": False, "list": [True]}}, "x/msg/Y").flags == (("a.b", False),)
+    log: dict[str, JsonValue] = {"level": 40, "name": "planner", "msg": "no path"}
+    assert state_of(log, "rcl_interfaces/msg/Log").faults == ("planner: no path",)
+    assert state_of({**log, "level": 30}, "rcl_interfaces/msg/Log") is NOTHING
+    status: list[JsonValue] = [
+        {"level": 0, "name": "lidar", "message": "fine"},
+        {"level": 2, "name": "motor", "message": "hot"},
+        {"level": 3, "name": "imu", "message": "stale"},
+    ]
+    found = state_of({"status": status}, "diagnostic_msgs/msg/DiagnosticArray")
+    assert found.faults == ("motor: hot",)
+    assert state_of({"value": 3.5}, "std_msgs/msg/Float64") is NOTHING
