@@ -30,12 +30,14 @@ def groups_of(view: Streams, topic: str, window: TimeWindow) -> list[Group]:
     groups: list[list[Holding]] = []
     reach: dict[Path, Ns] = {}
     for held in holdings:
-        reach = {each: last for each, last in reach.items() if last + COPY_HORIZON_NS >= held.first}
-        if groups and _belongs(held, reach):
+        recording = held.bag.recording
+        oldest = held.first - COPY_HORIZON_NS
+        if reach and min(reach.values()) < oldest:
+            reach = {each: last for each, last in reach.items() if last >= oldest}
+        if groups and _belongs(held, recording, reach):
             groups[-1].append(held)
         else:
             groups.append([held])
-        recording = held.bag.recording
         reach[recording] = max(reach.get(recording, MIN_NS), held.last)
     return [Group(view, topic, window, group, received_twice=False) for group in groups]
 
@@ -56,7 +58,9 @@ class Group:
         self._topic = topic
         self._window = window
         self.holdings = holdings
-        self._mixed = received_twice or len({held.bag.recording for held in holdings}) > 1
+        self._mixed = received_twice or (
+            len(holdings) > 1 and len({held.bag.recording for held in holdings}) > 1
+        )
         self._places: list[Place] | None = None
 
     def whole(self) -> BagFile | None:
@@ -125,15 +129,13 @@ def _numbered(times: Iterable[Ns]) -> Iterator[tuple[Ns, int]]:
         yield moment, nth
 
 
-def _belongs(held: Holding, reach: Mapping[Path, Ns]) -> bool:
+def _belongs(held: Holding, recording: Path, reach: Mapping[Path, Ns]) -> bool:
     """Whether a bag can hold messages before, or copies of, what the bags before it hold.
 
-    `reach` is the last log time so far of each recording. Splits of one recording that only share
-    a timestamp stay apart: bag order already orders them.
+    `recording` is the bag's own; `reach` is the last log time so far of each recording. Splits of
+    one recording that only share a timestamp stay apart: bag order already orders them.
     """
     return any(
-        held.first < last
-        if recording == held.bag.recording
-        else held.first <= last + COPY_HORIZON_NS
-        for recording, last in reach.items()
+        held.first < last if each == recording else held.first <= last + COPY_HORIZON_NS
+        for each, last in reach.items()
     )

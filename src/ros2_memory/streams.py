@@ -54,12 +54,19 @@ class Streams(Reading):
 
         Each with the times of its first and last message of these topics, in the window or not.
         """
+        names = tuple(topics)
+        if len(names) == 1 and len(self.snapshot.types_of(names[0])) == 1:
+            # The entry of a bag is then all that it holds of these topics.
+            holding = self.snapshot.holding(names[0], window)
+            return sorted(
+                [Holding(each.first, each.last, bag) for bag, each in holding], key=_in_order
+            )
         found: dict[Path, Holding] = {}
-        for topic in topics:
+        for topic in names:
             for bag, _ in self.snapshot.holding(topic, window):
                 if bag.path not in found:
-                    found[bag.path] = holding_of(bag, topics)
-        return sorted(found.values(), key=lambda held: (held.first, held.last, held.bag.path))
+                    found[bag.path] = holding_of(bag, names)
+        return sorted(found.values(), key=_in_order)
 
     def stream(
         self,
@@ -178,6 +185,9 @@ class Streams(Reading):
         newest_first: bool,
     ) -> Iterator[Found]:
         """All messages in order, copies too, opening a bag only when the stream reaches it."""
+        if len(holdings) == 1:
+            yield from self.read(holdings[0].bag, topics, window, newest_first=newest_first)
+            return
         sign = -1 if newest_first else 1
         waiting = deque(
             sorted(
@@ -204,6 +214,10 @@ class Streams(Reading):
                 _, rank, found, source = heapq.heappop(heap)
                 yield found
                 push(rank, source)
+
+
+def _in_order(held: Holding) -> tuple[Ns, Ns, Path]:
+    return held.first, held.last, held.bag.path
 
 
 def holding_of(bag: BagFile, topics: Collection[str]) -> Holding:

@@ -7,18 +7,18 @@ does not depend on what the catalogue knows.
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.absence import undecodable
 from ros2_memory.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.model import BagState
 from ros2_memory.packing import packed_poses, unpacked_poses
+from ros2_memory.sights import Sights
 from ros2_memory.trajectory import PoseCollector, TrajectoryBuilder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from ros2_memory.copies import Found
     from ros2_memory.groups import Group
@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from ros2_memory.recall import RunNotes
     from ros2_memory.timebase import Ns
     from ros2_memory.trajectory import Trajectory
+
+_MOST_AT_ONCE: Final = 1024
+"""Messages that are looked at together."""
+_MOST_BYTES_AT_ONCE: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +56,20 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     failures: list[UndecodableError] = []
     builder = TrajectoryBuilder(max_plausible_speed_mps=view.memory.limits.max_plausible_speed_mps)
     digests = _Digests(view, topic)
+    sights = Sights(view.memory.reader, view.memory.extractor)
     first: Ns | None = None
     last: Ns | None = None
     for group in view.groups(topic, window):
         span: tuple[Ns, Ns] | None
         if not _is_whole(group, window):
-            span = _added(view, builder, group.once(), failures)
+            span = _added(view, builder, sights, group.once(), failures)
         elif (known := digests.of(group)) is not None:
             digest, span = known
             builder.join(digest)
         else:
             collector = PoseCollector(view.memory.limits.max_plausible_speed_mps)
             failed = len(failures)
-            span = _added(view, collector, group.once(), failures)
+            span = _added(view, collector, sights, group.once(), failures)
             digest = collector.digest()
             builder.join(digest)
             if span is not None and failed == len(failures):
@@ -107,13 +112,14 @@ class _Digests:
         if len(group.holdings) > 1:
             return self._remembered(group)
         [held] = group.holdings
-        entry = self._view.entry(held.bag)
-        if entry is None:
-            return None
-        notes, number = entry
-        if notes is not self._notes:
+        number = None if self._notes is None else self._notes.numbers.get(held.bag.path)
+        if number is None:  # not of the run that the bag before it was of
+            entry = self._view.entry(held.bag)
+            if entry is None:
+                return None
             self._view.check_deadline()
-            self._notes, self._poses = notes, notes.poses(self._topic)
+            self._notes, number = entry
+            self._poses = self._notes.poses(self._topic)
         digest = self._poses.get(number)
         return None if digest is None else (digest, (held.first, held.last))
 
@@ -145,27 +151,39 @@ class _Digests:
 def _added(
     view: View,
     to: TrajectoryBuilder | PoseCollector,
+    sights: Sights,
     messages: Iterable[Found],
     failures: list[UndecodableError],
 ) -> tuple[Ns, Ns] | None:
     """Adds the poses of messages, and gives the times of the first and last; None without any."""
-    extractor = view.memory.extractor
     first: Ns | None = None
     last: Ns | None = None
-    for found in messages:
-        type_name = found.record.channel.type
-        try:
-            message = view.memory.reader.decode(found.record)
-        except UndecodableError as error:
-            failures.append(error)
-            continue
-        pose, twist = extractor.pose(message, type_name), extractor.twist(message, type_name)
-        if pose is None:
-            raise InvalidArgumentsError(carries_no("position", found))
-        to.add(found.time, pose, None if twist is None else math.hypot(*twist.linear))
-        first = found.time if first is None else first
-        last = found.time
+    for some in _batches(messages):
+        for found, sight in zip(some, sights.of([each.record for each in some]), strict=True):
+            if isinstance(sight, UndecodableError):
+                failures.append(sight)
+                continue
+            if sight.pose is None:
+                raise InvalidArgumentsError(carries_no("position", found))
+            to.add(found.time, sight.pose, sight.speed_mps)
+            first = found.time if first is None else first
+            last = found.time
+        view.check_deadline()
     return None if first is None or last is None else (first, last)
+
+
+def _batches(messages: Iterable[Found]) -> Iterator[list[Found]]:
+    """The messages, as many at a time as may be held."""
+    some: list[Found] = []
+    size = 0
+    for found in messages:
+        some.append(found)
+        size += len(found.record.payload)
+        if len(some) == _MOST_AT_ONCE or size > _MOST_BYTES_AT_ONCE:
+            yield some
+            some, size = [], 0
+    if some:
+        yield some
 
 
 def decoded(view: View, found: Found) -> object:

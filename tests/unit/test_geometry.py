@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyp
 
 from ros2_memory.geometry import (
     IDENTITY,
+    _columns,
+    _farthest,
     compose,
     conjugate,
     distance,
@@ -357,3 +359,14 @@ def test_a_long_path_is_simplified_within_its_tolerance(shape: str) -> None:
     kept = simplify(path, 0.05)
     assert _worst(path, kept) <= 0.05 + 1e-9
     assert len(kept) < count / 2 if shape == "zigzag" else len(kept) < 100
+
+
+_coordinates = st.floats(-1e6, 1e6) | st.sampled_from([0.0, -0.0, 1e200, -1e200])
+_anywhere = st.tuples(_coordinates, _coordinates, _coordinates)
+
+
+@given(st.lists(st.tuples(_cell, _cell, _cell) | _anywhere, min_size=48, max_size=90))
+def test_many_points_are_looked_through_as_arrays_with_the_same_result(path: list[Vector3]) -> None:
+    last = len(path) - 1
+    assert _columns(path) is not None
+    assert _farthest(path, _columns(path), 0, last) == _farthest(path, None, 0, last)
