@@ -62,7 +62,7 @@ def moved(digest: Digest, by: int) -> Digest:
 
 def _moved_summary(summary: BagSummary, by: int) -> BagSummary:
     topics = (replace(each, first=each.first + by, last=each.last + by) for each in summary.topics)
-    return replace(summary, topics=tuple(topics))
+    return summary.replaced(topics=tuple(topics))
 
 
 def _moved_topic(topic: TopicDigest, by: int) -> TopicDigest:

@@ -99,12 +99,12 @@ class Candidates:
             elif notes.whole:
                 self.ruled_out = True
                 return
-        for bag, summary in run.held[topic]:
-            if summary.first >= self._until:
+        for bag, first, last in run.extents(topic):
+            if first >= self._until:
                 continue
             number = known.get(bag.path)
             if number is None or number in possible:
-                yield _Candidate(summary.first, summary.last, bag)
+                yield _Candidate(first, last, bag)
             else:
                 self.ruled_out = True
 

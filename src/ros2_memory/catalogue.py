@@ -29,7 +29,7 @@ from ros2_memory.catalogue_sql import (
 )
 from ros2_memory.digest import EdgeDigest
 from ros2_memory.logs import get_logger
-from ros2_memory.packing import Shape, unpacked_poses
+from ros2_memory.packing import filled, shape_of_text, unpacked_poses
 from ros2_memory.recorder.standing import FormerFile
 from ros2_memory.storage.base import Channel, Record, Schema
 
@@ -117,10 +117,11 @@ class Catalogue:
 
         def ask(base: sqlite3.Connection) -> dict[str, FormerFile]:
             shapes = {
-                number: Shape(text) for number, text in base.execute("SELECT id, text FROM shapes")
+                number: shape_of_text(text)
+                for number, text in base.execute("SELECT id, text FROM shapes")
             }
             return {
-                root + path: FormerFile(size, mtime, sidecar, shapes[shape].filled(counts))
+                root + path: FormerFile(size, mtime, sidecar, filled(shapes[shape], counts))
                 for path, size, mtime, sidecar, shape, counts in base.execute(
                     "SELECT path, size, mtime, sidecar, shape, counts FROM bags WHERE config = ?",
                     (self._config,),

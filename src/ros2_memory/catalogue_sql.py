@@ -11,7 +11,7 @@ import json
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.evidence import OPEN, Box, Evidence
-from ros2_memory.packing import counts_of, packed_poses, shape_of
+from ros2_memory.packing import packed_poses, shape_text
 
 if TYPE_CHECKING:
     import sqlite3
@@ -78,11 +78,11 @@ def put(
     base: sqlite3.Connection, config: str, key: tuple[str, int, int, int], digest: Digest
 ) -> None:
     """Inserts an entry; `key` is path, size, mtime and sidecar's mtime."""
-    shape = _number(base, "shapes", "text", shape_of(digest.summary))
+    shape = _number(base, "shapes", "text", shape_text(digest.summary.shape))
     cursor = base.execute(
         "INSERT INTO bags (config, path, size, mtime, sidecar, shape, counts)"
         " VALUES (?, ?, ?, ?, ?, ?, ?)",
-        (config, *key, shape, counts_of(digest.summary)),
+        (config, *key, shape, digest.summary.numbers),
     )
     for topic in digest.topics:
         _put_topic(base, int(cursor.lastrowid or 0), topic)

@@ -106,14 +106,13 @@ def _known_pairs(
     view: View, run: Run, topic: str
 ) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
     """The pairs that the catalogue has of a run of bags, and the time of bags it has none of."""
-    held = run.held.get(topic, ())
-    notes = view.recalled(run) if held else None
+    notes = view.recalled(run) if topic in run.spans else None
     numbers = {} if notes is None else notes.numbers
     edges = {} if notes is None else notes.edges(topic)
     known = {pair for each in edges.values() for pair in each.pairs}
     rest = [
-        (summary.first, summary.last + 1)
-        for bag, summary in held
+        (first, last + 1)
+        for bag, first, last in run.extents(topic)
         if numbers.get(bag.path, 0) not in edges
     ]
     return known, rest

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, TypeAlias
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, NamedTuple, TypeAlias
 
 from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.summaries import BagSummary, TopicSummary
 from ros2_memory.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -20,11 +23,28 @@ from ros2_memory.timebase import (
     ns_from_unix,
 )
 
-if TYPE_CHECKING:
-    from pathlib import Path
+__all__ = [
+    "BagFile",
+    "BagState",
+    "BagSummary",
+    "JsonValue",
+    "Pose",
+    "Quaternion",
+    "Sample",
+    "SetAside",
+    "StampedTransform",
+    "TimeWindow",
+    "TopicSummary",
+    "Transform",
+    "Twist",
+    "Vector3",
+]
 
 JsonValue: TypeAlias = "bool | int | float | str | list[JsonValue] | dict[str, JsonValue] | None"
 """What a reply is made of; NaN and infinities are not JSON and become null before they leave."""
+
+_PATHS_AT_HAND: Final = 2048
+"""As many files and folders as a question may be about; a `Path` is as large as all the rest."""
 
 Vector3: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -93,57 +113,6 @@ class TimeWindow:
         return self.stop <= self.start
 
 
-@dataclass(frozen=True, slots=True)
-class TopicSummary:
-    """What one bag holds of one topic under one type; only where it holds at least one message.
-
-    `first` and `last` are the exact log times of its earliest and latest message (inclusive).
-    `latched`: some publisher offered it as transient local.
-    """
-
-    topic: str
-    type: str
-    encoding: str
-    count: int
-    first: Ns
-    last: Ns
-    latched: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class BagSummary:
-    """What one bag file holds.
-
-    `complete` is False where the file ends early and only what was readable is counted. `silent`
-    names the topics that are declared without a message. `notes` are sentences on what is odd.
-    """
-
-    topics: tuple[TopicSummary, ...]
-    silent: tuple[str, ...] = ()
-    complete: bool = True
-    notes: tuple[str, ...] = ()
-
-    @property
-    def count(self) -> int:
-        """Messages on all topics."""
-        return sum(topic.count for topic in self.topics)
-
-    @property
-    def empty(self) -> bool:
-        """Whether the bag holds no message: such a bag has no start and no end."""
-        return not self.topics
-
-    @property
-    def start(self) -> Ns:
-        """Log time of the earliest message. Only for a bag that is not empty."""
-        return min(topic.first for topic in self.topics)
-
-    @property
-    def end(self) -> Ns:
-        """Log time of the latest message (inclusive). Only for a bag that is not empty."""
-        return max(topic.last for topic in self.topics)
-
-
 class BagState(StrEnum):
     """How a bag file stands."""
 
@@ -153,15 +122,15 @@ class BagState(StrEnum):
     DAMAGED = "damaged"  # cannot be read at all: set aside with its reason
 
 
-@dataclass(frozen=True, slots=True)
-class BagFile:
+class BagFile(NamedTuple):
     """One bag file that answers questions (closed or incomplete, and not empty).
 
-    `start` and `end` are the log times of its first and last message, both inclusive.
-    `sidecar_ns` is the mtime of the file beside it that says which of its messages count, or 0.
+    `file` is its path as a text: of 60,000 files the index keeps no more. `start` and `end` are
+    the log times of its first and last message, both inclusive. `sidecar_ns` is the mtime of the
+    file beside it that says which of its messages count, or 0.
     """
 
-    path: Path
+    file: str
     size: int
     mtime_ns: Ns
     state: BagState
@@ -171,9 +140,20 @@ class BagFile:
     sidecar_ns: Ns = 0
 
     @property
+    def path(self) -> Path:
+        """Where it lies; mostly the same object each time."""
+        return _path(self.file)
+
+    @property
     def recording(self) -> Path:
         """The rosbag2 recording that this file is a split of: its directory."""
-        return self.path.parent
+        folder, slash, _ = self.file.rpartition("/")
+        return _path(folder or slash)
+
+
+@lru_cache(maxsize=_PATHS_AT_HAND)
+def _path(text: str) -> Path:
+    return Path(text)
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,16 +8,16 @@ from __future__ import annotations
 import json
 import math
 import struct
-import sys
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.model import BagSummary, TopicSummary
 from ros2_memory.motion import PoseDigest, Stop
+from ros2_memory.summaries import BagSummary, Heading, shared_shape
 
 if TYPE_CHECKING:
     from ros2_memory.model import JsonValue
     from ros2_memory.motion import Vertex
+    from ros2_memory.summaries import Shape
 
 _HEAD: Final = struct.Struct("<qqqqddB??qdddqdddqdddqddd")
 _VERTEX: Final = struct.Struct("<qdddd")
@@ -95,49 +95,33 @@ def _unpacked_poses(packed: bytes) -> PoseDigest:
     )
 
 
-def shape_of(summary: BagSummary) -> str:
-    """All of a summary but counts and times, which is what nearly all bags share."""
-    topics: JsonValue = [
-        [each.topic, each.type, each.encoding, each.latched] for each in summary.topics
-    ]
-    return json.dumps([topics, [*summary.silent], summary.complete, [*summary.notes]])
+def shape_text(shape: Shape) -> str:
+    """A shape as a text, the same for equal ones."""
+    topics: JsonValue = [[*heading] for heading in shape.topics]
+    return json.dumps([topics, [*shape.silent], shape.complete, [*shape.notes]])
 
 
-def counts_of(summary: BagSummary) -> bytes:
-    """Count, first and last log time of each topic of a summary, in its order."""
-    numbers = [part for each in summary.topics for part in (each.count, each.first, each.last)]
-    return struct.pack(f"<{len(numbers)}q", *numbers)
+def shape_of_text(text: str) -> Shape:
+    """The shape that this text is of.
+
+    Raises:
+        ValueError: it is of none.
+        TypeError: likewise.
+    """
+    topics, silent, complete, notes = json.loads(text)
+    headings = (
+        Heading(topic, type_name, encoding, bool(latched))
+        for topic, type_name, encoding, latched in topics
+    )
+    return shared_shape(tuple(headings), tuple(silent), bool(complete), tuple(notes))
 
 
-class Shape:
-    """A shape parsed once, to be filled for each bag that has it."""
+def filled(shape: Shape, counts: bytes) -> BagSummary:
+    """The summary of a bag of this shape.
 
-    def __init__(self, text: str) -> None:
-        topics, silent, complete, notes = json.loads(text)
-        intern = sys.intern
-        self._topics = [
-            (intern(topic), intern(type_name), intern(encoding), bool(latched))
-            for topic, type_name, encoding, latched in topics
-        ]
-        self._silent = tuple(intern(name) for name in silent)
-        self._complete = bool(complete)
-        self._notes = tuple(notes)
-        self._numbers = struct.Struct(f"<{3 * len(topics)}q")
-
-    def filled(self, counts: bytes) -> BagSummary:
-        """The summary of a bag of this shape.
-
-        Raises:
-            ValueError: the counts are of another shape.
-        """
-        try:
-            numbers = iter(self._numbers.unpack(counts))
-        except struct.error as error:
-            raise ValueError(f"not the counts of a bag: {error}") from error
-        topics = tuple(
-            TopicSummary(topic, type_name, encoding, count, first, last, latched)
-            for (topic, type_name, encoding, latched), count, first, last in zip(
-                self._topics, numbers, numbers, numbers, strict=True
-            )
-        )
-        return BagSummary(topics, self._silent, self._complete, self._notes)
+    Raises:
+        ValueError: the counts are of another shape.
+    """
+    if len(counts) != shape.layout.size:
+        raise ValueError(f"not the counts of a bag: {len(counts)} bytes")
+    return BagSummary.packed(shape, counts)

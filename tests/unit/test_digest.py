@@ -15,7 +15,7 @@ from ros2_memory.conditions import Condition, Contains, Equals, NearPosition, pa
 from ros2_memory.digest import MOST_KEPT, Digester, EvidenceCollector
 from ros2_memory.evidence import MOST_WORDS, united
 from ros2_memory.model import Pose
-from ros2_memory.packing import Shape, counts_of, packed_poses, shape_of, unpacked_poses
+from ros2_memory.packing import filled, packed_poses, shape_of_text, shape_text, unpacked_poses
 from ros2_memory.trajectory import PoseCollector, TrajectoryBuilder
 from tests.bags import Msg, boolean, detections, odom, text, tf, transform
 from tests.fakes import FakeReader
@@ -242,7 +242,13 @@ def test_few_latched_messages_are_kept_whole_and_many_are_not() -> None:
 
 def test_a_summary_is_the_same_after_it_was_packed() -> None:
     summary = digest_of([odom(T0, 0, 0), text(T0 + S, "a"), text(T0 + 2 * S, "b")]).summary
-    assert Shape(shape_of(summary)).filled(counts_of(summary)) == summary
+    assert filled(shape_of_text(shape_text(summary.shape)), summary.numbers) == summary
+
+
+def test_numbers_of_another_shape_are_refused() -> None:
+    summary = digest_of([odom(T0, 0, 0)]).summary
+    with pytest.raises(ValueError, match="not the counts"):
+        filled(summary.shape, summary.numbers[:-1])
 
 
 def test_bytes_that_are_no_digest_are_refused() -> None:

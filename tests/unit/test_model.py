@@ -128,5 +128,5 @@ def test_a_bag_without_messages_is_empty() -> None:
 
 def test_a_bag_file_belongs_to_the_recording_in_whose_directory_it_lies() -> None:
     path = Path("bags") / "rec_1" / "rec_1_0.mcap"
-    bag = BagFile(path, 1, 2, BagState.CLOSED, BagSummary(()), 0, 0)
+    bag = BagFile(str(path), 1, 2, BagState.CLOSED, BagSummary(()), 0, 0)
     assert bag.recording == Path("bags") / "rec_1"

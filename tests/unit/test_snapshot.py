@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -27,7 +26,7 @@ def _bag(
         ),
         silent=silent,
     )
-    return BagFile(Path(name), 1, 1, BagState.CLOSED, summary, summary.start, summary.end)
+    return BagFile(name, 1, 1, BagState.CLOSED, summary, summary.start, summary.end)
 
 
 def test_bags_are_ordered_by_time_and_never_by_name() -> None:
@@ -56,7 +55,7 @@ def test_the_latest_message_may_stand_in_a_bag_that_began_earlier() -> None:
 def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> None:
     both = _bag("b", ("/x", 10, 19), ("/odom", 10, 19))
     second = replace(both.summary.topics[0], type="std_msgs/msg/String")
-    both = replace(both, summary=BagSummary((*both.summary.topics, second)))
+    both = both._replace(summary=BagSummary((*both.summary.topics, second)))
     first = _bag("a", ("/x", 0, 9))
     snapshot = Snapshot(bags=(first, both))
     assert snapshot.holding("/x") == (

@@ -92,7 +92,7 @@ def week() -> tuple[Memory, FakeReader]:
         digest = later(first, number * SPLIT)
         path = BAG_DIR / f"rec_{number // 360}" / f"rec_{number}.mcap"
         summary = digest.summary
-        bags.append(BagFile(path, 1, T0, BagState.CLOSED, summary, summary.start, summary.end))
+        bags.append(BagFile(str(path), 1, T0, BagState.CLOSED, summary, summary.start, summary.end))
         entries.append((BagKey.of(bags[-1], BAG_DIR), digest))
     assert catalogue.put_all(entries)
     index = cast("IndexManager", Still(Snapshot(tuple(bags))))

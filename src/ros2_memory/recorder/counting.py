@@ -69,16 +69,16 @@ class CountingReader(BagReader):
         summary = self._reader.summarize(path)
         handover, problem = self._handover(path.parent)
         if problem is not None:
-            summary = replace(summary, notes=(*summary.notes, problem))
+            summary = summary.replaced(notes=(*summary.notes, problem))
         if handover.hides_all:
-            return replace(summary, topics=())
+            return summary.replaced(topics=())
         notes = handover.notes if handover.exclusions(path.name) else ()
         topics = tuple(
             counted
             for topic in summary.topics
             if (counted := self._counted(path, topic, handover)) is not None
         )
-        return replace(summary, topics=topics, notes=(*summary.notes, *notes))
+        return summary.replaced(topics=topics, notes=(*summary.notes, *notes))
 
     def records(
         self,

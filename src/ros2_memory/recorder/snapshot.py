@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from ros2_memory.recorder.timeline import RUN_LIMIT, Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.model import BagFile, SetAside, TimeWindow
-    from ros2_memory.recorder.timeline import Held, Run, Span, Stated
+    from ros2_memory.recorder.timeline import Extent, Held, Run, Span, Stated
     from ros2_memory.timebase import Ns
 
 __all__ = ["RUN_LIMIT", "Snapshot", "Timeline"]
@@ -69,6 +69,10 @@ class Snapshot:
         """
         return self._timeline.holding(topic, window)
 
+    def extents(self, topic: str, window: TimeWindow) -> Iterator[Extent]:
+        """As `holding`, but of the summaries only the times of the first and last message."""
+        return self._timeline.extents(topic, window)
+
     def overlapping(self, window: TimeWindow) -> tuple[BagFile, ...]:
         """The bags whose span has a moment in the window, in bag order."""
         return self._timeline.overlapping(window)
@@ -101,4 +105,4 @@ class Snapshot:
     def first_with(self, topic: str, type_name: str) -> BagFile:
         """The first bag, in bag order, that holds the topic under a type; there must be one."""
         run = next(run for run in self.runs if type_name in run.types.get(topic, ()))
-        return next(bag for bag, held in run.held[topic] if held.type == type_name)
+        return next(bag for bag, held in run.holding(topic) if held.type == type_name)

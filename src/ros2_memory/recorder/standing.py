@@ -19,14 +19,13 @@ after the bag in it was closed; it is open until its last frame is whole.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.errors import BagError, BagVanishedError
-from ros2_memory.model import BagFile, BagState, BagSummary, SetAside, TopicSummary
+from ros2_memory.model import BagFile, BagState, BagSummary, SetAside
 from ros2_memory.recorder.scan import YOUNG_NS, bag_kind, settled
 from ros2_memory.storage.base import Closing
 from ros2_memory.timebase import NS_PER_S, Ns
@@ -136,10 +135,7 @@ class FileNotes:
         return cls(path, bag_kind(path.name) or "", stamp, now, settled(stamp.mtime_ns, now))
 
     def recall(self, summary: BagSummary) -> None:
-        """Takes in what was found earlier in a closed file that looked just like this one.
-
-        Its names should be shared with the other summaries.
-        """
+        """Takes in what was found earlier in a closed file that looked just like this one."""
         self.closing, self.summary = Closing.CLOSED, summary
 
     def look(self, stamp: Stamp, now: Ns) -> bool:
@@ -206,7 +202,7 @@ def judge(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
         if _is_active(notes, scene):
             return _aside(Standing.ACTIVE, notes, _ACTIVE)
         if notes.summary is None and notes.fault is None:
-            notes.summary = _shared(reader.summarize(notes.path))
+            notes.summary = reader.summarize(notes.path)
     except BagVanishedError:
         raise
     except BagError as error:
@@ -259,7 +255,7 @@ def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
     state = BagState.CLOSED if closed else BagState.INCOMPLETE
     stamp = notes.stamp
     bag = BagFile(
-        notes.path,
+        str(notes.path),
         stamp.size,
         stamp.mtime_ns,
         state,
@@ -279,22 +275,3 @@ def _not_read(notes: FileNotes) -> str:
     if not notes.path.name.endswith(notes.kind):
         return f"the name of a bag file must end in {notes.kind}, in lower case: rename it"
     return f"this storage does not read {notes.kind} files: choose storage=rosbag2, which does"
-
-
-def _shared(summary: BagSummary) -> BagSummary:
-    """The summary with one copy of each name: 60,000 bags repeat the same few."""
-    intern = sys.intern
-    topics = tuple(
-        TopicSummary(
-            intern(each.topic),
-            intern(each.type),
-            intern(each.encoding),
-            each.count,
-            each.first,
-            each.last,
-            each.latched,
-        )
-        for each in summary.topics
-    )
-    silent = tuple(intern(name) for name in summary.silent)
-    return BagSummary(topics, silent, summary.complete, summary.notes)

@@ -12,18 +12,34 @@ from functools import cached_property
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from ros2_memory.model import BagFile, TopicSummary
-from ros2_memory.recorder.layout import is_carried
+import numpy as np
+
+from ros2_memory.recorder.layout import CARRY_FILE, is_carried
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import TimeWindow
+    from numpy.typing import NDArray
+
+    from ros2_memory.model import BagFile, TimeWindow, TopicSummary
+    from ros2_memory.summaries import Shape
     from ros2_memory.timebase import Ns
 
-Held: TypeAlias = tuple[BagFile, TopicSummary]
+Held: TypeAlias = "tuple[BagFile, TopicSummary]"
 """A bag, and what it holds of one topic under one type."""
+
+
+class Extent(NamedTuple):
+    """A bag, and the log times (inclusive) of the first and last message that it holds of a topic.
+
+    A bag in which the topic has two types has two extents.
+    """
+
+    bag: BagFile
+    first: Ns
+    last: Ns
+
 
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
@@ -32,9 +48,9 @@ RUN_LIMIT: Final = 256
 """Bags in a run at most: few enough to work out in a millisecond, and 240 runs make a week."""
 
 
-def in_time(bag: BagFile) -> tuple[Ns, Ns, Path]:
-    """What orders bags: the times inside them, never their names; the path only breaks ties."""
-    return bag.start, bag.end, bag.path
+def in_time(bag: BagFile) -> tuple[Ns, Ns, str]:
+    """What orders bags: the times inside them, never their names; the file only breaks ties."""
+    return bag.start, bag.end, bag.file
 
 
 class Stated(NamedTuple):
@@ -51,98 +67,148 @@ class Stated(NamedTuple):
         )
 
 
+class _Alike(NamedTuple):
+    """Bags of one shape: where they lie in their run, and their numbers by bag and topic."""
+
+    shape: Shape
+    at: NDArray[np.intp]
+    numbers: NDArray[np.int64]
+
+
+class _Column(NamedTuple):
+    """What the bags of a run hold of one topic, in bag order, one row for each of its types."""
+
+    at: NDArray[np.intp]
+    firsts: NDArray[np.int64]
+    lasts: NDArray[np.int64]
+    places: NDArray[np.intp]
+
+
 class Run:
     """Some consecutive bags of a timeline; never without any."""
 
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
-        self._extents: dict[str, tuple[list[Ns], list[Ns]]] = {}
+        self._columns: dict[str, _Column | None] = {}
 
     @cached_property
     def latest(self) -> Ns:
         """Log time of the last message in any of the bags."""
-        return max(bag.end for bag in self.bags)
+        return max([bag.end for bag in self.bags])
 
     @cached_property
     def recorded(self) -> tuple[BagFile, ...]:
         """The bags without that of carried messages."""
-        return tuple(bag for bag in self.bags if not is_carried(bag.path))
+        if any(bag.file.endswith(CARRY_FILE) for bag in self.bags):
+            return tuple(bag for bag in self.bags if not is_carried(bag.path))
+        return self.bags
 
     @cached_property
-    def held(self) -> dict[str, tuple[Held, ...]]:
-        """By topic, the bags that hold messages of it, one entry for each type, in bag order."""
-        held: dict[str, list[Held]] = {}
-        for bag in self.bags:
-            for topic in bag.summary.topics:
-                held.setdefault(topic.topic, []).append((bag, topic))
-        return {topic: tuple(entries) for topic, entries in held.items()}
+    def _alike(self) -> tuple[_Alike, ...]:
+        """The bags by shape. Most runs have one."""
+        places: dict[int, list[int]] = {}
+        for place, bag in enumerate(self.bags):
+            places.setdefault(id(bag.summary.shape), []).append(place)
+        return tuple(_alike([self.bags[place] for place in at], at) for at in places.values())
 
     @cached_property
     def stated(self) -> dict[str, dict[str, Stated]]:
         """By topic and type, what the summaries of the bags say."""
         stated: dict[str, dict[str, Stated]] = {}
-        for topic, entries in self.held.items():
-            by_type = stated.setdefault(topic, {})
-            for _, each in entries:
-                here = Stated(each.first, each.last, each.count)
-                known = by_type.get(each.type)
-                by_type[each.type] = here if known is None else known.with_more(here)
+        for shape, _, numbers in self._alike:
+            rows = zip(
+                shape.topics,
+                numbers[:, :, 1].min(axis=0).tolist(),
+                numbers[:, :, 2].max(axis=0).tolist(),
+                numbers[:, :, 0].sum(axis=0).tolist(),
+                strict=True,
+            )
+            for (topic, type_name, *_), first, last, messages in rows:
+                by_type = stated.setdefault(topic, {})
+                here = Stated(first, last, messages)
+                known = by_type.get(type_name)
+                by_type[type_name] = here if known is None else known.with_more(here)
         return stated
 
-    @cached_property
-    def recordings(self) -> dict[str, dict[Path, Span]]:
-        """By topic and recording, the log times of the first and last message."""
-        recordings: dict[str, dict[Path, Span]] = {}
-        folders = [bag.recording for bag in self.bags]
-        for bag, folder in zip(self.bags, folders, strict=True):
-            for each in bag.summary.topics:
-                spans = recordings.setdefault(each.topic, {})
-                spans[folder] = _wider(spans.get(folder), (each.first, each.last))
-        return recordings
+    def recordings(self, topic: str) -> dict[Path, Span]:
+        """The recordings that hold the topic, each with the times of its first and last message."""
+        column = self._column(topic)
+        if column is None:
+            return {}
+        folders = [self.bags[at].recording for at in column.at.tolist()]
+        if folders.count(folders[0]) == len(folders):
+            return {folders[0]: self.spans[topic]}
+        spans: dict[Path, Span] = {}
+        rows = zip(folders, column.firsts.tolist(), column.lasts.tolist(), strict=True)
+        for folder, first, last in rows:
+            spans[folder] = _wider(spans.get(folder), (first, last))
+        return spans
 
-    def between(self, topic: str, window: TimeWindow) -> Iterator[Held]:
-        """The entries of the topic in `held` that may hold a message in the window."""
-        if topic not in self._extents:
-            held = [each for _, each in self.held[topic]]
-            self._extents[topic] = ([each.first for each in held], [each.last for each in held])
-        firsts, lasts = self._extents[topic]
-        start, stop = window.start, window.stop
-        return (
-            entry
-            for entry, first, last in zip(self.held[topic], firsts, lasts, strict=True)
-            if first < stop and last >= start
-        )
+    def holding(self, topic: str, window: TimeWindow | None = None) -> Iterator[Held]:
+        """The bags that hold messages of the topic, one entry for each type, in bag order.
+
+        With a window, those that may hold some in it.
+        """
+        column = self._column(topic)
+        if column is None:
+            return
+        rows = _rows(column, window)
+        for at, place in zip(column.at[rows].tolist(), column.places[rows].tolist(), strict=True):
+            bag = self.bags[at]
+            yield bag, bag.summary.at(place)
+
+    def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[Extent]:
+        """As `holding`, but of the summaries only the times of the first and last message."""
+        column = self._column(topic)
+        if column is None:
+            return
+        rows = _rows(column, window)
+        columns = (column.at, column.firsts, column.lasts)
+        for at, first, last in zip(*(each[rows].tolist() for each in columns), strict=True):
+            yield Extent(self.bags[at], first, last)
+
+    @property
+    def held(self) -> dict[str, tuple[Held, ...]]:
+        """`holding` of every topic."""
+        return {topic: tuple(self.holding(topic)) for topic in self.spans}
+
+    def _column(self, topic: str) -> _Column | None:
+        """What is held of a topic; None where nothing is."""
+        if topic not in self._columns:
+            self._columns[topic] = _column_of(self._alike, topic)
+        return self._columns[topic]
 
     @cached_property
     def spans(self) -> dict[str, Span]:
         """By topic, the log times of its first and last message (inclusive)."""
         return {
-            topic: (min(held.first for _, held in entries), max(held.last for _, held in entries))
-            for topic, entries in self.held.items()
+            topic: (
+                min(each.first for each in by_type.values()),
+                max(each.last for each in by_type.values()),
+            )
+            for topic, by_type in self.stated.items()
         }
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
         """By topic, the types that its messages have."""
-        return {
-            topic: frozenset(held.type for _, held in entries)
-            for topic, entries in self.held.items()
-        }
+        return {topic: frozenset(by_type) for topic, by_type in self.stated.items()}
 
     @cached_property
     def latched(self) -> frozenset[str]:
         """The topics that some publisher offered as transient local."""
         return frozenset(
-            topic
-            for topic, entries in self.held.items()
-            if any(held.latched for _, held in entries)
+            heading.topic
+            for alike in self._alike
+            for heading in alike.shape.topics
+            if heading.latched
         )
 
     @cached_property
     def silent(self) -> frozenset[str]:
         """The topics that some bag declares without a message."""
-        return frozenset(chain.from_iterable(bag.summary.silent for bag in self.bags))
+        return frozenset(chain.from_iterable(alike.shape.silent for alike in self._alike))
 
 
 class Timeline:
@@ -150,7 +216,6 @@ class Timeline:
 
     def __init__(self, runs: Sequence[Run] = ()) -> None:
         self._runs = tuple(runs)
-        self._held: dict[str, tuple[Held, ...]] = {}
         self._recordings: dict[str, dict[Path, Span]] = {}
 
     @property
@@ -191,7 +256,7 @@ class Timeline:
         return Timeline(runs)
 
     @cached_property
-    def _firsts(self) -> list[tuple[Ns, Ns, Path]]:
+    def _firsts(self) -> list[tuple[Ns, Ns, str]]:
         return [run.first for run in self._runs]
 
     @cached_property
@@ -223,7 +288,7 @@ class Timeline:
         if topic not in self._recordings:
             spans: dict[Path, Span] = {}
             for run in self._runs:
-                for folder, span in run.recordings.get(topic, {}).items():
+                for folder, span in run.recordings(topic).items():
                     spans[folder] = _wider(spans.get(folder), span)
             self._recordings[topic] = spans
         return self._recordings[topic]
@@ -287,25 +352,22 @@ class Timeline:
 
         A bag in which the topic has two types appears once for each.
         """
-        if window is not None:
-            return self._holding_in(topic, window)
-        if topic not in self.types:
-            return ()
-        if topic not in self._held:
-            self._held[topic] = tuple(
-                chain.from_iterable(run.held.get(topic, ()) for run in self._runs)
-            )
-        return self._held[topic]
-
-    def _holding_in(self, topic: str, window: TimeWindow) -> tuple[Held, ...]:
-        if window.empty:
-            return ()
         return tuple(
-            entry
-            for run in self._runs_in(window)
-            if topic in run.spans and window.overlaps(*run.spans[topic])
-            for entry in run.between(topic, window)
+            chain.from_iterable(run.holding(topic, window) for run in self._of(topic, window))
         )
+
+    def extents(self, topic: str, window: TimeWindow) -> Iterator[Extent]:
+        """As `holding`, but of the summaries only the times of the first and last message."""
+        return chain.from_iterable(run.extents(topic, window) for run in self._of(topic, window))
+
+    def _of(self, topic: str, window: TimeWindow | None) -> Iterator[Run]:
+        """The runs that may hold messages of the topic (in the window), in order."""
+        if window is not None and window.empty:
+            return
+        for run in self._runs if window is None else self._runs_in(window):
+            span = run.spans.get(topic)
+            if span is not None and (window is None or window.overlaps(*span)):
+                yield run
 
 
 def _runs_of(bags: Sequence[BagFile]) -> list[Run]:
@@ -315,3 +377,40 @@ def _runs_of(bags: Sequence[BagFile]) -> list[Run]:
 
 def _wider(known: Span | None, span: Span) -> Span:
     return span if known is None else (min(known[0], span[0]), max(known[1], span[1]))
+
+
+def _alike(bags: Sequence[BagFile], at: Sequence[int]) -> _Alike:
+    shape = bags[0].summary.shape
+    packed = b"".join([bag.summary.numbers for bag in bags])
+    numbers = np.frombuffer(packed, "<i8").reshape(len(bags), len(shape.topics), 3)
+    return _Alike(shape, np.array(at, np.intp), numbers)
+
+
+def _column_of(alike: Iterable[_Alike], topic: str) -> _Column | None:
+    columns = [
+        _Column(
+            at,
+            numbers[:, place, 1],
+            numbers[:, place, 2],
+            np.broadcast_to(np.intp(place), at.shape),
+        )
+        for shape, at, numbers in alike
+        for place in shape.places.get(topic, ())
+    ]
+    if len(columns) < 2:
+        return columns[0] if columns else None
+    at = np.concatenate([each.at for each in columns])
+    places = np.concatenate([each.places for each in columns])
+    order = np.lexsort((places, at))
+    return _Column(
+        at[order],
+        np.concatenate([each.firsts for each in columns])[order],
+        np.concatenate([each.lasts for each in columns])[order],
+        places[order],
+    )
+
+
+def _rows(column: _Column, window: TimeWindow | None) -> NDArray[np.intp]:
+    if window is None:
+        return np.arange(len(column.at))
+    return np.flatnonzero((column.firsts < window.stop) & (column.lasts >= window.start))

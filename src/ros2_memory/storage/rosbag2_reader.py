@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -93,7 +92,7 @@ class Rosbag2Reader(BagReader):
             summary = opened.room.summarize(opened.path)
             if not opened.note:
                 return summary
-            return replace(summary, complete=False, notes=(opened.note, *summary.notes))
+            return summary.replaced(complete=False, notes=(opened.note, *summary.notes))
 
     def records(
         self,
