@@ -107,6 +107,13 @@ class TestAge:
         across = bag("across", NOW - HOUR, length=300 * DAY)
         assert expired(stock(across, bag("new", NOW)), LIMITS) == ()
 
+    def test_a_bag_that_a_bad_clock_dated_is_as_old_as_its_file(self) -> None:
+        ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
+        boot = bag("boot", 60 * S, written=NOW - 171 * HOUR)
+        fresh = bag("fresh", 60 * S, written=NOW - HOUR)
+        doomed = expired(stock(ahead, boot, fresh, *hourly(172)), LIMITS)
+        assert names(doomed) == ["boot", "h171", "ahead", "h170", "h169"]
+
     def test_a_bag_without_messages_does_not_age_others_and_goes_with_its_time(self) -> None:
         old = bag("empty", None, written=NOW - 170 * HOUR + 1)
         doomed = expired(stock(old, bag("later", None, written=NOW), *hourly(172)), LIMITS)
@@ -149,6 +156,25 @@ class TestBudget:
         ]
         limits = replace(LIMITS, max_total_bytes=0)
         assert names(expired(stock(*bags), limits)) == ["a", "b", "c", "d", "e"]
+
+    def test_a_bag_of_1970_is_not_the_oldest_before_its_file_is(self) -> None:
+        boot = bag("boot", 60 * S, written=NOW - 150 * 60 * S)
+        doomed = expired(stock(boot, *hourly(5)), budget(30))
+        assert names(doomed) == ["h4", "h3", "boot"]
+
+    def test_a_file_from_a_far_future_goes_first_and_is_not_kept_for_good(self) -> None:
+        ahead = bag("ahead", NOW + 3650 * DAY)
+        limits = RetentionLimits(max_total_bytes=30, max_age_ns=168 * HOUR)
+        assert names(expired(stock(*hourly(3), ahead), limits)) == ["ahead"]
+
+    def test_files_dated_a_little_ahead_of_a_clock_that_is_behind_keep_their_order(self) -> None:
+        last_hours = hourly(5, until=NOW + 10 * HOUR)
+        assert names(expired(stock(*last_hours), budget(30))) == ["h4", "h3"]
+
+    def test_while_the_clock_is_not_set_what_it_dates_is_newest(self) -> None:
+        boot = [bag(f"boot{n}", n * 60 * S) for n in (1, 2)]
+        doomed = expired(stock(*hourly(3), *boot, now=200 * S), budget(20))
+        assert names(doomed) == ["h2", "h1", "h0"]
 
     def test_the_last_bag_of_a_recording_takes_its_sidecars_along(self) -> None:
         bags = [bag("a", NOW - 2 * HOUR, recording="old"), *hourly(2)]

@@ -4,12 +4,15 @@ Age counts from the newest recorded data, not from the wall clock: a robot that 
 does not erase itself when it wakes. Clocks step, so not every date is believed:
 
 - A bag dated in the future, before there was ROS 2, or longer than any recording is not dated: it
-  neither ages others nor is aged.
+  ages no others, and is itself as old as its file.
 - A pause longer than `max_age_ns`, and than a day, is a robot that was off or a clock that was
   set, which nothing can tell apart. It parts two eras, and no bag ages those of another era.
 
 The budget takes them all, oldest first: a dated bag of the present era by its newest message, any
-other by the time of its file. The newest bag stays, whatever the limits say.
+other by the time of its file. A file dated after all that may be kept, counted from now, tells no
+time, and goes first: else it would stay for good. One dated before there was ROS 2, while the clock
+stands there now, is being recorded now, and goes last. The newest bag stays, whatever the limits
+say.
 """
 
 from __future__ import annotations
@@ -18,15 +21,12 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from ros2_memory.timebase import NS_PER_S, Ns
+from ros2_memory.recorder.clock_faults import FIRST_BAGS_NS, FUTURE_NS
+from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-FIRST_BAGS_NS: Final[Ns] = 1_483_228_800 * NS_PER_S
-"""2017-01-01: there was no release of ROS 2 before. Clocks without a battery start in 1970."""
-FUTURE_NS: Final[Ns] = 60 * NS_PER_S
-"""A date so little ahead of the clock comes from a clock that is being corrected."""
 SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """A shorter pause never parts two eras, however little history is kept."""
 
@@ -114,7 +114,7 @@ def weighed(stock: Stock, limits: RetentionLimits) -> Weighed:
     aged = _aged(stock.bags, eras, limits.max_age_ns)
     if not aged and plan.fits(limits):
         return Weighed((), total, fits=True)
-    order = _oldest_first(stock.bags, eras[-1] if eras else [], shared=plan.shared)
+    order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)
     # What shares a file with the bag that stays would free nothing.
     kept = _inodes(_newest(order, eras))
     doomed: set[str] = set()
@@ -200,33 +200,48 @@ def _eras(stock: Stock, limits: RetentionLimits) -> list[_Era]:
 def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
     """The bags that are too old for the newest of their era.
 
-    One without a span is of the present era if it was written in it, else of none.
+    One that is not dated is of the present era if it was written in it, else of none.
     """
     aged: set[str] = set()
+    dated = {bag.path for era in eras for _, bag in era}
     for era in eras:
         oldest = max(span.end for span, _ in era) - max_age_ns
         aged.update(bag.path for span, bag in era if span.end < oldest)
         if era is eras[-1]:
             begun = min(span.start for span, _ in era)
-            silent = (bag for bag in bags if bag.span is None)
-            aged.update(bag.path for bag in silent if begun <= bag.written < oldest)
+            undated = (bag for bag in bags if bag.path not in dated)
+            aged.update(bag.path for bag in undated if begun <= bag.written < oldest)
     return aged
 
 
-def _oldest_first(bags: Sequence[StoredBag], present: _Era, *, shared: bool) -> list[StoredBag]:
+def _oldest_first(
+    stock: Stock, limits: RetentionLimits, present: _Era, *, shared: bool
+) -> list[StoredBag]:
     """All bags, oldest first.
 
     One that shares a file is as old as the newest that does: deleting it frees nothing before.
     """
-    moments = {bag.path: span.end for span, bag in present}
+    moments = {bag.path: _written(bag, stock.now, limits) for bag in stock.bags}
+    moments.update((bag.path, (span.end, span.end)) for span, bag in present)
     if shared:
-        newest: dict[tuple[int, int], Ns] = {}
-        for bag in bags:
-            moment = moments.get(bag.path, bag.written)
+        newest: dict[tuple[int, int], tuple[Ns, Ns]] = {}
+        for bag in stock.bags:
+            moment = moments[bag.path]
             for each in bag.files:
                 newest[each.inode] = max(moment, newest.get(each.inode, moment))
-        moments = {bag.path: max(newest[each.inode] for each in bag.files) for bag in bags}
-    return sorted(bags, key=lambda bag: (moments.get(bag.path, bag.written), bag.path))
+        moments = {bag.path: max(newest[each.inode] for each in bag.files) for bag in stock.bags}
+    return sorted(stock.bags, key=lambda bag: (moments[bag.path], bag.path))
+
+
+def _written(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns, Ns]:
+    """What orders a bag by its file; the second number orders those of which the first is made up.
+
+    While the clock is behind by less than history is kept, the dates of files still order them.
+    """
+    if now < FIRST_BAGS_NS:
+        return (MAX_NS if bag.written < FIRST_BAGS_NS else bag.written), bag.written
+    longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
+    return (MIN_NS if bag.written > now + longest else bag.written), bag.written
 
 
 def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:

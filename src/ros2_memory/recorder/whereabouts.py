@@ -1,0 +1,72 @@
+"""When the messages of a file that cannot be read may have been recorded. A pure decision.
+
+Such a file says nothing of its times; what lies around it does:
+
+    not before   the end of the split before it in its recording, else the time in the name of a
+                 recording of this program
+    not after    the start of the split after it, else the last time that the file was written to
+
+Between two splits that is all there is to know. Where only one side is known, or the other is only
+known from outside, the file is taken to hold a day at most: so an old one that nobody removes, or
+one that was copied here later, leaves the answers about all other days alone. Where neither side is
+known, or the file's own date cannot be true, its time is unknown.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.clock_faults import FIRST_BAGS_NS, FUTURE_NS, last_believed
+from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from ros2_memory.recorder.courses import Neighbours
+
+LONGEST_NS: Final[Ns] = 24 * 3600 * NS_PER_S
+"""What a file of which one end is known is taken to hold at most."""
+
+_OWN_NAME: Final = re.compile(r"rec_(\d{8}T\d{6})Z(?:_\d+)?")
+
+
+def begun(recording: str) -> Ns | None:
+    """When a recording of this program began, by its name; None for any other."""
+    named = _OWN_NAME.fullmatch(recording)
+    if named is None:
+        return None
+    try:
+        moment = datetime.strptime(named[1], "%Y%m%dT%H%M%S").replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return int(moment.timestamp()) * NS_PER_S
+
+
+def whereabouts(
+    recording: str, near: Neighbours, written: Ns | None, now: Ns, *, growing: bool = False
+) -> TimeWindow | None:
+    """The log times between which all messages of a file lie; None where that is unknown.
+
+    Args:
+        recording: the name of the file's folder.
+        near: the splits around it.
+        written: the file's mtime; None where it is not known.
+        now: the present.
+        growing: whether the file is still being written.
+    """
+    start = begun(recording) if near.before is None else near.before
+    if near.after is not None:
+        if start is None or (near.before is None and start > near.after):
+            start = max(near.after - LONGEST_NS, MIN_NS)
+        low, high = sorted((start, near.after))
+        return TimeWindow(low, min(high + 1, MAX_NS))
+    if growing:
+        return TimeWindow(max(now - LONGEST_NS, MIN_NS) if start is None else start, MAX_NS)
+    believed = written is not None and FIRST_BAGS_NS <= written <= last_believed(now)
+    end = min(written + FUTURE_NS, MAX_NS) if believed and written is not None else None
+    if start is None:
+        return None if end is None else TimeWindow(end - LONGEST_NS, end)
+    longest = min(start + LONGEST_NS, MAX_NS)
+    # A file that was last written before it began was recorded by another clock than it lies under.
+    return TimeWindow(start, longest if end is None or end <= start else min(end, longest))
