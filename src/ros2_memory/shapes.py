@@ -7,21 +7,21 @@ finite number is null. `notes` is there only where there is something to say.
 
 from __future__ import annotations
 
-import math
 from functools import singledispatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory import answers
+from ros2_memory.figures import degrees, local, metres, moment, rounded, seconds, with_notes
 from ros2_memory.fitting import compact, without_constant_zeros
 from ros2_memory.geometry import normalised, yaw
-from ros2_memory.timebase import Ns, iso_local, unix_from_ns, unix_rounded_up
+from ros2_memory.timebase import Ns, unix_rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.fitting import JsonObject
-    from ros2_memory.model import JsonValue, Quaternion, SetAside, Vector3
+    from ros2_memory.model import JsonValue, Quaternion, SetAside
 
 Answer: TypeAlias = (
     tuple[answers.TopicRow, ...]
@@ -69,7 +69,7 @@ def _time_range(answer: answers.TimeRange, bag_dir: Path) -> JsonObject:
         {
             "start": unix_rounded_up(gap.start),
             "end": unix_rounded_up(gap.end),
-            "duration_s": _seconds(gap.end - gap.start),
+            "duration_s": seconds(gap.end - gap.start),
         }
         for gap in answer.gaps
     ]
@@ -84,12 +84,12 @@ def _time_range(answer: answers.TimeRange, bag_dir: Path) -> JsonObject:
         if len(rows) > _NEWEST_LISTED:
             notes.append(f"{name}: the last {_NEWEST_LISTED} of {len(rows)} are listed")
     reply: JsonObject = {
-        "earliest": _moment(answer.earliest),
-        "latest": _moment(answer.latest),
-        "earliest_local": _local(answer.earliest),
-        "latest_local": _local(answer.latest),
-        "now": _moment(answer.now),
-        "now_local": _local(answer.now),
+        "earliest": moment(answer.earliest),
+        "latest": moment(answer.latest),
+        "earliest_local": local(answer.earliest),
+        "latest_local": local(answer.latest),
+        "now": moment(answer.now),
+        "now_local": local(answer.now),
         "bags": answer.bags,
     }
     for name, rows in lists.items():
@@ -97,7 +97,7 @@ def _time_range(answer: answers.TimeRange, bag_dir: Path) -> JsonObject:
         if len(rows) > _NEWEST_LISTED:
             reply[f"{name}_count"] = len(rows)
     reply["silent_topics"] = answer.silent_topics
-    return _with_notes(reply, notes)
+    return with_notes(reply, notes)
 
 
 def _files(files: Sequence[SetAside], bag_dir: Path) -> list[JsonValue]:
@@ -159,7 +159,7 @@ def _range_of(
         "total": answer.total,
         "samples": samples,
     }
-    return _with_notes(reply, notes)
+    return with_notes(reply, notes)
 
 
 @shown.register(answers.Position)
@@ -167,8 +167,8 @@ def _position(answer: answers.Position, _bag_dir: Path) -> JsonObject:
     pose = answer.pose
     unit = None if pose.orientation is None else normalised(pose.orientation)
     reply: JsonObject = {
-        **_xyz(pose.position),
-        "yaw_deg": _degrees(None if unit is None else yaw(unit)),
+        **metres(pose.position),
+        "yaw_deg": degrees(None if unit is None else yaw(unit)),
         "timestamp": unix_rounded_up(answer.time),
         "topic": answer.topic,
         "frame_id": pose.frame_id or None,
@@ -179,8 +179,8 @@ def _position(answer: answers.Position, _bag_dir: Path) -> JsonObject:
 @shown.register(answers.Velocity)
 def _velocity(answer: answers.Velocity, _bag_dir: Path) -> JsonObject:
     reply: JsonObject = {
-        "linear": _xyz(answer.twist.linear),
-        "angular": _xyz(answer.twist.angular),
+        "linear": metres(answer.twist.linear),
+        "angular": metres(answer.twist.angular),
         "timestamp": unix_rounded_up(answer.time),
         "topic": answer.topic,
         "frame_id": answer.twist.frame_id or None,
@@ -192,9 +192,9 @@ def _velocity(answer: answers.Velocity, _bag_dir: Path) -> JsonObject:
 def _transform(answer: answers.TransformAt, _bag_dir: Path) -> JsonObject:
     rotation = _upright(answer.transform.rotation)
     reply: JsonObject = {
-        "translation": _xyz(answer.transform.translation),
-        "rotation": {name: _rounded(part, 6) for name, part in zip("xyzw", rotation, strict=True)},
-        "yaw_deg": _degrees(yaw(rotation)),
+        "translation": metres(answer.transform.translation),
+        "rotation": {name: rounded(part, 6) for name, part in zip("xyzw", rotation, strict=True)},
+        "yaw_deg": degrees(yaw(rotation)),
         "timestamp": unix_rounded_up(answer.time),
         "parent": answer.parent,
         "child": answer.child,
@@ -215,7 +215,7 @@ def _frames(answer: answers.Frames, _bag_dir: Path) -> JsonObject:
             {"parent": edge.parent, "child": edge.child, "static": edge.static} for edge in edges
         ],
     }
-    return _with_notes(reply, answer.notes)
+    return with_notes(reply, answer.notes)
 
 
 @shown.register(answers.Match)
@@ -251,22 +251,22 @@ def _value_when(answer: answers.ValueWhen, _bag_dir: Path) -> JsonObject | None:
 
 def _no_match(notes: Sequence[str]) -> JsonObject | None:
     """`null` after a complete search; a search that could not look everywhere says so instead."""
-    return _with_notes({"match": None}, notes) if notes else None
+    return with_notes({"match": None}, notes) if notes else None
 
 
 @shown.register(answers.TrajectorySummary)
 def _trajectory(answer: answers.TrajectorySummary, _bag_dir: Path) -> JsonObject:
     way = answer.trajectory
     reply: JsonObject = {
-        "distance_m": _rounded(way.distance_m, 4),
-        "avg_speed": _rounded(way.avg_speed, 4),
-        "max_speed": _rounded(way.max_speed, 4),
-        "duration_s": _rounded(way.duration_s, 3),
+        "distance_m": rounded(way.distance_m, 4),
+        "avg_speed": rounded(way.avg_speed, 4),
+        "max_speed": rounded(way.max_speed, 4),
+        "duration_s": rounded(way.duration_s, 3),
         "waypoints": [
             {
                 "timestamp": unix_rounded_up(point.time),
-                **_xyz(point.position),
-                "yaw_deg": _degrees(point.yaw_rad),
+                **metres(point.position),
+                "yaw_deg": degrees(point.yaw_rad),
             }
             for point in way.waypoints
         ],
@@ -290,47 +290,19 @@ def _trajectory(answer: answers.TrajectorySummary, _bag_dir: Path) -> JsonObject
         notes.append("max_speed is measured from positions: the messages state no speed")
     if way.waypoint_error_m > FINE_PATH_M:
         notes.append(f"the path lies within {way.waypoint_error_m:.2f} m of the waypoints' line")
-    return _with_notes(reply, notes)
+    return with_notes(reply, notes)
 
 
 def _finished(reply: JsonObject, age: Ns | None, notes: Sequence[str]) -> JsonObject:
-    aged = reply if age is None else {**reply, "age_s": _seconds(age)}
-    return _with_notes(aged, notes)
-
-
-def _with_notes(reply: JsonObject, notes: Sequence[str]) -> JsonObject:
-    return {**reply, "notes": [*notes]} if notes else reply
+    aged = reply if age is None else {**reply, "age_s": seconds(age)}
+    return with_notes(aged, notes)
 
 
 def _once(*notes: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(note for some in notes for note in some))
 
 
-def _moment(at: Ns | None) -> float | None:
-    return None if at is None else unix_rounded_up(at)
-
-
-def _local(at: Ns | None) -> str | None:
-    return None if at is None else iso_local(at)
-
-
-def _seconds(duration: Ns) -> float:
-    return round(unix_from_ns(duration), 3)
-
-
-def _xyz(vector: Vector3) -> JsonObject:
-    return {name: _rounded(part, 4) for name, part in zip("xyz", vector, strict=True)}
-
-
-def _degrees(angle: float | None) -> float | None:
-    return None if angle is None else _rounded(math.degrees(angle), 2)
-
-
 def _upright(rotation: Quaternion) -> Quaternion:
     """Of the two quaternions of one rotation the one with w >= 0."""
     x, y, z, w = rotation
     return (-x, -y, -z, -w) if w < 0 else rotation
-
-
-def _rounded(number: float, places: int) -> float | None:
-    return round(number, places) if math.isfinite(number) else None
