@@ -1,4 +1,4 @@
-"""One tool call from arguments to reply: a worker thread, a deadline, one log event.
+"""One tool call from arguments to reply: its turn, a worker thread, a deadline, one log event.
 
 Nothing escapes: what a query raises becomes a reply, and what it should not have raised is logged
 with its traceback under the call's correlation id, which is all that the client learns of it.
@@ -15,20 +15,27 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import anyio
-import anyio.to_thread
 import structlog
-from mcp.server.mcpserver import MCPServer
+from mcp.server.mcpserver import Context, MCPServer
 from mcp.types import CallToolResult, TextContent, ToolAnnotations
 from mcp.types import Tool as ListedTool
+from starlette.requests import Request
 
-from ros2_memory.errors import EpisodicError, InvalidArgumentsError, NoDataError, QueryTimeoutError
+from ros2_memory.errors import (
+    BusyError,
+    EpisodicError,
+    InvalidArgumentsError,
+    NoDataError,
+    QueryTimeoutError,
+)
 from ros2_memory.glimpse import glimpse
+from ros2_memory.lanes import Lane
 from ros2_memory.logs import get_logger
 from ros2_memory.memory import Call
 from ros2_memory.timebase import Deadline, ms_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Hashable, Mapping, Sequence
 
     from ros2_memory.entries import Question, Tool
     from ros2_memory.memory import Memory
@@ -41,9 +48,13 @@ BLOCKING_AT_ONCE: Final = 2
 Those that may take long have places of their own, so that a quick one never waits for them.
 """
 
+MESSAGES_PATH: Final = "/messages/"
+"""Where the clients of event streams post, each with its session in the query string."""
+
 _SOONER_S: Final = 0.5
 """How much before the call a query gives up, so that its own sentence is what the client reads."""
 
+_WORTH_TELLING_S: Final = 0.5
 _LOGGED_CHARS: Final = 300
 _LONGEST_NAME: Final = 64
 
@@ -60,16 +71,23 @@ class Dispatcher:
         self._tools = {tool.name: tool for tool in tools}
         self._replies = replies
         self._call_timeout_s = call_timeout_s
-        self._quick = anyio.CapacityLimiter(QUICK_AT_ONCE)
-        self._blocking = anyio.CapacityLimiter(BLOCKING_AT_ONCE)
+        self.quick = Lane("quick", QUICK_AT_ONCE)
+        self.blocking = Lane("blocking", BLOCKING_AT_ONCE)
         self._stopping = threading.Event()
 
     def stop(self) -> None:
-        """Has every query that still runs give up, so that the program can end."""
+        """Has every query that still runs give up, and begins no other: the program can end."""
         self._stopping.set()
+        self.quick.stop()
+        self.blocking.stop()
 
-    async def answer(self, name: str, given: Mapping[str, object]) -> Reply:
-        """The reply to one call, within `call_timeout_s`. Raises nothing but cancellation."""
+    async def answer(
+        self, name: str, given: Mapping[str, object], client: Hashable = None
+    ) -> Reply:
+        """The reply to one call, within `call_timeout_s`. Raises nothing but cancellation.
+
+        Where there are more calls than places, they are begun in turn for each `client`.
+        """
         begun = time.perf_counter_ns()
         patience_s = max(self._call_timeout_s - _SOONER_S, self._call_timeout_s * 0.9)
         over = threading.Event()
@@ -77,7 +95,7 @@ class Dispatcher:
         outcome, chars = "cancelled", 0
         with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
             try:
-                outcome, reply = await self._outcome(name, given, call)
+                outcome, reply = await self._outcome(name, given, call, client)
                 chars = len(reply.text)
             finally:
                 over.set()
@@ -97,23 +115,36 @@ class Dispatcher:
         return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
 
     async def _outcome(
-        self, name: str, given: Mapping[str, object], call: Call
+        self, name: str, given: Mapping[str, object], call: Call, client: Hashable
     ) -> tuple[str, Reply]:
         try:
             tool = self._tool(name)
             question = tool.question(given)
         except InvalidArgumentsError as error:
             return error.code, self._replies.error(error)
-        places = self._blocking if tool.blocking else self._quick
-        with anyio.move_on_after(self._call_timeout_s):
-            return await anyio.to_thread.run_sync(
-                self._ask, question, call, abandon_on_cancel=True, limiter=places
+        waits = _Waits()
+        lane = self.blocking if tool.blocking else self.quick
+        late: EpisodicError
+        try:
+            with anyio.move_on_after(self._call_timeout_s):
+                return await lane.run(client, partial(self._ask, question, call, waits))
+        except BusyError as busy:
+            late = busy
+        else:
+            late = self._late(name, waits)
+        return late.code, self._replies.error(late)
+
+    def _late(self, name: str, waits: _Waits) -> EpisodicError:
+        """Why there is no answer when the time of a call is up."""
+        if waits.ended_s is None:
+            return BusyError(
+                f"{name} waited {self._call_timeout_s:g} s behind other questions and was not "
+                "begun; ask again, and fewer at once"
             )
-        late = QueryTimeoutError(
-            f"{name} needs more than {self._call_timeout_s:g} s; "
+        return QueryTimeoutError(
+            f"{name} needs more than {self._call_timeout_s:g} s{waits.told()}; "
             "ask about a shorter window or a single topic"
         )
-        return late.code, self._replies.error(late)
 
     def _tool(self, name: str) -> Tool:
         if name in self._tools:
@@ -124,18 +155,41 @@ class Dispatcher:
         )
         raise InvalidArgumentsError(f"there is no tool {glimpse(name)}; {hint}")
 
-    def _ask(self, question: Question, call: Call) -> tuple[str, Reply]:
+    def _ask(self, question: Question, call: Call, waits: _Waits) -> tuple[str, Reply]:
         """Runs in a worker thread: the query, and the rendering of what it gives."""
+        waits.end()
         try:
             return "ok", self._replies.answer(question(self._memory, call))
         except NoDataError as error:
             return f"{error.code}: {error.reason}", self._replies.error(error)
+        except QueryTimeoutError as error:
+            told = QueryTimeoutError(f"{error}{waits.told()}", error.searched_back_to)
+            return told.code, self._replies.error(told)
         except EpisodicError as error:
             return error.code, self._replies.error(error)
         except Exception:
             log.exception("tool_failed")
             context = structlog.contextvars.get_contextvars()
             return "internal", self._replies.internal(str(context.get("correlation_id")))
+
+
+class _Waits:
+    """How long a call waited for its turn."""
+
+    def __init__(self) -> None:
+        self._begun_s = time.monotonic()
+        self.ended_s: float | None = None
+
+    def end(self) -> None:
+        """Its turn has come."""
+        self.ended_s = time.monotonic()
+
+    def told(self) -> str:
+        """What a sentence on lack of time says of it; nothing where it was short."""
+        waited = 0.0 if self.ended_s is None else self.ended_s - self._begun_s
+        if waited < _WORTH_TELLING_S:
+            return ""
+        return f" (it waited {waited:.1f} s of its time behind other questions)"
 
 
 class EpisodicServer(MCPServer[object]):
@@ -166,11 +220,25 @@ class EpisodicServer(MCPServer[object]):
         self, name: str, arguments: Mapping[str, object], context: object | None = None
     ) -> CallToolResult:
         """One call's reply as one text block. Raises nothing but cancellation."""
-        del context
-        reply = await self.dispatcher.answer(name, arguments)
+        client = _client(context)
+        reply = await self.dispatcher.answer(name, arguments, client)
         return CallToolResult(
             content=[TextContent(type="text", text=reply.text)], is_error=reply.is_error
         )
+
+
+def _client(context: object) -> Hashable:
+    """Who asks, as far as it can be told: an event stream's session, or an address and a program.
+
+    Calls over `/mcp` have no session. None over stdio, which has one client.
+    """
+    request = context.request_context.request if isinstance(context, Context) else None
+    if not isinstance(request, Request):
+        return None
+    session = request.query_params.get("session_id")
+    if session is not None and request.url.path.startswith(MESSAGES_PATH):
+        return session
+    return (request.client.host if request.client else "", request.headers.get("user-agent", ""))
 
 
 def _listed(tool: Tool) -> ListedTool:

@@ -5,6 +5,7 @@
     |-- InvalidArgumentsError     invalid_arguments  a question that cannot be asked
     |-- NoDataError               no_data            an answer: there is nothing, and why
     |-- QueryTimeoutError         timeout            the question needs more than call_timeout_s
+    |-- BusyError                 busy               it was not even begun: others were before it
     |-- BagError                  bag_unreadable     a file that cannot be read at all
     |   `-- BagVanishedError      bag_unreadable     it is gone (retention, unmount)
     |-- UndecodableError          undecodable        a message whose bytes mean nothing to us
@@ -73,6 +74,12 @@ class QueryTimeoutError(EpisodicError):
     def __init__(self, sentence: str, searched_back_to: int | None = None) -> None:
         super().__init__(sentence)
         self.searched_back_to = searched_back_to
+
+
+class BusyError(EpisodicError):
+    """The question was not begun, because others were before it; the sentence says what to do."""
+
+    code = "busy"
 
 
 class BagError(EpisodicError):

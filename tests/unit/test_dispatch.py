@@ -16,6 +16,7 @@ from ros2_memory import answers
 from ros2_memory.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher, EpisodicServer
 from ros2_memory.entries import Tool
 from ros2_memory.errors import InvalidArgumentsError, NoDataError, NoDataReason, QueryTimeoutError
+from ros2_memory.lanes import MOST_WAITING
 from ros2_memory.memory import Memory
 from ros2_memory.model import Sample
 from ros2_memory.replies import Replies
@@ -255,6 +256,104 @@ async def test_a_query_gives_up_when_its_client_no_longer_waits(log: LogCapture)
         tasks.cancel_scope.cancel()
     assert ended.wait(10)
     assert [entry["outcome"] for entry in log.entries] == ["cancelled"]
+
+
+class Held:
+    """A slow question that lasts until the test lets it end; it counts how often it was begun."""
+
+    def __init__(self) -> None:
+        self.released = threading.Event()
+        self.begun = 0
+
+    def ask(self, call: Call) -> Answer:
+        self.begun += 1
+        assert self.released.wait(20)
+        return value(self.begun)
+
+
+async def test_one_client_that_floods_the_server_does_not_starve_another() -> None:
+    held = Held()
+    slow = tool("slow", held.ask, blocking=True)
+    search = tool("search", lambda _call: value("found"), blocking=True)
+    dispatcher = served(slow, search).dispatcher
+    async with anyio.create_task_group() as tasks:
+        for _ in range(64):
+            tasks.start_soon(dispatcher.answer, "slow", {}, "flood")
+        await anyio.wait_all_tasks_blocked()
+        assert dispatcher.blocking.waiting == 64 - BLOCKING_AT_ONCE
+
+        async def other() -> None:
+            reply = await dispatcher.answer("search", {}, "other")
+            assert json.loads(reply.text)["value"] == "found"
+            # All of the flood but what ran and was next still waits.
+            assert dispatcher.blocking.waiting >= 64 - 3 * BLOCKING_AT_ONCE
+
+        tasks.start_soon(other)
+        await anyio.wait_all_tasks_blocked()
+        held.released.set()
+    assert held.begun == 64
+
+
+async def test_a_call_that_waits_for_all_of_its_time_is_told_that_the_server_is_busy(
+    log: LogCapture,
+) -> None:
+    held = Held()
+    dispatcher = served(tool("slow", held.ask, blocking=True), timeout_s=0.05).dispatcher
+    replies: list[str] = []
+
+    async def call() -> None:
+        replies.append((await dispatcher.answer("slow", {})).text)
+
+    async with anyio.create_task_group() as tasks:
+        for _ in range(BLOCKING_AT_ONCE + 2):
+            tasks.start_soon(call)
+    held.released.set()
+    told = [json.loads(text) for text in replies]
+    assert sorted(each["error"] for each in told) == ["busy", "busy", "timeout", "timeout"]
+    [detail] = {each["detail"] for each in told if each["error"] == "busy"}
+    assert detail == (
+        "slow waited 0.05 s behind other questions and was not begun; ask again, and fewer at once"
+    )
+    assert held.begun == BLOCKING_AT_ONCE
+    assert dispatcher.blocking.waiting == 0
+
+
+async def test_questions_that_cannot_be_stopped_do_not_become_ever_more_threads() -> None:
+    held = Held()
+    dispatcher = served(tool("stuck", held.ask), timeout_s=0.02).dispatcher
+    for _ in range(3 * QUICK_AT_ONCE):
+        reply = await dispatcher.answer("stuck", {})
+        assert json.loads(reply.text)["error"] in {"timeout", "busy"}
+    assert held.begun == QUICK_AT_ONCE
+    held.released.set()
+
+
+async def test_a_timeout_after_a_wait_says_how_long_the_wait_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ros2_memory.dispatch._WORTH_TELLING_S", 0.0)
+    late = tool("late", raising(QueryTimeoutError("too long", 5)))
+    reply = await served(late).dispatcher.answer("late", {})
+    told = json.loads(reply.text)
+    assert told["detail"] == "too long (it waited 0.0 s of its time behind other questions)"
+    assert "searched_back_to" in told
+
+
+async def test_more_calls_than_may_wait_are_told_so() -> None:
+    held = Held()
+    dispatcher = served(tool("slow", held.ask, blocking=True)).dispatcher
+    told: list[Any] = []
+
+    async def call() -> None:
+        told.append(json.loads((await dispatcher.answer("slow", {}, "flood")).text))
+
+    async with anyio.create_task_group() as tasks:
+        for _ in range(MOST_WAITING + BLOCKING_AT_ONCE + 5):
+            tasks.start_soon(call)
+        await anyio.wait_all_tasks_blocked()
+        assert [each["error"] for each in told] == ["busy"] * 5
+        held.released.set()
+    assert len(told) == MOST_WAITING + BLOCKING_AT_ONCE + 5
 
 
 async def test_stopping_has_running_queries_give_up() -> None:
