@@ -4,19 +4,17 @@ Everything here is derived: deleting the file changes no answer, only how long i
 is of one file, told by its path below the bag directory, its size and mtime and the mtime of the
 sidecar that says which of its messages count, under one way of reading (a hash of the
 configuration). An entry never changes; what takes its place has another number, and numbers are
-not used twice.
+not used twice: not even where another file takes the place of this one.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import sqlite3
-import threading
-from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+import time
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.catalogue_file import open_base, set_aside
+from ros2_memory.catalogue_base import KeptBase
 from ros2_memory.catalogue_sql import (
     EVIDENCE,
     drop,
@@ -28,16 +26,15 @@ from ros2_memory.catalogue_sql import (
     put,
 )
 from ros2_memory.digest import EdgeDigest
-from ros2_memory.logs import get_logger
 from ros2_memory.packing import filled, shape_of_text, unpacked_poses
 from ros2_memory.recorder.standing import FormerFile
 from ros2_memory.storage.base import Channel, Record, Schema
 
 if TYPE_CHECKING:
+    import sqlite3
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.catalogue_file import Opened
     from ros2_memory.digest import Digest
     from ros2_memory.evidence import Evidence
     from ros2_memory.model import BagFile
@@ -46,10 +43,6 @@ if TYPE_CHECKING:
 
 FOLDER: Final = ".episodic"
 FILE: Final = "catalogue.sqlite"
-
-T = TypeVar("T")
-
-log = get_logger(__name__)
 
 
 class BagKey(NamedTuple):
@@ -75,39 +68,61 @@ class Catalogue:
         places: where the file may lie, in order of preference; memory where none can be written.
         config: what digests depend on besides the bag, as a hash.
         waits_for: a directory; until it exists, nothing is opened or made.
+        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
-        self, places: Sequence[Path], config: str, *, waits_for: Path | None = None
+        self,
+        places: Sequence[Path],
+        config: str,
+        *,
+        waits_for: Path | None = None,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config = config
-        self._lock = threading.Lock()
-        self._places = tuple(places)
-        self._waits_for = waits_for
-        self._closed = False
-        self._opened: Opened | None = None
+        self._base = KeptBase(places, waits_for=waits_for, monotonic=monotonic)
+        self._read = self._base.read
+        self._write = self._base.write
         self._channels: dict[int, Channel] = {}
 
     @property
     def path(self) -> Path | None:
         """Where the file lies; None in memory, and before there is one."""
-        with self._lock:
-            opened = self._ready()
-        return None if opened is None else opened.path
+        return self._base.path
+
+    @property
+    def trouble(self) -> str | None:
+        """Why it is not what it should be, for the operator; None where nothing is amiss."""
+        return self._base.trouble
+
+    @property
+    def is_failing(self) -> bool:
+        """Whether it could not be written or asked when that was last tried."""
+        return self._base.is_failing
+
+    @property
+    def failures(self) -> int:
+        """How often it could not be asked: what was read meanwhile may lack something."""
+        return self._base.failures
+
+    def look_after(self) -> None:
+        """Goes back to the file where it was lost; may wait for another program."""
+        self._base.look_after()
 
     def close(self) -> None:
         """Ends; afterwards nothing is known of any bag."""
-        with self._lock:
-            self._closed = True
-            if self._opened is not None:
-                self._opened.base.close()
-                self._opened = None
+        self._base.close()
+
+    def is_same_base(self, number: int, other: int) -> bool:
+        """Whether two numbers are of one file: those of another say nothing of this one."""
+        return self._base.is_same(number, other)
 
     def newest(self) -> int:
         """The greatest number of any entry: it grows with each one that is added, by whomever."""
 
         def ask(base: sqlite3.Connection) -> int:
-            return int(base.execute("SELECT max(id) FROM bags").fetchone()[0] or 0)
+            last = base.execute("SELECT max(id) FROM bags").fetchone()[0]
+            return self._base.first + int(last or 0)
 
         return self._read(ask, 0)
 
@@ -143,8 +158,9 @@ class Catalogue:
         """The number of each file's entry; None where there is none, or it is of other bytes."""
 
         def ask(base: sqlite3.Connection) -> dict[BagKey, int]:
+            first = self._base.first
             rows = keys_rows(base, self._config, [key.path for key in keys])
-            return {BagKey(*key): number for number, *key in rows}
+            return {BagKey(*key): first + number for number, *key in rows}
 
         found: dict[BagKey, int] = self._read(ask, {})
         return [found.get(key) for key in keys]
@@ -153,7 +169,9 @@ class Catalogue:
         """What the entries say of the topic; those that hold none of it are left out."""
 
         def ask(base: sqlite3.Connection) -> dict[int, Evidence]:
-            return {row[0]: evidence_of(row) for row in held_rows(base, EVIDENCE, topic, numbers)}
+            first, here = self._base.first, self._base.here(numbers)
+            rows = held_rows(base, EVIDENCE, topic, here)
+            return {first + row[0]: evidence_of(row) for row in rows}
 
         return self._read(ask, {})
 
@@ -161,8 +179,13 @@ class Catalogue:
         """The poses of the topic in the entries; those that are not all poses are left out."""
 
         def ask(base: sqlite3.Connection) -> dict[int, PoseDigest]:
-            rows = held_rows(base, "poses", topic, numbers)
-            return {number: unpacked_poses(packed) for number, packed in rows if packed is not None}
+            first, here = self._base.first, self._base.here(numbers)
+            rows = held_rows(base, "poses", topic, here)
+            return {
+                first + number: unpacked_poses(packed)
+                for number, packed in rows
+                if packed is not None
+            }
 
         return self._read(ask, {})
 
@@ -173,12 +196,13 @@ class Catalogue:
             columns = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
             pairs: dict[str, tuple[tuple[str, str], ...]] = {}
             found: dict[int, EdgeDigest] = {}
-            for number, text, first, last in held_rows(base, columns, topic, numbers):
+            here = self._base.here(numbers)
+            for number, text, first, last in held_rows(base, columns, topic, here):
                 if text is None:
                     continue
                 if text not in pairs:
                     pairs[text] = tuple((parent, child) for parent, child in json.loads(text))
-                found[number] = EdgeDigest(pairs[text], first, last)
+                found[self._base.first + number] = EdgeDigest(pairs[text], first, last)
             return found
 
         return self._read(ask, {})
@@ -187,14 +211,14 @@ class Catalogue:
         """All messages of the topic in the entries that keep them."""
 
         def ask(base: sqlite3.Connection) -> dict[int, tuple[Record, ...]]:
-            found: dict[int, list[Record]] = {
-                number: [] for number, keeps in held_rows(base, "kept", topic, numbers) if keeps
-            }
+            first, here = self._base.first, self._base.here(numbers)
+            held = held_rows(base, "kept", topic, here)
+            found: dict[int, list[Record]] = {number: [] for number, keeps in held if keeps}
             rows = kept_rows(base, topic, [*found])
             for number, channel, log_time, publish_time, payload in rows:
                 record = Record(self._channel(base, channel), log_time, publish_time, payload)
                 found[number].append(record)
-            return {number: tuple(records) for number, records in found.items()}
+            return {first + number: tuple(records) for number, records in found.items()}
 
         return self._read(ask, {})
 
@@ -202,30 +226,38 @@ class Catalogue:
         """By type, why messages of the topic in the entries cannot be decoded; mostly nothing."""
 
         def ask(base: sqlite3.Connection) -> dict[int, dict[str, str]]:
-            rows = held_rows(base, "undecodable", topic, numbers)
-            return {number: {} if text is None else json.loads(text) for number, text in rows}
+            first, here = self._base.first, self._base.here(numbers)
+            rows = held_rows(base, "undecodable", topic, here)
+            return {
+                first + number: {} if text is None else json.loads(text) for number, text in rows
+            }
 
         return self._read(ask, {})
 
-    def remembered(self, question: str) -> str | None:
-        """The answer that was worked out from entries, if they all stand."""
+    def remembered(self, question: str, numbers: Sequence[int]) -> str | None:
+        """The answer that was worked out from these entries, if they all stand."""
 
         def ask(base: sqlite3.Connection) -> str | None:
+            here = self._base.here(numbers)
+            if len(here) < len(numbers):
+                return None
             row = base.execute(
-                "SELECT answer FROM remembered WHERE question = ?", (question,)
+                "SELECT answer FROM remembered WHERE question = ?", (_named(question, here),)
             ).fetchone()
             return None if row is None else str(row[0])
 
         return self._read(ask, None)
 
     def remember(self, question: str, numbers: Sequence[int], answer: str) -> None:
-        """Keeps an answer until the oldest of the entries goes; the question names them all."""
+        """Keeps what was worked out from these entries, until the oldest of them goes."""
 
         def write(base: sqlite3.Connection) -> None:
-            base.execute(
-                "INSERT OR REPLACE INTO remembered VALUES (?, ?, ?)",
-                (question, min(numbers), answer),
-            )
+            here = self._base.here(numbers)
+            if len(here) == len(numbers):
+                base.execute(
+                    "INSERT OR REPLACE INTO remembered VALUES (?, ?, ?)",
+                    (_named(question, here), min(here), answer),
+                )
 
         self._write(write)
 
@@ -267,72 +299,20 @@ class Catalogue:
 
     def _channel(self, base: sqlite3.Connection, number: int) -> Channel:
         """The channel of a number: one object for all records, as decoders are found by it."""
-        if number not in self._channels:
+        known = self._base.first + number
+        if known not in self._channels:
             topic, encoding, latched, name, kind, text = base.execute(
                 "SELECT topic, encoding, latched, schema_name, schema_encoding, schema_text"
                 " FROM channels WHERE id = ?",
                 (number,),
             ).fetchone()
             schema = Schema(name, kind, text)
-            self._channels[number] = Channel(topic, encoding, schema, bool(latched))
-        return self._channels[number]
+            self._channels[known] = Channel(topic, encoding, schema, bool(latched))
+        return self._channels[known]
 
-    def _read(self, ask: Callable[[sqlite3.Connection], T], unknown: T) -> T:
-        """What the base says; `unknown` where it cannot be asked."""
-        with self._lock:
-            opened = self._ready()
-            if opened is None:
-                return unknown
-            try:
-                return ask(opened.base)
-            # Rows of a damaged file hold anything.
-            except (sqlite3.Error, ValueError, TypeError, LookupError) as error:
-                self._failed(error)
-                return unknown
 
-    def _write(self, write: Callable[[sqlite3.Connection], None]) -> bool:
-        with self._lock:
-            opened = self._ready()
-            if opened is None:
-                return False
-            base = opened.base
-            try:
-                base.execute("BEGIN IMMEDIATE")
-                write(base)
-                base.execute("COMMIT")
-            except sqlite3.Error as error:
-                with suppress(sqlite3.Error):
-                    base.execute("ROLLBACK")
-                self._failed(error)
-                return False
-            # A number or text that SQLite does not hold: the bags stay without an entry.
-            except (ValueError, OverflowError) as error:
-                base.execute("ROLLBACK")
-                log.warning("catalogue_refused", reason=str(error))
-                return False
-            return True
-
-    def _ready(self) -> Opened | None:
-        """The open base; None where there is none yet, or no more."""
-        if self._opened is None and not self._closed:
-            if self._waits_for is not None and not self._waits_for.is_dir():
-                return None
-            self._opened = open_base(self._places)
-        return self._opened
-
-    def _failed(self, error: Exception) -> None:
-        """A base that is only busy or full is asked again; any other is set aside."""
-        opened = self._opened
-        path = None if opened is None else opened.path
-        if isinstance(error, sqlite3.OperationalError):
-            log.warning("catalogue_failed", path=str(path), reason=str(error))
-            return
-        self._opened = None
-        self._channels = {}
-        if opened is not None:
-            opened.base.close()
-            if opened.path is not None:
-                set_aside(opened.path, f"it is damaged: {error}")
+def _named(question: str, numbers: Sequence[int]) -> str:
+    return json.dumps([question, *numbers])
 
 
 def relative(path: Path, bag_dir: Path) -> str:

@@ -15,7 +15,26 @@ if TYPE_CHECKING:
 VERSION: Final = 1
 """Of the tables below and of what stands in them; a file of any other is set aside."""
 
-_BUSY_S: Final = 1.0
+BUSY_S: Final = 1.0
+"""How long another program that holds the file is waited for."""
+
+_SHORT_MS: Final = 20
+"""How long one attempt may wait: whoever asks a question waits for it too."""
+_PASSING: Final = frozenset(
+    {
+        sqlite3.SQLITE_BUSY,
+        sqlite3.SQLITE_LOCKED,
+        sqlite3.SQLITE_FULL,
+        sqlite3.SQLITE_IOERR,
+        sqlite3.SQLITE_CANTOPEN,
+        sqlite3.SQLITE_READONLY,
+        sqlite3.SQLITE_PERM,
+        sqlite3.SQLITE_NOMEM,
+        sqlite3.SQLITE_PROTOCOL,
+    }
+)
+"""Faults of the machine, or of the moment: the file may be whole."""
+_WAL: Final = "-wal"
 _TABLES: Final = """
 CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, path TEXT NOT NULL,
   size INTEGER NOT NULL, mtime INTEGER NOT NULL, sidecar INTEGER NOT NULL,
@@ -44,26 +63,93 @@ log = get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """An open base, and its file; None in memory."""
+    """An open base, and its file; None in memory.
+
+    `file` and `log` tell the file and its write-ahead log from others of the same name.
+    """
 
     base: sqlite3.Connection
     path: Path | None
+    file: tuple[int, int] | None = None
+    log: tuple[int, int] | None = None
+
+    def is_in_place(self) -> bool:
+        """Whether the names still lead to what is open; also where that cannot be told."""
+        if self.path is None:
+            return True
+        try:
+            return self.file == _identity(self.path) and not self.is_mixed()
+        except OSError:
+            return True
+
+    def is_mixed(self) -> bool:
+        """Whether the file lies there and its write-ahead log is another, or gone.
+
+        What another program makes of the two is no base.
+        """
+        if self.path is None or self.log is None or self.file != _identity(self.path):
+            return False
+        return self.log != _identity(_beside(self.path, _WAL))
 
 
-def open_base(places: Sequence[Path]) -> Opened:
-    """The base at the first place that can be written; in memory where none can."""
+def open_file(places: Sequence[Path], *, again: bool = False) -> Opened | str:
+    """The base at the first place that can be written; why not where none can.
+
+    Args:
+        places: where it may lie, in order of preference.
+        again: that this was tried before: what is as it was is not told once more.
+    """
+    reason = ""
     for path in places:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            return Opened(_ready(path), path)
+            base = _ready(path)
+            base.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
+            return Opened(base, path, _identity(path), _identity(_beside(path, _WAL)))
         except _LockedError:
-            log.warning("catalogue_locked", path=str(path), instead="memory")
-            break
+            tell = log.debug if again else log.warning
+            tell("catalogue_locked", path=str(path), instead="memory")
+            return "another program holds its file"
         except (OSError, sqlite3.Error) as error:
-            log.info("catalogue_place_refused", path=str(path), reason=str(error))
+            tell = log.debug if again else log.info
+            tell("catalogue_place_refused", path=str(path), reason=str(error))
+            reason = str(error.strerror if isinstance(error, OSError) else error)
+    return f"no file can be written for it ({reason})"
+
+
+def in_memory() -> Opened:
+    """An empty base in memory."""
     base = _connected(":memory:")
     base.executescript(_TABLES)
     return Opened(base, None)
+
+
+def is_passing(error: Exception) -> bool:
+    """Whether the base may work again as it is."""
+    return isinstance(error, MemoryError) or _code(error) in _PASSING
+
+
+def is_busy(error: Exception) -> bool:
+    """Whether another program holds the base."""
+    return _code(error) in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}
+
+
+def _code(error: Exception) -> int:
+    """SQLite's primary code; 0 where the error is not of SQLite itself."""
+    code: object = getattr(error, "sqlite_errorcode", 0)
+    return code & 0xFF if isinstance(code, int) else 0
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name + suffix)
 
 
 class _LockedError(Exception):
@@ -92,7 +178,7 @@ def _ready(path: Path) -> sqlite3.Connection:
             continue
         except sqlite3.OperationalError as error:
             base.close()
-            if error.sqlite_errorcode & 0xFF in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+            if is_busy(error):
                 raise _LockedError from error
             raise
         except sqlite3.DatabaseError as error:
@@ -104,7 +190,7 @@ def _ready(path: Path) -> sqlite3.Connection:
 
 
 def _connected(target: str) -> sqlite3.Connection:
-    return sqlite3.connect(target, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+    return sqlite3.connect(target, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
 
 
 def _prepare(base: sqlite3.Connection) -> None:
@@ -128,6 +214,6 @@ def set_aside(path: Path, reason: str) -> None:
     """Makes room for a new file; the old one stays beside it for whoever wants to look."""
     aside = path.with_name(f"{path.name}.aside")
     log.warning("catalogue_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
-    for suffix in ("-wal", "-shm"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)
+    for suffix in (_WAL, "-shm"):
+        _beside(path, suffix).unlink(missing_ok=True)
     path.rename(aside)

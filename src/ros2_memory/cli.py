@@ -13,7 +13,7 @@ from ros2_memory.bootstrap import build_filler, build_memory
 from ros2_memory.config import load_settings
 from ros2_memory.demo.run import DemoOptions, run_demo
 from ros2_memory.errors import ConfigError, EpisodicError
-from ros2_memory.indexing import Bar, fill, orphaned, step_back
+from ros2_memory.indexing import Bar, die_with, fill, orphaned, step_back
 from ros2_memory.logs import configure_logging
 from ros2_memory.recovery import recover
 
@@ -62,7 +62,10 @@ def _recover(arguments: argparse.Namespace) -> int:
 
 def _index(arguments: argparse.Namespace) -> int:
     settings = load_settings(arguments.overrides)
-    serving: bool = arguments.for_server
+    server: int | None = arguments.for_server
+    serving = server is not None
+    if server is not None and not die_with(server):
+        return _CANNOT_START
     configure_logging(settings.logging.level if serving else "warning", settings.logging.format)
     memory = build_memory(settings)
     filler = build_filler(settings, memory)
@@ -119,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
     indexing.add_argument(
         "overrides", nargs="*", metavar="key=value", help="settings, as for ros2-memory-server"
     )
-    indexing.add_argument("--for-server", action="store_true", help=argparse.SUPPRESS)
+    indexing.add_argument("--for-server", type=int, metavar="PID", help=argparse.SUPPRESS)
     recovering = commands.add_parser(
         "recover",
         help="repair MCAP files that a crash, a full disk or a pulled plug left unfinished",

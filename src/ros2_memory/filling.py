@@ -26,7 +26,7 @@ from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from ros2_memory.recall import bags_without_entry
 from ros2_memory.recorder.layout import HANDOVER_FILE
 from ros2_memory.recorder.scan import settled
-from ros2_memory.timebase import ms_from_ns
+from ros2_memory.timebase import NS_PER_S, Ns, ms_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from ros2_memory.digest import Digester
     from ros2_memory.memory import Memory
     from ros2_memory.model import BagFile
-    from ros2_memory.timebase import Ns
 
 log = get_logger(__name__)
 
@@ -46,6 +45,9 @@ TIDY_S: Final = 600.0
 
 LAST_S: Final = 9.2e9
 """Unix seconds after everything that was ever recorded."""
+
+AGAIN_NS: Final[Ns] = 600 * NS_PER_S
+"""After this long a bag that could not be digested is tried again: the disk may have failed."""
 
 _MOST_REFUSED: Final = 10_000
 
@@ -73,7 +75,7 @@ class Filler:
         self._memory = memory
         self._digester = digester
         self._bag_dir = bag_dir
-        self._refused: dict[BagKey, str] = {}
+        self._refused: dict[BagKey, Ns] = {}
 
     def waiting(self) -> list[BagFile]:
         """The bags to be digested, the newest first."""
@@ -81,13 +83,14 @@ class Filler:
         if recall is None:
             return []
         missing = bags_without_entry(self._memory.index.snapshot().runs, recall)
-        return [bag for bag in reversed(missing) if self._key(bag) not in self._refused]
+        return [bag for bag in reversed(missing) if not self._is_refused(self._key(bag))]
 
     def progress(self) -> Progress:
         """How far the catalogue is."""
         bags = self._memory.index.snapshot().bags
         closed = sum(bag.state is BagState.CLOSED for bag in bags)
-        return Progress(closed, len(self.waiting()), len(self._refused))
+        refused = sum(self._is_refused(key) for key in list(self._refused))
+        return Progress(closed, len(self.waiting()), refused)
 
     def digest(self, bag: BagFile) -> bool:
         """Digests one bag; False where it must wait, was changed meanwhile, or is refused."""
@@ -116,6 +119,24 @@ class Filler:
         return True
 
     @property
+    def cannot_write(self) -> bool:
+        """Whether what was digested last could not be kept."""
+        recall = self._memory.recall
+        return recall is not None and recall.catalogue.is_failing
+
+    @property
+    def trouble(self) -> str | None:
+        """Why the catalogue is not what it should be; None where nothing is amiss."""
+        recall = self._memory.recall
+        return None if recall is None else recall.catalogue.trouble
+
+    def look_after(self) -> None:
+        """Has the catalogue go back to its file, unless the bag directory itself is away."""
+        recall = self._memory.recall
+        if recall is not None and self._memory.index.snapshot().problem is None:
+            recall.catalogue.look_after()
+
+    @property
     def in_memory(self) -> bool:
         """Whether no other process could see what is written."""
         recall = self._memory.recall
@@ -128,10 +149,14 @@ class Filler:
             trajectory_summary(self._memory, Call(), Span(start_s=0.0, end_s=LAST_S))
 
     def tidy(self) -> None:
-        """Drops the entries of files that are gone, and those of other configurations."""
+        """Drops the entries of files that are gone, and those of other configurations.
+
+        Not while there are no bags at all.
+        """
         recall = self._memory.recall
         snapshot = self._memory.index.snapshot()
-        if recall is None or snapshot.problem is not None:
+        # Where no bag is left the disk of the bags is rather missing than empty.
+        if recall is None or snapshot.problem is not None or not snapshot.bags:
             return
         there = {self._key(bag).path for run in snapshot.runs for bag in run.bags}
         recall.catalogue.forget([path for path in recall.catalogue.paths() if path not in there])
@@ -155,7 +180,11 @@ class Filler:
         log.warning("bag_not_digested", path=str(bag.path), reason=reason)
         if len(self._refused) >= _MOST_REFUSED:
             self._refused.clear()
-        self._refused[self._key(bag)] = reason
+        self._refused[self._key(bag)] = self._memory.clock.now()
+
+    def _is_refused(self, key: BagKey) -> bool:
+        since = self._refused.get(key)
+        return since is not None and abs(self._memory.clock.now() - since) < AGAIN_NS
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
@@ -169,9 +198,12 @@ async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> 
     tidied = -math.inf
     while True:
         try:
+            await anyio.to_thread.run_sync(filler.look_after, abandon_on_cancel=True)
             waiting = await anyio.to_thread.run_sync(filler.waiting, abandon_on_cancel=True)
-            if len(waiting) <= BACKLOG or filler.in_memory or not await _helped(helper):
-                await _digest(filler, waiting[:BACKLOG])
+            if len(waiting) > BACKLOG and not filler.in_memory and await _helped(helper):
+                # What it could not digest is tried here, and refused if need be.
+                waiting = await anyio.to_thread.run_sync(filler.waiting, abandon_on_cancel=True)
+            await _digest(filler, waiting[:BACKLOG])
             if time.monotonic() - tidied > TIDY_S:
                 await anyio.to_thread.run_sync(filler.tidy, abandon_on_cancel=True)
                 tidied = time.monotonic()
@@ -184,6 +216,8 @@ async def _digest(filler: Filler, bags: Sequence[BagFile]) -> None:
     done = 0
     for bag in bags:
         done += await anyio.to_thread.run_sync(filler.digest, bag, abandon_on_cancel=True)
+        if filler.cannot_write:
+            return
     if done:
         await anyio.to_thread.run_sync(filler.warm, abandon_on_cancel=True)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
 import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TextIO
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
 NICENESS: Final = 15
 """So low that whoever answers meanwhile goes first."""
 
+_PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 _ROUND: Final = 64
 """Bags that are digested before it is looked what has closed meanwhile."""
 _WIDTH: Final = 40
@@ -74,6 +77,19 @@ def fill(filler: Filler, bar: Bar | None, abandoned: Callable[[], bool]) -> Prog
     if bar is not None:
         bar.end(progress)
     return progress
+
+
+def die_with(parent: int) -> bool:
+    """Has the system kill this process when its parent dies; whether that still lives.
+
+    What is killed loses nothing: entries are written whole or not at all.
+
+    Args:
+        parent: the number of the process that started this one.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    return os.getppid() == parent
 
 
 def orphaned() -> Callable[[], bool]:

@@ -6,9 +6,8 @@ long as somebody has it; only a run with bags that have no entry yet is looked a
 
 from __future__ import annotations
 
-import json
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, TypeVar
 from weakref import WeakKeyDictionary
 
 from ros2_memory.catalogue import BagKey
@@ -16,7 +15,7 @@ from ros2_memory.evidence import OPEN, Boxes, united
 from ros2_memory.model import BagState
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.catalogue import Catalogue
@@ -27,15 +26,21 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.timeline import Run
     from ros2_memory.storage.base import Record
 
+T = TypeVar("T")
+
+_IN_DOUBT: Final = -1
+"""The state of a catalogue that could not be asked."""
+
 
 class RunNotes:
     """What the catalogue says of one run. Bags without an entry are not spoken of."""
 
     def __init__(self, catalogue: Catalogue, run: Run, bag_dir: Path, as_of: int) -> None:
         self._catalogue = catalogue
-        self.as_of = as_of
+        before = catalogue.failures
         closed = [bag for bag in run.bags if bag.state is BagState.CLOSED]
         numbers = catalogue.find([BagKey.of(bag, bag_dir) for bag in closed])
+        self.as_of = as_of if catalogue.failures == before else _IN_DOUBT
         self.numbers: dict[Path, int] = {
             bag.path: number
             for bag, number in zip(closed, numbers, strict=True)
@@ -58,9 +63,7 @@ class RunNotes:
 
     def evidence_of_all(self, topic: str) -> Evidence:
         """What can have stood in any message of the topic in the bags with an entry."""
-        if topic not in self._evidence:
-            self._evidence[topic] = united(self.evidence(topic).values())
-        return self._evidence[topic]
+        return self._kept_as(self._evidence, topic, lambda: united(self.evidence(topic).values()))
 
     def evidence(self, topic: str) -> Mapping[int, Evidence]:
         """For each entry that holds the topic what can have stood in it."""
@@ -71,9 +74,7 @@ class RunNotes:
 
     def boxes(self, topic: str) -> Boxes:
         """The places in the evidence; kept, since they are few numbers and asked for often."""
-        if topic not in self._boxes:
-            self._boxes[topic] = Boxes(self.evidence(topic))
-        return self._boxes[topic]
+        return self._kept_as(self._boxes, topic, lambda: Boxes(self.evidence(topic)))
 
     def poses(self, topic: str) -> Mapping[int, PoseDigest]:
         """For each entry that has it the digest of its poses."""
@@ -81,21 +82,31 @@ class RunNotes:
 
     def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
         """For each entry that has them the frame edges."""
-        if topic not in self._edges:
-            self._edges[topic] = self._catalogue.edges(topic, self._of(topic))
-        return self._edges[topic]
+        return self._kept_as(
+            self._edges, topic, lambda: self._catalogue.edges(topic, self._of(topic))
+        )
 
     def kept(self, topic: str) -> Mapping[int, tuple[Record, ...]]:
         """For each entry that keeps them all messages of the topic."""
-        if topic not in self._kept:
-            self._kept[topic] = self._catalogue.kept(topic, self._of(topic))
-        return self._kept[topic]
+        return self._kept_as(
+            self._kept, topic, lambda: self._catalogue.kept(topic, self._of(topic))
+        )
 
     def undecodable(self, topic: str) -> Mapping[int, Mapping[str, str]]:
         """For each entry, by message type, why messages of the topic cannot be decoded."""
-        if topic not in self._undecodable:
-            self._undecodable[topic] = self._catalogue.undecodable(topic, self._of(topic))
-        return self._undecodable[topic]
+        return self._kept_as(
+            self._undecodable, topic, lambda: self._catalogue.undecodable(topic, self._of(topic))
+        )
+
+    def _kept_as(self, known: dict[str, T], topic: str, ask: Callable[[], T]) -> T:
+        """What was worked out before, or is now; kept unless the catalogue failed meanwhile."""
+        if topic in known:
+            return known[topic]
+        before = self._catalogue.failures
+        found = ask()
+        if self._catalogue.failures == before:
+            known[topic] = found
+        return found
 
     def _of(self, topic: str) -> list[int]:
         return self._holding.get(topic, [])
@@ -118,7 +129,7 @@ class Recall:
         """What is known of a run, at that state of the catalogue or a later one."""
         with self._lock:
             known = self._runs.get(run)
-        if known is None or (not known.whole and known.as_of != as_of):
+        if known is None or not self._holds(known, as_of):
             known = RunNotes(self.catalogue, run, self._bag_dir, as_of)
             with self._lock:
                 self._runs[run] = known
@@ -126,11 +137,17 @@ class Recall:
 
     def remembered(self, question: str, numbers: Sequence[int]) -> str | None:
         """What was once worked out from these entries."""
-        return self.catalogue.remembered(_named(question, numbers))
+        return self.catalogue.remembered(question, numbers)
 
     def remember(self, question: str, numbers: Sequence[int], answer: str) -> None:
         """Keeps what was worked out from these entries, for as long as they stand."""
-        self.catalogue.remember(_named(question, numbers), numbers, answer)
+        self.catalogue.remember(question, numbers, answer)
+
+    def _holds(self, known: RunNotes, as_of: int) -> bool:
+        """Whether another look would say no more."""
+        if known.as_of == as_of:
+            return True
+        return known.whole and self.catalogue.is_same_base(known.as_of, as_of)
 
 
 def bags_without_entry(runs: Sequence[Run], recall: Recall) -> list[BagFile]:
@@ -143,7 +160,3 @@ def bags_without_entry(runs: Sequence[Run], recall: Recall) -> list[BagFile]:
         for bag in run.bags
         if bag.state is BagState.CLOSED and bag.path not in notes.numbers
     ]
-
-
-def _named(question: str, numbers: Sequence[int]) -> str:
-    return json.dumps([question, *numbers])

@@ -140,7 +140,8 @@ async def _in_background(
     memory: Memory, filler: Filler, every_s: float, overrides: Sequence[str]
 ) -> None:
     """Keeps the index fresh and the catalogue full, until it is cancelled."""
-    helper = [sys.executable, "-m", "ros2_memory.cli", "index", "--for-server", "--", *overrides]
+    program = [sys.executable, "-m", "ros2_memory.cli", "index"]
+    helper = [*program, "--for-server", str(os.getpid()), "--", *overrides]
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(keep_fresh, memory, every_s)
         tasks.start_soon(keep_filled, filler, helper, every_s)

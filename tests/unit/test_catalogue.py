@@ -184,7 +184,7 @@ def test_a_file_of_a_newer_version_is_set_aside(tmp_path: Path) -> None:
 def test_a_locked_file_is_left_alone_and_memory_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ros2_memory.catalogue_file._BUSY_S", 0.01)
+    monkeypatch.setattr("ros2_memory.catalogue_file.BUSY_S", 0.01)
     made(tmp_path)
     path = tmp_path / FOLDER / FILE
     with closing(sqlite3.connect(path, isolation_level=None)) as other:

@@ -1,0 +1,95 @@
+"""A memory with everything in it that a server has, and questions that every answer shows in."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ros2_memory import queries
+from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.config import load_settings
+from ros2_memory.errors import EpisodicError
+from ros2_memory.indexing import fill
+from ros2_memory.memory import Call
+from ros2_memory.moments import Moment, Span
+from ros2_memory.timebase import NS_PER_S, FixedClock
+from tests.bags import McapLayout, detections, odom, tf, transform, write_mcap
+from tests.memories import memory_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ros2_memory.filling import Filler
+    from ros2_memory.memory import Memory
+
+T0_S = 1_700_000_000
+T0 = T0_S * NS_PER_S
+NOW = FixedClock(T0 + 1_000_000 * NS_PER_S)
+
+
+def write_bags(bag_dir: Path, count: int = 12, *, first: int = 0) -> list[Path]:
+    """Bags of ten seconds, each with odometry, transforms and a thing of its own."""
+    return [write_bag(bag_dir, number) for number in range(first, first + count)]
+
+
+def write_bag(bag_dir: Path, number: int) -> Path:
+    start = T0 + number * 10 * NS_PER_S
+    messages = [odom(start + n * NS_PER_S // 2, number + n / 20, 0.0) for n in range(20)]
+    fixed = transform(start, "base_link", f"laser_{number % 3}", (0.1, 0.0, 0.0))
+    messages.append(tf(start, fixed, topic="/tf_static"))
+    messages.append(detections(start + NS_PER_S, ["cup", f"thing{number}"]))
+    layout = McapLayout(chunk_size=500)
+    path = write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages, layout)
+    os.utime(path, ns=(start, start))
+    return path
+
+
+def told(memory: Memory, *, count: int = 12) -> list[str]:
+    """What is answered: topics, frames, searches that find and that find nothing, the way driven.
+
+    An error of the tree is an answer too.
+    """
+    span = Span(start_s=T0_S, end_s=T0_S + 10 * count)
+    place = '{"x": 4.0, "y": 0.0}'
+
+    def last(wanted: str) -> Callable[[], object]:
+        return partial(queries.find_last_match, memory, Call(), "/vision/*", "contains", wanted)
+
+    asked: list[Callable[[], object]] = [
+        lambda: queries.list_recorded_topics(memory, Call()),
+        lambda: queries.frames(memory, Call()),
+        *(last(wanted) for wanted in ("thing3", "never", "cup", f"thing{count - 1}")),
+        lambda: queries.find_last_match(memory, Call(), "/odom", "near_position", place),
+        lambda: queries.trajectory_summary(memory, Call(), span),
+        lambda: queries.topic_value(memory, Call(), "/odom", Moment(at_s=T0_S + 42.0)),
+    ]
+    answers = []
+    for ask in asked:
+        try:
+            answers.append(repr(ask()))
+        except EpisodicError as error:
+            answers.append(repr(error))
+    return answers
+
+
+def served(bag_dir: Path) -> tuple[Memory, Filler]:
+    """A memory as the server builds it, and what fills its catalogue."""
+    settings = load_settings((), {"MEMORY_BAG_DIR": str(bag_dir)})
+    memory = build_memory(settings)
+    # Every question looks, and the clock stands long after the bags.
+    plain = memory_of(bag_dir, clock=NOW)
+    memory = replace(memory, clock=NOW, index=plain.index, reader=plain.reader)
+    return memory, build_filler(settings, memory)
+
+
+def fill_up(filler: Filler) -> None:
+    """Digests all that waits."""
+    fill(filler, None, lambda: False)
+
+
+def plainly(bag_dir: Path, *, count: int = 12) -> list[str]:
+    """What is answered without a catalogue, by a memory that has seen nothing before."""
+    return told(memory_of(bag_dir, clock=NOW), count=count)
