@@ -148,20 +148,30 @@ class BagFile(NamedTuple):
     def recording(self) -> Path:
         """The rosbag2 recording that this file is a split of: its directory."""
         folder, slash, _ = self.file.rpartition("/")
-        return _path(folder or slash)
+        return _folder(folder or slash)
 
 
+# Apart, since a pass over all files would drive out the folders.
 @lru_cache(maxsize=_PATHS_AT_HAND)
 def _path(text: str) -> Path:
     return Path(text)
 
 
+@lru_cache(maxsize=_PATHS_AT_HAND)
+def _folder(text: str) -> Path:
+    return Path(text)
+
+
 @dataclass(frozen=True, slots=True)
 class SetAside:
-    """A file that does not answer: active, damaged, or of a kind that the reader does not read."""
+    """A file that does not answer: active, damaged, or of a kind that the reader does not read.
+
+    `written` is when it was last written to; None where that is not known, or goes on.
+    """
 
     path: Path
     reason: str
+    written: Ns | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -148,8 +148,9 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
     held = [(bag, topic) for bag in ordered for topic in bag.summary.topics]
     names = sorted({topic.topic for _, topic in held})
     assert timeline.bags == tuple(ordered)
-    assert timeline.earliest == min((bag.start for bag in bags), default=None)
-    assert timeline.latest == max((bag.end for bag in bags), default=None)
+    snapshot = Snapshot(timeline=timeline)
+    assert snapshot.earliest == min((bag.start for bag in bags), default=None)
+    assert snapshot.latest == max((bag.end for bag in bags), default=None)
     assert timeline.silent == {name for bag in bags for name in bag.summary.silent}
     assert timeline.latched == {topic.topic for _, topic in held if topic.latched}
     assert timeline.types == {

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+from ros2_memory.recorder import bearings
 from ros2_memory.recorder.timeline import RUN_LIMIT, Timeline
 
 if TYPE_CHECKING:
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.model import BagFile, SetAside, TimeWindow
+    from ros2_memory.recorder.clock_faults import Dating
     from ros2_memory.recorder.timeline import Extent, Held, Run, Span, Stated
     from ros2_memory.timebase import Ns
 
@@ -49,13 +51,36 @@ class Snapshot:
 
     @property
     def earliest(self) -> Ns | None:
-        """Log time of the first message in any bag; None without bags."""
-        return self._timeline.earliest
+        """Log time of the first message in any bag that its date does not refute; None without."""
+        return self._dates.earliest
 
     @property
     def latest(self) -> Ns | None:
-        """Log time of the last message in any bag (inclusive); None without bags."""
-        return self._timeline.latest
+        """Log time of the last message (inclusive) in such a bag; None without one."""
+        return self._dates.latest
+
+    @cached_property
+    def _dates(self) -> Dating:
+        return bearings.dating(self._timeline, self.scanned_at, with_steps=False)
+
+    @cached_property
+    def dating(self) -> Dating:
+        """What the dates and the order of all bags tell of the clocks that dated them."""
+        return bearings.dating(self._timeline, self.scanned_at, with_steps=True)
+
+    @cached_property
+    def places(self) -> Mapping[SetAside, TimeWindow | None]:
+        """Of the files set aside, when their messages may have been recorded; None: unknown."""
+        timeline, now = self._timeline, self.scanned_at
+        return {
+            aside: bearings.place(timeline, aside, now, growing=growing)
+            for asides, growing in (
+                (self.active, True),
+                (self.damaged, False),
+                (self.unread, False),
+            )
+            for aside in asides
+        }
 
     def topics(self) -> tuple[str, ...]:
         """The topics of which some bag holds a message, sorted."""
@@ -76,6 +101,24 @@ class Snapshot:
     def overlapping(self, window: TimeWindow) -> tuple[BagFile, ...]:
         """The bags whose span has a moment in the window, in bag order."""
         return self._timeline.overlapping(window)
+
+    def odd(self, window: TimeWindow) -> list[BagFile]:
+        """The bags of which something is amiss and may bear on the window, in bag order.
+
+        That of a bag which a crash left open reaches on to the last time its file was written to,
+        if that was within a day.
+        """
+        return [
+            bag
+            for run in self._odd_runs
+            if run.bags[0].start < window.stop
+            for bag in run.odd
+            if window.overlaps(bag.start, bearings.lost_until(bag))
+        ]
+
+    @cached_property
+    def _odd_runs(self) -> list[Run]:
+        return [run for run in self.runs if run.odd]
 
     def types_of(self, topic: str) -> tuple[str, ...]:
         """The message types under which the topic was heard, sorted; empty where it was not."""

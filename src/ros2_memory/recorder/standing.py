@@ -268,7 +268,8 @@ def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
 
 
 def _aside(standing: Standing, notes: FileNotes, reason: str) -> Verdict:
-    return Verdict(standing, aside=SetAside(notes.path, reason))
+    written = None if standing is Standing.ACTIVE else notes.stamp.mtime_ns
+    return Verdict(standing, aside=SetAside(notes.path, reason, written))
 
 
 def _not_read(notes: FileNotes) -> str:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ros2_memory.model import BagState
+from ros2_memory.recorder.courses import courses_of
 from ros2_memory.recorder.layout import CARRY_FILE, is_carried
 
 if TYPE_CHECKING:
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.model import BagFile, TimeWindow, TopicSummary
+    from ros2_memory.recorder.courses import Course, Series
     from ros2_memory.summaries import Shape
     from ros2_memory.timebase import Ns
 
@@ -105,6 +108,23 @@ class Run:
         return self.bags
 
     @cached_property
+    def folders(self) -> frozenset[str]:
+        """The folders in which the bags lie."""
+        return frozenset([bag.file[: bag.file.rfind("/")] for bag in self.bags])
+
+    @cached_property
+    def courses(self) -> dict[Series, Course]:
+        """How far each recording's splits reach among the bags, by their count."""
+        return courses_of(self.bags)
+
+    @cached_property
+    def odd(self) -> tuple[BagFile, ...]:
+        """The bags of which not all could be read, or that contradict themselves."""
+        return tuple(
+            bag for bag in self.bags if bag.state is BagState.INCOMPLETE or bag.summary.notes
+        )
+
+    @cached_property
     def _alike(self) -> tuple[_Alike, ...]:
         """The bags by shape. Most runs have one."""
         places: dict[int, list[int]] = {}
@@ -168,10 +188,13 @@ class Run:
         for at, first, last in zip(*(each[rows].tolist() for each in columns), strict=True):
             yield Extent(self.bags[at], first, last)
 
-    @property
-    def held(self) -> dict[str, tuple[Held, ...]]:
-        """`holding` of every topic."""
-        return {topic: tuple(self.holding(topic)) for topic in self.spans}
+    def bags_with(self, topic: str) -> tuple[BagFile, ...]:
+        """The bags that hold messages of the topic, in order; `bags` itself where all do."""
+        if all(topic in alike.shape.places for alike in self._alike):
+            return self.bags
+        column = self._column(topic)
+        places = [] if column is None else column.at.tolist()
+        return tuple(self.bags[at] for at in dict.fromkeys(places))
 
     def _column(self, topic: str) -> _Column | None:
         """What is held of a topic; None where nothing is."""
@@ -306,16 +329,6 @@ class Timeline:
         tells of itself where there is no other.
         """
         return tuple(chain.from_iterable(run.recorded for run in self._runs)) or self.bags
-
-    @property
-    def earliest(self) -> Ns | None:
-        """Log time of the first message that was recorded and is kept; None without bags."""
-        return self.recorded[0].start if self._runs else None
-
-    @cached_property
-    def latest(self) -> Ns | None:
-        """Log time of the last message (inclusive); None without bags."""
-        return max((run.latest for run in self._runs), default=None)
 
     @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:

@@ -1,0 +1,70 @@
+"""What the bags of a timeline tell of clocks, and of the files between them that cannot be read."""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import TYPE_CHECKING
+
+from ros2_memory.model import BagState, TimeWindow
+from ros2_memory.recorder.clock_faults import Part, dating_of
+from ros2_memory.recorder.courses import neighbours, steps_of
+from ros2_memory.recorder.whereabouts import LONGEST_NS, whereabouts
+from ros2_memory.timebase import MAX_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.model import BagFile, SetAside
+    from ros2_memory.recorder.clock_faults import Dating
+    from ros2_memory.recorder.courses import StepBack
+    from ros2_memory.recorder.timeline import Run, Timeline
+    from ros2_memory.timebase import Ns
+
+
+def dating(timeline: Timeline, now: Ns, *, with_steps: bool) -> Dating:
+    """What the dates of the bags come to; the bag of carried messages dates nothing.
+
+    `with_steps` looks at the order of the splits too, which takes a moment where bags are many.
+    """
+
+    def around(first: Ns, last: Ns) -> Sequence[BagFile]:
+        return timeline.overlapping(TimeWindow(first, min(last + 1, MAX_NS)))
+
+    steps = _steps(timeline.runs) if with_steps else []
+    return dating_of(_parts(timeline.runs), steps, now, around)
+
+
+def place(timeline: Timeline, aside: SetAside, now: Ns, *, growing: bool) -> TimeWindow | None:
+    """When the messages of a file that was set aside may have been recorded; None: unknown."""
+    folder = str(aside.path.parent)
+    runs = [run for run in timeline.runs if folder in run.folders]
+    courses = [run.courses for run in runs]
+    near = neighbours(str(aside.path), courses, lambda at: _bags(runs, at))
+    return whereabouts(aside.path.parent.name, near, aside.written, now, growing=growing)
+
+
+def lost_until(bag: BagFile) -> Ns:
+    """Until when (inclusive) a bag may have recorded what cannot be read of it."""
+    written = bag.mtime_ns
+    behind = bag.state is BagState.INCOMPLETE and bag.end < written <= bag.end + LONGEST_NS
+    return written if behind else bag.end
+
+
+def _parts(runs: Sequence[Run]) -> list[Part]:
+    parts = [
+        Part(
+            run.recorded,
+            run.latest if run.recorded is run.bags else max(bag.end for bag in run.recorded),
+        )
+        for run in runs
+        if run.recorded
+    ]
+    return parts or [Part(run.bags, run.latest) for run in runs]
+
+
+def _steps(runs: Sequence[Run]) -> list[StepBack]:
+    return steps_of([run.courses for run in runs], lambda at: _bags(runs, at))
+
+
+def _bags(runs: Sequence[Run], at: Sequence[int]) -> chain[BagFile]:
+    return chain.from_iterable(runs[number].bags for number in at)
