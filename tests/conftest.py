@@ -1,6 +1,5 @@
 """What holds for every test."""
 
-import atexit
 import os
 import shutil
 from collections.abc import Iterator
@@ -9,6 +8,9 @@ from tempfile import mkdtemp
 import pytest
 import structlog
 from hypothesis import settings
+from xdist.remote import Producer
+
+from tests.workers import Groups, place
 
 # A loaded machine is slow, not wrong.
 settings.register_profile("steady", deadline=None)
@@ -16,8 +18,23 @@ settings.load_profile("steady")
 
 # Also for the programs that tests start: nothing is to be left in the user's own.
 _CACHE = mkdtemp(prefix="ros2-memory-tests-")
-atexit.register(shutil.rmtree, _CACHE, ignore_errors=True)
 os.environ["XDG_CACHE_HOME"] = _CACHE
+
+
+def pytest_unconfigure() -> None:
+    """Removes what tests left in that cache."""
+    shutil.rmtree(_CACHE, ignore_errors=True)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest first, so that the others are done meanwhile."""
+    items.sort(key=lambda item: place(item.nodeid))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Groups:
+    """Tests that share a worker, see `tests/workers.py`."""
+    return Groups(config, log)
 
 
 @pytest.fixture(autouse=True)
