@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.recorder import bearings
 from ros2_memory.recorder.timeline import RUN_LIMIT, Timeline
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from ros2_memory.timebase import Ns
 
 __all__ = ["RUN_LIMIT", "Snapshot", "Timeline"]
+
+_PLACED: Final = 500
 
 
 @dataclass(frozen=True)
@@ -70,16 +72,18 @@ class Snapshot:
 
     @cached_property
     def places(self) -> Mapping[SetAside, TimeWindow | None]:
-        """Of the files set aside, when their messages may have been recorded; None: unknown."""
+        """Of the files set aside, when their messages may have been recorded; None: unknown.
+
+        Of very many files that cannot be read only the last ones are placed.
+        """
         timeline, now = self._timeline, self.scanned_at
+        asides = [(aside, True) for aside in self.active]
+        asides += [(aside, False) for aside in (*self.damaged, *self.unread)]
         return {
             aside: bearings.place(timeline, aside, now, growing=growing)
-            for asides, growing in (
-                (self.active, True),
-                (self.damaged, False),
-                (self.unread, False),
-            )
-            for aside in asides
+            if growing or number >= len(asides) - _PLACED
+            else None
+            for number, (aside, growing) in enumerate(asides)
         }
 
     def topics(self) -> tuple[str, ...]:

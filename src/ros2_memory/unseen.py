@@ -1,0 +1,104 @@
+"""What a question's window touched and could not be read: part of the answer, never passed over.
+
+Named are, the first few of each and the others counted:
+
+- files that were not read at all: damaged, or of a kind that is not read here. Such a file says
+  nothing of its times, so it counts where its recording and its own date have it lie (see
+  `recorder.whereabouts`): an old one that nobody removes is not part of every answer for ever. One
+  whose time is unknown counts where the answer is that there is nothing, since it may hold it.
+- the file that is still being written, from the end of the split before it on;
+- bags that a crash left open, on to the last time that their files were written to;
+- closed bags of which parts could not be read, or that contradict themselves.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ros2_memory.model import BagState
+from ros2_memory.reading import short_name
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, unix_rounded_up
+from ros2_memory.wording import NAMED, counted, listed, shortened
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.model import BagFile, SetAside, TimeWindow
+    from ros2_memory.reading import Reading
+    from ros2_memory.recorder.snapshot import Snapshot
+
+
+def note_unseen(view: Reading, window: TimeWindow, *, nothing: bool = False) -> None:
+    """Notes what of a window could not be read; `nothing`: the answer is that there is nothing."""
+    if window.empty:
+        return
+    for sentence in unseen(view.snapshot, window, nothing=nothing):
+        view.note(sentence)
+
+
+def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> Iterator[str]:
+    """The sentences for a window; none where all of it was read."""
+    lost = [
+        aside
+        for aside in (*snapshot.damaged, *snapshot.unread)
+        if _touches(snapshot.places[aside], window, unknown=nothing)
+    ]
+    if lost:
+        yield not_read(lost)
+    active = [
+        aside for aside in snapshot.active if _touches(snapshot.places[aside], window, unknown=True)
+    ]
+    if active:
+        yield _still_written(snapshot, active, window)
+    odd = snapshot.odd(window)
+    if odd:
+        yield from _left_open([bag for bag in odd if bag.state is BagState.INCOMPLETE])
+        yield from _odd([bag for bag in odd if bag.state is BagState.CLOSED])
+
+
+def not_read(files: Sequence[SetAside]) -> str:
+    """The sentence on files that no question can look into, the latest ones named."""
+    names = [f"{short_name(each.path)} ({shortened(each.reason)})" for each in files[-NAMED:]]
+    what = counted(len(files), "bag file")
+    return f"{what} could not be read and may hold more: {listed(names, len(files))}"
+
+
+def _touches(place: TimeWindow | None, window: TimeWindow, *, unknown: bool) -> bool:
+    if place is None:
+        return unknown
+    return place.start < window.stop and window.start < place.stop
+
+
+def _still_written(snapshot: Snapshot, active: Sequence[SetAside], window: TimeWindow) -> str:
+    latest = snapshot.latest
+    if latest is not None and window.stop - 1 - AT_OR_BEFORE_SLACK_NS > latest:
+        return (
+            f"the split being written is not included: nothing after {unix_rounded_up(latest):.6f}"
+        )
+    names = [short_name(each.path) for each in active]
+    return f"still being written and not included: {listed(names)}"
+
+
+def _left_open(bags: Sequence[BagFile]) -> Iterator[str]:
+    if bags:
+        names = [_with_notes(bag) for bag in bags[-NAMED:]]
+        yield (
+            f"{counted(len(bags), 'bag')} left open by a crash; what is readable is used: "
+            f"{listed(names, len(bags))}"
+        )
+
+
+def _odd(bags: Sequence[BagFile]) -> Iterator[str]:
+    for bag in bags[-NAMED:]:
+        yield f"{short_name(bag.path)}: {shortened('; '.join(bag.summary.notes))}"
+    if len(bags) > NAMED:
+        yield f"{counted(len(bags) - NAMED, 'older bag')} of this time {_are(bags)} odd too"
+
+
+def _are(bags: Sequence[BagFile]) -> str:
+    return "is" if len(bags) - NAMED == 1 else "are"
+
+
+def _with_notes(bag: BagFile) -> str:
+    name = short_name(bag.path)
+    return f"{name} ({shortened('; '.join(bag.summary.notes))})" if bag.summary.notes else name
