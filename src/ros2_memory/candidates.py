@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 class Stretch(NamedTuple):
-    """A half-open span of time and the bags in it that are not ruled out."""
+    """A half-open span of time and the files in it that are not ruled out."""
 
     window: TimeWindow
-    bags: frozenset[Path]
+    bags: frozenset[str]
     recordings: frozenset[Path]
 
 
@@ -102,7 +102,7 @@ class Candidates:
         for bag, first, last in run.extents(topic):
             if first >= self._until:
                 continue
-            number = known.get(bag.path)
+            number = known.get(bag.file)
             if number is None or number in possible:
                 yield _Candidate(first, last, bag)
             else:
@@ -123,6 +123,6 @@ def _stretch(group: Sequence[_Candidate], start: Ns, until: Ns) -> Stretch:
     bags = [each.bag for each in group]
     return Stretch(
         TimeWindow(start, stop),
-        frozenset(bag.path for bag in bags),
+        frozenset(bag.file for bag in bags),
         frozenset(bag.recording for bag in bags),
     )

@@ -56,7 +56,7 @@ class BagKey(NamedTuple):
     @classmethod
     def of(cls, bag: BagFile, bag_dir: Path) -> BagKey:
         """The key of a bag of the index."""
-        return cls(relative(bag.path, bag_dir), bag.size, bag.mtime_ns, bag.sidecar_ns)
+        return cls(below(bag.file, str(bag_dir)), bag.size, bag.mtime_ns, bag.sidecar_ns)
 
 
 class Catalogue:

@@ -113,7 +113,7 @@ def _known_pairs(
     rest = [
         (first, last + 1)
         for bag, first, last in run.extents(topic)
-        if numbers.get(bag.path, 0) not in edges
+        if numbers.get(bag.file, 0) not in edges
     ]
     return known, rest
 

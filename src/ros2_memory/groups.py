@@ -79,7 +79,7 @@ class Group:
             return sum(1 for _ in self.once())
         bag = self.whole()
         if bag is not None:
-            return sum(each.count for each in bag.summary.topics if each.topic == self._topic)
+            return sum(each.count for each in bag.summary.of(self._topic))
         return len(self._located())
 
     def fetch(self, indices: Sequence[int]) -> Iterator[Found]:

@@ -371,7 +371,7 @@ def _undecodable_types(view: View, topic: str) -> dict[str, str]:
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     bag = view.snapshot.first_with(topic, type_name)
     entry = view.entry(bag)
-    known = None if entry is None else entry[0].undecodable(topic).get(entry[1])
+    known = None if entry is None else entry[0].undecodable(topic, entry[1])
     if known is not None:
         return known.get(type_name)
     reasons = [

@@ -65,7 +65,7 @@ class Reading:
     def entry(self, bag: BagFile) -> tuple[RunNotes, int] | None:
         """The notes that speak of a bag and the number of its entry; None where it has none."""
         notes = self.recalled(self.snapshot.run_of(bag))
-        number = None if notes is None else notes.numbers.get(bag.path)
+        number = None if notes is None else notes.numbers.get(bag.file)
         return None if notes is None or number is None else (notes, number)
 
     def used(self, found: Iterator[Found]) -> Iterator[Found]:

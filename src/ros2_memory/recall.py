@@ -33,7 +33,12 @@ _IN_DOUBT: Final = -1
 
 
 class RunNotes:
-    """What the catalogue says of one run. Bags without an entry are not spoken of."""
+    """What the catalogue says of one run. Bags without an entry are not spoken of.
+
+    Attributes:
+        numbers: by file, the number of its entry.
+        whole: whether every bag of the run has one.
+    """
 
     def __init__(self, catalogue: Catalogue, run: Run, bag_dir: Path, as_of: int) -> None:
         self._catalogue = catalogue
@@ -41,25 +46,22 @@ class RunNotes:
         closed = [bag for bag in run.bags if bag.state is BagState.CLOSED]
         numbers = catalogue.find([BagKey.of(bag, bag_dir) for bag in closed])
         self.as_of = as_of if catalogue.failures == before else _IN_DOUBT
-        self.numbers: dict[Path, int] = {
-            bag.path: number
+        self.numbers: dict[str, int] = {
+            bag.file: number
             for bag, number in zip(closed, numbers, strict=True)
             if number is not None
         }
         self.whole = len(self.numbers) == len(run.bags)
+        every = [*self.numbers.values()]
         self._holding: dict[str, list[int]] = {
-            topic: [
-                self.numbers[path]
-                for path in dict.fromkeys(bag.path for bag, _ in held)
-                if path in self.numbers
-            ]
-            for topic, held in run.held.items()
+            topic: every if held is run.bags else self._numbers_of(held)
+            for topic in run.spans
+            for held in (run.bags_with(topic),)
         }
         self._evidence: dict[str, Evidence] = {}
         self._boxes: dict[str, Boxes] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._kept: dict[str, dict[int, tuple[Record, ...]]] = {}
-        self._undecodable: dict[str, dict[int, dict[str, str]]] = {}
 
     def evidence_of_all(self, topic: str) -> Evidence:
         """What can have stood in any message of the topic in the bags with an entry."""
@@ -92,11 +94,12 @@ class RunNotes:
             self._kept, topic, lambda: self._catalogue.kept(topic, self._of(topic))
         )
 
-    def undecodable(self, topic: str) -> Mapping[int, Mapping[str, str]]:
-        """For each entry, by message type, why messages of the topic cannot be decoded."""
-        return self._kept_as(
-            self._undecodable, topic, lambda: self._catalogue.undecodable(topic, self._of(topic))
-        )
+    def undecodable(self, topic: str, number: int) -> Mapping[str, str] | None:
+        """By message type, why messages of the topic in an entry cannot be decoded.
+
+        None where the entry does not say. Not kept: one bag is asked about for each type.
+        """
+        return self._catalogue.undecodable(topic, [number]).get(number)
 
     def _kept_as(self, known: dict[str, T], topic: str, ask: Callable[[], T]) -> T:
         """What was worked out before, or is now; kept unless the catalogue failed meanwhile."""
@@ -107,6 +110,9 @@ class RunNotes:
         if self._catalogue.failures == before:
             known[topic] = found
         return found
+
+    def _numbers_of(self, bags: Sequence[BagFile]) -> list[int]:
+        return [self.numbers[bag.file] for bag in bags if bag.file in self.numbers]
 
     def _of(self, topic: str) -> list[int]:
         return self._holding.get(topic, [])
@@ -158,5 +164,5 @@ def bags_without_entry(runs: Sequence[Run], recall: Recall) -> list[BagFile]:
         for run in runs
         if not (notes := recall.notes(run, as_of)).whole
         for bag in run.bags
-        if bag.state is BagState.CLOSED and bag.path not in notes.numbers
+        if bag.state is BagState.CLOSED and bag.file not in notes.numbers
     ]

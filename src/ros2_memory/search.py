@@ -100,7 +100,7 @@ class _Search:
         among = [
             held
             for held in self._view.holdings(self._topics, wider)
-            if held.bag.path in stretch.bags or stretch.recordings != {held.bag.recording}
+            if held.bag.file in stretch.bags or stretch.recordings != {held.bag.recording}
         ]
         return self._view.stream(self._topics, window, newest_first=True, among=among)
 

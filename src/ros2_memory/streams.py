@@ -57,15 +57,15 @@ class Streams(Reading):
         names = tuple(topics)
         if len(names) == 1 and len(self.snapshot.types_of(names[0])) == 1:
             # The entry of a bag is then all that it holds of these topics.
-            holding = self.snapshot.holding(names[0], window)
+            extents = self.snapshot.extents(names[0], window)
             return sorted(
-                [Holding(each.first, each.last, bag) for bag, each in holding], key=_in_order
+                [Holding(first, last, bag) for bag, first, last in extents], key=_in_order
             )
-        found: dict[Path, Holding] = {}
+        found: dict[str, Holding] = {}
         for topic in names:
-            for bag, _ in self.snapshot.holding(topic, window):
-                if bag.path not in found:
-                    found[bag.path] = holding_of(bag, names)
+            for bag, *_ in self.snapshot.extents(topic, window):
+                if bag.file not in found:
+                    found[bag.file] = holding_of(bag, names)
         return sorted(found.values(), key=_in_order)
 
     def stream(
@@ -216,14 +216,13 @@ class Streams(Reading):
                 push(rank, source)
 
 
-def _in_order(held: Holding) -> tuple[Ns, Ns, Path]:
-    return held.first, held.last, held.bag.path
+def _in_order(held: Holding) -> tuple[Ns, Ns, str]:
+    return held.first, held.last, held.bag.file
 
 
 def holding_of(bag: BagFile, topics: Collection[str]) -> Holding:
     """A bag with the times of its first and last message of these topics; it must hold some."""
-    spans = [(each.first, each.last) for each in bag.summary.topics if each.topic in topics]
-    return Holding(min(first for first, _ in spans), max(last for _, last in spans), bag)
+    return Holding(*bag.summary.span_of(topics), bag)
 
 
 def _edge(held: Holding, *, newest_first: bool) -> Ns:

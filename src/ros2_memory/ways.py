@@ -112,7 +112,7 @@ class _Digests:
         if len(group.holdings) > 1:
             return self._remembered(group)
         [held] = group.holdings
-        number = None if self._notes is None else self._notes.numbers.get(held.bag.path)
+        number = None if self._notes is None else self._notes.numbers.get(held.bag.file)
         if number is None:  # not of the run that the bag before it was of
             entry = self._view.entry(held.bag)
             if entry is None:

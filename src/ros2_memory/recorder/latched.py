@@ -145,10 +145,12 @@ class Carrier:
 
     def concerned(self, snapshot: Snapshot, doomed: Collection[Path]) -> tuple[BagFile, ...]:
         """Those of the bags that hold messages of a latched topic."""
-        found: dict[Path, BagFile] = {}
+        found: dict[str, BagFile] = {}
+        leaving = {str(path) for path in doomed}
+        everything = TimeWindow.everything()
         for topic in self._topics(snapshot):
-            held = snapshot.holding(topic)
-            found.update((bag.path, bag) for bag, _ in held if bag.path in doomed)
+            held = snapshot.extents(topic, everything)
+            found.update((bag.file, bag) for bag, *_ in held if bag.file in leaving)
         return tuple(found.values())
 
     def carry(self, snapshot: Snapshot, doomed: Collection[Path]) -> int | None:
@@ -241,7 +243,7 @@ class Carrier:
         asked: dict[tuple[Path, Ns, str], dict[Identity, Ns]] = {}
         for topic in topics:
             seen: set[Path] = set()
-            for bag, _ in snapshot.holding(topic):
+            for bag, *_ in snapshot.extents(topic, TimeWindow.everything()):
                 if bag.recording in seen or bag.path in doomed or is_carried(bag.path):
                     continue
                 seen.add(bag.recording)
