@@ -135,6 +135,11 @@ Fields: TypeAlias = Annotated[
     BeforeValidator(_as_list),
     Field(description='Dot-paths that narrow value, e.g. ["position.x"].'),
 ]
+Since: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing before.")]
+Until: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing after.")]
+Limit: TypeAlias = Annotated[
+    Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_whole)
+]
 MaxSamples: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=10_000)], BeforeValidator(_whole)
 ]
@@ -292,3 +297,23 @@ class WayOver(Arguments):
 
     span: Span
     topic: PoseTopic | None = None
+
+
+class Matches(Arguments):
+    """A condition on a topic, in a window or in all history."""
+
+    topic: SearchTopic
+    condition_type: ConditionType
+    value: ConditionValue
+    field: SearchField | None = None
+    start: Since | None = None
+    end: Until | None = None
+    limit: Limit = 5
+
+
+def tested(given: Search | Correlation | Matches) -> JsonValue:
+    """The value of a condition: planners tend to send an object as JSON text."""
+    if given.condition_type == "near_position" and isinstance(given.value, str):
+        parsed = from_json(given.value)
+        return parsed if isinstance(parsed, dict) else given.value
+    return given.value

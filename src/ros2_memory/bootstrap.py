@@ -110,6 +110,7 @@ def limits_of(settings: Settings) -> Limits:
         position_tolerance_m=data.position_tolerance_m,
         time_tolerance_s=data.time_tolerance_s,
         pose_topic=data.pose_topic,
+        map_frame=data.map_frame,
         tf_topics=data.tf_topics,
         tf_static_topics=data.tf_static_topics,
         now=data.now,
@@ -122,7 +123,12 @@ def limits_of(settings: Settings) -> Limits:
 def build_server(settings: Settings, memory: Memory) -> EpisodicServer:
     """The MCP server that answers from a memory."""
     served = settings.server
-    tools = build_tools(memory.limits, served.call_timeout_s)
+    tools = build_tools(
+        memory.limits,
+        served.call_timeout_s,
+        additions=served.tools == "all",
+        writing=served.write_tools,
+    )
     dispatcher = Dispatcher(
         memory,
         tools,

@@ -13,12 +13,13 @@ from ros2_memory.signatures import Signature
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
+    from ros2_memory.accounts import Account
     from ros2_memory.arguments import When
     from ros2_memory.fitting import JsonObject
     from ros2_memory.memory import Call, Memory
     from ros2_memory.shapes import Answer
 
-Question: TypeAlias = "Callable[[Memory, Call], Answer]"
+Question: TypeAlias = "Callable[[Memory, Call], Answer | Account]"
 
 A = TypeVar("A", bound=Arguments)
 
@@ -52,7 +53,7 @@ class Entry(Generic[A]):
     variants: tuple[Variant, ...]
     description: str
     arguments: type[A]
-    ask: Callable[[Memory, Call, A], Answer]
+    ask: Callable[[Memory, Call, A], Answer | Account]
     blocking: bool = False
 
     def tools(self, facts: Mapping[str, object]) -> Iterator[Tool]:

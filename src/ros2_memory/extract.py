@@ -166,6 +166,10 @@ class SchemaExtractor:
                 return Twist(along, about, frame)
         return None
 
+    def frame(self, message: object) -> str:
+        """The frame in a message's header; empty where it has none."""
+        return _text(_FRAME.of(message))
+
     def stamp(self, message: object) -> Ns | None:
         """The time in a message's header; None where it has none."""
         return nanoseconds(_STAMP.of(message))

@@ -29,6 +29,7 @@ class Limits:
     position_tolerance_m: float = 0.5
     time_tolerance_s: float = 0.1
     pose_topic: str = "/odom"
+    map_frame: str | None = "map"
     tf_topics: tuple[str, ...] = ("/tf",)
     tf_static_topics: tuple[str, ...] = ("/tf_static",)
     now: NowOfMemory = "wall"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.account_shapes import shown
 from ros2_memory.errors import (
     BagError,
     EpisodicError,
@@ -15,14 +16,16 @@ from ros2_memory.errors import (
     UndecodableError,
 )
 from ros2_memory.fitting import compact, fit
-from ros2_memory.shapes import Answer, file_name, shown
+from ros2_memory.shapes import file_name
 from ros2_memory.timebase import unix_rounded_up
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.accounts import Account
     from ros2_memory.fitting import JsonObject
     from ros2_memory.model import JsonValue
+    from ros2_memory.shapes import Answer
 
 _HOW_TO_NARROW: Final = "narrow the list with pattern, a glob such as /vision/*"
 
@@ -42,7 +45,7 @@ class Replies:
     bag_dir: Path
     max_chars: int
 
-    def answer(self, answer: Answer) -> Reply:
+    def answer(self, answer: Answer | Account) -> Reply:
         """An answer in the shape that the tool's description promises."""
         value = shown(answer, self.bag_dir)
         if isinstance(value, dict):
@@ -57,7 +60,7 @@ class Replies:
         """An error of the tree. Having no data is an answer; the others are errors."""
         match error:
             case NoDataError():
-                return self._no_data(error.reason, error.detail)
+                return self._no_data(error.reason, error.detail, error.notes)
             case UndecodableError():
                 return self._no_data(NoDataReason.UNDECODABLE, str(error))
             case QueryTimeoutError(searched_back_to=int(back_to)):
@@ -80,9 +83,9 @@ class Replies:
             f"its log has the cause under correlation_id {correlation_id}",
         )
 
-    def _no_data(self, reason: NoDataReason, detail: str) -> Reply:
+    def _no_data(self, reason: NoDataReason, detail: str, notes: tuple[str, ...] = ()) -> Reply:
         shown: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
-        return Reply(fit(shown, self.max_chars))
+        return Reply(fit({**shown, "notes": [*notes]} if notes else shown, self.max_chars))
 
     def _failure(self, code: str, detail: str, **more: JsonValue) -> Reply:
         shown: JsonObject = {"error": code, **more, "detail": detail}

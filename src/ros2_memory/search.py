@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from ros2_memory.absence import damaged_note, matching_topics, moment, undecodable
+from ros2_memory.absence import matching_topics, moment, undecodable
 from ros2_memory.candidates import Candidates
 from ros2_memory.copies import COPY_HORIZON_NS
 from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.model import TimeWindow
 from ros2_memory.testable import can_be_untestable, untestable
 from ros2_memory.timebase import MIN_NS
+from ros2_memory.unseen import note_unseen
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,24 +31,38 @@ def last_match(view: View, pattern: str, condition: Condition, until: Ns) -> Fou
         InvalidArgumentsError: no value of the topics can meet the condition.
         QueryTimeoutError: the call's time is over; says how far back was searched.
     """
-    return _Search(view, pattern, condition).newest(until)
+    return Search(view, pattern, condition).newest(until)
 
 
-class _Search:
+class Search:
+    """One condition on the topics of a name or glob.
+
+    Attributes:
+        topics: the recorded topics that are meant.
+
+    Raises:
+        NoDataError: there is no such topic.
+    """
+
     def __init__(self, view: View, pattern: str, condition: Condition) -> None:
         self._view = view
         self._condition = condition
-        self._topics = matching_topics(view, pattern)
+        self.topics = matching_topics(view, pattern)
         self._failures: dict[tuple[str, str], UndecodableError] = {}
         self._tested = False
         self._back_to: Ns | None = None
 
+    def candidates(self, until: Ns) -> Candidates:
+        """The bags that may hold a match before a moment."""
+        return Candidates(self._view, self.topics, self._condition, until)
+
     def newest(self, until: Ns) -> Found | None:
-        candidates = Candidates(self._view, self._topics, self._condition, until)
+        """The newest match before a moment, as `last_match` gives it."""
+        candidates = self.candidates(until)
         try:
             for stretch in candidates.stretches():
                 for found in self._messages(stretch):
-                    if self._matches(found):
+                    if self.matches(found):
                         self._note_undecodable()
                         return found
                     self._back_to = found.time
@@ -56,12 +71,22 @@ class _Search:
             if self._back_to is None:
                 raise
             raise self._out_of_time(self._back_to) from error
-        if self._failures and not self._tested and not candidates.ruled_out:
+        self.close(candidates, found=False)
+        return None
+
+    def close(self, candidates: Candidates, *, found: bool) -> None:
+        """Ends a search that looked everywhere: notes what could not be tested.
+
+        Raises:
+            InvalidArgumentsError: nothing was found, and no value of the topics can be a match.
+            NoDataError: nothing was found, since no message could be decoded.
+        """
+        if not found and self._failures and not self._tested and not candidates.ruled_out:
             (topic, type_name), failure = next(iter(self._failures.items()))
             raise undecodable(topic, type_name, failure)
         self._note_undecodable()
-        self._require_testable()
-        return None
+        if not found:
+            self._require_testable()
 
     def _require_testable(self) -> None:
         """Refuses to call "never" what no value of these topics can meet.
@@ -72,12 +97,12 @@ class _Search:
         if not can_be_untestable(self._condition):
             return
         first: str | None = None
-        for topic in self._topics:
+        for topic in self.topics:
             reason = self._refusal(topic)
             if reason is None:
                 return
             first = first or reason
-        raise InvalidArgumentsError(f"{self._topics[0]}: {first}")
+        raise InvalidArgumentsError(f"{self.topics[0]}: {first}")
 
     def _refusal(self, topic: str) -> str | None:
         found = self._view.newest(topic, TimeWindow.everything())
@@ -99,12 +124,13 @@ class _Search:
         wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
         among = [
             held
-            for held in self._view.holdings(self._topics, wider)
+            for held in self._view.holdings(self.topics, wider)
             if held.bag.file in stretch.bags or stretch.recordings != {held.bag.recording}
         ]
-        return self._view.stream(self._topics, window, newest_first=True, among=among)
+        return self._view.stream(self.topics, window, newest_first=True, among=among)
 
-    def _matches(self, found: Found) -> bool:
+    def matches(self, found: Found) -> bool:
+        """Whether a message meets the condition; one that cannot be decoded does not."""
         begin = time.perf_counter_ns()
         channel = found.record.channel
         memory = self._view.memory
@@ -135,9 +161,10 @@ class _Search:
         )
 
 
-def unsearched(view: View) -> tuple[str, ...]:
-    """Why a search without a match was not complete; empty where it was."""
-    damaged = damaged_note(view)
-    if damaged:
-        view.note(damaged)
-    return view.notes if damaged or not view.complete else ()
+def unsearched(view: View, window: TimeWindow | None = None) -> tuple[str, ...]:
+    """Why a search of a window (or of everything) without a match was not complete.
+
+    Empty where it was.
+    """
+    note_unseen(view, window or TimeWindow.everything(), nothing=True)
+    return view.notes

@@ -83,14 +83,16 @@ class RecordingSettings:
 class DataSettings:
     """How recorded data is read and judged.
 
-    `now` is what "ago" counts from: the wall clock, or the newest recorded moment. `tf_clock` is
-    the time that orders transforms: header stamps, log time, or stamps where the two agree.
+    `map_frame` is the frame in which places are told where transforms lead there. `now` is what
+    "ago" counts from: the wall clock, or the newest recorded moment. `tf_clock` is the time that
+    orders transforms: header stamps, log time, or stamps where the two agree.
     """
 
     max_array_length: Count
     position_tolerance_m: Tolerance
     time_tolerance_s: Tolerance
     pose_topic: Text
+    map_frame: Text | None
     tf_topics: tuple[Text, ...]
     tf_static_topics: tuple[Text, ...]
     now: Literal["wall", "latest"]
@@ -119,7 +121,10 @@ class RetentionSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class ServerSettings:
-    """How the query server is reached. Port 0 is any that is free."""
+    """How the query server is reached, and what it offers. Port 0 is any that is free.
+
+    `tools`: all, or the specification's alone; `write_tools`: those that write, too.
+    """
 
     name: Text
     transport: Literal["stdio", "sse"]
@@ -127,6 +132,8 @@ class ServerSettings:
     port: Port
     call_timeout_s: Positive
     max_reply_chars: Annotated[int, Field(strict=True, ge=1000)]
+    tools: Literal["all", "spec"]
+    write_tools: Switch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory import answers, queries
+from ros2_memory import answers, happenings, queries
 from ros2_memory.arguments import (
     Ago,
     At,
@@ -23,7 +23,7 @@ from ros2_memory.arguments import (
     TopicOver,
     TransformAt,
     WayOver,
-    from_json,
+    tested,
 )
 from ros2_memory.entries import Entry, Variant
 from ros2_memory.errors import NoDataError, NoDataReason
@@ -32,11 +32,15 @@ from ros2_memory.globs import matching
 if TYPE_CHECKING:
     from ros2_memory.entries import Tool
     from ros2_memory.memory import Call, Limits, Memory
-    from ros2_memory.model import JsonValue
 
 
-def build_tools(limits: Limits, call_timeout_s: float) -> tuple[Tool, ...]:
-    """All tools, in order. The descriptions tell this deployment's defaults."""
+def build_tools(
+    limits: Limits, call_timeout_s: float, *, additions: bool = True, writing: bool = False
+) -> tuple[Tool, ...]:
+    """The tools, in order. The descriptions tell this deployment's defaults.
+
+    `additions`: those beyond the specification's, too; `writing`: those among them that write.
+    """
     facts = {
         "timeout": f"{call_timeout_s:g}",
         "pose_topic": limits.pose_topic,
@@ -55,6 +59,7 @@ def build_tools(limits: Limits, call_timeout_s: float) -> tuple[Tool, ...]:
         *_LAST_MATCH.tools(facts),
         *_VALUE_WHEN.tools(facts),
         *_TRAJECTORY.tools(facts),
+        *(happenings.tools(facts, writing=writing) if additions else ()),
     )
 
 
@@ -71,14 +76,6 @@ def _list_topics(memory: Memory, call: Call, given: Listing) -> tuple[answers.To
             "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
         )
     return named
-
-
-def _condition_value(given: Search | Correlation) -> JsonValue:
-    """Planners tend to send an object as JSON text."""
-    if given.condition_type == "near_position" and isinstance(given.value, str):
-        parsed = from_json(given.value)
-        return parsed if isinstance(parsed, dict) else given.value
-    return given.value
 
 
 def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[Variant, ...]:
@@ -184,7 +181,7 @@ _LAST_MATCH = Entry(
         call,
         given.topic,
         given.condition_type,
-        _condition_value(given),
+        tested(given),
         field=given.field,
         fields=given.fields,
         before_s=given.before,
@@ -203,7 +200,7 @@ _VALUE_WHEN = Entry(
         given.value_topic,
         given.condition_topic,
         condition_type=given.condition_type,
-        value=_condition_value(given),
+        value=tested(given),
         field=given.field,
         fields=given.fields,
         before_s=given.before,

@@ -18,6 +18,7 @@ from ros2_memory.errors import EpisodicError
 from ros2_memory.memory import Call, Limits
 from ros2_memory.moments import Moment, Span
 from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.histories import S, write_history
 from tests.memories import memory_of
@@ -88,6 +89,7 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
                     f"last {topic} {kind} {wanted} {field} {before}",
                     partial(_match, topic, kind, wanted, field, before),
                 )
+        yield f"all {topic} {kind} {wanted}", partial(_matches, topic, kind, wanted, before)
     yield "odom when", partial(_when, "/chatter")
 
 
@@ -133,6 +135,12 @@ def _match(
         field=field,
         before_s=before,
     )
+
+
+def _matches(
+    topic: str, kind: str, wanted: JsonValue, end: float | None, memory: Memory, call: Call
+) -> object:
+    return find_matches(memory, call, topic, kind, wanted, end_s=end, limit=3)
 
 
 def _when(topic: str, memory: Memory, call: Call) -> object:

@@ -1,0 +1,64 @@
+"""The answers of `accounts` as JSON values; names, units and rounding are those of `shapes`.
+
+Whatever has a time also says how long before now that was, so that nobody has to subtract.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ros2_memory import accounts
+from ros2_memory.figures import degrees, metres, moment, seconds, with_notes
+from ros2_memory.geometry import normalised, yaw
+from ros2_memory.shapes import shown
+from ros2_memory.timebase import unix_rounded_up
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.fitting import JsonObject
+    from ros2_memory.model import Pose
+    from ros2_memory.timebase import Ns
+
+
+__all__ = ["robot", "shown"]
+
+
+@shown.register(accounts.Sightings)
+def _sightings(answer: accounts.Sightings, _bag_dir: Path) -> JsonObject:
+    reply: JsonObject = {
+        "sightings": [_sighting(each, answer.now) for each in answer.sightings],
+        "searched_from": moment(answer.start),
+        "searched_to": moment(answer.end),
+    }
+    if answer.more:
+        reply["more"] = True
+    return with_notes(reply, answer.notes)
+
+
+def _sighting(sighting: accounts.Sighting, now: Ns) -> JsonObject:
+    reply: JsonObject = {
+        "topic": sighting.topic,
+        "first_seen": unix_rounded_up(sighting.first),
+        "last_seen": unix_rounded_up(sighting.last),
+        "duration_s": seconds(sighting.last - sighting.first),
+        "ago_s": seconds(now - sighting.last),
+        "count": sighting.messages,
+        "robot": None if sighting.robot is None else robot(sighting.robot),
+    }
+    if sighting.thing is not None:
+        spot = sighting.thing
+        reply["place"] = {**metres(spot.position), "frame_id": spot.frame_id or None}
+    if not sighting.begun:
+        reply["began_earlier"] = True
+    return reply
+
+
+def robot(pose: Pose) -> JsonObject:
+    """Where the robot was, and how it stood."""
+    unit = None if pose.orientation is None else normalised(pose.orientation)
+    return {
+        **metres(pose.position),
+        "yaw_deg": degrees(None if unit is None else yaw(unit)),
+        "frame_id": pose.frame_id or None,
+    }

@@ -1,0 +1,60 @@
+"""What the questions beyond the specification's are answered with, before it becomes JSON.
+
+Units and `notes` are those of `answers`; `now` is what ages count from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from ros2_memory.model import Pose, Vector3
+    from ros2_memory.timebase import Ns
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A place (m) in a frame; `label` names what is there."""
+
+    label: str
+    position: Vector3
+    frame_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """Message after message of one topic that met a condition.
+
+    Attributes:
+        topic: where.
+        first: log time of the first of them; of the earliest one read where `begun` is False.
+        last: of the last.
+        messages: how many there are.
+        begun: whether the search went on to before the first.
+        robot: where the robot was at the last.
+        thing: where the thing itself was then, if the message says so.
+    """
+
+    topic: str
+    first: Ns
+    last: Ns
+    messages: int
+    begun: bool
+    robot: Pose | None
+    thing: Spot | None
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Sightings, newest first; `more`: there are older ones. `start` and `end` were searched."""
+
+    sightings: tuple[Sighting, ...]
+    more: bool
+    start: Ns | None
+    end: Ns | None
+    now: Ns
+    notes: tuple[str, ...] = ()
+
+
+Account: TypeAlias = Sightings

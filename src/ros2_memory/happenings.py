@@ -1,0 +1,41 @@
+"""The tools beyond the specification's: what happened, where and when, in one call each."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ros2_memory.arguments import Matches, tested
+from ros2_memory.entries import Entry, Variant
+from ros2_memory.sightings import find_matches
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from ros2_memory.entries import Tool
+
+
+def tools(facts: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
+    """The tools, in order; `facts` fill the placeholders of descriptions."""
+    del writing
+    yield from _SIGHTINGS.tools(facts)
+
+
+_SIGHTINGS = Entry(
+    (Variant("find_matches", "Sightings (blocking)"),),
+    "When and where a condition (as in find_last_match) held, newest first, matches in a row as "
+    "one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, duration_s, ago_s, count, "
+    "robot: where it was at last_seen, place: of the thing}}], more}}.",
+    Matches,
+    lambda memory, call, given: find_matches(
+        memory,
+        call,
+        given.topic,
+        given.condition_type,
+        tested(given),
+        field=given.field,
+        start_s=given.start,
+        end_s=given.end,
+        limit=given.limit,
+    ),
+    blocking=True,
+)

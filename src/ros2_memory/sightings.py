@@ -1,0 +1,286 @@
+"""Matches in a row as sightings: when each began and ended, and where the robot and the thing were.
+
+A sighting is message after message of one topic that meets a condition. It is over with a message
+of that topic that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector
+may speak only of what it sees.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.absence import moment, require_bags
+from ros2_memory.accounts import Sighting, Sightings, Spot
+from ros2_memory.conditions import NearPosition, parse_condition
+from ros2_memory.errors import (
+    InvalidArgumentsError,
+    NoDataError,
+    QueryTimeoutError,
+    UndecodableError,
+)
+from ros2_memory.frames import transform_at
+from ros2_memory.geometry import rotate
+from ros2_memory.history import View
+from ros2_memory.model import TimeWindow
+from ros2_memory.moments import ns_argument
+from ros2_memory.search import Search, unsearched
+from ros2_memory.stories import SILENCE_NS
+from ros2_memory.things import things_of
+from ros2_memory.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    MIN_NS,
+    START_SLACK_NS,
+    Ns,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.candidates import Stretch
+    from ros2_memory.conditions import Condition
+    from ros2_memory.copies import Found
+    from ros2_memory.memory import Call, Memory
+    from ros2_memory.model import JsonValue, Pose
+    from ros2_memory.things import Thing
+
+NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
+"""An older pose does not tell where the robot was."""
+
+
+@dataclass(slots=True)
+class _Run:
+    """Matches in a row, the newest first; `begun`: it is known what is before them."""
+
+    newest: Found
+    first: Ns
+    messages: int = 1
+    begun: bool = False
+
+
+def find_matches(
+    memory: Memory,
+    call: Call,
+    topic: str,
+    condition_type: str,
+    value: JsonValue,
+    *,
+    field: str | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    limit: int = 5,
+) -> Sightings:
+    """The newest `limit` sightings on a topic, or on all topics of a glob, newest first.
+
+    `start_s` and `end_s` (Unix seconds, inclusive) bound what is searched.
+    """
+    condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
+    now = memory.clock.now()
+    window = _window(start_s, end_s)
+    view = View(memory, call, min(window.stop, now))
+    require_bags(view)
+    latest = view.snapshot.latest
+    runs, more = _newest_runs(view, topic, condition, window, limit)
+    pose_topic = memory.limits.pose_topic
+    found = tuple(_told(view, condition, run, pose_topic) for run in runs)
+    return Sightings(
+        found,
+        more,
+        start=max(window.start, view.snapshot.earliest or window.start),
+        end=min(window.stop, latest or window.stop),
+        now=now if memory.limits.now == "wall" or latest is None else latest,
+        notes=view.notes if found else unsearched(view),
+    )
+
+
+def _window(start_s: float | None, end_s: float | None) -> TimeWindow:
+    """The window searched, with the slack of floats of seconds.
+
+    Raises:
+        InvalidArgumentsError: the end lies before the start, or a bound is not finite.
+    """
+    start = MIN_NS if start_s is None else ns_argument("start", start_s) - START_SLACK_NS
+    end = MAX_NS - 1 if end_s is None else ns_argument("end", end_s) + AT_OR_BEFORE_SLACK_NS
+    if end < start:
+        raise InvalidArgumentsError(f"end ({end_s}) lies before start ({start_s})")
+    return TimeWindow(max(start, MIN_NS), min(end + 1, MAX_NS))
+
+
+def _newest_runs(
+    view: View, pattern: str, condition: Condition, window: TimeWindow, limit: int
+) -> tuple[list[_Run], bool]:
+    """The newest rows of matches in a window, newest first, and whether there are more.
+
+    Raises:
+        InvalidArgumentsError: no value of the topics can meet the condition.
+        NoDataError: there is no such topic, or none of its messages can be decoded.
+        QueryTimeoutError: the call's time is over before the first match was found.
+    """
+    search = Search(view, pattern, condition)
+    runs = _Runs(limit)
+    candidates = search.candidates(window.stop)
+    before = window.stop
+    try:
+        for part in _parts(view, search.topics, candidates.stretches(), window):
+            for topic in runs.under_way():
+                if _any_between(view, topic, TimeWindow(part.stop, max(before, part.stop))):
+                    runs.end(topic)
+            for found in view.stream(search.topics, part, newest_first=True):
+                before = found.time
+                if search.matches(found):
+                    runs.add(found)
+                else:
+                    runs.end(found.record.channel.topic)
+                if runs.enough:
+                    return runs.newest, True
+            before = part.start
+    except QueryTimeoutError:
+        if not runs.newest:
+            raise
+        view.complete = False
+        view.note(f"the search ran out of time at {moment(before)}: to go on, ask with end there")
+        return runs.newest, True
+    search.close(candidates, found=bool(runs.newest))
+    for topic in runs.under_way():
+        runs.end(topic)
+    return runs.newest, runs.more
+
+
+class _Runs:
+    """Matches that come newest first, in rows by topic."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._all: list[_Run] = []
+        self._open: dict[str, _Run] = {}
+
+    def add(self, found: Found) -> None:
+        """Takes the next older match."""
+        topic = found.record.channel.topic
+        run = self._open.get(topic)
+        if run is not None and run.first - found.time > SILENCE_NS:
+            self.end(topic)
+            run = None
+        if run is None:
+            self._open[topic] = run = _Run(found, found.time)
+            self._all.append(run)
+        else:
+            run.first = found.time
+            run.messages += 1
+
+    def end(self, topic: str) -> None:
+        """What comes next of the topic belongs to another row."""
+        run = self._open.pop(topic, None)
+        if run is not None:
+            run.begun = True
+
+    def under_way(self) -> tuple[str, ...]:
+        """The topics whose row may go on."""
+        return tuple(self._open)
+
+    @property
+    def newest(self) -> list[_Run]:
+        """As many as are asked for."""
+        return self._all[: self._limit]
+
+    @property
+    def more(self) -> bool:
+        """Whether there are more than that."""
+        return len(self._all) > self._limit
+
+    @property
+    def enough(self) -> bool:
+        """Whether nothing that comes can change the newest ones."""
+        return self.more and all(run.begun for run in self.newest)
+
+
+def _parts(
+    view: View, topics: Sequence[str], stretches: Iterator[Stretch], window: TimeWindow
+) -> Iterator[TimeWindow]:
+    """The parts of a window in which there may be matches, newest first."""
+    if view.received_twice(topics):
+        # What ends a row may be a copy of a message in a bag that is ruled out.
+        yield window
+        return
+    for stretch in stretches:
+        if stretch.window.stop <= window.start:
+            return
+        part = stretch.window.intersect(window)
+        if not part.empty:
+            yield part
+
+
+def _any_between(view: View, topic: str, gap: TimeWindow) -> bool:
+    """Whether the topic has a message in a time that holds no match."""
+    if gap.empty:
+        return False
+    held = view.holdings([topic], gap)
+    if len({each.bag.recording for each in held}) == 1 and any(
+        gap.contains(each.first) or gap.contains(each.last) for each in held
+    ):
+        return True
+    return bool(held) and view.oldest(topic, gap) is not None
+
+
+def _told(view: View, condition: Condition, run: _Run, pose_topic: str) -> Sighting:
+    """A row with where the robot was at its newest message, and where the thing was."""
+    robot = _robot(view, pose_topic, run.newest.time)
+    return Sighting(
+        topic=run.newest.record.channel.topic,
+        first=run.first,
+        last=run.newest.time,
+        messages=run.messages,
+        begun=run.begun,
+        robot=robot,
+        thing=_spot(view, condition, run.newest, robot),
+    )
+
+
+def _robot(view: View, topic: str, at: Ns) -> Pose | None:
+    """Where the robot was: its newest pose at or before then that can be read."""
+    found = view.newest(topic, TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1))
+    if found is None:
+        return None
+    try:
+        message = view.memory.reader.decode(found.record)
+    except UndecodableError:
+        return None
+    pose = view.memory.extractor.pose(message, found.record.channel.type)
+    return pose if pose is not None and all(map(math.isfinite, pose.position)) else None
+
+
+def _spot(view: View, condition: Condition, found: Found, robot: Pose | None) -> Spot | None:
+    """Where the thing that matched was; in the map, the robot's frame, or its message's own."""
+    message = view.memory.reader.decode(found.record)
+    value = view.memory.extractor.exact(message, found.record.channel.type)
+    frame = view.memory.extractor.frame(message)
+    thing = _matching(things_of(value, frame), condition)
+    if thing is None or thing.place is None:
+        return None
+    frames = (view.memory.limits.map_frame, "" if robot is None else robot.frame_id)
+    for target in filter(None, frames):
+        if target == thing.frame_id:
+            return Spot(thing.label, thing.place, target)
+        try:
+            found_transform = transform_at(view, target, thing.frame_id, found.time)
+        except NoDataError:
+            continue
+        pose = found_transform.lookup.transform
+        x, y, z = rotate(pose.rotation, thing.place)
+        dx, dy, dz = pose.translation
+        return Spot(thing.label, (x + dx, y + dy, z + dz), target)
+    return Spot(thing.label, thing.place, thing.frame_id)
+
+
+def _matching(things: Sequence[Thing], condition: Condition) -> Thing | None:
+    """The thing that a condition is about: by name or place, or the only one; placed ones first."""
+    test = condition.test
+    if isinstance(test, NearPosition):
+        about = [each for each in things if each.place is not None and test.is_near(*each.place)]
+    else:
+        about = [each for each in things if test.matches(each.label)]
+    if not about and len(things) == 1:
+        about = list(things)
+    return max(about, key=lambda thing: thing.place is not None, default=None)
