@@ -14,8 +14,7 @@ from ros2_memory.timebase import Ns, iso_local, unix_from_ns, unix_rounded_up
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.fitting import JsonObject
-    from ros2_memory.model import Vector3
+    from ros2_memory.model import JsonValue, Vector3
 
 
 def moment(at: Ns | None) -> float | None:
@@ -33,7 +32,7 @@ def seconds(duration: Ns) -> float:
     return round(unix_from_ns(duration), 3)
 
 
-def metres(vector: Vector3) -> JsonObject:
+def metres(vector: Vector3) -> dict[str, JsonValue]:
     """A point or vector by its axes."""
     return {name: rounded(part, 4) for name, part in zip("xyz", vector, strict=True)}
 
@@ -48,6 +47,6 @@ def rounded(number: float, places: int) -> float | None:
     return round(number, places) if math.isfinite(number) else None
 
 
-def with_notes(reply: JsonObject, notes: Sequence[str]) -> JsonObject:
+def with_notes(reply: dict[str, JsonValue], notes: Sequence[str]) -> dict[str, JsonValue]:
     """A reply with its notes, where there is something to say."""
     return {**reply, "notes": [*notes]} if notes else reply
