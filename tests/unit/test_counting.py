@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import random
 from typing import TYPE_CHECKING
+
+import pytest
 
 from ros2_memory import queries
 from ros2_memory.memory import Call
@@ -116,3 +119,53 @@ def test_a_sidecar_that_cannot_be_read_hides_nothing_and_is_named(tmp_path: Path
     assert summary.count == 20
     assert "handover.json" in summary.notes[-1]
     assert "handover.json" in queries.data_time_range(counting(tmp_path), Call()).notes[0]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_summary_states_what_a_reading_gives(tmp_path: Path, seed: int) -> None:
+    draw = random.Random(seed)
+
+    def moment() -> int:
+        return T0 + draw.randrange(40) * S // 4
+
+    def message(topic: str) -> Msg:
+        at = moment()
+        body = boolean(at, data=True) if draw.random() < 0.7 else text(at, "also of this name")
+        return Msg(topic, body.type, at, body.body, at - draw.randrange(-2, 3) * S // 4)
+
+    messages = [message(draw.choice(["/bumper", "/other"])) for _ in range(60)]
+    layout = McapLayout(chunk_size=draw.choice([200, 1000, 1 << 20]))
+    bag = write_mcap(tmp_path / "a" / "a_0.mcap", messages, layout)
+
+    def overlap() -> Overlap:
+        start, stop = sorted((moment(), moment()))
+        return Overlap(draw.choice([None, start]), draw.choice([None, stop]), ("a_0.mcap",))
+
+    write_handover(
+        tmp_path / "a",
+        Handover(
+            previous="z",
+            counts_from=draw.choice([None, moment(), moment()]),
+            begin=overlap(),
+            next="b",
+            counts_until=draw.choice([None, moment(), moment()]),
+            end=overlap(),
+        ),
+    )
+    reader = CountingReader(McapReader())
+    found: dict[tuple[str, str], list[int]] = {}
+    for record in reader.records(bag, ["/bumper", "/other"], TimeWindow.everything()):
+        found.setdefault((record.channel.topic, record.channel.type), []).append(record.log_time)
+    assert {
+        (each.topic, each.type): (each.count, each.first, each.last)
+        for each in reader.summarize(bag).topics
+    } == {key: (len(times), times[0], times[-1]) for key, times in found.items()}
+
+
+def test_a_relative_path_has_its_sidecar_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, _ = taken_over(tmp_path)
+    cut(tmp_path, T0 + 8 * S)
+    monkeypatch.chdir(old.parent)
+    assert CountingReader(McapReader()).summarize(old.relative_to(old.parent)).count == 16

@@ -7,23 +7,27 @@ count, sum, search or answer has to think of it.
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.model import BagSummary, TimeWindow, TopicSummary
-from ros2_memory.recorder.handover import HandoverReading, read_handover
+from ros2_memory.recorder.handover import Handover, HandoverReading, read_handover
 from ros2_memory.recorder.layout import HANDOVER_FILE
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.handover import Exclusion, Handover
+    from ros2_memory.recorder.handover import Exclusion
     from ros2_memory.storage.base import Channel, Closing, Layout, Record
     from ros2_memory.timebase import Ns
 
 _KNOWN_SIDECARS: Final = 4096
+_NONE: Final = HandoverReading(Handover(), None)
+"""What is read where there is no sidecar."""
 
 
 class CountingReader(BagReader):
@@ -34,7 +38,7 @@ class CountingReader(BagReader):
 
     def __init__(self, reader: BagReader) -> None:
         self._reader = reader
-        self._known: dict[Path, tuple[tuple[int, int, int], HandoverReading]] = {}
+        self._known: dict[str, tuple[tuple[int, int, int], HandoverReading]] = {}
 
     def reads(self, path: Path) -> bool:
         """As the reader beneath."""
@@ -67,18 +71,19 @@ class CountingReader(BagReader):
             BagError: as the reader beneath.
         """
         summary = self._reader.summarize(path)
-        handover, problem = self._handover(path.parent)
+        handover, problem = self._handover(path)
         if problem is not None:
             summary = summary.replaced(notes=(*summary.notes, problem))
         if handover.hides_all:
             return summary.replaced(topics=())
-        notes = handover.notes if handover.exclusions(path.name) else ()
-        topics = tuple(
-            counted
-            for topic in summary.topics
-            if (counted := self._counted(path, topic, handover)) is not None
+        exclusions = handover.exclusions(path.name)
+        if not exclusions:
+            return summary
+        topics = (self._counted(path, topic, exclusions) for topic in summary.topics)
+        return summary.replaced(
+            topics=tuple(topic for topic in topics if topic is not None),
+            notes=(*summary.notes, *handover.notes),
         )
-        return summary.replaced(topics=topics, notes=(*summary.notes, *notes))
 
     def records(
         self,
@@ -93,11 +98,11 @@ class CountingReader(BagReader):
         Raises:
             BagError: as the reader beneath.
         """
-        handover = self._handover(path.parent).handover
+        handover = self._handover(path).handover
         if handover.hides_all:
             return
         records = self._reader.records(path, topics, window, newest_first=newest_first)
-        exclusions = _touching(handover, path, window)
+        exclusions = _touching(handover.exclusions(path.name), window)
         if exclusions:
             records = (record for record in records if _counts(record, exclusions))
         yield from records
@@ -108,51 +113,74 @@ class CountingReader(BagReader):
         Raises:
             BagError: as the reader beneath.
         """
-        handover = self._handover(path.parent).handover
+        handover = self._handover(path).handover
         if handover.hides_all:
             return ()
-        if not _touching(handover, path, window):
+        if not _touching(handover.exclusions(path.name), window):
             return self._reader.log_times(path, topic, window)
         return [record.log_time for record in self.records(path, [topic], window)]
 
-    def _handover(self, recording: Path) -> HandoverReading:
-        """The recording's sidecar; parsed again when the file is another one than before."""
+    def _handover(self, path: Path) -> HandoverReading:
+        """The sidecar of a file's recording; parsed again when it is another one than before."""
+        file = str(path)
+        sidecar = file[: file.rfind("/") + 1] + HANDOVER_FILE
         try:
-            stat = (recording / HANDOVER_FILE).stat()
+            stat = os.stat(sidecar)  # noqa: PTH116 - before every reading; a Path costs more
+        except (FileNotFoundError, NotADirectoryError):
+            return _NONE
         except OSError:
-            return read_handover(recording)
+            return read_handover(path.parent)
         stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
-        known = self._known.get(recording)
+        known = self._known.get(sidecar)
         if known is not None and known[0] == stamp:
             return known[1]
-        reading = read_handover(recording)
+        reading = read_handover(path.parent)
         if len(self._known) >= _KNOWN_SIDECARS:
             self._known.clear()
-        self._known[recording] = (stamp, reading)
+        self._known[sidecar] = (stamp, reading)
         return reading
 
-    def _counted(self, path: Path, topic: TopicSummary, handover: Handover) -> TopicSummary | None:
+    def _counted(
+        self, path: Path, topic: TopicSummary, exclusions: Sequence[Exclusion]
+    ) -> TopicSummary | None:
         """The topic without what counts elsewhere; None where nothing of it is left."""
         span = TimeWindow(topic.first, topic.last + 1)
-        if topic.latched or not _touching(handover, path, span):
+        if topic.latched or not _touching(exclusions, span):
             return topic
-        times = [
-            record.log_time
-            for record in self.records(path, [topic.topic], span)
-            if record.channel.type == topic.type
-        ]
-        if not times:
+        # What is excluded lies in few of the chunks: only these are read.
+        lost = sum(
+            record.channel.type == topic.type and not _counts(record, exclusions)
+            for window in _united(exclusions, span)
+            for record in self._reader.records(path, [topic.topic], window)
+        )
+        if not lost:
+            return topic
+        first, last = (
+            next((each.log_time for each in found if each.channel.type == topic.type), None)
+            for found in (
+                self.records(path, [topic.topic], span),
+                self.records(path, [topic.topic], span, newest_first=True),
+            )
+        )
+        if first is None or last is None:
             return None
-        return replace(topic, count=len(times), first=times[0], last=times[-1])
+        return replace(topic, count=topic.count - lost, first=first, last=last)
 
 
-def _touching(handover: Handover, path: Path, window: TimeWindow) -> list[Exclusion]:
+def _touching(exclusions: Iterable[Exclusion], window: TimeWindow) -> list[Exclusion]:
     """What of a file may not count among the log times of a window."""
     return [
-        each
-        for each in handover.exclusions(path.name)
-        if each.log_from < window.stop and window.start < each.log_until
+        each for each in exclusions if each.log_from < window.stop and window.start < each.log_until
     ]
+
+
+def _united(exclusions: Iterable[Exclusion], span: TimeWindow) -> list[TimeWindow]:
+    """The log times of a span in which something may not count; none twice."""
+    united: list[TimeWindow] = []
+    for each in sorted(_touching(exclusions, span), key=attrgetter("log_from")):
+        start = max(each.log_from, united[-1].stop if united else span.start)
+        united.append(TimeWindow(start, max(start, min(each.log_until, span.stop))))
+    return united
 
 
 def _counts(record: Record, exclusions: Sequence[Exclusion]) -> bool:

@@ -33,7 +33,7 @@ from ros2_memory.storage.zstd import plain_payload
 from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.model import BagSummary, TimeWindow
@@ -55,6 +55,7 @@ class McapBags:
         self._found: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self._shared: Shared[Channel] = Shared()
+        self._last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel]] = {}, {}
 
     def closing(self, path: Path) -> Closing:
         """Whether the writer has finished the file."""
@@ -130,10 +131,17 @@ class McapBags:
         index = self._found.get(file.key)
         if not isinstance(index, McapIndex):
             index = _index_of(file, self._max_chunk_bytes)
-            shared = {number: self._shared.of(each) for number, each in index.channels.items()}
-            index = index._replace(channels=shared)
+            index = index._replace(channels=self._shared_of(index.channels))
             self._found.put(file.key, index, index.bytes_held)
         return index
+
+    def _shared_of(self, channels: Mapping[int, Channel]) -> Mapping[int, Channel]:
+        """The channels, one object for all equal ones; the next bag mostly has these very ones."""
+        given, shared = self._last_shared
+        if channels is not given:
+            shared = {number: self._shared.of(each) for number, each in channels.items()}
+            self._last_shared = channels, shared
+        return shared
 
     def _chunk_columns(self, file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> list[Column]:
         columns: list[Column] = []

@@ -24,7 +24,7 @@ from ros2_memory.storage.zstd import unpacked_zstd
 from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.storage.open_file import OpenFile
 
@@ -33,7 +33,10 @@ Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 _INDEX_HEAD: Final = struct.Struct("<BQHI")
 """A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
 _INDEX_HEAD_BYTES: Final = _INDEX_HEAD.size
+_index_head: Final = _INDEX_HEAD.unpack_from
 _PAIR_BYTES: Final = 16
+_tuple: Final = tuple.__new__
+"""Makes a named tuple, past the function that its fields go through."""
 _MESSAGE_INDEX: Final = int(Opcode.MESSAGE_INDEX)
 _IMPOSSIBLE_TIMES: Final = "damaged: a message index holds impossible log times"
 _EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
@@ -117,21 +120,24 @@ class Extent(NamedTuple):
 def extents_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> dict[int, Extent]:
     """What `columns_from_index` amounts to, of the channels that have messages."""
     extents: dict[int, Extent] = {}
+    latest = 0
     for channel, offset in offsets.items():
         at, count = _index_at(region, channel, offset - base)
         if count:
             # Few numbers: an array would cost more than it saves.
-            times = _times_of(count).unpack_from(region, at)
-            extents[channel] = Extent(count, min(times), max(times))
-    if extents and max([extent.last for extent in extents.values()]) >= MAX_NS:
+            times = _times_of(count)(region, at)
+            last = max(times)
+            extents[channel] = _tuple(Extent, (count, min(times), last))
+            latest = max(latest, last)
+    if latest >= MAX_NS:
         raise UnreadableError(_IMPOSSIBLE_TIMES)
     return extents
 
 
 @lru_cache(256)
-def _times_of(count: int) -> struct.Struct:
-    """The log times of so many pairs of log time and offset."""
-    return struct.Struct("<" + "Q8x" * count)
+def _times_of(count: int) -> Callable[[bytes, int], tuple[int, ...]]:
+    """What takes the log times from so many pairs of log time and offset."""
+    return struct.Struct("<" + "Q8x" * count).unpack_from
 
 
 def _index_at(region: bytes, channel: int, at: int) -> tuple[int, int]:
@@ -139,9 +145,8 @@ def _index_at(region: bytes, channel: int, at: int) -> tuple[int, int]:
     pairs_at = at + _INDEX_HEAD_BYTES
     if at < 0 or pairs_at > len(region):
         raise UnreadableError("damaged: a message index is not where its chunk index says")
-    opcode, length, number, size = _INDEX_HEAD.unpack_from(region, at)
-    known = opcode == _MESSAGE_INDEX and number == channel
-    if not known or length != size + 6 or size % _PAIR_BYTES:
+    opcode, length, number, size = _index_head(region, at)
+    if opcode != _MESSAGE_INDEX or number != channel or length != size + 6 or size % _PAIR_BYTES:
         raise UnreadableError("damaged: a message index is not what its chunk index says")
     return pairs_at, size // _PAIR_BYTES
 

@@ -28,7 +28,7 @@ from ros2_memory.storage.mcap_summary import MAX_SECTION_BYTES, Chunk, DoubtErro
 from ros2_memory.timebase import MAX_NS, unix_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from ros2_memory.storage.base import Channel
     from ros2_memory.storage.open_file import OpenFile
@@ -85,9 +85,9 @@ def chunk_columns(
     if wanted is not None:
         offsets = {channel: offset for channel, offset in offsets.items() if channel in wanted}
     columns = columns_from_index(_index_region(file, chunk), offsets, chunk.offset + chunk.length)
-    for column in columns.values():
-        if column.times.size:
-            _require_inside(chunk, int(column.times[0]), int(column.times[-1]))
+    for times, _ in columns.values():
+        if times.size and not chunk.start <= int(times[0]) <= int(times[-1]) <= chunk.end:
+            raise _outside()
     return columns
 
 
@@ -95,9 +95,10 @@ def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
     """What `chunk_columns` amounts to, for less."""
     offsets, base = chunk.index_offsets, chunk.offset + chunk.length
     extents = extents_from_index(_index_region(file, chunk), offsets, base)
-    if extents:
-        first = min([extent.first for extent in extents.values()])
-        _require_inside(chunk, first, max([extent.last for extent in extents.values()]))
+    start, end = chunk.start, chunk.end
+    for _, first, last in extents.values():
+        if not start <= first <= last <= end:
+            raise _outside()
     return extents
 
 
@@ -107,9 +108,8 @@ def _index_region(file: OpenFile, chunk: Chunk) -> bytes:
     return file.read(chunk.offset + chunk.length, chunk.index_length)
 
 
-def _require_inside(chunk: Chunk, first: Ns, last: Ns) -> None:
-    if not chunk.start <= first <= last <= chunk.end:
-        raise UnreadableError("damaged: a chunk holds messages outside its stated times")
+def _outside() -> UnreadableError:
+    return UnreadableError("damaged: a chunk holds messages outside its stated times")
 
 
 def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
@@ -143,22 +143,23 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     channels, resolved, chunks, stated = read_summary(file)
     if stated is None or not resolved or stated.channels > len(channels):
         raise DoubtError
-    if not stated.counts.keys() <= channels.keys():
+    counts = stated.counts
+    if not counts.keys() <= channels.keys():
         raise DoubtError
-    if stated.counts and not all(chunk.index_places for chunk in chunks):
-        raise DoubtError
-    exact = _agrees(stated, chunks)
-    totals = totals_of(file, chunks, stated.counts if exact else None)
-    found = {channel: total.count for channel, total in totals.items()}
-    if found != stated.counts or sum(found.values()) != stated.messages:
-        raise DoubtError
-    held = tuple([chunk for chunk in chunks if chunk.channels])
-    return McapIndex(channels, held, totals, notes=disagreements(stated, totals))
-
-
-def _agrees(stated: Statistics, chunks: list[Chunk]) -> bool:
-    """Whether the statistics agree with themselves and with the chunk indexes."""
     held = [chunk for chunk in chunks if chunk.channels]
+    if counts and len(held) < len(chunks):  # some have no index places
+        raise DoubtError
+    exact = _agrees(stated, chunks, held)
+    totals = totals_of(file, held, counts if exact else None)
+    found = {channel: total.count for channel, total in totals.items()}
+    if found != counts or sum(found.values()) != stated.messages:
+        raise DoubtError
+    notes = disagreements(stated, totals)
+    return McapIndex(channels, tuple(held), totals, notes=notes)
+
+
+def _agrees(stated: Statistics, chunks: Sequence[Chunk], held: Sequence[Chunk]) -> bool:
+    """Whether the statistics agree with themselves and with the chunk indexes."""
     if sum(stated.counts.values()) != stated.messages or stated.chunks != len(chunks):
         return False
     if not held:
@@ -184,28 +185,47 @@ def totals_of(
         for chunk in held:
             _take_in(file, chunk, totals)
         return totals
+    read = _take_in_beginnings(file, held, counts, totals)
+    _take_in_ends(file, [chunk for chunk in held if chunk.offset not in read], counts, totals)
+    for channel, total in totals.items():
+        total.count = counts.get(channel, 0)
+    return totals
+
+
+def _take_in_beginnings(
+    file: OpenFile, held: Sequence[Chunk], counts: Mapping[int, int], totals: dict[int, Total]
+) -> set[int]:
+    """Reads every chunk that can hold a channel's earliest message; says which these are."""
     read: set[int] = set()
     # By the set of channels, since the chunks of a file mostly hold the same ones.
     edges: dict[frozenset[int], Ns] = {}
+    settled = _NEVER
     for chunk in sorted(held, key=attrgetter("start")):
+        if chunk.start >= settled:
+            break
         edge = edges.get(chunk.channels)
         if edge is None:
             edge = edges[chunk.channels] = _latest_first(chunk.channels, counts, totals)
         if chunk.start < edge:
             _take_in(file, chunk, totals)
             read.add(chunk.offset)
+            settled = _latest_first(counts, counts, totals)
             edges.clear()
-    edges.clear()
+    return read
+
+
+def _take_in_ends(
+    file: OpenFile, held: Sequence[Chunk], counts: Mapping[int, int], totals: dict[int, Total]
+) -> None:
+    """Reads every chunk that can hold a channel's latest message."""
+    edges: dict[frozenset[int], Ns] = {}
     for chunk in sorted(held, key=attrgetter("end"), reverse=True):
         edge = edges.get(chunk.channels)
         if edge is None:
             edge = edges[chunk.channels] = _earliest_last(chunk.channels, counts, totals)
-        if chunk.end > edge and chunk.offset not in read:
+        if chunk.end > edge:
             _take_in(file, chunk, totals)
             edges.clear()
-    for channel, total in totals.items():
-        total.count = counts.get(channel, 0)
-    return totals
 
 
 def _take_in(file: OpenFile, chunk: Chunk, totals: dict[int, Total]) -> None:
@@ -249,17 +269,19 @@ def _add(totals: dict[int, Total], channel: int, extent: Extent) -> None:
     if total is None:
         totals[channel] = Total(*extent)
         return
-    total.count += extent.messages
-    total.first = min(total.first, extent.first)
-    total.last = max(total.last, extent.last)
+    messages, first, last = extent
+    total.count += messages
+    total.first = min(total.first, first)
+    total.last = max(total.last, last)
 
 
 def disagreements(stated: Statistics, totals: Mapping[int, Total]) -> tuple[str, ...]:
     """A note where the messages contradict the statistics."""
+    every = totals.values()
     counts = {channel: total.count for channel, total in totals.items()}
-    count = sum(counts.values())
-    first = min((total.first for total in totals.values()), default=stated.start)
-    last = max((total.last for total in totals.values()), default=stated.end)
+    count = sum([total.count for total in every])
+    first = min([total.first for total in every], default=stated.start)
+    last = max([total.last for total in every], default=stated.end)
     claimed = (stated.messages, stated.start, stated.end)
     if stated.counts == counts and claimed == (count, first, last):
         return ()

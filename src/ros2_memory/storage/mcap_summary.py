@@ -36,10 +36,14 @@ MAX_SECTION_BYTES = 256 << 20
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
 _CHUNK_INDEX_BYTES: Final = _CHUNK_INDEX.size
+_chunk_index: Final = _CHUNK_INDEX.unpack_from
 _INDEX_OFFSET: Final = struct.Struct("<HQ")
 _INDEX_OFFSET_BYTES: Final = _INDEX_OFFSET.size
 _SIZE_BYTES: Final = 8
-_DECLARING: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL))
+_index_size: Final = struct.Struct("<Q").unpack_from
+_tuple: Final = tuple.__new__
+_DECLARING: Final = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))
+_STATISTICS: Final = int(Opcode.STATISTICS)
 _MOST_REMEMBERED: Final = 32
 _LONGEST_REMEMBERED: Final = 128 * 1024
 
@@ -67,6 +71,18 @@ class Chunk(NamedTuple):
         return dict(_INDEX_OFFSET.iter_unpack(self.index_places or b""))
 
 
+class _Declared(NamedTuple):
+    """Schema and channel records as they stand in a file, and what they declare."""
+
+    records: bytes
+    channels: Mapping[int, Channel]
+    resolved: bool
+
+
+_beginnings: tuple[_Declared, ...] = ()
+"""What sections begin with that were read: those of one robot's bags begin with the same bytes."""
+
+
 class DoubtError(UnreadableError):
     """The summary section cannot be relied on; the text is a note on it, or empty."""
 
@@ -88,10 +104,11 @@ def read_summary(file: OpenFile) -> Summary:
         UnreadableError, struct.error and others: it is damaged.
     """
     section = _section(file)
-    declaring: list[bytes] = []
+    beginning = next((each for each in _beginnings if section.startswith(each.records)), None)
+    declaring: list[bytes] = [] if beginning is None else [beginning.records]
     chunks: list[Chunk] = []
     stated: Statistics | None = None
-    position, end = 0, len(section)
+    position, end = sum(map(len, declaring)), len(section)
     record, size, chunk_index = RECORD.unpack_from, RECORD.size, int(Opcode.CHUNK_INDEX)
     while position < end:
         if position + size > end:
@@ -104,13 +121,13 @@ def read_summary(file: OpenFile) -> Summary:
             chunks.append(_chunk(section, position + size, following))
         elif opcode in _DECLARING:
             declaring.append(section[position:following])
-        elif opcode == Opcode.STATISTICS:
+        elif opcode == _STATISTICS:
             stated = statistics(section[position + size : following])
         position = following
-    declared = b"".join(declaring)
-    short = len(declared) <= _LONGEST_REMEMBERED
-    channels, resolved = (_declared if short else _declared.__wrapped__)(declared)
-    return Summary(channels, resolved, chunks, stated)
+    if beginning is None or len(declaring) > 1:
+        beginning = _declared(b"".join(declaring))
+        _remember(beginning, section)
+    return Summary(beginning.channels, beginning.resolved, chunks, stated)
 
 
 def _section(file: OpenFile) -> bytes:
@@ -129,17 +146,16 @@ def _section(file: OpenFile) -> bytes:
 
 def _chunk(section: bytes, at: int, end: int) -> Chunk:
     """The chunk of the chunk index record whose body lies from `at` to `end`."""
-    start, last, offset, length, places_size = _CHUNK_INDEX.unpack_from(section, at)
+    start, last, offset, length, places_size = _chunk_index(section, at)
     at += _CHUNK_INDEX_BYTES
     stop = at + places_size
     if stop + _SIZE_BYTES > end or places_size % _INDEX_OFFSET_BYTES:
         raise UnreadableError("damaged: a chunk index is shorter than it states")
     places = section[at:stop]
     channels = _numbers(places[::_INDEX_OFFSET_BYTES], places[1::_INDEX_OFFSET_BYTES])
-    index_length = int.from_bytes(section[stop : stop + _SIZE_BYTES], "little")
+    (index_length,) = _index_size(section, stop)
     # As a tuple is made, past the function that a named tuple's fields go through.
-    fields = (offset, length, start, last, channels, places, index_length, None)
-    return tuple.__new__(Chunk, fields)
+    return _tuple(Chunk, (offset, length, start, last, channels, places, index_length, None))
 
 
 @lru_cache(1024)
@@ -148,10 +164,17 @@ def _numbers(low: bytes, high: bytes) -> frozenset[int]:
     return frozenset(one | other << 8 for one, other in zip(low, high, strict=True))
 
 
-@lru_cache(_MOST_REMEMBERED)
-def _declared(records: bytes) -> tuple[Mapping[int, Channel], bool]:
+def _declared(records: bytes) -> _Declared:
     """The channels of schema and channel records, and whether their schemas are all among them."""
     declarations = Declarations()
     for opcode, body in framed(records):
         declarations.add(opcode, body)
-    return declarations.channels(), declarations.resolved
+    return _Declared(records, declarations.channels(), declarations.resolved)
+
+
+def _remember(declared: _Declared, section: bytes) -> None:
+    """Remembers what a section begins with, if it declares nothing else."""
+    global _beginnings  # noqa: PLW0603 - replaced as a whole, so that threads may share it
+    records = declared.records
+    if records and len(records) <= _LONGEST_REMEMBERED and section.startswith(records):
+        _beginnings = (declared, *_beginnings[: _MOST_REMEMBERED - 1])
