@@ -11,11 +11,15 @@ from ros2_memory.globs import matching
 from ros2_memory.model import TimeWindow
 from ros2_memory.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    MIN_NS,
     START_SLACK_NS,
     Ns,
     unix_from_ns,
     unix_rounded_up,
 )
+from ros2_memory.unseen import note_unseen
+from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
     from ros2_memory.history import View
@@ -76,9 +80,9 @@ def require_bags(view: View) -> None:
         )
     why = [snapshot.problem or "no bag with messages lies in the bag directory"]
     if snapshot.damaged:
-        why.append(f"{len(snapshot.damaged)} damaged files were set aside")
+        why.append(f"{counted(len(snapshot.damaged), 'damaged file')} set aside")
     if snapshot.unread:
-        why.append(f"{len(snapshot.unread)} files are of a kind that is not read here")
+        why.append(f"{counted(len(snapshot.unread), 'file')} of a kind that is not read here")
     raise NoDataError(
         NoDataReason.EMPTY_MEMORY, f"{'; '.join(why)}; data_time_range lists the files"
     )
@@ -97,7 +101,8 @@ def not_recorded(view: View, name: str) -> NoDataError:
         stem = name.rstrip("/").rpartition("/")[2].strip("*")
         close = [topic for topic in snapshot.topics() if stem and stem in topic][:5]
     hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
-    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}")
+    note_unseen(view, TimeWindow.everything(), nothing=True)
+    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}", view.notes)
 
 
 def nothing_at(
@@ -130,7 +135,10 @@ def nothing_at(
     reason = NoDataReason.GAP if older and newer else beyond(view, at)
     acceptable = older.time if older and tolerance is not None else None
     told.append(_advice(view, reason, at, acceptable))
-    return NoDataError(reason, "; ".join(told))
+    before = tolerance if around is None else around
+    start = TimeWindow.everything().start if before is None else max(at - before, MIN_NS)
+    note_unseen(view, TimeWindow(start, min(at + (around or 0) + 1, MAX_NS)), nothing=True)
+    return NoDataError(reason, "; ".join(told), view.notes)
 
 
 def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
@@ -146,7 +154,8 @@ def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         told.append(f"the first one after is at {moment(newer.time)}")
     reason = NoDataReason.GAP if older and newer else beyond(view, end)
     told.append(_advice(view, reason, window.start, None))
-    return NoDataError(reason, "; ".join(told))
+    note_unseen(view, window, nothing=True)
+    return NoDataError(reason, "; ".join(told), view.notes)
 
 
 def beyond(view: View, at: Ns) -> NoDataReason:
@@ -163,16 +172,6 @@ def undecodable(topic: str, type_name: str, error: UndecodableError) -> NoDataEr
         NoDataReason.UNDECODABLE,
         f"messages of {topic} ({type_name}) are recorded but cannot be decoded: {error.reason}",
     )
-
-
-def damaged_note(view: View) -> str | None:
-    """A sentence on the files that no search can look into, or None."""
-    damaged = view.snapshot.damaged
-    if not damaged:
-        return None
-    named = ", ".join(f"{each.path.name} ({each.reason})" for each in damaged[-3:])
-    more = f" and {len(damaged) - 3} more" if len(damaged) > 3 else ""
-    return f"could not be read and were not searched: {named}{more}"
 
 
 def _advice(view: View, reason: NoDataReason, at: Ns, older: Ns | None) -> str:

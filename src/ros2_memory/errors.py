@@ -52,14 +52,18 @@ class NoDataReason(StrEnum):
 
 
 class NoDataError(EpisodicError):
-    """There is no answer; `detail` says what there is instead and what to ask."""
+    """There is no answer; `detail` says what there is instead and what to ask.
+
+    `notes` are sentences on what could not be read, and may hold what was asked for.
+    """
 
     code = "no_data"
 
-    def __init__(self, reason: NoDataReason, detail: str) -> None:
+    def __init__(self, reason: NoDataReason, detail: str, notes: tuple[str, ...] = ()) -> None:
         super().__init__(detail)
         self.reason = reason
         self.detail = detail
+        self.notes = notes
 
 
 class QueryTimeoutError(EpisodicError):

@@ -39,10 +39,11 @@ _OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAME
 
 
 class FoundTransform(NamedTuple):
-    """A transform, and the clock in which the moment was meant."""
+    """A transform, the clock in which the moment was meant, and how far around it was read."""
 
     lookup: Lookup
     clock: TfClock
+    reach: Ns = TF_CACHE_NS
 
 
 def transform_at(view: View, parent: str, child: str, at: Ns) -> FoundTransform:
@@ -60,7 +61,8 @@ def transform_at(view: View, parent: str, child: str, at: Ns) -> FoundTransform:
     for half_width in _HALF_WIDTHS:
         dynamic = list(_transforms(view, limits.tf_topics, _around(at, half_width), static=False))
         try:
-            return _lookup(static, dynamic, limits.tf_clock, (parent, child), at)
+            found = _lookup(static, dynamic, limits.tf_clock, (parent, child), at)
+            return found._replace(reach=half_width)
         except NoDataError as error:
             failure = error
     if limits.tf_clock == "stamp":

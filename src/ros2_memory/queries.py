@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import answers
@@ -31,8 +32,10 @@ from ros2_memory.errors import (
 from ros2_memory.history import View, short_name
 from ros2_memory.model import BagState, Sample, SetAside, TimeWindow
 from ros2_memory.moments import Moment, Span, ns_argument, open_moment, open_span
+from ros2_memory.recorder.clock_faults import FUTURE_NS
 from ros2_memory.sampling import samples_note
 from ros2_memory.search import last_match, unsearched
+from ros2_memory.tf_tree import TF_CACHE_NS
 from ros2_memory.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -41,6 +44,7 @@ from ros2_memory.timebase import (
     Ns,
     ns_from_unix,
 )
+from ros2_memory.unseen import note_unseen
 from ros2_memory.ways import carries_no, decoded, way_driven
 
 if TYPE_CHECKING:
@@ -141,6 +145,7 @@ def topic_range(
         view.note(f"the topic was recorded under several types: {', '.join(types)}")
     if len(chosen) < total:
         view.note(samples_note(len(chosen), total))
+    note_unseen(view, window)
     _note_edges(view, window)
     return answers.TopicRange(name, types[-1], total, samples, view.notes)
 
@@ -190,7 +195,12 @@ def transform(
 ) -> answers.TransformAt:
     """The pose of `child` in `parent` at a moment, interpolated by tf2's rules."""
     view, at, now = open_moment(memory, call, moment)
-    found = frame_history.transform_at(view, parent, child, at)
+    try:
+        found = frame_history.transform_at(view, parent, child, at)
+    except NoDataError as error:
+        note_unseen(view, _around(at, TF_CACHE_NS), nothing=True)
+        raise NoDataError(error.reason, error.detail, view.notes) from error
+    note_unseen(view, _around(at, found.reach))
     age = None if now is None else now - at
     return answers.TransformAt(
         parent, child, at, found.lookup.transform, found.clock, view.notes, age
@@ -201,7 +211,9 @@ def frames(memory: Memory, call: Call) -> answers.Frames:
     """Every frame and parent-child pair that was recorded."""
     view = View(memory, call, memory.clock.now())
     require_bags(view)
-    return answers.Frames(frame_history.edges(view), view.notes)
+    edges = frame_history.edges(view)
+    note_unseen(view, TimeWindow.everything(), nothing=True)
+    return answers.Frames(edges, view.notes)
 
 
 def find_last_match(
@@ -222,10 +234,15 @@ def find_last_match(
     condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
     now = memory.clock.now()
     view = View(memory, call, now)
-    found = last_match(view, topic, condition, _before(before_s))
+    until = _before(before_s)
+    found = last_match(view, topic, condition, until)
     if found is None:
-        return answers.Match(None, unsearched(view))
+        return answers.Match(None, unsearched(view, TimeWindow(MIN_NS, until)))
+    note_unseen(view, _searched(view, found, until, now))
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
+    if counted_from is not None and found.time > counted_from + FUTURE_NS:
+        view.note(f"dated {seconds(found.time - counted_from)} after now: when it was is unknown")
+        counted_from = None
     return answers.Match(_value(view, found, fields, counted_from), view.notes)
 
 
@@ -246,13 +263,17 @@ def value_when(
     With `before_s` (Unix seconds) the condition is looked for up to and including then.
     """
     condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
-    view = View(memory, call, memory.clock.now())
+    now, until = memory.clock.now(), _before(before_s)
+    view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
-    found = last_match(view, condition_topic, condition, _before(before_s))
+    found = last_match(view, condition_topic, condition, until)
     if found is None:
-        return answers.ValueWhen(None, notes=unsearched(view))
+        return answers.ValueWhen(None, notes=unsearched(view, TimeWindow(MIN_NS, until)))
+    note_unseen(view, _searched(view, found, until, now))
     matched = _value(view, found, (), None)
-    held = view.newest(name, TimeWindow.until(found.time))
+    upto = TimeWindow.until(found.time)
+    held = view.newest(name, upto)
+    note_unseen(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
     if held is None:
         view.note(f"{name} held no message yet at {moment(found.time)}")
         return answers.ValueWhen(matched, None, view.notes)
@@ -275,10 +296,17 @@ def trajectory_summary(
         raise nothing_between(view, (name,), window)
     if len(way.frames) > 1:
         view.note(f"poses in several frames were joined: {', '.join(way.frames)}")
+    note_unseen(view, window)
     _note_edges(view, window)
     return answers.TrajectorySummary(
         name, way.frames[0], way.first, way.last, way.trajectory, view.notes
     )
+
+
+def _searched(view: View, found: Found, until: Ns, now: Ns) -> TimeWindow:
+    """What a search went through to its match, as far as there has been anything."""
+    stop = until if view.memory.limits.now == "latest" else min(until, now + 1)
+    return TimeWindow(found.time, max(stop, found.time + 1))
 
 
 def _before(before_s: float | None) -> Ns:
@@ -300,6 +328,7 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Foun
     found = view.newest(topic, TimeWindow(start, stop))
     if found is None:
         raise nothing_at(view, (topic,), at, tolerance)
+    note_unseen(view, TimeWindow(found.time, stop))
     return found
 
 
@@ -405,12 +434,18 @@ def _holes(view: View, longest: Ns) -> Iterator[answers.Gap]:
         reach = bag.end if reach is None else max(reach, bag.end)
 
 
+def _around(at: Ns, reach: Ns) -> TimeWindow:
+    return TimeWindow(max(at - reach, MIN_NS), min(at + reach + 1, MAX_NS))
+
+
 def _note_edges(view: View, window: TimeWindow) -> None:
     """Says where a window was asked to reach past what the memory can answer."""
     snapshot = view.snapshot
-    asked_from = window.start + START_SLACK_NS
-    if snapshot.earliest is not None and asked_from < snapshot.earliest:
-        view.note(f"the memory begins at {moment(snapshot.earliest)}")
+    asked_from, earliest = window.start + START_SLACK_NS, snapshot.earliest
+    if earliest is not None and asked_from < earliest:
+        before = TimeWindow(asked_from, earliest)
+        if not any(before.overlaps(each.bag.start, each.bag.end) for each in snapshot.misdated):
+            view.note(f"the memory begins at {moment(earliest)}")
     asked_to = window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     if snapshot.latest is None or asked_to <= snapshot.latest:
         return

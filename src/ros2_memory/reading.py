@@ -69,14 +69,10 @@ class Reading:
         return None if notes is None or number is None else (notes, number)
 
     def used(self, found: Iterator[Found]) -> Iterator[Found]:
-        """The messages, with a note where one stands in a bag that a crash left open."""
+        """The messages; where one stands in a bag that a crash left open, they are not all."""
         for each in found:
             if each.bag.state is BagState.INCOMPLETE:
                 self.complete = False
-                self.note(
-                    f"{short_name(each.bag.path)} was left open by a crash; "
-                    "what is readable of it is used"
-                )
             yield each
 
     def log_times(self, bag: BagFile, topic: str, window: TimeWindow) -> Sequence[Ns]:

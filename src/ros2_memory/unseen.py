@@ -8,7 +8,8 @@ Named are, the first few of each and the others counted:
   whose time is unknown counts where the answer is that there is nothing, since it may hold it.
 - the file that is still being written, from the end of the split before it on;
 - bags that a crash left open, on to the last time that their files were written to;
-- closed bags of which parts could not be read, or that contradict themselves.
+- closed bags of which parts could not be read, or that contradict themselves;
+- bags that a wrong clock dated, where the answer is not that there is nothing.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.model import BagFile, SetAside, TimeWindow
     from ros2_memory.reading import Reading
+    from ros2_memory.recorder.clock_faults import ClockFault
     from ros2_memory.recorder.snapshot import Snapshot
 
 
@@ -50,6 +52,11 @@ def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> 
     ]
     if active:
         yield _still_written(snapshot, active, window)
+    misdated = [
+        fault for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
+    ]
+    if misdated and not nothing:
+        yield _misdated(misdated)
     odd = snapshot.odd(window)
     if odd:
         yield from _left_open([bag for bag in odd if bag.state is BagState.INCOMPLETE])
@@ -97,6 +104,11 @@ def _odd(bags: Sequence[BagFile]) -> Iterator[str]:
 
 def _are(bags: Sequence[BagFile]) -> str:
     return "is" if len(bags) - NAMED == 1 else "are"
+
+
+def _misdated(faults: Sequence[ClockFault]) -> str:
+    names = [f"{short_name(fault.bag.path)} ({fault.told})" for fault in faults[-NAMED:]]
+    return f"{counted(len(faults), 'bag')} dated by a wrong clock: {listed(names, len(faults))}"
 
 
 def _with_notes(bag: BagFile) -> str:

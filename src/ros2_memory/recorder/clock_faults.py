@@ -66,10 +66,11 @@ class ClockFault(NamedTuple):
     @property
     def reason(self) -> str:
         """What is wrong, in a sentence."""
-        told = self._told()
-        return f"{told}; left out of earliest and latest" if self.misleads else told
+        return f"{self.told}; left out of earliest and latest" if self.misleads else self.told
 
-    def _told(self) -> str:
+    @property
+    def told(self) -> str:
+        """As `reason`, of the bag alone."""
         match self.kind:
             case FaultyClock.UNSET if self.bag.mtime_ns >= FIRST_BAGS_NS:
                 return (

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.model import BagFile, SetAside, TimeWindow
-    from ros2_memory.recorder.clock_faults import Dating
+    from ros2_memory.recorder.clock_faults import ClockFault, Dating
     from ros2_memory.recorder.timeline import Extent, Held, Run, Span, Stated
     from ros2_memory.timebase import Ns
 
@@ -64,6 +64,11 @@ class Snapshot:
     @cached_property
     def _dates(self) -> Dating:
         return bearings.dating(self._timeline, self.scanned_at, with_steps=False)
+
+    @property
+    def misdated(self) -> Sequence[ClockFault]:
+        """The bags that `earliest` and `latest` leave out, since their dates cannot be true."""
+        return [fault for fault in self._dates.faults if fault.misleads]
 
     @cached_property
     def dating(self) -> Dating:
