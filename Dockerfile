@@ -1,8 +1,13 @@
 # The query server, in two stages: what is needed to build stays behind. It runs as a user without
-# rights, reads /bags, writes nothing there, and listens on the container's port 9203:
+# rights, reads /bags, writes nothing there, and listens on the container's port 9203. Other
+# containers reach that, so it does not start without a token that clients show:
 #
 #   docker build -t ros2-memory .
-#   docker run --rm --read-only --tmpfs /tmp -p 127.0.0.1:9203:9203 -v ~/bags:/bags:ro ros2-memory
+#   export MEMORY_API_TOKEN=$(openssl rand -hex 32)
+#   docker run --rm --read-only --tmpfs /tmp -p 127.0.0.1:9203:9203 -v ~/bags:/bags:ro \
+#     -e MEMORY_API_TOKEN ros2-memory
+#
+# deploy/compose.yaml does the same.
 #
 # The recorder needs the robot's own ROS installation and is not in here.
 
@@ -22,8 +27,8 @@ RUN useradd --system --no-create-home --shell /usr/sbin/nologin ros2-memory
 COPY --from=build /opt/ros2-memory /opt/ros2-memory
 USER ros2-memory
 WORKDIR /tmp
-# Inside the container every interface is the container's own; who may reach the port is decided
-# by what it is published on, above only the machine itself.
+# Inside the container every interface is the container's own; who else may reach the port is
+# decided by what it is published on, above only the machine itself.
 ENV PATH=/opt/ros2-memory/bin:$PATH \
     PYTHONDONTWRITEBYTECODE=1 \
     MEMORY_BAG_DIR=/bags \

@@ -209,14 +209,25 @@ def _split_overrides(given: Mapping[str, str]) -> list[str]:
     try:
         return shlex.split(text)
     except ValueError as error:
+        shown = "what it holds" if _names_a_token(text) else repr(text)
         raise ConfigError(
-            f"MEMORY_CONFIG_OVERRIDES: {text!r} is not allowed ({error}); "
+            f"MEMORY_CONFIG_OVERRIDES: {shown} is not allowed ({error}); "
             "write assignments as for a shell, separated by spaces"
-        ) from error
+        ) from (None if _names_a_token(text) else error)
+
+
+def _names_a_token(text: str) -> bool:
+    """Whether somebody took a secret for a setting: what is wrong with it must not be shown."""
+    return re.search(r"token\w*\s*=", text, re.IGNORECASE) is not None
 
 
 def _parsed(assignment: _Assignment, groups: Mapping[str, Sequence[str]]) -> _Asked:
     text, source = assignment.text, assignment.source
+    if _names_a_token(text):
+        raise ConfigError(
+            f"a token has no place among the settings (set {source}), where others can read it; "
+            "give the one that clients must show as MEMORY_API_TOKEN"
+        )
     try:
         override = OverridesParser.create().parse_override(text)
     except HydraException as error:

@@ -15,6 +15,8 @@ from starlette.datastructures import Headers
 from starlette.responses import JSONResponse, PlainTextResponse
 from starlette.routing import Route
 
+from ros2_memory.gate import ADMITTED, HEALTH_PATH, TokenGate
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 
@@ -40,10 +42,12 @@ def web_app(
     host: str,
     health: Callable[[], Awaitable[JsonObject]],
     background: Background,
+    api_token: str | None = None,
 ) -> WebApp:
     """The application that listens on `host`.
 
-    `background` runs from start to end of the application, and is cancelled then.
+    `background` runs from start to end of the application, and is cancelled then. `api_token` is
+    demanded of every request; without it `/health` shows its status alone.
     """
     # `Guard` stands before all routes, and knows the addresses of a host such as 0.0.0.0.
     guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
@@ -52,8 +56,12 @@ def web_app(
         stateless_http=True, json_response=True, transport_security=guarded
     )
 
-    async def show_health(_request: Request) -> JSONResponse:
-        return JSONResponse(await health())
+    async def show_health(request: Request) -> JSONResponse:
+        told = await health()
+        if api_token is not None and not request.scope.get(ADMITTED, False):
+            # Enough for whoever only watches that the server is up.
+            told = {"status": told["status"]}
+        return JSONResponse(told)
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
@@ -62,8 +70,11 @@ def web_app(
             yield
             tasks.cancel_scope.cancel()
 
-    routes = [*streams.routes, *requests.routes, Route("/health", show_health, methods=["GET"])]
-    return WebApp(Guard(Starlette(routes=routes, lifespan=lifespan), host))
+    routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
+    app: ASGIApp = Starlette(routes=routes, lifespan=lifespan)
+    if api_token is not None:
+        app = TokenGate(app, api_token)
+    return WebApp(Guard(app, host))
 
 
 class WebApp:

@@ -6,62 +6,77 @@ In stdio mode stdout is the wire, so nothing else is ever written there; logs go
 from __future__ import annotations
 
 import argparse
-import errno
 import logging
 import os
 import signal
-import socket
 import sys
 import threading
 from functools import partial
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 
 import anyio
 import uvicorn
 
+from ros2_memory.api_token import take_token
 from ros2_memory.bootstrap import build_filler, build_memory, build_server, package_version
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.filling import keep_filled
 from ros2_memory.health import health, keep_fresh
 from ros2_memory.http import STREAM_PATH, web_app
+from ros2_memory.listening import CannotListenError, bound, resolved
 from ros2_memory.logs import configure_logging, get_logger
 from ros2_memory.recorder.notify import READY, STOPPING, ServiceManager
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import Sequence
     from types import FrameType
+
+    from pydantic import SecretStr
 
     from ros2_memory.dispatch import EpisodicServer
     from ros2_memory.filling import Filler
     from ros2_memory.http import Background, WebApp
+    from ros2_memory.listening import Address
     from ros2_memory.memory import Memory
     from ros2_memory.settings import ServerSettings
 
 PROGRAM: Final = "ros2-memory-server"
 CANNOT_LISTEN: Final = 1
 
-_BACKLOG: Final = 128
 _THREADS_END_S: Final = 0.2
 
 log = get_logger("ros2_memory.server")
-
-
-class CannotListenError(Exception):
-    """The address cannot be listened on; the sentence says why and what to do."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Serves until it is told to stop, and returns the exit code.
 
     0: stopped by SIGTERM, SIGINT or the end of stdin; 1: the address cannot be listened on; 2: the
-    configuration or the command line is refused.
+    configuration or the command line is refused, or a token is missing where there must be one.
     """
     overrides: list[str] = _parser().parse_args(argv).overrides
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _stopped)
+    try:
+        _run(overrides)
+    except CannotListenError as error:
+        sys.stderr.write(f"{PROGRAM}: {error}\n")
+        return _left(CANNOT_LISTEN)
+    return _left(0)
+
+
+def _run(overrides: Sequence[str]) -> None:
+    """Serves until it is told to stop.
+
+    Raises:
+        CannotListenError: the address cannot be listened on.
+        SystemExit: the configuration is refused.
+    """
     with exit_on_config_error(PROGRAM):
         settings = load_settings(overrides)
         configure_logging(settings.logging.level, settings.logging.format)
+        front = None if settings.server.transport == "stdio" else _front(settings.server)
         memory = build_memory(settings)
         server = build_server(settings, memory)
     filler = build_filler(settings, memory)
@@ -72,9 +87,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         bag_dir=str(settings.recording.bag_dir.absolute()),
         transport=settings.server.transport,
     )
-    code = 0
     try:
-        if settings.server.transport == "stdio":
+        if front is None:
             anyio.run(_serve_stdio, server, background)
         else:
             app = web_app(
@@ -82,15 +96,32 @@ def main(argv: Sequence[str] | None = None) -> int:
                 host=settings.server.host,
                 health=partial(health, memory, package_version(), filler),
                 background=background,
+                api_token=front.token.get_secret_value() if front.token else None,
             )
-            _serve_http(server, app, settings.server)
-    except CannotListenError as error:
-        sys.stderr.write(f"{PROGRAM}: {error}\n")
-        code = CANNOT_LISTEN
+            _serve_http(server, app, front.address)
     except SystemExit:
         log.info("stopped")
-    server.dispatcher.stop()
-    return _left(code)
+    finally:
+        server.dispatcher.stop()
+
+
+class _Front(NamedTuple):
+    """Where clients come to, and what they have to show there."""
+
+    address: Address
+    token: SecretStr | None
+
+
+def _front(at: ServerSettings) -> _Front:
+    """Finds both before anything is built.
+
+    Raises:
+        CannotListenError: the host stands for no address.
+        ConfigError: a token is missing, or cannot be used.
+    """
+    address = resolved(at.host, at.port)
+    token = take_token(os.environ, host=at.host, loopback=address.is_loopback)
+    return _Front(address, token)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -99,7 +130,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Answers questions about a robot's past, from its bags, over MCP.",
         epilog="Environment: MCP_TRANSPORT (stdio, sse), MCP_HOST, MCP_PORT, MEMORY_BAG_DIR, "
         "MEMORY_DEPLOYMENT, MEMORY_CONFIG_DIR, MEMORY_CONFIG_OVERRIDES, "
-        "ROS_VISION_INTERFACES_PATH.",
+        "ROS_VISION_INTERFACES_PATH, MEMORY_API_TOKEN or MEMORY_API_TOKEN_FILE.",
     )
     parser.add_argument(
         "overrides",
@@ -154,17 +185,18 @@ async def _serve_stdio(server: EpisodicServer, background: Background) -> None:
         tasks.cancel_scope.cancel()
 
 
-def _serve_http(server: EpisodicServer, app: WebApp, at: ServerSettings) -> None:
+def _serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
     config = uvicorn.Config(
         app,
         lifespan="on",
         ws="none",
         log_config=None,
         log_level="warning",
+        # Nobody needs it, and it would show whatever somebody puts into a query string.
         access_log=False,
         timeout_graceful_shutdown=1,
     )
-    listening = _bound(at.host, at.port)
+    listening = bound(at)
     anyio.run(_Listener(config, server, app).serve, [listening])
 
 
@@ -189,38 +221,6 @@ class _Listener(uvicorn.Server):
         self._server.dispatcher.stop()
         self._app.stop()
         await super().shutdown(sockets)
-
-
-def _bound(host: str, port: int) -> socket.socket:
-    """A socket that listens; a name that has addresses of both kinds stands for its IPv4 one.
-
-    Raises:
-        CannotListenError: the address is in use, not this machine's, or not allowed.
-    """
-    try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, *_, address = min(found, key=lambda each: each[0] is not socket.AF_INET)
-        listening = socket.create_server(address[:2], family=family, backlog=_BACKLOG)
-    except OSError as error:
-        raise CannotListenError(_why_not(host, port, error)) from error
-    # asyncio sets this on sockets of its own making only. Accepted ones inherit it; without it each
-    # reply on a kept connection waits 40 ms for the client's delayed acknowledgement.
-    listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    return listening
-
-
-def _why_not(host: str, port: int, error: OSError) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return (
-            f"port {port} on {host} is in use by another program; "
-            "stop that one, or choose another port with MCP_PORT"
-        )
-    if error.errno == errno.EACCES:
-        return f"port {port} on {host} is not allowed; choose one from 1024 up with MCP_PORT"
-    return (
-        f"{host} port {port} cannot be listened on ({error.strerror or error}); "
-        "give an address of this machine with MCP_HOST"
-    )
 
 
 if __name__ == "__main__":

@@ -74,9 +74,12 @@ class Served:
 
 
 @contextmanager
-def serving(bag_dir: Path, log: Path, *overrides: str) -> Iterator[Served]:
-    """The server over HTTP on a free port, from when it answers `/health`."""
-    env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT="0")
+def serving(bag_dir: Path, log: Path, *overrides: str, **more: str) -> Iterator[Served]:
+    """The server over HTTP on a free port, from when it answers `/health`.
+
+    `more` joins its environment.
+    """
+    env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT="0", **more)
     with log.open("wb") as stderr:
         process = subprocess.Popen(
             command(*overrides), env=env, stdout=subprocess.PIPE, stderr=stderr
@@ -212,7 +215,7 @@ def test_a_port_in_use_is_told_in_one_line(bag_dir: Path) -> None:
 
 
 def test_an_address_of_another_machine_is_told_in_one_line(bag_dir: Path) -> None:
-    env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_HOST="192.0.2.1")
+    env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_HOST="192.0.2.1", MEMORY_API_TOKEN="x" * 32)
     ended = subprocess.run(
         command("logging.level=error"), env=env, capture_output=True, text=True, check=False
     )

@@ -9,7 +9,9 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import yaml
 
+from ros2_memory.api_token import CREDENTIAL
 from ros2_memory.config import load_settings
 from ros2_memory.settings import Ros2BagNode
 
@@ -109,6 +111,24 @@ def test_the_environment_file_is_understood_by_the_program() -> None:
     recorder = load_settings((), env).recorder
     assert isinstance(recorder, Ros2BagNode)
     assert recorder.setup_files == (Path("/opt/ros/jazzy/setup.bash"),)
+
+
+def test_the_server_listens_on_the_loopback_address_unless_it_is_given_a_token() -> None:
+    said = settings_of(SERVER)
+    assert said["IPAddressAllow"] == ["localhost"]
+    assert not [line for line in said["Environment"] if "MCP_HOST" in line]
+    # The lines that are commented out are to be right when they are not.
+    (credential,) = re.findall(r"^#LoadCredential=(\w+):", SERVER.read_text(), re.MULTILINE)
+    assert credential == CREDENTIAL
+
+
+def test_the_container_is_published_on_the_loopback_address_and_needs_a_token() -> None:
+    told = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    (service,) = told["services"].values()
+    assert service["ports"] == ["127.0.0.1:9203:9203"]
+    assert service["environment"]["MEMORY_API_TOKEN"].startswith("${MEMORY_API_TOKEN:?")
+    assert all(volume.endswith(":ro") for volume in service["volumes"])
+    assert service["read_only"] is True
 
 
 @needs_sysusers

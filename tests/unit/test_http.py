@@ -23,10 +23,16 @@ if TYPE_CHECKING:
 
 HOME = "http://127.0.0.1:9203"
 EVERYWHERE = ".".join("0000")
+GOOD = "kJ7-x._~+/0123456789=="
+SHOWN = {"authorization": f"Bearer {GOOD}"}
 MCP_HEADERS = {"accept": "application/json, text/event-stream"}
 
 
-def app(host: str = "127.0.0.1", background: Any = anyio.sleep_forever) -> WebApp:
+def app(
+    host: str = "127.0.0.1",
+    background: Any = anyio.sleep_forever,
+    api_token: str | None = None,
+) -> WebApp:
     schema: dict[str, Any] = {"type": "object", "properties": {}}
     reply = answers.TopicValue("/a", "a/msg/A", Sample(0, 7))
     tool = Tool("ask", "Ask", "Asks.", schema, blocking=False, question=lambda _: lambda *_: reply)
@@ -36,9 +42,9 @@ def app(host: str = "127.0.0.1", background: Any = anyio.sleep_forever) -> WebAp
     server = EpisodicServer(dispatcher, [tool], name="episodic", version="1", instructions="")
 
     async def health() -> Any:
-        return {"status": "ok"}
+        return {"status": "ok", "bags": 3}
 
-    return web_app(server, host=host, health=health, background=background)
+    return web_app(server, host=host, health=health, background=background, api_token=api_token)
 
 
 @asynccontextmanager
@@ -74,7 +80,50 @@ async def test_health_is_json() -> None:
     async with client(app()) as http:
         response = await http.get("/health")
     assert response.status_code == 200
-    assert response.json() == {"status": "ok"}
+    assert response.json() == {"status": "ok", "bags": 3}
+
+
+async def test_health_shows_its_status_alone_to_whoever_shows_no_token() -> None:
+    async with client(app(api_token=GOOD)) as http:
+        assert (await http.get("/health")).json() == {"status": "ok"}
+        shown = await http.get("/health", headers=SHOWN)
+        assert shown.json() == {"status": "ok", "bags": 3}
+        assert (await http.get("/health", headers={"authorization": "Bearer x"})).status_code == 401
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("GET", "/sse"),
+        ("POST", "/messages/"),
+        ("POST", "/mcp"),
+        ("GET", "/mcp"),
+        ("DELETE", "/mcp"),
+    ],
+)
+async def test_a_token_is_demanded_wherever_tools_are_called(method: str, path: str) -> None:
+    web = app(api_token=GOOD)
+    async with running(web), client(web) as http:
+        for headers in ({}, {"authorization": f"Bearer {GOOD}x"}):
+            response = await http.request(method, path, headers=MCP_HEADERS | headers)
+            assert response.status_code == 401
+            assert response.headers["www-authenticate"].startswith("Bearer ")
+
+
+async def test_a_tool_is_called_by_whoever_shows_the_token() -> None:
+    web = app(api_token=GOOD)
+    async with running(web), client(web) as http:
+        response = await http.post("/mcp", json=call_tool("ask"), headers=MCP_HEADERS | SHOWN)
+    assert response.status_code == 200
+
+
+async def test_a_page_of_another_site_is_refused_before_it_is_asked_for_a_token() -> None:
+    async with client(app(EVERYWHERE, api_token=GOOD)) as http:
+        for headers in ({}, SHOWN):
+            other = await http.get("/mcp", headers={"host": "evil.example"} | headers)
+            assert other.status_code == 421
+            its = {"host": "192.168.7.20:9203", "origin": "http://evil.example"}
+            assert (await http.get("/mcp", headers=its | headers)).status_code == 403
 
 
 async def test_a_tool_is_called_over_mcp_in_one_request_without_a_session() -> None:

@@ -47,6 +47,9 @@ _OURS: Final = frozenset(
         "LISTEN_FDS",
         "LISTEN_PID",
         "JOURNAL_STREAM",
+        "CREDENTIALS_DIRECTORY",
+        # The server's, from an environment file that both programs have.
+        "MEMORY_API_TOKEN",
     }
 )
 _SHELLS_OWN: Final = ("_", "SHLVL", "PWD", "OLDPWD")

@@ -1,0 +1,84 @@
+"""The address that the server listens on: who can reach it, and why it cannot be had."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import socket
+from dataclasses import dataclass
+from typing import Final
+
+_BACKLOG: Final = 128
+
+
+class CannotListenError(Exception):
+    """The address cannot be listened on; the sentence says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """An address to listen on, and the host name or address that was asked for."""
+
+    host: str
+    family: socket.AddressFamily
+    ip: str
+    port: int
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only programs on this machine can reach it.
+
+        Judged by the address itself: a name may stand for any.
+        """
+        try:
+            return ipaddress.ip_address(self.ip.partition("%")[0]).is_loopback
+        except ValueError:
+            return False
+
+
+def resolved(host: str, port: int) -> Address:
+    """The address that a host stands for; its IPv4 one where it has addresses of both kinds.
+
+    Raises:
+        CannotListenError: it stands for none.
+    """
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (OSError, UnicodeError) as error:
+        raise CannotListenError(_why_not(host, port, error)) from error
+    family, *_, address = min(found, key=lambda each: each[0] is not socket.AF_INET)
+    return Address(host, family, str(address[0]), port)
+
+
+def bound(address: Address) -> socket.socket:
+    """A socket that listens.
+
+    Raises:
+        CannotListenError: the address is in use, not this machine's, or not allowed.
+    """
+    try:
+        listening = socket.create_server(
+            (address.ip, address.port), family=address.family, backlog=_BACKLOG
+        )
+    except OSError as error:
+        raise CannotListenError(_why_not(address.host, address.port, error)) from error
+    # asyncio sets this on sockets of its own making only. Accepted ones inherit it; without it each
+    # reply on a kept connection waits 40 ms for the client's delayed acknowledgement.
+    listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return listening
+
+
+def _why_not(host: str, port: int, error: OSError | UnicodeError) -> str:
+    number = error.errno if isinstance(error, OSError) else None
+    if number == errno.EADDRINUSE:
+        return (
+            f"port {port} on {host} is in use by another program; "
+            "stop that one, or choose another port with MCP_PORT"
+        )
+    if number == errno.EACCES:
+        return f"port {port} on {host} is not allowed; choose one from 1024 up with MCP_PORT"
+    reason = error.strerror if isinstance(error, OSError) else None
+    return (
+        f"{host} port {port} cannot be listened on ({reason or error}); "
+        "give an address of this machine with MCP_HOST"
+    )

@@ -1,0 +1,126 @@
+"""The query server where others can reach it: no start and no answer without a token."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import subprocess
+from typing import TYPE_CHECKING
+
+import httpx2
+import pytest
+from mcp import Client
+from mcp.client.sse import sse_client
+from mcp.client.streamable_http import streamable_http_client
+
+from tests.integration.test_server_process import Served, command, environment, serving
+from tests.questions import ask, write_run
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+GOOD = "kJ7-x._~+/0123456789=="
+SHOWN = {"Authorization": f"Bearer {GOOD}"}
+EVERYWHERE = ".".join("0000")
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    write_run(tmp_path / "bags")
+    return tmp_path / "bags"
+
+
+def refused(bag_dir: Path, **env: str) -> str:
+    """What a server says that does not start."""
+    ended = subprocess.run(
+        command("server.transport=sse", "server.port=0"),
+        env=environment(bag_dir, **env),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    return ended.stderr
+
+
+def status(served: Served, method: str, path: str, headers: dict[str, str]) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=10)
+    try:
+        connection.request(method, path, headers=headers)
+        response = connection.getresponse()
+        return response.status, response.read()
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize("host", [EVERYWHERE, "::", "192.0.2.1"])
+def test_it_does_not_start_without_a_token_where_others_can_reach_it(
+    bag_dir: Path, host: str
+) -> None:
+    told = refused(bag_dir, MCP_HOST=host)
+    assert "MEMORY_API_TOKEN: missing" in told
+    assert repr(host) in told
+    assert len(told.splitlines()) == 2
+
+
+def test_it_does_not_start_with_one_that_is_empty_or_cannot_be_used(
+    bag_dir: Path, tmp_path: Path
+) -> None:
+    assert "missing" in refused(bag_dir, MCP_HOST=EVERYWHERE, MEMORY_API_TOKEN="")
+    for token in ("sEcReT7", "sEcReT7 sEcReT7 sEcReT7"):
+        told = refused(bag_dir, MEMORY_API_TOKEN=token)
+        assert told.splitlines()[1].startswith("MEMORY_API_TOKEN: the API token")
+        assert "sEcReT7" not in told
+    (tmp_path / "token").touch()
+    told = refused(bag_dir, MEMORY_API_TOKEN_FILE=str(tmp_path / "token"))
+    assert "is empty" in told
+
+
+async def test_whoever_shows_the_token_is_answered_and_nobody_else(
+    bag_dir: Path, tmp_path: Path
+) -> None:
+    credentials = tmp_path / "credentials"
+    credentials.mkdir()
+    (credentials / "memory_api_token").write_text(GOOD + "\n")
+    more = {"MCP_HOST": EVERYWHERE, "CREDENTIALS_DIRECTORY": str(credentials)}
+    with serving(bag_dir, tmp_path / "log", "logging.level=debug", **more) as served:
+        async with Client(sse_client(served.url("/sse"), headers=SHOWN)) as client:
+            assert (await ask(client, "data_time_range", {}))[0]["bags"] == 1
+        async with (
+            httpx2.AsyncClient(headers=SHOWN) as shown,
+            Client(streamable_http_client(served.url("/mcp"), http_client=shown)) as client,
+        ):
+            assert (await ask(client, "data_time_range", {}))[0]["bags"] == 1
+        for path in ("/sse", "/mcp", "/messages/"):
+            for headers in ({}, {"Authorization": "Bearer " + GOOD[:-1]}):
+                assert status(served, "POST", path, headers)[0] == 401
+        assert json.loads(served.get("/health")[1]) == {"status": "ok"}
+        assert json.loads(status(served, "GET", "/health", SHOWN)[1])["bags"] == 1
+        _leave_traces(served)
+    told = (tmp_path / "log").read_text(encoding="utf-8")
+    assert '"event": "tool_call"' in told
+    for secret in (GOOD, GOOD[:-2], "in-a-query"):
+        assert secret not in told
+
+
+def _leave_traces(served: Served) -> None:
+    """Shows the token, and another, in every place that somebody may put into a log."""
+    for path in (f"/sse?token={GOOD}", f"/mcp?access_token={GOOD}", "/health?token=in-a-query"):
+        for headers in ({}, SHOWN | {"Host": "evil.example"}, SHOWN | {"Content-Length": "x"}):
+            status(served, "POST", path, headers)
+    status(served, "POST", f"/messages/?session_id={GOOD}", SHOWN)
+    status(served, "POST", f"/messages/{GOOD}?session_id=in-a-query", SHOWN)
+
+
+async def test_a_token_is_demanded_on_the_loopback_address_too(
+    bag_dir: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "token"
+    file.write_text(GOOD)
+    with serving(bag_dir, tmp_path / "log", MEMORY_API_TOKEN_FILE=str(file)) as served:
+        assert status(served, "GET", "/sse", {})[0] == 401
+        async with Client(sse_client(served.url("/sse"), headers=SHOWN)) as client:
+            told, _ = await ask(client, "data_time_range", {})
+            assert told["bags"] == 1
