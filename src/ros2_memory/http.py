@@ -16,6 +16,7 @@ from starlette.responses import JSONResponse, PlainTextResponse
 from starlette.routing import Route
 
 from ros2_memory.gate import ADMITTED, HEALTH_PATH, TokenGate
+from ros2_memory.intake import Intake
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
@@ -71,7 +72,7 @@ def web_app(
             tasks.cancel_scope.cancel()
 
     routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
-    app: ASGIApp = Starlette(routes=routes, lifespan=lifespan)
+    app: ASGIApp = Intake(Starlette(routes=routes, lifespan=lifespan))
     if api_token is not None:
         app = TokenGate(app, api_token)
     return WebApp(Guard(app, host))

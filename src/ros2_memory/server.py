@@ -20,6 +20,7 @@ import uvicorn
 from ros2_memory.api_token import take_token
 from ros2_memory.bootstrap import build_filler, build_memory, build_server, package_version
 from ros2_memory.config import exit_on_config_error, load_settings
+from ros2_memory.connections import BoundedConnection
 from ros2_memory.filling import keep_filled
 from ros2_memory.health import health, keep_fresh
 from ros2_memory.http import STREAM_PATH, web_app
@@ -188,6 +189,7 @@ async def _serve_stdio(server: EpisodicServer, background: Background) -> None:
 def _serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
     config = uvicorn.Config(
         app,
+        http=BoundedConnection,
         lifespan="on",
         ws="none",
         log_config=None,

@@ -1,0 +1,248 @@
+"""Clients that keep the server waiting, on real sockets; the bounds are made short."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import uvicorn
+
+from ros2_memory import connections
+from ros2_memory.connections import BoundedConnection
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+BOUND_S = 20
+GET = b"GET / HTTP/1.1\r\nhost: a\r\n\r\n"
+HALF = b"GET / HTTP/1.1\r\nhost: a\r\nx: "
+POST = b"POST / HTTP/1.1\r\nhost: a\r\ncontent-length: 10\r\n\r\n"
+
+
+class App:
+    """Reads bodies and answers; `/flood` never stops sending, `/early` answers before it reads."""
+
+    def __init__(self) -> None:
+        self.under_way = 0
+        self.left = 0
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        self.under_way += 1
+        try:
+            await self._answer(scope, receive, send)
+        finally:
+            self.under_way -= 1
+
+    async def _answer(self, scope: Any, receive: Any, send: Any) -> None:
+        more = scope["method"] == "POST" and scope["path"] != "/early"
+        while more:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                self.left += 1
+                return
+            more = message["more_body"]
+        length = [] if scope["path"] == "/flood" else [(b"content-length", b"2")]
+        await send({"type": "http.response.start", "status": 200, "headers": length})
+        while scope["path"] == "/flood" and self.under_way:
+            await send({"type": "http.response.body", "body": b"x" * 65536, "more_body": True})
+        await send({"type": "http.response.body", "body": b"ok"})
+
+
+class Served:
+    def __init__(self, server: uvicorn.Server, app: App, port: int) -> None:
+        self.server = server
+        self.app = app
+        self.port = port
+
+    async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        return await asyncio.open_connection("127.0.0.1", self.port)
+
+    async def reply(self, *sent: bytes) -> bytes:
+        """Everything until the server ends the connection."""
+        reader, writer = await self.connect()
+        for part in sent:
+            writer.write(part)
+            await writer.drain()
+        async with asyncio.timeout(BOUND_S):
+            told = await reader.read()
+        writer.close()
+        return told
+
+    async def gone(self) -> None:
+        async with asyncio.timeout(BOUND_S):
+            while self.server.server_state.connections:
+                await asyncio.sleep(0.001)
+
+
+@asynccontextmanager
+async def serving() -> AsyncIterator[Served]:
+    app = App()
+    config = uvicorn.Config(
+        app, http=BoundedConnection, lifespan="off", ws="none", log_config=None, access_log=False
+    )
+    server = uvicorn.Server(config)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        task = asyncio.create_task(server._serve([listening]))
+        async with asyncio.timeout(BOUND_S):
+            while not server.started:
+                await asyncio.sleep(0.001)
+        try:
+            yield Served(server, app, listening.getsockname()[1])
+        finally:
+            server.should_exit = True
+            server.force_exit = True
+            await task
+
+
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("HEAD_S", "BODY_S", "UNREAD_S"):
+        monkeypatch.setattr(connections, name, 0.1)
+
+
+@pytest.mark.usefixtures("hurried")
+@pytest.mark.parametrize("sent", [[], [b"G"], [HALF], [HALF, b"y"]])
+async def test_headers_that_do_not_come_to_their_end_are_answered_with_timeout(
+    sent: list[bytes],
+) -> None:
+    async with serving() as served:
+        told = await served.reply(*sent)
+        assert told.startswith(b"HTTP/1.1 408 Request Timeout\r\n")
+        assert told.endswith(b"did not come to its end in time.\n")
+        await served.gone()
+
+
+@pytest.mark.usefixtures("hurried")
+async def test_headers_that_trickle_win_no_time() -> None:
+    async with serving() as served:
+        reader, writer = await served.connect()
+
+        async def trickle() -> None:
+            writer.write(HALF)
+            while not reader.at_eof():
+                writer.write(b"y")
+                await asyncio.sleep(0.005)
+
+        task = asyncio.create_task(trickle())
+        async with asyncio.timeout(BOUND_S):
+            told = await reader.read()
+        assert b" 408 " in told
+        task.cancel()
+        writer.close()
+        await served.gone()
+
+
+@pytest.mark.usefixtures("hurried")
+@pytest.mark.parametrize(
+    "sent",
+    [
+        [POST],
+        [POST, b"12345"],
+        [b"POST / HTTP/1.1\r\nhost: a\r\ntransfer-encoding: chunked\r\n\r\n", b"5\r\nab"],
+    ],
+)
+async def test_a_body_that_does_not_come_to_its_end_is_answered_with_timeout(
+    sent: list[bytes],
+) -> None:
+    async with serving() as served:
+        assert b" 408 " in await served.reply(*sent)
+        await served.gone()
+        assert (served.app.under_way, served.app.left) == (0, 1)
+
+
+@pytest.mark.usefixtures("hurried")
+async def test_what_is_left_of_a_body_that_was_answered_early_is_not_waited_for() -> None:
+    async with serving() as served:
+        told = await served.reply(b"POST /early HTTP/1.1\r\ncontent-length: 99\r\nhost: a\r\n\r\n")
+        assert told.count(b"HTTP/1.1 ") == 1
+        assert told.startswith(b"HTTP/1.1 200")
+        await served.gone()
+
+
+@pytest.mark.usefixtures("hurried")
+async def test_a_reply_that_is_not_read_ends_the_connection_and_the_call() -> None:
+    async with serving() as served:
+        # Not asyncio's: that one reads by itself.
+        with socket.create_connection(("127.0.0.1", served.port)) as client:
+            client.sendall(b"GET /flood HTTP/1.1\r\nhost: a\r\n\r\n")
+            async with asyncio.timeout(BOUND_S):
+                while not served.app.under_way:
+                    await asyncio.sleep(0.001)
+                await served.gone()
+                # Uvicorn lets an application go on sending to nobody; here it would for ever.
+                served.app.under_way = 0
+
+
+async def test_requests_in_time_are_answered_one_after_another_on_one_connection() -> None:
+    async with serving() as served:
+        reader, writer = await served.connect()
+        for request in (GET, POST + b"0123456789", GET, POST + b"0123456789"):
+            writer.write(request)
+            async with asyncio.timeout(BOUND_S):
+                told = await reader.readuntil(b"\r\n\r\nok")
+            assert told.startswith(b"HTTP/1.1 200")
+        writer.close()
+
+
+async def test_requests_sent_without_waiting_are_answered_in_order() -> None:
+    async with serving() as served:
+        reader, writer = await served.connect()
+        writer.write(GET * 20 + (POST + b"0123456789") * 20)
+        async with asyncio.timeout(BOUND_S):
+            for _ in range(40):
+                assert (await reader.readuntil(b"\r\n\r\nok")).startswith(b"HTTP/1.1 200")
+        writer.close()
+
+
+async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
+    async with serving() as served:
+        open_ones = [await served.connect() for _ in range(3)]
+        told = await served.reply()
+        assert told.startswith(b"HTTP/1.1 503 Service Unavailable\r\n")
+        assert told.endswith(b"Too many connections; close some.\n")
+        for reader, writer in open_ones:
+            writer.write(GET)
+            async with asyncio.timeout(BOUND_S):
+                assert b" 200 " in await reader.readuntil(b"ok")
+            writer.close()
+        await served.gone()
+        assert b" 200 " in await served.reply(
+            GET.replace(b"\r\n\r\n", b"\r\nconnection: close\r\n\r\n")
+        )
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"GET / HTTP/1.1\r\nhost: a\r\nx: " + b"y" * 70_000,
+        b"GET /" + b"y" * 70_000,
+        b"GET / HTTP/1.1\r\n" + b"x: y\r\n" * 20_000,
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+        b"\x00" * 70_000,
+    ],
+    ids=["header", "path", "headers", "tls", "zeros"],
+)
+async def test_headers_without_end_and_what_is_no_http_are_refused(head: bytes) -> None:
+    async with serving() as served:
+        told = await served.reply(head)
+        assert told == b"" or told.startswith(b"HTTP/1.1 4")  # may be cut by what was left unread
+        await served.gone()
+
+
+async def test_a_peer_that_vanished_is_given_up_by_the_system() -> None:
+    async with serving() as served:
+        _, writer = await served.connect()
+        async with asyncio.timeout(BOUND_S):
+            while not served.server.server_state.connections:
+                await asyncio.sleep(0.001)
+        [connection] = served.server.server_state.connections
+        connected = connection.transport.get_extra_info("socket")
+        waits = connected.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+        assert waits == connections.UNREAD_S * 1000
+        writer.close()
