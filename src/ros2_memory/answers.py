@@ -27,6 +27,16 @@ class TopicRow:
     last: Ns
     count: int
     undecodable: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Undecodable:
+    """A topic of which messages are recorded under a type that cannot be decoded, and why."""
+
+    topic: str
+    type: str
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +62,8 @@ class TimeRange:
     unread: tuple[SetAside, ...]
     silent_topics: int
     notes: tuple[str, ...] = ()
+    undecodable: tuple[Undecodable, ...] = ()
+    clock_faults: tuple[SetAside, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import math
 import time
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ros2_memory import answers
 from ros2_memory import frames as frame_history
@@ -29,9 +29,10 @@ from ros2_memory.errors import (
     NoDataError,
     NoDataReason,
 )
-from ros2_memory.history import View, short_name
-from ros2_memory.model import BagState, Sample, SetAside, TimeWindow
+from ros2_memory.history import View
+from ros2_memory.model import Sample, TimeWindow
 from ros2_memory.moments import Moment, Span, ns_argument, open_moment, open_span
+from ros2_memory.overview import data_time_range, list_recorded_topics
 from ros2_memory.recorder.clock_faults import FUTURE_NS
 from ros2_memory.sampling import samples_note
 from ros2_memory.search import last_match, unsearched
@@ -48,63 +49,25 @@ from ros2_memory.unseen import note_unseen
 from ros2_memory.ways import carries_no, decoded, way_driven
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from ros2_memory.copies import Found
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import JsonValue, Pose, Twist
 
-_ODD_BAGS: Final = 5
-
-
-def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, ...]:
-    """Every topic that was heard, under each of its types; empty for an empty memory."""
-    view = View(memory, call, memory.clock.now())
-    rows = []
-    for topic in view.snapshot.topics():
-        reasons = _undecodable_types(view, topic)
-        for type_name, census in sorted(view.census(topic).items()):
-            rows.append(
-                answers.TopicRow(
-                    topic,
-                    type_name,
-                    census.first,
-                    census.last,
-                    census.count,
-                    reasons.get(type_name),
-                )
-            )
-    return tuple(rows)
-
-
-def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
-    """What the memory spans, where it has holes, and which files do not answer."""
-    now = memory.clock.now()
-    view = View(memory, call, now if memory.limits.now == "wall" else None)
-    snapshot = view.snapshot
-    if memory.limits.now == "latest" and snapshot.latest is not None:
-        now = snapshot.latest
-    incomplete = tuple(
-        SetAside(bag.path, "; ".join(bag.summary.notes) or "left open by a crash")
-        for bag in snapshot.bags
-        if bag.state is BagState.INCOMPLETE
-    )
-    if snapshot.problem:
-        view.note(snapshot.problem)
-    _note_odd_bags(view)
-    return answers.TimeRange(
-        earliest=snapshot.earliest,
-        latest=snapshot.latest,
-        now=now,
-        bags=len(snapshot.bags),
-        gaps=_gaps(view),
-        incomplete=incomplete,
-        active=snapshot.active,
-        damaged=snapshot.damaged,
-        unread=snapshot.unread,
-        silent_topics=len(snapshot.silent_topics),
-        notes=view.notes,
-    )
+__all__ = [
+    "data_time_range",
+    "find_last_match",
+    "frames",
+    "list_recorded_topics",
+    "position",
+    "topic_range",
+    "topic_value",
+    "trajectory_summary",
+    "transform",
+    "value_when",
+    "velocity",
+]
 
 
 def topic_value(
@@ -385,53 +348,6 @@ def _twist(view: View, found: Found) -> Twist | None:
 
 def _age(found: Found, now: Ns | None) -> Ns | None:
     return None if now is None else now - found.time
-
-
-def _undecodable_types(view: View, topic: str) -> dict[str, str]:
-    """Why messages of the topic cannot be decoded, by type; from one bag for each type."""
-    reasons: dict[str, str] = {}
-    for type_name in view.snapshot.types_of(topic):
-        reason = _why_undecodable(view, topic, type_name)
-        if reason:
-            reasons[type_name] = reason
-    return reasons
-
-
-def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
-    bag = view.snapshot.first_with(topic, type_name)
-    entry = view.entry(bag)
-    known = None if entry is None else entry[0].undecodable(topic, entry[1])
-    if known is not None:
-        return known.get(type_name)
-    reasons = [
-        view.memory.reader.undecodable(channel)
-        for channel in view.channels(bag)
-        if channel.topic == topic and channel.type == type_name
-    ]
-    return next(filter(None, reversed(reasons)), None)
-
-
-def _note_odd_bags(view: View) -> None:
-    """Says of the newest closed bags that are odd what is odd about them."""
-    odd = [bag for bag in view.snapshot.bags if bag.state is BagState.CLOSED and bag.summary.notes]
-    for bag in odd[-_ODD_BAGS:]:
-        view.note(f"{short_name(bag.path)}: {'; '.join(bag.summary.notes)}")
-    if len(odd) > _ODD_BAGS:
-        view.note(f"{len(odd) - _ODD_BAGS} older bags are odd too")
-
-
-def _gaps(view: View) -> tuple[answers.Gap, ...]:
-    """Holes of more than two splits between one bag's end and the next one's start."""
-    longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
-    return tuple(_holes(view, longest))
-
-
-def _holes(view: View, longest: Ns) -> Iterator[answers.Gap]:
-    reach: Ns | None = None
-    for bag in view.snapshot.bags:
-        if reach is not None and bag.start - reach > longest:
-            yield answers.Gap(reach, bag.start)
-        reach = bag.end if reach is None else max(reach, bag.end)
 
 
 def _around(at: Ns, reach: Ns) -> TimeWindow:

@@ -79,6 +79,11 @@ def _time_range(answer: answers.TimeRange, bag_dir: Path) -> JsonObject:
         "damaged": _files(answer.damaged, bag_dir),
         "incomplete": _files(answer.incomplete, bag_dir),
         "unread": _files(answer.unread, bag_dir),
+        "clock_faults": _files(answer.clock_faults, bag_dir),
+        "undecodable": [
+            {"topic": each.topic, "type": each.type, "reason": each.reason}
+            for each in answer.undecodable
+        ],
     }
     for name, rows in lists.items():
         if len(rows) > _NEWEST_LISTED:
@@ -118,7 +123,9 @@ def _topic_row(row: answers.TopicRow) -> JsonObject:
         "last_ts": unix_rounded_up(row.last),
         "count": row.count,
     }
-    return reply if row.undecodable is None else {**reply, "undecodable": row.undecodable}
+    if row.undecodable is not None:
+        reply["undecodable"] = row.undecodable
+    return with_notes(reply, row.notes)
 
 
 @shown.register(answers.TopicValue)

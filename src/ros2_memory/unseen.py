@@ -52,15 +52,12 @@ def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> 
     ]
     if active:
         yield _still_written(snapshot, active, window)
-    misdated = [
+    faults = [
         fault for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
     ]
-    if misdated and not nothing:
-        yield _misdated(misdated)
-    odd = snapshot.odd(window)
-    if odd:
-        yield from _left_open([bag for bag in odd if bag.state is BagState.INCOMPLETE])
-        yield from _odd([bag for bag in odd if bag.state is BagState.CLOSED])
+    if faults and not nothing:
+        yield misdated(faults)
+    yield from amiss(snapshot.odd(window))
 
 
 def not_read(files: Sequence[SetAside]) -> str:
@@ -99,14 +96,19 @@ def _odd(bags: Sequence[BagFile]) -> Iterator[str]:
     for bag in bags[-NAMED:]:
         yield f"{short_name(bag.path)}: {shortened('; '.join(bag.summary.notes))}"
     if len(bags) > NAMED:
-        yield f"{counted(len(bags) - NAMED, 'older bag')} of this time {_are(bags)} odd too"
+        more = counted(len(bags) - NAMED, "older bag is", "older bags are")
+        yield f"{more} odd too"
 
 
-def _are(bags: Sequence[BagFile]) -> str:
-    return "is" if len(bags) - NAMED == 1 else "are"
+def amiss(bags: Sequence[BagFile]) -> Iterator[str]:
+    """The sentences on bags that are not whole or contradict themselves."""
+    if bags:
+        yield from _left_open([bag for bag in bags if bag.state is BagState.INCOMPLETE])
+        yield from _odd([bag for bag in bags if bag.state is BagState.CLOSED])
 
 
-def _misdated(faults: Sequence[ClockFault]) -> str:
+def misdated(faults: Sequence[ClockFault]) -> str:
+    """The sentence on bags that a wrong clock dated, the last ones named."""
     names = [f"{short_name(fault.bag.path)} ({fault.told})" for fault in faults[-NAMED:]]
     return f"{counted(len(faults), 'bag')} dated by a wrong clock: {listed(names, len(faults))}"
 
