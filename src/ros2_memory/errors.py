@@ -7,7 +7,8 @@
     |-- QueryTimeoutError         timeout            the question needs more than call_timeout_s
     |-- BusyError                 busy               it was not even begun: others were before it
     |-- BagError                  bag_unreadable     a file that cannot be read at all
-    |   `-- BagVanishedError      bag_unreadable     it is gone (retention, unmount)
+    |   |-- BagVanishedError      bag_unreadable     it is gone (retention, unmount)
+    |   `-- BagUnreachableError   bag_unreadable     the disk or the machine fails, not the file
     |-- UndecodableError          undecodable        a message whose bytes mean nothing to us
     `-- RecorderError             recorder           recording cannot start or go on
 
@@ -99,6 +100,10 @@ class BagError(EpisodicError):
 
 class BagVanishedError(BagError):
     """The bag file is not there any more."""
+
+
+class BagUnreachableError(BagError):
+    """The disk failed, or the machine lacked something: the file may be whole, and read later."""
 
 
 class UndecodableError(EpisodicError):

@@ -6,10 +6,11 @@ what was written *into* a file, so the caller names the files that it wants look
 
 from __future__ import annotations
 
+import errno
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.model import SetAside
 from ros2_memory.recorder.layout import HANDOVER_FILE
@@ -27,15 +28,19 @@ YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 LOST_AND_FOUND: Final = "lost+found"
 """Stands in the root of a file system, where only the system's administrator may look into it."""
 
+_OTHER_DISK = (
+    "the bag directory lies on another disk than before, and no bag lies there: the disk of the "
+    "bags has been unmounted; they are found again when it is mounted"
+)
 _LINK = "a symbolic link, which is not followed: move or mount the bags into the bag directory"
 
 
 def bag_kind(name: str) -> str | None:
     """The kind of bag that a file name claims, one of `BAG_KINDS`, or None."""
     lowered = name.lower()
-    if lowered in BAG_KINDS:
+    if not lowered.endswith(BAG_KINDS) or lowered in BAG_KINDS:
         return None
-    return next((kind for kind in BAG_KINDS if lowered.endswith(kind)), None)
+    return next(kind for kind in BAG_KINDS if lowered.endswith(kind))
 
 
 def other_form(path: str) -> str:
@@ -48,8 +53,7 @@ def settled(mtime_ns: Ns, now: Ns) -> bool:
     return abs(now - mtime_ns) >= YOUNG_NS
 
 
-@dataclass(frozen=True, slots=True)
-class Stamp:
+class Stamp(NamedTuple):
     """How a file looked from outside.
 
     `sidecar_ns` is the mtime of the `handover.json` beside it, 0 without one: that file says which
@@ -67,6 +71,15 @@ class Stamp:
         """The stamp in a stat result."""
         return cls(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino, sidecar_ns)
 
+    def shows(self, before: Stamp) -> bool:
+        """Whether all but the ctime, which permissions change too, is as it was before."""
+        return (self.size, self.mtime_ns, self.inode, self.sidecar_ns) == (
+            before.size,
+            before.mtime_ns,
+            before.inode,
+            before.sidecar_ns,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Walked:
@@ -75,7 +88,8 @@ class Walked:
     `looked_at` has every bag file of the directories that were listed, and the watched ones; `gone`
     the ones that are known no more. `damaged` are directories that cannot be listed and bag names
     that are no files, `links` the symbolic links, neither in any order. With a `problem` the bag
-    directory itself is not there, and everything in it is gone.
+    directory itself is not there, and everything in it is gone; or it cannot be listed at the
+    moment, and everything in it counts as it did.
     """
 
     looked_at: dict[str, Stamp]
@@ -89,6 +103,7 @@ class Walked:
 class _Folder:
     mtime_ns: Ns
     trusted: bool
+    device: int = 0
     folders: list[str] = field(default_factory=list)
     files: set[str] = field(default_factory=set)
     links: list[Path] = field(default_factory=list)
@@ -106,16 +121,21 @@ class Tree:
     def __init__(self, root: Path) -> None:
         self._root = str(root)
         self._folders: dict[str, _Folder] = {}
+        self._device: int | None = None  # of the disk that bags were last found on
 
     def walk(self, now: Ns, watched: Iterable[str]) -> Walked:
         """Looks for what is new, changed or gone since the last walk, and at the `watched` files.
 
         `now` tells which mtimes are too young to be trusted. Raises nothing: a directory that
-        cannot be listed is part of the result.
+        cannot be listed is part of the result, and what was known to lie in it counts as there.
         """
         before, self._folders = self._folders, {}
         walked = Walked({}, set(), [], [])
-        problem = self._descend(before, now, walked)
+        fault = self._descend(before, now, walked)
+        if fault is not None and not _is_gone(fault) and before:
+            self._folders = before
+            return Walked({}, set(), [], [], _problem(fault))
+        problem = self._other_disk() if fault is None else _problem(fault)
         if problem is not None:
             self._folders = {}
             walked = Walked({}, set(), [], [], problem)
@@ -133,8 +153,18 @@ class Tree:
         if folder is not None:
             folder.trusted = False
 
-    def _descend(self, before: dict[str, _Folder], now: Ns, walked: Walked) -> str | None:
-        """Visits every folder; says what is wrong where the root cannot be listed."""
+    def _other_disk(self) -> str | None:
+        """What to say where the root lies on another disk than bags were found on, and has none.
+
+        That is how a mount point looks below the disk that was mounted there.
+        """
+        device = self._folders[self._root].device
+        if any(folder.files for folder in self._folders.values()):
+            self._device = device
+        return None if self._device in {None, device} else _OTHER_DISK
+
+    def _descend(self, before: dict[str, _Folder], now: Ns, walked: Walked) -> OSError | None:
+        """Visits every folder; gives what is wrong where the root cannot be listed."""
         waiting = [self._root]
         while waiting:
             path = waiting.pop()
@@ -142,12 +172,16 @@ class Tree:
                 folder = _visit(path, before.get(path), now, walked.looked_at)
             except OSError as error:
                 if path == self._root:
-                    return _problem(error)
+                    return error
                 # A folder that went since its parent was listed changes that parent's mtime.
-                if not isinstance(error, FileNotFoundError):
-                    reason = f"the directory cannot be listed: {error.strerror or error}"
-                    walked.damaged.append(SetAside(Path(path), reason))
-                continue
+                if _is_gone(error):
+                    continue
+                reason = f"the directory cannot be listed: {error.strerror or error}"
+                walked.damaged.append(SetAside(Path(path), reason))
+                if path not in before:
+                    continue
+                # What was there is not gone because the disk fails.
+                folder = replace(before[path], trusted=False)
             self._folders[path] = folder
             waiting.extend(folder.folders)
             walked.damaged.extend(folder.odd)
@@ -164,9 +198,10 @@ class Tree:
         folder = self._folders.get(_folder_of(path))
         try:
             walked.looked_at[path] = Stamp.of(os.lstat(path), folder.sidecar_ns if folder else 0)
-        except OSError:
+        except OSError as error:
             # Its folder looks as before, and may soon look the same with the file back in it.
-            walked.gone.add(path)
+            if _is_gone(error):
+                walked.gone.add(path)
             self.distrust(path)
 
 
@@ -175,16 +210,17 @@ def _visit(path: str, known: _Folder | None, now: Ns, looked_at: dict[str, Stamp
 
     Its mtime is taken first: what changes during the listing is then found by the next walk.
     """
-    mtime_ns = os.stat(path).st_mtime_ns  # noqa: PTH116  a Path for each of 1,000 folders costs more
-    if known is not None and known.trusted and known.mtime_ns == mtime_ns:
+    status = os.stat(path)  # noqa: PTH116  a Path for each of 1,000 folders costs more
+    mtime_ns, device = status.st_mtime_ns, status.st_dev
+    if known is not None and known.trusted and (known.mtime_ns, known.device) == (mtime_ns, device):
         return known
-    folder = _Folder(mtime_ns, trusted=settled(mtime_ns, now))
+    folder = _Folder(mtime_ns, trusted=settled(mtime_ns, now), device=device)
     with os.scandir(path) as entries:
         for entry in entries:
             _enter(folder, entry, looked_at)
     if folder.sidecar_ns:
-        for file in folder.files:
-            looked_at[file] = replace(looked_at[file], sidecar_ns=folder.sidecar_ns)
+        for file in folder.files & looked_at.keys():
+            looked_at[file] = looked_at[file]._replace(sidecar_ns=folder.sidecar_ns)
     return folder
 
 
@@ -197,7 +233,7 @@ def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]
         if not hidden and entry.name != LOST_AND_FOUND:
             folder.folders.append(entry.path)
     elif entry.name == HANDOVER_FILE:
-        folder.sidecar_ns = _mtime_ns(entry)
+        _enter_sidecar(folder, entry)
     elif bag_kind(entry.name):
         _enter_file(folder, entry, looked_at)
 
@@ -214,15 +250,22 @@ def _enter_file(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, S
         reason = f"cannot be looked at: {error.strerror or error}"
         folder.odd.append(SetAside(Path(entry.path), reason))
         folder.trusted = False
+        # One that is known is not gone because of it.
+        folder.files.add(entry.path)
         return
     folder.files.add(entry.path)
 
 
-def _mtime_ns(entry: os.DirEntry[str]) -> Ns:
+def _enter_sidecar(folder: _Folder, entry: os.DirEntry[str]) -> None:
     try:
-        return entry.stat(follow_symlinks=False).st_mtime_ns
+        folder.sidecar_ns = entry.stat(follow_symlinks=False).st_mtime_ns
     except OSError:
-        return 0
+        folder.trusted = False
+
+
+def _is_gone(error: OSError) -> bool:
+    """Whether there is nothing of that name; otherwise it may be there, and cannot be looked at."""
+    return error.errno in {errno.ENOENT, errno.ENOTDIR}
 
 
 def _folder_of(path: str) -> str:

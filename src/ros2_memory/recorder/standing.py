@@ -24,7 +24,7 @@ from enum import IntEnum
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.errors import BagError, BagVanishedError
+from ros2_memory.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.model import BagFile, BagState, BagSummary, SetAside
 from ros2_memory.recorder.scan import YOUNG_NS, bag_kind, settled
 from ros2_memory.storage.base import Closing
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long an unreadable file is tried again: the fault may have been the machine's."""
+RETRY_SOON_NS: Final[Ns] = 5 * NS_PER_S
+"""The same where it certainly was: a disk that failed, or too many open files."""
 
 _ACTIVE = "still being written"
 _NO_MESSAGE = (
@@ -99,12 +101,17 @@ class Scene:
 
 
 class FormerFile(NamedTuple):
-    """A closed file as it looked when it was read, and what it held then."""
+    """A closed file as it looked when it was read, and what it held then.
+
+    `start` and `end` are log times (inclusive); 0 where it holds no message.
+    """
 
     size: int
     mtime_ns: Ns
     sidecar_ns: Ns
     summary: BagSummary
+    start: Ns
+    end: Ns
 
     def looks_like(self, stamp: Stamp) -> bool:
         """Whether a file still looks as it did."""
@@ -128,6 +135,7 @@ class FileNotes:
     closing: Closing | None = None
     summary: BagSummary | None = None
     fault: str | None = None
+    passing: bool = False
 
     @classmethod
     def first(cls, path: Path, stamp: Stamp, now: Ns) -> FileNotes:
@@ -150,6 +158,7 @@ class FileNotes:
         outdated = self._outdated(stamp, now)
         if outdated:
             self.closing, self.summary, self.fault = None, None, None
+            self.passing = False
             self.seen_at = now
         self.stamp = stamp
         self.trusted = settled(stamp.mtime_ns, now)
@@ -181,8 +190,9 @@ class FileNotes:
         ):
             return True
         # Permissions change only the ctime.
+        patience = RETRY_SOON_NS if self.passing else RETRY_NS
         return self.fault is not None and (
-            stamp.ctime_ns != before.ctime_ns or abs(now - self.seen_at) >= RETRY_NS
+            stamp.ctime_ns != before.ctime_ns or abs(now - self.seen_at) >= patience
         )
 
 
@@ -206,7 +216,7 @@ def judge(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
     except BagVanishedError:
         raise
     except BagError as error:
-        notes.fault = error.reason
+        notes.fault, notes.passing = error.reason, isinstance(error, BagUnreachableError)
     if notes.summary is None:
         return _aside(Standing.DAMAGED, notes, notes.fault or "it cannot be read")
     return _readable(notes, notes.summary)

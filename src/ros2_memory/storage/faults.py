@@ -9,21 +9,39 @@ find wrong themselves; `reading` names the file.
 from __future__ import annotations
 
 import errno
+import sqlite3
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from ros2_memory.errors import BagError, BagVanishedError, EpisodicError
+from ros2_memory.errors import (
+    BagError,
+    BagUnreachableError,
+    BagVanishedError,
+    EpisodicError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
     from types import TracebackType
 
-_GONE = {errno.ENOENT, errno.ENOTDIR, errno.ESTALE, errno.ENODEV}
+# Not ESTALE and ENODEV: a server or a disk that went may come back with all its files.
+_GONE = {errno.ENOENT, errno.ENOTDIR}
+_OF_THE_DISK = {
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_PERM,
+}
 
 
 class UnreadableError(Exception):
     """Bytes of a bag that cannot be read; the text is the reason, without the file's name."""
+
+
+class UnreachableError(UnreadableError):
+    """As `UnreadableError`, where the fault is not the file's and may pass."""
 
 
 def reading(path: Path) -> _Reading:
@@ -31,6 +49,7 @@ def reading(path: Path) -> _Reading:
 
     Raises:
         BagVanishedError: the file or a folder above it is gone.
+        BagUnreachableError: the fault is not the file's, and may pass.
         BagError: anything else; it ends on the reason.
     """
     return _Reading(path)
@@ -55,18 +74,19 @@ class _Reading:
             return
         if isinstance(error, OSError) and error.errno in _GONE:
             raise BagVanishedError(str(self._path), "the file is not there any more") from error
-        raise BagError(str(self._path), reason_of(error)) from error
+        kind_of = BagUnreachableError if _may_pass(error) else BagError
+        raise kind_of(str(self._path), reason_of(error)) from error
 
 
 @contextmanager
 def damage() -> Iterator[None]:
     """Raises `UnreadableError` for whatever damaged bytes raise, where others may be whole.
 
-    What the disk itself raises (OSError) passes.
+    What the disk or the machine lacks (OSError, MemoryError) passes: whole bytes raise it too.
     """
     try:
         yield
-    except (UnreadableError, OSError):
+    except (UnreadableError, OSError, MemoryError):
         raise
     except Exception as error:
         raise UnreadableError(reason_of(error)) from error
@@ -79,6 +99,21 @@ def reason_of(error: Exception) -> str:
     if isinstance(error, OSError):
         return f"it cannot be opened or read: {error.strerror or error}"
     if isinstance(error, MemoryError):
-        return "damaged: it asks for more memory than there is"
+        return "there is not enough memory to read it"
+    if _sqlite_code(error) in _OF_THE_DISK:
+        return f"it cannot be opened or read: {error}"
     words = " ".join(str(error).split())[:160]
     return f"damaged: {words} ({type(error).__name__})" if words else type(error).__name__
+
+
+def _may_pass(error: Exception) -> bool:
+    """Whether the same bytes may be read later."""
+    if isinstance(error, (OSError, MemoryError, UnreachableError)):
+        return True
+    return _sqlite_code(error) in _OF_THE_DISK
+
+
+def _sqlite_code(error: Exception) -> int | None:
+    """SQLite's primary code; None of any other error."""
+    code: object = getattr(error, "sqlite_errorcode", None)
+    return code & 0xFF if isinstance(code, int) else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 import tempfile
 import threading
@@ -12,10 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.faults import UnreachableError, UnreadableError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 @dataclass(slots=True)
@@ -58,6 +61,7 @@ class Scratch:
 
         Raises:
             UnreadableError: it does not fit into `max_bytes`.
+            UnreachableError: the disk of the temporary files is full.
         """
         entry = self._enter(key)
         try:
@@ -81,7 +85,10 @@ class Scratch:
 
     def _folder(self) -> Path:
         if self._root is None or not self._root.is_dir():
-            self._root = Path(tempfile.mkdtemp(prefix="ros2-memory-"))
+            try:
+                self._root = Path(tempfile.mkdtemp(prefix="ros2-memory-"))
+            except OSError as error:
+                raise _no_room(error) from error
             weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
         return self._root
 
@@ -101,6 +108,11 @@ class Scratch:
         try:
             entry.folder.mkdir(parents=True)
             return fill(entry.folder, reserve)
+        except OSError as error:
+            self._forget(entry)
+            if error.errno in _NO_ROOM:
+                raise _no_room(error) from error
+            raise
         except BaseException:
             self._forget(entry)
             raise
@@ -128,3 +140,10 @@ class Scratch:
                 )
             self._bytes += size
             entry.size += size
+
+
+def _no_room(error: OSError) -> UnreachableError:
+    return UnreachableError(
+        "it must be unpacked, and nothing can be written into the folder for temporary files"
+        f" ({error.strerror or error}); free disk space there, or name another folder in TMPDIR"
+    )

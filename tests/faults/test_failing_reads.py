@@ -1,0 +1,225 @@
+"""A disk that fails: whatever it fails at, nothing false is answered, and all is there afterwards.
+
+`FAULTS_READS` is how many calls are made to fail one after another for each kind of file (20 unless
+given); with 0 every single one is: that takes an hour.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+import resource
+import sqlite3
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import zstandard
+
+from ros2_memory.errors import BagError, BagUnreachableError, BagVanishedError
+from ros2_memory.health import health
+from ros2_memory.recorder.standing import RETRY_SOON_NS
+from ros2_memory.storage.base import BagReader
+from ros2_memory.storage.faults import reading
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.bags import odom, write_db3
+from tests.faults.failing_disk import LOOK, OPEN, PASSING, failing
+from tests.faults.world import NOW, T0, fill_up, served, told, write_bag, write_bags
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.memory import Memory
+
+READS = int(os.environ.get("FAULTS_READS", "20"))
+COUNT = 3
+
+
+def compressed(path: Path) -> None:
+    path.with_name(f"{path.name}.zstd").write_bytes(zstandard.compress(path.read_bytes()))
+    path.unlink()
+
+
+def memory_at(bag_dir: Path, reader: BagReader | None = None) -> tuple[Memory, SettableClock]:
+    """A memory that has seen nothing yet, and whose clock can be moved."""
+    clock = SettableClock(NOW.now())
+    return memory_of(bag_dir, clock=clock, reader=reader or Rosbag2Reader()), clock
+
+
+def ask_honest(memory: Memory, right: list[str]) -> list[str]:
+    """Asks; every answer is right, or says that something is missing, or health does then."""
+    amiss: list[bool] = []
+
+    def look() -> None:
+        seen = memory.index._published
+        amiss.append(seen is None or bool(seen.damaged or seen.problem))
+
+    answers = told(memory, count=COUNT, after_each=look)
+    for given, expected, told_elsewhere in zip(answers, right, amiss, strict=True):
+        says = "Error(" in given or ("notes=(" in given and "notes=()" not in given)
+        assert given == expected or says or told_elsewhere, given
+    return answers
+
+
+def chosen(calls: int, seed: int) -> list[int]:
+    """Which calls are made to fail: all, or some drawn by chance, the first and the last."""
+    if not READS or calls <= READS:
+        return list(range(calls))
+    drawn = random.Random(seed).sample(range(calls), READS - 2)
+    return sorted({0, calls - 1, *drawn})
+
+
+@pytest.mark.parametrize("functions", [OPEN, LOOK], ids=["reading", "looking"])
+@pytest.mark.parametrize("packed", [False, True], ids=["mcap", "mcap.zstd"])
+@pytest.mark.parametrize("lasting", [False, True], ids=["once", "until it is over"])
+def test_a_call_that_fails_hides_nothing_for_good(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    functions: frozenset[str],
+    *,
+    packed: bool,
+    lasting: bool,
+) -> None:
+    for path in write_bags(tmp_path, COUNT):
+        if packed:
+            compressed(path)
+    right = told(memory_at(tmp_path)[0], count=COUNT)
+    with failing(monkeypatch, functions) as disk:
+        assert told(memory_at(tmp_path)[0], count=COUNT) == right
+        calls = disk.calls
+        for nth, after in enumerate(chosen(calls, seed=len(functions))):
+            memory, clock = memory_at(tmp_path)
+            disk.fail(PASSING[nth % len(PASSING)], after=after, times=1 << 60 if lasting else 1)
+            ask_honest(memory, right)
+            assert disk.failed
+            disk.heal()
+            clock.at += RETRY_SOON_NS
+            assert told(memory, count=COUNT) == right, (nth, after)
+
+
+@pytest.mark.parametrize("functions", [OPEN, LOOK], ids=["reading", "looking"])
+@pytest.mark.parametrize("number", PASSING, ids=errno.errorcode.get)
+async def test_a_disk_that_fails_under_a_running_memory_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, functions: frozenset[str], number: int
+) -> None:
+    write_bags(tmp_path, COUNT)
+    memory, clock = memory_at(tmp_path, McapReader())
+    right = told(memory, count=COUNT)
+    with failing(monkeypatch, functions) as disk:
+        disk.fail(number)
+        answers = ask_honest(memory, right)
+        told_health = await health(memory, "1")
+        disk.heal()
+    if functions is LOOK:
+        assert told_health["status"] == "degraded"
+        assert not [each for each in answers if "was deleted" in each]
+    clock.at += RETRY_SOON_NS
+    assert told(memory, count=COUNT) == right
+    assert (await health(memory, "1"))["status"] == "ok"
+
+
+def test_a_disk_that_fails_while_bags_are_digested_has_them_digested_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bags(tmp_path, COUNT)
+    memory, filler = served(tmp_path)
+    clock = SettableClock(NOW.now())
+    memory = replace(memory, clock=clock)
+    filler._memory = memory
+    right = told(memory, count=COUNT)
+    for after in range(0, 60, 3):
+        with failing(monkeypatch, OPEN) as disk:
+            disk.fail(errno.EIO, after=after)
+            fill_up(filler)
+    assert memory.recall is not None
+    clock.at += 600 * RETRY_SOON_NS
+    fill_up(filler)
+    assert filler.progress().waiting == 0
+    assert filler.progress().refused == 0
+    assert told(memory, count=COUNT) == right
+
+
+def test_short_reads_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_bags(tmp_path, COUNT)
+    right = told(memory_at(tmp_path)[0], count=COUNT)
+    with failing(monkeypatch, OPEN) as disk:
+        disk.short = True
+        assert told(memory_at(tmp_path)[0], count=COUNT) == right
+
+
+@contextmanager
+def few_files(more: int) -> Iterator[None]:
+    """So many more files can be opened than are."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    # The next one gets the lowest free number: those above it are what is left.
+    with Path(os.devnull).open("rb") as probe:
+        least = probe.fileno()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (least + more, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.parametrize("kind", ["mcap", "mcap.zstd", "db3"])
+@pytest.mark.parametrize("more", [0, 1, 2])
+def test_too_many_open_files_are_a_fault_that_passes(tmp_path: Path, kind: str, more: int) -> None:
+    for number in range(COUNT):
+        path = write_bag(tmp_path, number)
+        if kind == "mcap.zstd":
+            compressed(path)
+        if kind == "db3":
+            path.unlink()
+            write_db3(path.with_suffix(".db3"), [odom(T0 + number, 0.0, 0.0)])
+    right = told(memory_at(tmp_path)[0], count=COUNT)
+    memory, clock = memory_at(tmp_path)
+    memory.index.snapshot()
+    with few_files(more):
+        ask_honest(memory, right)
+    clock.at += RETRY_SOON_NS
+    assert told(memory, count=COUNT) == right
+    fresh, clock = memory_at(tmp_path)
+    with few_files(more):
+        ask_honest(fresh, right)
+    clock.at += RETRY_SOON_NS
+    assert told(fresh, count=COUNT) == right
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (OSError(errno.EIO, "Input/output error"), BagUnreachableError),
+        (OSError(errno.ESTALE, "Stale file handle"), BagUnreachableError),
+        (OSError(errno.ENOENT, "No such file or directory"), BagVanishedError),
+        (MemoryError(), BagUnreachableError),
+        (ValueError("no such record"), BagError),
+    ],
+    ids=repr,
+)
+def test_what_may_pass_is_told_from_damage(error: Exception, kind: type[BagError]) -> None:
+    with pytest.raises(BagError) as raised, reading(Path("a.mcap")):
+        raise error
+    assert type(raised.value) is kind
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [
+        (sqlite3.SQLITE_IOERR_READ, BagUnreachableError),
+        (sqlite3.SQLITE_CANTOPEN, BagUnreachableError),
+        (sqlite3.SQLITE_NOMEM, BagUnreachableError),
+        (sqlite3.SQLITE_CORRUPT, BagError),
+        (sqlite3.SQLITE_NOTADB, BagError),
+    ],
+)
+def test_what_sqlite_says_of_the_disk_is_told_from_damage(code: int, kind: type[BagError]) -> None:
+    error = sqlite3.OperationalError("as sqlite puts it")
+    error.sqlite_errorcode = code
+    with pytest.raises(BagError) as raised, reading(Path("a.db3")):
+        raise error
+    assert type(raised.value) is kind
