@@ -227,7 +227,9 @@ def _object(value: object, what: str) -> dict[object, object]:
 
 def _name(fields: dict[object, object], key: str) -> str | None:
     value = fields.get(key)
-    if value is not None and (not isinstance(value, str) or "/" in value or not value):
+    if value is not None and (
+        not isinstance(value, str) or "/" in value or value in {"", ".", ".."}
+    ):
         raise ValueError(f"{key} must be the name of a recording, or null")
     return value
 

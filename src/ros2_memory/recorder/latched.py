@@ -266,12 +266,12 @@ class Carrier:
 
     def _write(self, records: Sequence[Record]) -> None:
         folder = self.path.parent
+        if folder.is_symlink():
+            raise BagError(str(folder), "a symbolic link, which is not followed: remove it")
         if not records:
             self.path.unlink(missing_ok=True)
             return
         folder.mkdir(exist_ok=True)
-        if folder.is_symlink():
-            raise BagError(str(folder), "a symbolic link, which is not followed: remove it")
         beside = folder / f".{CARRY_FILE}.tmp"
         try:
             beside.unlink(missing_ok=True)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 CHILD_PATIENCE_S: Final = 15.0
 """How long the child of a recorder that died is waited for."""
 _POLL_S: Final = 0.1
+_FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _MAX_TEXT: Final = 1000
 
 
@@ -43,7 +44,7 @@ class BagDirLock:
         """
         path = bag_dir / LOCK_FILE
         try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            descriptor = os.open(path, _FLAGS, 0o644)
         except OSError as error:
             raise RecorderError(
                 f"{path} cannot be opened: {error.strerror}; the recorder must be able to write "
@@ -70,7 +71,7 @@ class BagDirLock:
         try:
             if not self._path.parent.is_dir() or _is_file(self._path, self.descriptor):
                 return False
-            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            descriptor = os.open(self._path, _FLAGS, 0o644)
         except OSError:
             return False
         try:

@@ -189,6 +189,8 @@ class Ros2BagRecorder(Recorder):
 def _prune(log_dir: Path) -> None:
     """Keeps the newest logs: every run of `ros2` leaves one, and all it says is read here."""
     with suppress(OSError):
+        if log_dir.is_symlink():
+            return  # what lies elsewhere is somebody else's
         logs = sorted(log_dir.iterdir(), key=lambda path: path.lstat().st_mtime_ns)
         for path in logs[:-LOGS_KEPT]:
             with suppress(OSError):  # a directory; the others may go all the same

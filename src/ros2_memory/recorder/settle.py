@@ -50,7 +50,7 @@ def settle_all(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) 
     Raises:
         OSError: the bag directory cannot be listed.
     """
-    for directory in sorted(each for each in bag_dir.iterdir() if each.is_dir()):
+    for directory in sorted(each for each in bag_dir.iterdir() if _is_folder(each)):
         new_name = None if directory.name in running else unsettled(directory)
         if new_name is None:
             continue
@@ -58,6 +58,11 @@ def settle_all(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) 
             settle(directory, bag_dir / new_name, reader)
         except RecorderError as error:
             _log.error("handover_not_settled", recording=directory.name, reason=str(error))
+
+
+def _is_folder(path: Path) -> bool:
+    """Whether it is a directory itself, and not a link to one elsewhere."""
+    return path.is_dir() and not path.is_symlink()
 
 
 def unsettled(recording: Path) -> str | None:
@@ -81,7 +86,7 @@ def settle(old: Path, new: Path, reader: BagReader) -> None:
 
 def _settle(old: Path, new: Path, reader: BagReader) -> None:
     before = read_handover(old).handover
-    if not new.is_dir():
+    if not _is_folder(new):
         write_handover(old, withdrawn(before))
         return
     after = read_handover(new).handover

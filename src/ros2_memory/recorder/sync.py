@@ -16,6 +16,10 @@ if TYPE_CHECKING:
 
 MAX_SMALL_FILE: Final = 1 << 20
 
+# Never through a symbolic link: what is written or read lies in the bag directory itself.
+_ANEW: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
+_AS_IT_IS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
+
 
 def write_durably(target: Path, text: str) -> None:
     """Replaces the file at once: a reader sees what was there, or all of the new text.
@@ -37,7 +41,7 @@ def write_all_durably(texts: Mapping[Path, str]) -> None:
     waiting = {target: target.with_name(f".{target.name}.tmp") for target in texts}
     try:
         for target, beside in waiting.items():
-            with beside.open("w", encoding="utf-8") as stream:
+            with os.fdopen(os.open(beside, _ANEW, 0o666), "w", encoding="utf-8") as stream:
                 stream.write(texts[target])
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -58,7 +62,7 @@ def read_small_file(path: Path) -> str:
         OSError: it cannot be read.
         ValueError: it is no regular file, no text, or larger than `MAX_SMALL_FILE`.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor = os.open(path, _AS_IT_IS)
     with os.fdopen(descriptor, "rb") as stream:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise ValueError("it is not a regular file")

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import os
 import pwd
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.layout import (
@@ -22,6 +22,9 @@ from ros2_memory.recorder.layout import (
     RECORDING_FILES,
 )
 from ros2_memory.recorder.scan import bag_kind
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 _SQLITE_COMPANIONS: Final = (".db3-wal", ".db3-shm", ".db3-journal")
 
@@ -44,8 +47,13 @@ def clear_bags(bag_dir: Path) -> Wiped:
     refuse_homes(bag_dir)
     root = bag_dir.resolve()
     wiped = Wiped()
-    with suppress(FileNotFoundError):
-        _clear(root, root.stat().st_dev, wiped, is_root=True)
+    try:
+        with _opened(root) as opened:
+            _clear(root, opened, os.fstat(opened).st_dev, wiped, is_root=True)
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        wiped.faults.append(f"{root} cannot be listed: {error.strerror}")
     return wiped
 
 
@@ -94,23 +102,45 @@ def _is_nothing(entry: os.DirEntry[str]) -> bool:
     )
 
 
-def _clear(directory: Path, device: int, wiped: Wiped, *, is_root: bool) -> None:
-    """Deletes the bags below a directory, and the directory with them if nothing else is in it."""
-    try:
-        with os.scandir(directory) as listing:
-            entries = list(listing)
-    except OSError as error:
-        wiped.faults.append(f"{directory} cannot be listed: {error.strerror}")
-        return
+def _clear(path: Path, opened: int, device: int, wiped: Wiped, *, is_root: bool) -> bool:
+    """Deletes the bags below an open directory; whether there were any in it.
+
+    Names are looked up in the open directory: whatever takes the place of its path meanwhile is
+    not touched. A directory below goes too if nothing else is in it.
+    """
+    with os.scandir(opened) as listing:
+        entries = list(listing)
     had_bags = any(_is_bag(entry) for entry in entries)
     for entry in entries:
-        if _is_directory(entry, device):
-            _clear(Path(entry.path), device, wiped, is_root=False)
-        elif _is_bag(entry) or _goes_with_bags(entry, is_root=is_root, had_bags=had_bags):
-            _delete(entry, wiped)
-    if had_bags and not is_root:
-        with suppress(OSError):
-            directory.rmdir()
+        below = path / entry.name
+        try:
+            if _is_directory(entry, device):
+                with _opened(entry.name, opened) as inner:
+                    emptied = _clear(below, inner, device, wiped, is_root=False)
+                if emptied:
+                    with suppress(OSError):
+                        os.rmdir(entry.name, dir_fd=opened)
+            elif _is_bag(entry) or _goes_with_bags(entry, is_root=is_root, had_bags=had_bags):
+                size = entry.stat(follow_symlinks=False).st_size
+                os.unlink(entry.name, dir_fd=opened)
+                wiped.files += 1
+                wiped.bytes += size
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            wiped.faults.append(f"{below} cannot be deleted: {error.strerror}")
+    return had_bags
+
+
+@contextmanager
+def _opened(path: Path | str, within: int | None = None) -> Iterator[int]:
+    """A descriptor of a directory that stands there itself and not through a link."""
+    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
+    descriptor = os.open(path, flags, dir_fd=within)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 def _is_directory(entry: os.DirEntry[str], device: int) -> bool:
@@ -127,16 +157,3 @@ def _is_bag(entry: os.DirEntry[str]) -> bool:
 def _goes_with_bags(entry: os.DirEntry[str], *, is_root: bool, had_bags: bool) -> bool:
     names = (OWN_FILES if is_root else frozenset()) | (RECORDING_FILES if had_bags else frozenset())
     return entry.name in names and entry.is_file(follow_symlinks=False)
-
-
-def _delete(entry: os.DirEntry[str], wiped: Wiped) -> None:
-    try:
-        size = entry.stat(follow_symlinks=False).st_size
-        Path(entry.path).unlink()
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        wiped.faults.append(f"{entry.path} cannot be deleted: {error.strerror}")
-        return
-    wiped.files += 1
-    wiped.bytes += size

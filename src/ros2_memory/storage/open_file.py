@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
@@ -13,6 +14,28 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 EMPTY_FILE: Final = "empty file: nothing had reached the disk"
+LINK: Final = "a symbolic link, which is not followed"
+
+
+def open_regular(path: Path) -> int:
+    """A descriptor of a regular file, which stands there itself and not through a link.
+
+    Raises:
+        OSError: it cannot be opened.
+        UnreadableError: it is not a regular file.
+    """
+    try:
+        # Without blocking: opening a pipe would wait for somebody to write into it.
+        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+        descriptor = os.open(path, flags)
+    except OSError as error:
+        if error.errno == errno.ELOOP and path.is_symlink():
+            raise UnreadableError(LINK) from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise UnreadableError("not a regular file")
+    return descriptor
 
 
 class FileKey(NamedTuple):
@@ -36,12 +59,8 @@ class OpenFile:
     """
 
     def __init__(self, path: Path) -> None:
-        # Without blocking: opening a pipe would wait for somebody to write into it.
-        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        self._descriptor = open_regular(path)
         status = os.fstat(self._descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            os.close(self._descriptor)
-            raise UnreadableError("not a regular file")
         self.size = status.st_size
         self.key = FileKey(str(path), status.st_size, status.st_mtime_ns, status.st_ino)
 
