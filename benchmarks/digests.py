@@ -13,6 +13,7 @@ from benchmarks.report import Figure
 from ros2_memory.bootstrap import build_filler
 from ros2_memory.digest import Digester
 from ros2_memory.indexing import fill
+from ros2_memory.rests import SLOT_NS
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
     from ros2_memory.memory import Memory
     from ros2_memory.model import BagSummary
     from ros2_memory.motion import PoseDigest, Stop
+    from ros2_memory.rests import RestDigest, Slot
     from ros2_memory.settings import Settings
+    from ros2_memory.stories import Story
 
 _MAX_MS = 10.0
 
@@ -75,7 +78,42 @@ def _moved_topic(topic: TopicDigest, by: int) -> TopicDigest:
             for each in kept
         )
     poses = None if topic.poses is None else _moved_poses(topic.poses, by)
-    return replace(topic, poses=poses, edges=edges, kept=kept)
+    rests = None if topic.rests is None else _moved_rests(topic.rests, by)
+    story = None if topic.story is None else _moved_story(topic.story, by)
+    return replace(topic, poses=poses, rests=rests, story=story, edges=edges, kept=kept)
+
+
+def _moved_rests(rests: RestDigest, by: int) -> RestDigest:
+    def later(slot: Slot) -> Slot:
+        first = slot.first._replace(time=slot.first.time + by)
+        number = slot.number + by // SLOT_NS
+        return slot._replace(number=number, first=first, last=slot.last + by)
+
+    return replace(
+        rests,
+        head=later(rests.head),
+        second=None if rests.second is None else rests.second._replace(time=rests.second.time + by),
+        rests=tuple(
+            each._replace(start=each.start + by, end=each.end + by) for each in rests.rests
+        ),
+        tail=None if rests.tail is None else later(rests.tail),
+    )
+
+
+def _moved_story(story: Story, by: int) -> Story:
+    return replace(
+        story,
+        first=story.first + by,
+        last=story.last + by,
+        seen=tuple(
+            each._replace(first=each.first + by, last=each.last + by) for each in story.seen
+        ),
+        known=tuple(each._replace(at=each.at + by) for each in story.known),
+        flips=tuple(each._replace(time=each.time + by) for each in story.flips),
+        faults=tuple(
+            each._replace(first=each.first + by, last=each.last + by) for each in story.faults
+        ),
+    )
 
 
 def _moved_poses(poses: PoseDigest, by: int) -> PoseDigest:

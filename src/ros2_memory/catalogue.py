@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.catalogue_base import KeptBase
@@ -24,11 +25,17 @@ from ros2_memory.catalogue_sql import (
     keys_rows,
     numbers_of,
     put,
+    tale_rows,
 )
 from ros2_memory.digest import EdgeDigest
-from ros2_memory.packing import filled, shape_of_text, unpacked_poses
-from ros2_memory.recorder.standing import FormerFile
+from ros2_memory.former import former_files
+from ros2_memory.packing import (
+    unpacked_poses,
+    unpacked_rests,
+    unpacked_story,
+)
 from ros2_memory.storage.base import Channel, Record, Schema
+from ros2_memory.stories import QUIET
 
 if TYPE_CHECKING:
     import sqlite3
@@ -39,6 +46,9 @@ if TYPE_CHECKING:
     from ros2_memory.evidence import Evidence
     from ros2_memory.model import BagFile
     from ros2_memory.motion import PoseDigest
+    from ros2_memory.recorder.standing import FormerFile
+    from ros2_memory.rests import RestDigest
+    from ros2_memory.stories import Story
     from ros2_memory.timebase import Ns
 
 FOLDER: Final = ".episodic"
@@ -128,22 +138,7 @@ class Catalogue:
 
     def summaries(self, bag_dir: Path) -> dict[str, FormerFile]:
         """What is known of every file below the bag directory, by its whole path."""
-        root = f"{bag_dir}{os.sep}"
-
-        def ask(base: sqlite3.Connection) -> dict[str, FormerFile]:
-            shapes = {
-                number: shape_of_text(text)
-                for number, text in base.execute("SELECT id, text FROM shapes")
-            }
-            return {
-                root + path: FormerFile(size, mtime, sidecar, filled(shapes[shape], counts))
-                for path, size, mtime, sidecar, shape, counts in base.execute(
-                    "SELECT path, size, mtime, sidecar, shape, counts FROM bags WHERE config = ?",
-                    (self._config,),
-                )
-            }
-
-        return self._read(ask, {})
+        return self._read(partial(former_files, config=self._config, root=f"{bag_dir}{os.sep}"), {})
 
     def paths(self) -> list[str]:
         """The files that have an entry, below the bag directory."""
@@ -186,6 +181,30 @@ class Catalogue:
                 for number, packed in rows
                 if packed is not None
             }
+
+        return self._read(ask, {})
+
+    def rests(self, topic: str, numbers: Sequence[int]) -> dict[int, RestDigest]:
+        """Where the poses of the topic in the entries stand still; not where some have no pose."""
+
+        def ask(base: sqlite3.Connection) -> dict[int, RestDigest]:
+            rows = tale_rows(base, "rests", topic, numbers)
+            return {number: unpacked_rests(packed) for number, packed in rows}
+
+        return self._read(ask, {})
+
+    def stories(self, topic: str, numbers: Sequence[int]) -> dict[int, Story | None]:
+        """What the messages of the topic in the entries say.
+
+        `QUIET` where they say nothing; None where none can be decoded. The entries must hold the
+        topic; none is left out but where the file fails.
+        """
+
+        def ask(base: sqlite3.Connection) -> dict[int, Story | None]:
+            found: dict[int, Story | None] = dict.fromkeys(numbers, QUIET)
+            for number, text in tale_rows(base, "story", topic, numbers):
+                found[number] = unpacked_story(text) if text else None
+            return found
 
         return self._read(ask, {})
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Of the tables below and of what stands in them; a file of any other is set aside."""
 
 BUSY_S: Final = 1.0
@@ -46,6 +46,8 @@ CREATE TABLE held (topic INTEGER NOT NULL, bag INTEGER NOT NULL, flags INTEGER N
   min_x REAL, max_x REAL, min_y REAL, max_y REAL, min_z REAL, max_z REAL,
   poses BLOB, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER, kept INTEGER,
   undecodable TEXT,
+  PRIMARY KEY (topic, bag)) WITHOUT ROWID;
+CREATE TABLE tales (topic INTEGER NOT NULL, bag INTEGER NOT NULL, rests BLOB, story TEXT,
   PRIMARY KEY (topic, bag)) WITHOUT ROWID;
 CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
 CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
@@ -207,7 +209,7 @@ def _prepare(base: sqlite3.Connection) -> None:
     base.execute("COMMIT")
     if tables and version != VERSION:
         raise _OtherError(f"it is of version {version}, and {VERSION} is what is known")
-    base.execute("SELECT 1 FROM bags, held, kept, payloads, channels, edges, shapes LIMIT 1")
+    base.execute("SELECT 1 FROM bags, held, tales, kept, payloads, channels, edges, shapes LIMIT 1")
 
 
 def set_aside(path: Path, reason: str) -> None:

@@ -11,7 +11,8 @@ import json
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.evidence import OPEN, Box, Evidence
-from ros2_memory.packing import packed_poses, shape_text
+from ros2_memory.packing import packed_poses, packed_rests, packed_story, shape_text
+from ros2_memory.stories import Story
 
 if TYPE_CHECKING:
     import sqlite3
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.digest import Digest, TopicDigest
     from ros2_memory.storage.base import Record
+    from ros2_memory.summaries import BagSummary
 
 _OPEN, _TEXTS, _FALSE, _TRUE = 1, 2, 4, 8
 EVIDENCE: Final = "flags, words, low, high, numbers, min_x, max_x, min_y, max_y, min_z, max_z"
@@ -68,7 +70,7 @@ def drop(base: sqlite3.Connection, numbers: Sequence[int]) -> None:
         return
     listed = json.dumps(numbers)
     for (topic,) in base.execute("SELECT id FROM topics").fetchall():
-        for table in ("held", "kept"):
+        for table in ("held", "tales", "kept"):
             base.execute(f"DELETE FROM {table} WHERE topic = ? AND bag {AMONG}", (topic, listed))
     base.execute(f"DELETE FROM bags WHERE id {AMONG}", (listed,))
     base.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
@@ -84,8 +86,10 @@ def put(
         " VALUES (?, ?, ?, ?, ?, ?, ?)",
         (config, *key, shape, digest.summary.numbers),
     )
+    number = int(cursor.lastrowid or 0)
     for topic in digest.topics:
-        _put_topic(base, int(cursor.lastrowid or 0), topic)
+        _put_topic(base, number, topic)
+        _put_tale(base, number, topic, digest.summary)
 
 
 def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
@@ -119,6 +123,35 @@ def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
     )
     for nth, record in enumerate(topic.kept or ()):
         _put_record(base, (bag, number, nth), record)
+
+
+def _put_tale(base: sqlite3.Connection, bag: int, topic: TopicDigest, summary: BagSummary) -> None:
+    """Inserts where a topic's poses stand still and what its messages say, if there is any."""
+    story = "" if topic.story is None else packed_story(topic.story)
+    spans = [(each.first, each.last) for each in summary.topics if each.topic == topic.topic]
+    quiet = Story(min(first for first, _ in spans), max(last for _, last in spans))
+    if topic.rests is None and topic.story == quiet:
+        return
+    base.execute(
+        f"INSERT INTO tales VALUES ({TOPIC}, ?, ?, ?)",
+        (
+            topic.topic,
+            bag,
+            None if topic.rests is None else packed_rests(topic.rests),
+            None if topic.story == quiet else story,
+        ),
+    )
+
+
+def tale_rows(
+    base: sqlite3.Connection, column: str, topic: str, numbers: Sequence[int]
+) -> list[sqlite3.Row]:
+    """The entry and a column of what is told of a topic, where there is something in it."""
+    return base.execute(
+        f"SELECT bag, {column} FROM tales"
+        f" WHERE topic = {TOPIC} AND bag {AMONG} AND {column} IS NOT NULL",
+        (topic, json.dumps(numbers)),
+    ).fetchall()
 
 
 def _put_record(base: sqlite3.Connection, place: tuple[int, int, int], record: Record) -> None:

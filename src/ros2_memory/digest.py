@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.conditions import leaves, positions
-from ros2_memory.errors import UndecodableError
+from ros2_memory.errors import BagError, UndecodableError
 from ros2_memory.evidence import (
     MOST_NUMBERS,
     MOST_WORD_CHARS,
@@ -27,7 +27,10 @@ from ros2_memory.evidence import (
     words_of,
 )
 from ros2_memory.model import Pose, TimeWindow
+from ros2_memory.motion import is_place
 from ros2_memory.mould import mould_of
+from ros2_memory.rests import RestCollector
+from ros2_memory.stories import MOST_TOLD, StoryBuilder, state_of
 from ros2_memory.trajectory import PoseCollector
 
 if TYPE_CHECKING:
@@ -38,10 +41,12 @@ if TYPE_CHECKING:
     from ros2_memory.model import BagSummary, JsonValue, StampedTransform
     from ros2_memory.motion import PoseDigest
     from ros2_memory.mould import Bytes, Mould
+    from ros2_memory.rests import RestDigest
     from ros2_memory.storage.base import BagReader, Record
+    from ros2_memory.stories import State, Story
     from ros2_memory.timebase import Ns
 
-DIGEST_VERSION: Final = 1
+DIGEST_VERSION: Final = 2
 """Of what is found in a bag and how; another one has every bag digested again."""
 MOST_KEPT: Final = 64
 """Messages that are kept whole of a topic that has few: latched ones, and transforms."""
@@ -50,6 +55,11 @@ MOST_KEPT_BYTES: Final = 1 << 20
 MOST_TEXTS: Final = 2_000
 """Distinct texts of one topic that are looked at before its words count as too many."""
 MOST_EDGES: Final = 1_000
+_MOST_TEXT_CHARS: Final = 1 << 20
+"""The words of a longer text alone would take more memory than it."""
+_ALWAYS_READ_BYTES: Final = 64 << 20
+_MOST_TIMES_PACKED: Final = 100
+"""A bag whose messages unpack to more times its size is left to be read when it is asked for."""
 
 _LARGEST: Final = 1e300
 _FEW: Final = 24
@@ -81,6 +91,8 @@ class TopicDigest:
         topic: its name.
         evidence: what rules conditions out.
         poses: what its poses amount to; None where some message carries none.
+        rests: where they stand still; None where `poses` is None or has no valid one.
+        story: what its messages say; None where none can be decoded.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
         undecodable: by type, why none of its messages can be decoded; for most nothing.
@@ -89,6 +101,8 @@ class TopicDigest:
     topic: str
     evidence: Evidence
     poses: PoseDigest | None
+    rests: RestDigest | None
+    story: Story | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
     undecodable: tuple[tuple[str, str], ...] = ()
@@ -140,7 +154,11 @@ class Digester:
             )
             for topic, latched in topics.items()
         }
+        left = _ALWAYS_READ_BYTES + _MOST_TIMES_PACKED * _size(path)
         for record in self._reader.records(path, tuple(topics), TimeWindow.everything()):
+            left -= len(record.payload)
+            if left < 0:
+                raise BagError(str(path), "its messages unpack to more than they can be worth")
             collectors[record.channel.topic].add(record)
         reasons = self._reasons(path)
         return Digest(
@@ -158,11 +176,19 @@ class Digester:
         return reasons
 
 
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
 class _Seen(NamedTuple):
-    """What one message that could be decoded says of the robot's motion."""
+    """What one message that could be decoded says of the robot's motion, and else."""
 
     pose: Pose | None
     speed_mps: float | None
+    state: State
 
 
 class _Collector:
@@ -187,11 +213,13 @@ class _Collector:
         self._latched = latched
         self._evidence = EvidenceCollector()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
+        self._rests = RestCollector()
+        self._story = StoryBuilder()
         self._pairs: set[tuple[str, str]] | None = set()
         self._ends: tuple[Record, Record] | None = None
         self._kept: list[Record] | None = []
         self._kept_bytes = 0
-        self._moulds: list[tuple[Mould, Record]] = []
+        self._moulds: list[tuple[Mould, Record, State]] = []
         self._more_moulds = _MOST_MOULDS if many else 0
         self._waiting: list[Record] = []
         self._waiting_bytes = 0
@@ -214,6 +242,8 @@ class _Collector:
             topic=self._topic,
             evidence=self._evidence.evidence(),
             poses=None if self._poses is None else self._poses.digest(),
+            rests=None if self._poses is None else self._rests.digest(),
+            story=self._story.story(MOST_TOLD),
             edges=self._edges(),
             kept=tuple(self._kept) if self._kept is not None and few else None,
             undecodable=tuple(undecodable.items()),
@@ -250,7 +280,8 @@ class _Collector:
             self._evidence.give_up()
             self._pairs = None
             return None
-        self._evidence.add(self._extractor.exact(message, type_name))
+        value = self._extractor.exact(message, type_name)
+        self._evidence.add(value)
         if self._pairs is not None:
             edges = self._extractor.transforms(message, record.log_time, static=False)
             self._pairs.update((each.parent, each.child) for each in edges)
@@ -258,31 +289,36 @@ class _Collector:
                 self._pairs = None
         twist = self._extractor.twist(message, type_name)
         speed = None if twist is None else math.hypot(*twist.linear)
-        return _Seen(self._extractor.pose(message, type_name), speed)
+        pose = self._extractor.pose(message, type_name)
+        return _Seen(pose, speed, state_of(value, type_name))
 
     def _take(self, record: Record, seen: _Seen | None) -> None:
-        """Takes the pose of the next message."""
+        """Takes the pose of the next message, and what it says."""
+        if seen is not None:
+            self._story.add(record.log_time, seen.state)
         if seen is None or seen.pose is None:
             self._poses = None
         elif self._poses is not None:
             self._poses.add(record.log_time, seen.pose, seen.speed_mps)
+            if is_place(seen.pose.position):
+                self._rests.add(record.log_time, seen.pose.position)
 
     def _flush(self) -> None:
         """Takes the waiting messages: those of one mould together, the others one by one."""
         records, self._waiting, self._waiting_bytes = self._waiting, [], 0
         seen: list[_Seen | None] = [None] * len(records)
         rest: Sequence[int] = range(len(records))
-        for mould, first in self._moulds:
-            rest = self._cast(mould, first, records, rest, seen)
+        for mould, first, state in self._moulds:
+            rest = self._cast(mould, (first, state), records, rest, seen)
         while rest:
             at, rest = rest[0], rest[1:]
-            seen[at] = self._decoded(records[at])
-            made = self._new_mould(records[at]) if seen[at] is not None else None
-            if made is not None:
+            seen[at] = one = self._decoded(records[at])
+            made = self._new_mould(records[at]) if one is not None else None
+            if made is not None and one is not None:
                 before = len(rest)
-                rest = self._cast(made, records[at], records, rest, seen)
+                rest = self._cast(made, (records[at], one.state), records, rest, seen)
                 if before - len(rest) >= _WORTH_IT:
-                    self._moulds.append((made, records[at]))
+                    self._moulds.append((made, records[at], one.state))
                 else:
                     self._more_moulds = 0
         for record, each in zip(records, seen, strict=True):
@@ -305,19 +341,20 @@ class _Collector:
     def _cast(
         self,
         mould: Mould,
-        first: Record,
+        model: tuple[Record, State],
         records: Sequence[Record],
         rest: Sequence[int],
         seen: list[_Seen | None],
     ) -> Sequence[int]:
-        """Takes those of `rest` that are of a mould; gives the others."""
+        """Takes those of `rest` that are of the mould of `model`; gives the others."""
+        first, state = model
         chosen, rows = mould.those_like(first, records, rest)
         if not chosen:
             return rest
         self._evidence.add_rows(mould, rows)
         speeds = [None if v is None else math.hypot(*v) for v in mould.velocities(rows)]
         for at, pose, speed in zip(chosen, mould.poses(rows), speeds, strict=True):
-            seen[at] = _Seen(pose, speed)
+            seen[at] = _Seen(pose, speed, state)
         taken = set(chosen)
         return [at for at in rest if at not in taken]
 
@@ -395,7 +432,8 @@ class EvidenceCollector:
         if text in self._strings or (self._words is None and self._strings):
             return
         self._strings.add(text)
-        if self._words is None:
+        if self._words is None or len(text) > _MOST_TEXT_CHARS:
+            self._words = None
             return
         fresh = set(words_of(text.casefold())) - self._words
         self._chars += sum(len(word) + 1 for word in fresh)

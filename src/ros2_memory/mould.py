@@ -18,6 +18,7 @@ import numpy as np
 
 from ros2_memory.conditions import positions
 from ros2_memory.model import Pose
+from ros2_memory.things import hangs_on_numbers
 from ros2_memory.timebase import NS_PER_S, unix_from_ns
 from ros2_memory.views import ANGLES, unit
 
@@ -238,6 +239,8 @@ def _fixed(layout: Layout) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
 
 
 def _mould(layout: Layout, one: _Marked, other: _Marked) -> Mould:
+    if hangs_on_numbers(one.value):
+        raise _NoMouldError
     numbers, times, angles = _shown_numbers(one, other)
     places = tuple(one.place(point) for point in positions(one.value))
     pose = None if one.pose is None else one.place(one.pose.position)

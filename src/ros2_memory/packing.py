@@ -8,10 +8,13 @@ from __future__ import annotations
 import json
 import math
 import struct
+from dataclasses import astuple
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.motion import PoseDigest, Stop
+from ros2_memory.rests import Box3, Rest, RestDigest, Slot
+from ros2_memory.stories import Fault, Flip, Known, Presence, Story
 from ros2_memory.summaries import BagSummary, Heading, shared_shape
 
 if TYPE_CHECKING:
@@ -21,6 +24,9 @@ if TYPE_CHECKING:
 
 _HEAD: Final = struct.Struct("<qqqqddB??qdddqdddqdddqddd")
 _VERTEX: Final = struct.Struct("<qdddd")
+_REST_HEAD: Final = struct.Struct("<BBqddd")
+_SLOT: Final = struct.Struct("<qqdddqdddddd")
+_REST: Final = struct.Struct("<qqdddddd")
 _NOWHERE: Final = Stop(0, (math.nan, math.nan, math.nan))
 
 
@@ -60,6 +66,91 @@ def unpacked_poses(packed: bytes) -> PoseDigest:
         return _unpacked_poses(packed)
     except struct.error as error:
         raise ValueError(f"not a digest of poses: {error}") from error
+
+
+def packed_rests(rests: RestDigest) -> bytes:
+    """A digest of rests as bytes."""
+    ends = [each for each in (rests.head, rests.tail) if each is not None]
+    flags = rests.from_second | rests.to_tail << 1
+    second = _NOWHERE if rests.second is None else rests.second
+    return b"".join(
+        (
+            _REST_HEAD.pack(flags, len(ends), second.time, *second.position),
+            *(
+                _SLOT.pack(
+                    each.number,
+                    each.first.time,
+                    *each.first.position,
+                    each.last,
+                    *each.box.low,
+                    *each.box.high,
+                )
+                for each in ends
+            ),
+            *(
+                _REST.pack(each.start, each.end, *each.box.low, *each.box.high)
+                for each in rests.rests
+            ),
+        )
+    )
+
+
+def unpacked_rests(packed: bytes) -> RestDigest:
+    """The digest that these bytes are of.
+
+    Raises:
+        ValueError: they are of none.
+    """
+    try:
+        flags, ends, *second = _REST_HEAD.unpack_from(packed)
+        slots = [
+            _slot(_SLOT.unpack_from(packed, _REST_HEAD.size + nth * _SLOT.size))
+            for nth in range(ends)
+        ]
+        body = packed[_REST_HEAD.size + ends * _SLOT.size :]
+        rests = [
+            Rest(start, end, Box3((a, b, c), (d, e, f)))
+            for start, end, a, b, c, d, e, f in _REST.iter_unpack(body)
+        ]
+        head, tail = slots[0], slots[1] if ends > 1 else None
+    except (struct.error, IndexError) as error:
+        raise ValueError(f"not a digest of rests: {error}") from error
+    time, x, y, z = second
+    known = Stop(time, (x, y, z)) if tail is not None else None
+    return RestDigest(head, known, tuple(rests), bool(flags & 1), bool(flags & 2), tail)
+
+
+def _slot(numbers: tuple[int | float, ...]) -> Slot:
+    number, time, x, y, z, last, a, b, c, d, e, f = numbers
+    return Slot(int(number), Stop(int(time), (x, y, z)), int(last), Box3((a, b, c), (d, e, f)))
+
+
+def packed_story(story: Story) -> str:
+    """A story as text."""
+    return json.dumps(astuple(story), ensure_ascii=False, separators=(",", ":"))
+
+
+def unpacked_story(text: str) -> Story:
+    """The story that this text is of.
+
+    Raises:
+        ValueError: it is of none.
+    """
+    try:
+        first, last, seen, from_start, to_end, known, flips, faults, left_out = json.loads(text)
+        return Story(
+            first,
+            last,
+            tuple(Presence(*each) for each in seen),
+            tuple(from_start),
+            tuple(to_end),
+            tuple(Known(*each) for each in known),
+            tuple(Flip(*each) for each in flips),
+            tuple(Fault(*each) for each in faults),
+            left_out,
+        )
+    except TypeError as error:
+        raise ValueError(f"not a story: {error}") from error
 
 
 def _unpacked_poses(packed: bytes) -> PoseDigest:

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from ros2_memory.model import BagFile
     from ros2_memory.motion import PoseDigest
     from ros2_memory.recorder.timeline import Run
+    from ros2_memory.rests import RestDigest
     from ros2_memory.storage.base import Record
+    from ros2_memory.stories import Story
 
 T = TypeVar("T")
 
@@ -81,6 +83,14 @@ class RunNotes:
     def poses(self, topic: str) -> Mapping[int, PoseDigest]:
         """For each entry that has it the digest of its poses."""
         return self._catalogue.poses(topic, self._of(topic))
+
+    def rests(self, topic: str) -> Mapping[int, RestDigest]:
+        """For each entry that has it where its poses stand still."""
+        return self._catalogue.rests(topic, self._of(topic))
+
+    def stories(self, topic: str) -> Mapping[int, Story | None]:
+        """For each entry what the messages of the topic say, as the catalogue has it."""
+        return self._catalogue.stories(topic, self._of(topic))
 
     def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
         """For each entry that has them the frame edges."""

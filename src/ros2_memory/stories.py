@@ -31,6 +31,9 @@ _ERROR_LEVELS: Final = {
     "diagnostic_msgs/msg/DiagnosticArray": _ERROR,
 }
 _LONGEST_TEXT: Final = 160
+_TOLD_OF: Final = frozenset({"sensor_msgs/msg/BatteryState"})
+_MEASURING: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "tf2_msgs/")
+"""Packages whose messages are measurements: nothing in them comes, goes or flips."""
 
 
 class State(NamedTuple):
@@ -116,8 +119,19 @@ class Story:
         return not (self.seen or self.known or self.faults)
 
 
+QUIET: Final = Story(0, 0)
+"""Stands for the story of messages that say nothing, whenever they were."""
+
+
+def tells(type_name: str) -> bool:
+    """Whether messages of a type can say anything."""
+    return type_name in _TOLD_OF or not type_name.startswith(_MEASURING)
+
+
 def state_of(value: JsonValue, type_name: str) -> State:
     """What an extracted message of a type says."""
+    if not tells(type_name):
+        return NOTHING
     faults = tuple(_faults(value, _ERROR_LEVELS.get(type_name)))
     if type_name in _ERROR_LEVELS:
         return State(faults=faults) if faults else NOTHING

@@ -52,6 +52,21 @@ def things_of(value: JsonValue, frame_id: str = "") -> tuple[Thing, ...]:
     return tuple(found)
 
 
+def hangs_on_numbers(value: JsonValue) -> bool:
+    """Whether other scores in the same message may give things other names."""
+    waiting = [value]
+    while waiting:
+        held = waiting.pop()
+        if isinstance(held, dict):
+            results = held.get("results")
+            if isinstance(results, list) and len(results) > 1:
+                return True
+            waiting.extend(held.values())
+        elif isinstance(held, list):
+            waiting.extend(held)
+    return False
+
+
 def _things(value: JsonValue, frame_id: str, depth: int) -> Iterator[Thing]:
     if depth == 0:
         return

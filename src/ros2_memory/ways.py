@@ -6,26 +6,22 @@ does not depend on what the catalogue knows.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.absence import undecodable
 from ros2_memory.errors import InvalidArgumentsError, UndecodableError
-from ros2_memory.model import BagState
 from ros2_memory.packing import packed_poses, unpacked_poses
+from ros2_memory.portions import Kept, Kind, is_whole
 from ros2_memory.sights import Sights
 from ros2_memory.trajectory import PoseCollector, TrajectoryBuilder
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
 
     from ros2_memory.copies import Found
-    from ros2_memory.groups import Group
     from ros2_memory.history import View
     from ros2_memory.model import TimeWindow
-    from ros2_memory.motion import PoseDigest
-    from ros2_memory.recall import RunNotes
     from ros2_memory.timebase import Ns
     from ros2_memory.trajectory import Trajectory
 
@@ -44,6 +40,14 @@ class Way:
     last: Ns
 
 
+POSES: Final = Kind(
+    "poses",
+    ask=lambda notes, topic: notes.poses(topic),
+    packed=lambda digest: packed_poses(digest).hex(),
+    unpacked=lambda text: unpacked_poses(bytes.fromhex(text)),
+)
+
+
 def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     """The way in a window by the poses of one topic; None where there is no message.
 
@@ -55,13 +59,13 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     """
     failures: list[UndecodableError] = []
     builder = TrajectoryBuilder(max_plausible_speed_mps=view.memory.limits.max_plausible_speed_mps)
-    digests = _Digests(view, topic)
+    digests = Kept(view, topic, POSES)
     sights = Sights(view.memory.reader, view.memory.extractor)
     first: Ns | None = None
     last: Ns | None = None
     for group in view.groups(topic, window):
         span: tuple[Ns, Ns] | None
-        if not _is_whole(group, window):
+        if not is_whole(group, window):
             span = _added(view, builder, sights, group.once(), failures)
         elif (known := digests.of(group)) is not None:
             digest, span = known
@@ -85,67 +89,6 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     if first is None or last is None:
         return None
     return Way(builder.result(), builder.frames, first, last)
-
-
-def _is_whole(group: Group, window: TimeWindow) -> bool:
-    """Whether all messages of the group's bags lie in the window, and no crash cut a bag short."""
-    return all(
-        window.covers(held.first, held.last) and held.bag.state is BagState.CLOSED
-        for held in group.holdings
-    )
-
-
-class _Digests:
-    """What the catalogue has of the poses of one topic; of one run of bags at a time."""
-
-    def __init__(self, view: View, topic: str) -> None:
-        self._view = view
-        self._topic = topic
-        self._notes: RunNotes | None = None
-        self._poses: Mapping[int, PoseDigest] = {}
-
-    def of(self, group: Group) -> tuple[PoseDigest, tuple[Ns, Ns]] | None:
-        """The digest of a group's poses, and the times of its first and last message.
-
-        None where there is none yet, or not all messages have a pose.
-        """
-        if len(group.holdings) > 1:
-            return self._remembered(group)
-        [held] = group.holdings
-        number = None if self._notes is None else self._notes.numbers.get(held.bag.file)
-        if number is None:  # not of the run that the bag before it was of
-            entry = self._view.entry(held.bag)
-            if entry is None:
-                return None
-            self._view.check_deadline()
-            self._notes, number = entry
-            self._poses = self._notes.poses(self._topic)
-        digest = self._poses.get(number)
-        return None if digest is None else (digest, (held.first, held.last))
-
-    def keep(self, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> None:
-        """Keeps the digest of bags that hold copies of each other, for the next time."""
-        recall, numbers = self._view.memory.recall, self._numbers(group)
-        if recall is None or numbers is None or len(numbers) < 2 or not self._view.complete:
-            return
-        answer = json.dumps([packed_poses(digest).hex(), *span])
-        recall.remember(f"poses {self._topic}", numbers, answer)
-
-    def _remembered(self, group: Group) -> tuple[PoseDigest, tuple[Ns, Ns]] | None:
-        recall, numbers = self._view.memory.recall, self._numbers(group)
-        if recall is None or numbers is None:
-            return None
-        answer = recall.remembered(f"poses {self._topic}", numbers)
-        if answer is None:
-            return None
-        packed, first, last = json.loads(answer)
-        return unpacked_poses(bytes.fromhex(packed)), (first, last)
-
-    def _numbers(self, group: Group) -> list[int] | None:
-        """The entries of the group's bags; None where one has none."""
-        entries = [self._view.entry(held.bag) for held in group.holdings]
-        numbers = [entry[1] for entry in entries if entry is not None]
-        return numbers if len(numbers) == len(entries) else None
 
 
 def _added(

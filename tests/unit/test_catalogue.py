@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import threading
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import structlog
 
 from ros2_memory.catalogue import FILE, FOLDER, BagKey, Catalogue, relative
 from ros2_memory.digest import Digester
+from ros2_memory.stories import QUIET
 from tests.bags import boolean, detections, odom, tf, transform
 from tests.fakes import FakeReader
 from tests.memories import extractor
@@ -36,6 +38,9 @@ DIGEST = digest_of(
     tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static"),
     odom(T0, 1.0, 2.0, 0.3, vx=0.5),
     odom(T0 + S, 2.0, 2.0, 0.3, vx=0.5),
+    odom(T0 + 2 * S, 2.0, 2.0, 0.3, vx=0.5),
+    odom(T0 + 3 * S, 2.0, 2.0, 0.3, vx=0.5),
+    boolean(T0, False),
     detections(T0 + S, ["cup", "person"]),
     boolean(T0 + S, True),
 )
@@ -67,7 +72,9 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     [number] = again.find([KEY])
     assert number is not None
     path = str(tmp_path / KEY.path)
-    assert again.summaries(tmp_path) == {path: (*KEY[1:], DIGEST.summary)}
+    assert again.summaries(tmp_path) == {
+        path: (*KEY[1:], DIGEST.summary, DIGEST.summary.start, DIGEST.summary.end)
+    }
     for held in DIGEST.topics:
         evidence = again.evidence(held.topic, [number])[number]
         assert set(evidence.numbers or ()) == set(held.evidence.numbers or ())
@@ -79,10 +86,33 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
             held.evidence.booleans,
         )
         assert again.poses(held.topic, [number]).get(number) == held.poses
+        assert again.rests(held.topic, [number]).get(number) == held.rests
+        assert again.stories(held.topic, [number]) == {
+            number: QUIET if held.story is not None and held.story.says_nothing else held.story
+        }
         assert again.edges(held.topic, [number]).get(number) == held.edges
         assert again.kept(held.topic, [number]).get(number) == held.kept
     assert topic(DIGEST, "/odom").poses is not None
     assert topic(DIGEST, "/tf_static").kept is not None
+    rests, story = topic(DIGEST, "/odom").rests, topic(DIGEST, "/bumper").story
+    assert rests is not None
+    assert len(rests.rests) == 1
+    assert story is not None
+    assert len(story.flips) == 1
+
+
+def test_a_topic_that_cannot_be_decoded_has_no_story_and_is_not_taken_for_a_quiet_one(
+    tmp_path: Path,
+) -> None:
+    catalogue = catalogue_in(tmp_path)
+    quiet, unknown = topic(DIGEST, "/tf_static"), topic(DIGEST, "/bumper")
+    catalogue.put(KEY, replace(DIGEST, topics=(quiet, replace(unknown, story=None))))
+    [number] = catalogue.find([KEY])
+    assert number is not None
+    assert catalogue.stories("/tf_static", [number]) == {number: QUIET}
+    assert catalogue.stories("/bumper", [number]) == {number: None}
+    catalogue.close()
+    assert catalogue.stories("/tf_static", [number]) == {}
 
 
 @pytest.mark.parametrize(
@@ -133,7 +163,7 @@ def test_what_is_forgotten_leaves_nothing_behind(tmp_path: Path) -> None:
     catalogue.forget([KEY.path])
     catalogue.close()
     with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
-        for table in ("bags", "held", "kept", "payloads"):
+        for table in ("bags", "held", "tales", "kept", "payloads"):
             assert base.execute(f"SELECT count(*) FROM {table}").fetchone() == (0,)  # noqa: S608
 
 
