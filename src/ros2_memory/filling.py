@@ -76,6 +76,8 @@ class Filler:
         self._digester = digester
         self._bag_dir = bag_dir
         self._refused: dict[BagKey, Ns] = {}
+        self.undecodable: dict[str, str] = {}
+        """By topic, why its messages cannot be decoded, as it was when that was last looked at."""
 
     def waiting(self) -> list[BagFile]:
         """The bags to be digested, the newest first."""
@@ -144,7 +146,8 @@ class Filler:
 
     def warm(self) -> None:
         """Works out what recordings that overlap hold together, before somebody asks."""
-        list_recorded_topics(self._memory, Call())
+        rows = list_recorded_topics(self._memory, Call())
+        self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
         with suppress(EpisodicError):
             trajectory_summary(self._memory, Call(), Span(start_s=0.0, end_s=LAST_S))
 
@@ -195,7 +198,7 @@ async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> 
 
     `helper` is the command line of the program that digests a backlog (`ros2-memory index`).
     """
-    tidied = -math.inf
+    tidied, warmed = -math.inf, False
     while True:
         try:
             await anyio.to_thread.run_sync(filler.look_after, abandon_on_cancel=True)
@@ -203,7 +206,11 @@ async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> 
             if len(waiting) > BACKLOG and not filler.in_memory and await _helped(helper):
                 # What it could not digest is tried here, and refused if need be.
                 waiting = await anyio.to_thread.run_sync(filler.waiting, abandon_on_cancel=True)
-            await _digest(filler, waiting[:BACKLOG])
+            done = await _digest(filler, waiting[:BACKLOG])
+            # What is still to be digested would be read for it.
+            if (done or not warmed) and len(waiting) <= BACKLOG:
+                await anyio.to_thread.run_sync(filler.warm, abandon_on_cancel=True)
+                warmed = True
             if time.monotonic() - tidied > TIDY_S:
                 await anyio.to_thread.run_sync(filler.tidy, abandon_on_cancel=True)
                 tidied = time.monotonic()
@@ -212,14 +219,14 @@ async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> 
         await anyio.sleep(every_s)
 
 
-async def _digest(filler: Filler, bags: Sequence[BagFile]) -> None:
+async def _digest(filler: Filler, bags: Sequence[BagFile]) -> int:
+    """How many of these bags could be digested and kept."""
     done = 0
     for bag in bags:
         done += await anyio.to_thread.run_sync(filler.digest, bag, abandon_on_cancel=True)
         if filler.cannot_write:
-            return
-    if done:
-        await anyio.to_thread.run_sync(filler.warm, abandon_on_cancel=True)
+            break
+    return done
 
 
 async def _helped(helper: Sequence[str]) -> bool:

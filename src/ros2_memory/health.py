@@ -1,4 +1,7 @@
-"""What `/health` says, and the task that keeps the index fresh while nobody asks."""
+"""What `/health` says, and the task that keeps the index fresh while nobody asks.
+
+It stays small whatever is amiss: of many things the newest few are named, and all are counted.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import anyio
 import anyio.to_thread
 
 from ros2_memory.logs import get_logger
+from ros2_memory.reading import short_name
 from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.timebase import Ns, unix_from_ns, unix_rounded_up
 
@@ -20,6 +24,11 @@ if TYPE_CHECKING:
 
 PATIENCE_S: Final = 2.0
 """How long the index may take to answer; the first scan of a large directory takes longer."""
+NAMED: Final = 3
+"""Damaged files, and topics that cannot be decoded, that are named with their reasons."""
+
+_MOST_TOPICS: Final = 20
+_MOST_CHARS: Final = 300
 
 log = get_logger(__name__)
 
@@ -42,7 +51,8 @@ async def health(
 ) -> JsonObject:
     """How the server is: `ok`, or `degraded` with the reasons in `problems`.
 
-    An empty memory is no problem. Times are Unix seconds.
+    An empty memory is no problem, and neither is a topic that cannot be decoded. Times are Unix
+    seconds.
     """
     with anyio.move_on_after(patience_s):
         return await anyio.to_thread.run_sync(
@@ -63,22 +73,60 @@ def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
         "damaged": len(snapshot.damaged),
         "index_age_s": _seconds(now - snapshot.scanned_at),
     }
+    problems = _problems(snapshot, heartbeat, now)
+    if snapshot.damaged:
+        shown["damaged_files"] = [
+            {"file": _short(short_name(each.path)), "reason": _short(each.reason)}
+            for each in snapshot.damaged[-NAMED:]
+        ]
     if filler is not None:
-        progress = filler.progress()
-        shown["catalogue"] = {
+        shown |= _of_catalogue(filler)
+        if filler.trouble is not None:
+            problems.append(_short(f"the catalogue is {filler.trouble}; no answer depends on it"))
+    if heartbeat is not None:
+        shown["recorder"] = _of_recorder(heartbeat, now)
+    return _status(version, problems, shown)
+
+
+def _of_catalogue(filler: Filler) -> JsonObject:
+    progress, undecodable = filler.progress(), filler.undecodable
+    shown: JsonObject = {
+        "catalogue": {
             "bags": progress.closed - progress.waiting - progress.refused,
             "waiting": progress.waiting,
             "refused": progress.refused,
+            "state": _state(filler, progress.waiting),
         }
-    if heartbeat is not None:
-        shown["recorder"] = {
-            "state": str(heartbeat.state),
-            "live": heartbeat.is_live(now),
-            "heartbeat_age_s": _seconds(now - heartbeat.updated),
-            "silent_topics": [*heartbeat.silent],
-            "last_error": heartbeat.last_error,
+    }
+    if undecodable:
+        shown["undecodable"] = {
+            "topics": len(undecodable),
+            "reasons": {
+                _short(topic): _short(reason) for topic, reason in [*undecodable.items()][:NAMED]
+            },
         }
-    return _status(version, _problems(snapshot, heartbeat, now), shown)
+    return shown
+
+
+def _state(filler: Filler, waiting: int) -> str:
+    """`ready`, `filling`, or `failing` where it is not what it should be."""
+    if filler.trouble is not None:
+        return "failing"
+    return "filling" if waiting else "ready"
+
+
+def _of_recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
+    error = heartbeat.last_error
+    shown: JsonObject = {
+        "state": str(heartbeat.state),
+        "live": heartbeat.is_live(now),
+        "heartbeat_age_s": _seconds(now - heartbeat.updated),
+        "silent_topics": [_short(topic) for topic in heartbeat.silent[:_MOST_TOPICS]],
+        "last_error": None if error is None else _short(error),
+    }
+    if len(heartbeat.silent) > _MOST_TOPICS:
+        shown["more_silent_topics"] = len(heartbeat.silent) - _MOST_TOPICS
+    return shown
 
 
 def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
@@ -88,7 +136,7 @@ def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
 
 
 def _problems(snapshot: Snapshot, heartbeat: Heartbeat | None, now: Ns) -> list[str]:
-    problems = [snapshot.problem] if snapshot.problem else []
+    problems = [_short(snapshot.problem)] if snapshot.problem else []
     if snapshot.damaged:
         problems.append(f"{len(snapshot.damaged)} damaged bag files; data_time_range lists them")
     if heartbeat is None or heartbeat.state is RecorderState.STOPPED:
@@ -96,8 +144,13 @@ def _problems(snapshot: Snapshot, heartbeat: Heartbeat | None, now: Ns) -> list[
     if not heartbeat.is_live(now):
         problems.append("the recorder has stopped without saying so")
     elif heartbeat.state is RecorderState.PAUSED:
-        problems.append(f"the recorder is paused: {heartbeat.last_error or 'it does not say why'}")
+        reason = heartbeat.last_error or "it does not say why"
+        problems.append(_short(f"the recorder is paused: {reason}"))
     return problems
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _MOST_CHARS else f"{text[: _MOST_CHARS - 3]}..."
 
 
 def _seconds(duration: Ns) -> float:

@@ -192,7 +192,7 @@ async def test_health_tells_how_far_the_catalogue_is(tmp_path: Path) -> None:
     filler = filler_of(memory, tmp_path)
     filler.digest(filler.waiting()[0])
     told = await health(memory, "1.2.3", filler)
-    assert told["catalogue"] == {"bags": 1, "waiting": 2, "refused": 0}
+    assert told["catalogue"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
 
 
 # The command

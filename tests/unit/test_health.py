@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -69,6 +70,12 @@ async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
     assert told["status"] == "degraded"
     assert told["damaged"] == 1
     assert told["problems"] == ["1 damaged bag files; data_time_range lists them"]
+    assert told["damaged_files"] == [
+        {
+            "file": f"{tmp_path.name}/torn.mcap",
+            "reason": "not an MCAP file: it does not begin as one",
+        }
+    ]
 
 
 async def test_a_missing_bag_directory_is_told(tmp_path: Path) -> None:
@@ -170,3 +177,16 @@ async def test_a_scan_that_fails_is_logged_and_tried_again(tmp_path: Path) -> No
             await again.wait()
             tasks.cancel_scope.cancel()
     assert logs[0]["event"] == "index_refresh_failed"
+
+
+async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> None:
+    for number in range(50):
+        (tmp_path / f"{'x' * 200}{number}.mcap").write_bytes(b"no bag at all, but not empty")
+    names = tuple(f"/topic_{n}/{'y' * 300}" for n in range(1000))
+    told = beat(RecorderState.PAUSED, updated=T0 + 3600 * NS_PER_S, last_error="z" * 100_000)
+    write_heartbeat(tmp_path, replace(told, silent=names, subscribed=names))
+    said = await health(memory_at(tmp_path, seconds=3600), "1")
+    assert len(json.dumps(said)) < 10_000
+    assert said["damaged"] == 50
+    assert isinstance(said["recorder"], dict)
+    assert said["recorder"]["more_silent_topics"] == 980
