@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from mcap.exceptions import McapError
 from mcap.writer import Writer
 
 from ros2_memory.recorder.handover import Handover, Overlap, write_handover
@@ -22,6 +24,7 @@ from tests.bags import (
     transform,
     write_mcap,
 )
+from tests.mcap_surgery import spoil_chunk
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -111,7 +114,22 @@ def write_history(bag_dir: Path, draw: Random) -> Written:
     if draw.random() < 0.3:
         (bag_dir / "bad").mkdir()
         (bag_dir / "bad" / "bad_0.mcap").write_bytes(b"not a bag, however long it may be")
+    _spoil(bag_dir, draw)
     return written
+
+
+def _spoil(bag_dir: Path, draw: Random) -> None:
+    """Time does its work: a split is lost, a chunk of another is overwritten, a clock is wrong."""
+    splits = sorted(bag_dir.glob("rec_*/*.mcap"))
+    if draw.random() < 0.3:
+        draw.choice(splits).write_bytes(b"this was a split once, and is none any more")
+    if draw.random() < 0.2:
+        with suppress(IndexError, OSError, ValueError, McapError):
+            spoil_chunk(draw.choice(splits), 0)
+    if draw.random() < 0.2:
+        start = draw.choice([40 * S, 2**61])
+        wrong = [odom(40 * S, n, 0.0, log_time=start + n * S) for n in range(3)]
+        write_mcap(bag_dir / "wrong" / "wrong_0.mcap", wrong)
 
 
 def _again(message: Msg, at: int) -> Msg:

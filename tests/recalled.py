@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ros2_memory.catalogue import FILE, FOLDER, BagKey, Catalogue
 from ros2_memory.digest import Digester
+from ros2_memory.errors import BagError
 from ros2_memory.recall import Recall, bags_without_entry
 
 if TYPE_CHECKING:
@@ -23,5 +25,6 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     digester = Digester(memory.reader, memory.extractor, limit)
     bags = bags_without_entry(memory.index.snapshot().runs, recall)
     for bag in bags[: round(part * len(bags))]:
-        assert catalogue.put(BagKey.of(bag, bag_dir), digester.digest(bag.path))
+        with suppress(BagError):  # one that is damaged inside stays without an entry
+            assert catalogue.put(BagKey.of(bag, bag_dir), digester.digest(bag.path))
     return replace(memory, recall=recall)

@@ -16,18 +16,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.model import BagState
+from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.reading import short_name
-from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, unix_rounded_up
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS, unix_rounded_up
 from ros2_memory.wording import NAMED, counted, listed, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.model import BagFile, SetAside, TimeWindow
+    from ros2_memory.model import BagFile, SetAside
     from ros2_memory.reading import Reading
     from ros2_memory.recorder.clock_faults import ClockFault
     from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.timebase import Ns
 
 
 def note_unseen(view: Reading, window: TimeWindow, *, nothing: bool = False) -> None:
@@ -36,6 +37,29 @@ def note_unseen(view: Reading, window: TimeWindow, *, nothing: bool = False) -> 
         return
     for sentence in unseen(view.snapshot, window, nothing=nothing):
         view.note(sentence)
+
+
+def note_edges(view: Reading, window: TimeWindow) -> None:
+    """Says where a window was asked to reach past what the memory can answer."""
+    snapshot = view.snapshot
+    asked_from, earliest = window.start + START_SLACK_NS, snapshot.earliest
+    if earliest is not None and asked_from < earliest:
+        before = TimeWindow(asked_from, earliest)
+        if not any(before.overlaps(each.bag.start, each.bag.end) for each in snapshot.misdated):
+            view.note(f"the memory begins at {_moment(earliest)}")
+    asked_to = window.stop - 1 - AT_OR_BEFORE_SLACK_NS
+    if snapshot.latest is None or asked_to <= snapshot.latest:
+        return
+    if snapshot.active:
+        view.note(
+            f"the split being written is not included: nothing after {_moment(snapshot.latest)}"
+        )
+    else:
+        view.note(f"the memory ends at {_moment(snapshot.latest)}")
+
+
+def _moment(at: Ns) -> str:
+    return f"{unix_rounded_up(at):.6f}"
 
 
 def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> Iterator[str]:
@@ -70,7 +94,9 @@ def not_read(files: Sequence[SetAside]) -> str:
 def _touches(place: TimeWindow | None, window: TimeWindow, *, unknown: bool) -> bool:
     if place is None:
         return unknown
-    return place.start < window.stop and window.start < place.stop
+    # Without what the bounds were widened by: a window up to a split's end does not touch the next.
+    stop = max(window.stop - AT_OR_BEFORE_SLACK_NS, window.start + 1)
+    return place.start < stop - 1 and window.start + START_SLACK_NS < place.stop
 
 
 def _still_written(snapshot: Snapshot, active: Sequence[SetAside], window: TimeWindow) -> str:

@@ -153,7 +153,8 @@ def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
     try:
         return repr(ask(memory, Call()))
     except EpisodicError as error:
-        return f"{type(error).__name__} {getattr(error, 'reason', '')}: {error}"
+        said = getattr(error, "reason", ""), str(error), getattr(error, "notes", ())
+        return f"{type(error).__name__}: {said}"
 
 
 @pytest.mark.parametrize("clock", ["auto", "stamp"])
