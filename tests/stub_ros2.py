@@ -30,6 +30,21 @@ if TYPE_CHECKING:
 ENDED = False
 
 
+def install(program: Path) -> None:
+    """Makes this the program of that path, under the Python that runs the tests.
+
+    It starts without what site-packages would have run first: coverage's swallows a signal that
+    comes meanwhile, where a real recorder dies of it.
+    """
+    program.write_text(
+        f"#!{sys.executable} -IS\n"
+        "import runpy, sys\n"
+        f"sys.path[:] = {sys.path!r}\n"
+        f"runpy.run_path({__file__!r}, run_name='__main__')\n"
+    )
+    program.chmod(0o755)
+
+
 def say(level: str, text: str, node: str = "rosbag2_recorder") -> None:
     now = time.time_ns()
     # Whoever read this may have died.

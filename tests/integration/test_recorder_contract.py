@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,21 +14,16 @@ from ros2_memory.errors import ConfigError, RecorderError
 from ros2_memory.recorder.null import NullRecorder
 from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader
+from tests import stub_ros2
 
 if TYPE_CHECKING:
     from ros2_memory.recorder.base import Recorder
-
-STUB = Path(__file__).resolve().parents[1] / "stub_ros2.py"
 
 
 def ros2bag(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Ros2BagRecorder:
     programs = folder / "bin"
     programs.mkdir(exist_ok=True)
-    ros2 = programs / "ros2"
-    ros2.write_text(
-        f"#!{sys.executable}\nimport runpy\nrunpy.run_path({str(STUB)!r}, run_name='__main__')\n"
-    )
-    ros2.chmod(0o755)
+    stub_ros2.install(programs / "ros2")
     monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
     (folder / "topics.yaml").write_text("topics: [/odom]\n")
     return Ros2BagRecorder(

@@ -22,9 +22,9 @@ from ros2_memory.recorder.handover import read_handover
 from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
+from tests import stub_ros2
 from tests.waiting import until
 
-STUB = Path(__file__).resolve().parents[1] / "stub_ros2.py"
 PERIOD_NS = 10_000_000
 
 
@@ -84,12 +84,7 @@ class Site:
         self.daemons: list[Daemon] = []
         programs = folder / "bin"
         programs.mkdir()
-        ros2 = programs / "ros2"
-        ros2.write_text(
-            f"#!{sys.executable}\nimport runpy\n"
-            f"runpy.run_path({str(STUB)!r}, run_name='__main__')\n"
-        )
-        ros2.chmod(0o755)
+        stub_ros2.install(programs / "ros2")
         self.env = {
             **os.environ,
             "PATH": f"{programs}:{os.environ['PATH']}",
