@@ -108,9 +108,27 @@ class TestGates:
         script = (ROOT / ".ci/run").read_text()
         assert [gate for gate in GATES if gate not in script] == []
 
-    def test_the_script_is_sound_bash_and_executable(self) -> None:
-        subprocess.run(["bash", "-n", ROOT / ".ci/run"], check=True)
-        assert (ROOT / ".ci/run").stat().st_mode & 0o111
+    def test_readme_the_script_and_the_workflow_test_with_one_command(self) -> None:
+        (command,) = re.findall(r"\npip install uv && (.+)\n", (ROOT / "README.md").read_text())
+        assert command in GATES
+        assert f"\ngate pytest {command}\n" in (ROOT / ".ci/run").read_text()
+        steps = read_yaml(".github/workflows/ci.yml")["jobs"]["gates"]["steps"]
+        assert [step["run"] for step in steps if "pytest" in step.get("run", "")] == [command]
+
+    @pytest.mark.parametrize("name", ["run", "newest"])
+    def test_the_scripts_are_sound_bash_and_executable(self, name: str) -> None:
+        subprocess.run(["bash", "-n", ROOT / ".ci" / name], check=True)
+        assert (ROOT / ".ci" / name).stat().st_mode & 0o111
+
+    def test_the_newest_releases_that_are_allowed_are_tried_weekly_by_the_script_for_it(
+        self,
+    ) -> None:
+        workflow = read_yaml(".github/workflows/newest.yml")
+        (job,) = workflow["jobs"].values()
+        assert ".ci/newest" in {step.get("run") for step in job["steps"]}
+        assert "schedule" in workflow[True]  # YAML 1.1 reads the key "on" so
+        script = (ROOT / ".ci/newest").read_text()
+        assert re.findall(r"uv (?:sync|lock|run)", script) == []  # these go by uv.lock
 
     def test_the_workflow_runs_each_on_both_pythons_for_every_change(self) -> None:
         workflow = read_yaml(".github/workflows/ci.yml")
