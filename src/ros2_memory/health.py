@@ -11,9 +11,11 @@ import anyio
 import anyio.to_thread
 
 from ros2_memory.logs import get_logger
+from ros2_memory.overview import clock_faults, left_open
 from ros2_memory.reading import short_name
 from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.timebase import Ns, unix_from_ns, unix_rounded_up
+from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
     from ros2_memory.filling import Filler
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 PATIENCE_S: Final = 2.0
 """How long the index may take to answer; the first scan of a large directory takes longer."""
 NAMED: Final = 3
-"""Damaged files, and topics that cannot be decoded, that are named with their reasons."""
+"""Files of each kind that does not answer, and topics that cannot be decoded, that are named."""
 
 _MOST_TOPICS: Final = 20
 _MOST_CHARS: Final = 300
@@ -51,8 +53,8 @@ async def health(
 ) -> JsonObject:
     """How the server is: `ok`, or `degraded` with the reasons in `problems`.
 
-    An empty memory is no problem, and neither is a topic that cannot be decoded. Times are Unix
-    seconds.
+    An empty memory is no problem, and neither are a topic that cannot be decoded, a bag that a
+    crash left open, or one that a wrong clock dated; they are counted. Times are Unix seconds.
     """
     with anyio.move_on_after(patience_s):
         return await anyio.to_thread.run_sync(
@@ -65,20 +67,28 @@ def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
     heartbeat = memory.index.heartbeat()
+    dating = snapshot.dating
+    amiss = {
+        "damaged": snapshot.damaged,
+        "incomplete": left_open(snapshot),
+        "unread": snapshot.unread,
+        "clock_faults": clock_faults(snapshot),
+    }
     shown: JsonObject = {
         "bags": len(snapshot.bags),
-        "earliest": None if snapshot.earliest is None else unix_rounded_up(snapshot.earliest),
-        "latest": None if snapshot.latest is None else unix_rounded_up(snapshot.latest),
+        "earliest": None if dating.earliest is None else unix_rounded_up(dating.earliest),
+        "latest": None if dating.latest is None else unix_rounded_up(dating.latest),
         "active": len(snapshot.active),
-        "damaged": len(snapshot.damaged),
+        **{what: len(files) for what, files in amiss.items()},
         "index_age_s": _seconds(now - snapshot.scanned_at),
     }
     problems = _problems(snapshot, heartbeat, now)
-    if snapshot.damaged:
-        shown["damaged_files"] = [
-            {"file": _short(short_name(each.path)), "reason": _short(each.reason)}
-            for each in snapshot.damaged[-NAMED:]
-        ]
+    for what, files in amiss.items():
+        if files:
+            shown[f"{what.removesuffix('s')}_files"] = [
+                {"file": _short(short_name(each.path)), "reason": _short(each.reason)}
+                for each in files[-NAMED:]
+            ]
     if filler is not None:
         shown |= _of_catalogue(filler)
         if filler.trouble is not None:
@@ -138,7 +148,10 @@ def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
 def _problems(snapshot: Snapshot, heartbeat: Heartbeat | None, now: Ns) -> list[str]:
     problems = [_short(snapshot.problem)] if snapshot.problem else []
     if snapshot.damaged:
-        problems.append(f"{len(snapshot.damaged)} damaged bag files; data_time_range lists them")
+        damaged = counted(len(snapshot.damaged), "damaged bag file")
+        problems.append(f"{damaged}; data_time_range lists what does not answer")
+    if snapshot.dating.note:
+        problems.append(snapshot.dating.note)
     if heartbeat is None or heartbeat.state is RecorderState.STOPPED:
         return problems
     if not heartbeat.is_live(now):

@@ -12,11 +12,11 @@ import anyio.lowlevel
 import pytest
 from structlog.testing import capture_logs
 
-from ros2_memory.health import health, keep_fresh
+from ros2_memory.health import NAMED, health, keep_fresh
 from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.timebase import NS_PER_S
-from tests.bags import text, write_mcap
+from tests.bags import McapLayout, text, write_mcap
 from tests.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
@@ -54,6 +54,9 @@ async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
         "latest": None,
         "active": 0,
         "damaged": 0,
+        "incomplete": 0,
+        "unread": 0,
+        "clock_faults": 0,
         "index_age_s": 0.0,
     }
 
@@ -69,12 +72,40 @@ async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
     told = await health(memory_at(tmp_path, seconds=3600), "1")
     assert told["status"] == "degraded"
     assert told["damaged"] == 1
-    assert told["problems"] == ["1 damaged bag files; data_time_range lists them"]
+    assert told["problems"] == ["1 damaged bag file; data_time_range lists what does not answer"]
     assert told["damaged_files"] == [
         {
             "file": f"{tmp_path.name}/torn.mcap",
             "reason": "not an MCAP file: it does not begin as one",
         }
+    ]
+
+
+async def test_everything_that_does_not_answer_is_counted_and_the_last_of_it_named(
+    tmp_path: Path,
+) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    write_mcap(tmp_path / "cut" / "cut_0.mcap", [text(T0, "a")], McapLayout(None, finish=False))
+    (tmp_path / "r" / "r_1.db3").write_bytes(b"of another storage")
+    for number in range(5):
+        write_mcap(tmp_path / "boot" / f"boot_{number}.mcap", [text(number, "a")])
+    told = await health(memory_of(tmp_path), "1")
+    assert told["status"] == "ok"
+    counts = {what: told[what] for what in ("damaged", "incomplete", "unread", "clock_faults")}
+    assert counts == {"damaged": 0, "incomplete": 1, "unread": 1, "clock_faults": 5}
+    assert told["earliest"] == T0 / NS_PER_S
+    assert [len(told[f"{what.removesuffix('s')}_files"]) for what in counts if counts[what]] == [
+        1,
+        1,
+        NAMED,
+    ]  # type: ignore[arg-type]
+
+
+async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    told = await health(memory_at(tmp_path, seconds=-3600), "1")
+    assert told["problems"] == [
+        "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
     ]
 
 
