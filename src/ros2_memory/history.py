@@ -37,7 +37,7 @@ class View(Streams):
 
     def newest(self, topic: str, window: TimeWindow) -> Found | None:
         """The latest message of the topic in the window."""
-        return next(self.stream([topic], window, newest_first=True), None)
+        return self.last_of(topic, window)
 
     def oldest(self, topic: str, window: TimeWindow) -> Found | None:
         """The earliest message of the topic in the window."""

@@ -31,7 +31,7 @@ class Reading:
         self.call = call
         with call.stages.timed("index"):
             self.snapshot = memory.index.snapshot(reach)
-            self._as_of = 0 if memory.recall is None else memory.recall.as_of()
+        self._as_of: int | None = None
         self._notes: dict[str, None] = {}
         self.complete = True
 
@@ -60,7 +60,12 @@ class Reading:
     def recalled(self, run: Run) -> RunNotes | None:
         """What the catalogue says of a run of the snapshot; None without a catalogue."""
         recall = self.memory.recall
-        return None if recall is None else recall.notes(run, self._as_of)
+        if recall is None:
+            return None
+        if self._as_of is None:
+            # Once for each question, and only for one that the catalogue can bear on.
+            self._as_of = recall.as_of()
+        return recall.notes(run, self._as_of)
 
     def entry(self, bag: BagFile) -> tuple[RunNotes, int] | None:
         """The notes that speak of a bag and the number of its entry; None where it has none."""
@@ -135,6 +140,21 @@ class Reading:
             self.skip(bag, error)
         finally:
             self.call.stages.add("read", spent)
+
+    def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> Found | None:
+        """What `read` gives first when it reads newest first; for less."""
+        if self._kept(bag, [topic]) is not None:
+            return next(self.read(bag, [topic], window, newest_first=True), None)
+        self.check_deadline()
+        begin = time.perf_counter_ns()
+        try:
+            record = self.memory.reader.newest(bag.path, topic, window)
+        except BagError as error:
+            self.skip(bag, error)
+            return None
+        finally:
+            self.call.stages.add("read", time.perf_counter_ns() - begin)
+        return None if record is None else Found(bag, record)
 
     def _kept(self, bag: BagFile, topics: Sequence[str]) -> Sequence[Record] | None:
         """All the bag's messages of one topic of which the catalogue keeps them; else None."""

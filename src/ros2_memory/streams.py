@@ -8,6 +8,7 @@ log time, however long ago that is.
 from __future__ import annotations
 
 import heapq
+from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import BagFile
+    from ros2_memory.recorder.timeline import Run
     from ros2_memory.timebase import Ns
 
 RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
@@ -93,6 +95,19 @@ class Streams(Reading):
             )
         )
 
+    def last_of(self, topic: str, window: TimeWindow) -> Found | None:
+        """What `stream` gives first of the topic when it is newest first."""
+        if len(self._parts([topic], window)) == 1 and not self.received_twice([topic]):
+            holdings = self.holdings([topic], _with_horizon(window))
+            if not contested(holdings):
+                inside = [held for held in holdings if window.overlaps(held.first, held.last)]
+                if not inside:
+                    return None
+                if len(inside) == 1:
+                    found = self.newest_in(inside[0].bag, topic, window)
+                    return None if found is None else next(self.used(iter((found,))))
+        return next(self.stream([topic], window, newest_first=True), None)
+
     def spans_of_copies(self, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
         """Where in the window the topic's messages may stand in two recordings, widened."""
         recordings = self.snapshot.recordings(topic)
@@ -105,11 +120,11 @@ class Streams(Reading):
 
     def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """The window cut where runs of bags begin: a stream then holds few of them at a time."""
+        runs = self.snapshot.runs
+        begin = bisect_right(runs, window.start, key=_begins)
+        end = bisect_left(runs, window.stop, begin, key=_begins)
         cuts = [
-            run.bags[0].start
-            for run in self.snapshot.runs
-            if window.start < run.bags[0].start < window.stop
-            and any(topic in run.spans for topic in topics)
+            _begins(run) for run in runs[begin:end] if any(topic in run.spans for topic in topics)
         ]
         edges = [window.start, *dict.fromkeys(cuts), window.stop]
         return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
@@ -122,7 +137,7 @@ class Streams(Reading):
         *,
         newest_first: bool,
     ) -> Iterator[Found]:
-        wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
+        wider = _with_horizon(window)
         holdings = self.holdings(topics, wider) if among is None else among
         spans = contested(holdings)
         found: Iterator[Found]
@@ -214,6 +229,16 @@ class Streams(Reading):
                 _, rank, found, source = heapq.heappop(heap)
                 yield found
                 push(rank, source)
+
+
+def _with_horizon(window: TimeWindow) -> TimeWindow:
+    """The window and what before it can be the original of a copy in it."""
+    return TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
+
+
+def _begins(run: Run) -> Ns:
+    """Log time of the first message of the first bag: runs lie in its order."""
+    return run.bags[0].start
 
 
 def _in_order(held: Holding) -> tuple[Ns, Ns, str]:

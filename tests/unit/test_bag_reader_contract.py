@@ -98,6 +98,10 @@ def test_messages_come_by_log_time_and_newest_first_is_exactly_the_reverse(
             found = read(reader, path, topics, span)
             assert found == expected(messages, topics, span)
             assert read(reader, path, topics, span, newest_first=True) == found[::-1]
+            for topic in TOPICS:
+                newest = reader.newest(path, topic, span)
+                last = expected(messages, [topic], span)[-1:]
+                assert [seen(newest)] == last if newest is not None else not last
 
 
 @on_every_shelf

@@ -15,11 +15,15 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.errors import EpisodicError
+from ros2_memory.history import View
 from ros2_memory.memory import Call, Limits
+from ros2_memory.model import TimeWindow
 from ros2_memory.moments import Moment, Span
+from ros2_memory.recap import recap
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.timebase import MIN_NS
 from tests.histories import S, write_history
 from tests.memories import memory_of
 from tests.recalled import recalling
@@ -81,6 +85,7 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
         for topic in ("/odom", "/chatter", "/dock"):
             yield f"{topic} in {span}", partial(_range, topic, span)
             yield f"way of {topic} in {span}", partial(_way, topic, span)
+        yield f"recap of {span}", partial(_recap, span)
     for topic in TOPICS:
         for kind, wanted in draw.sample(CONDITIONS, 4):
             for field in (None, draw.choice(["goal", "detections.label", "position", "nowhere"])):
@@ -111,6 +116,10 @@ def _transform(child: str, moment: Moment, memory: Memory, call: Call) -> object
 
 def _range(topic: str, span: Span, memory: Memory, call: Call) -> object:
     return queries.topic_range(memory, call, topic, span, max_samples=5)
+
+
+def _recap(span: Span, memory: Memory, call: Call) -> object:
+    return recap(memory, call, span)
 
 
 def _way(topic: str, span: Span, memory: Memory, call: Call) -> object:
@@ -172,3 +181,23 @@ def test_every_question_is_answered_as_without_a_catalogue(
         recalled = recalling(replace(plain), bag_dir, part=part)
         for asked, ask in questions(moments, draw):
             assert answer(recalled, ask) == answer(plain, ask), (seed, part, asked)
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32))
+def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed: int) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        moments = write_history(bag_dir, draw).moments
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        recalled = recalling(replace(plain), bag_dir)
+        for _ in range(60):
+            stop = draw.choice(moments) + draw.choice([0, 1, 10**6])
+            start = draw.choice([MIN_NS, stop - draw.choice([1, 10**8, 3 * 10**9, 10**11])])
+            for memory in (plain, recalled):
+                asked = View(memory, Call())
+                topic = draw.choice(asked.snapshot.topics())
+                window = TimeWindow(start, stop)
+                first = next(View(memory, Call()).stream([topic], window, newest_first=True), None)
+                assert asked.newest(topic, window) == first, (seed, topic, window)

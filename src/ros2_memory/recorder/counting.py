@@ -107,6 +107,19 @@ class CountingReader(BagReader):
             records = (record for record in records if _counts(record, exclusions))
         yield from records
 
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """The latest message that counts.
+
+        Raises:
+            BagError: as the reader beneath.
+        """
+        handover = self._handover(path).handover
+        if handover.hides_all:
+            return None
+        if _touching(handover.exclusions(path.name), window):
+            return super().newest(path, topic, window)
+        return self._reader.newest(path, topic, window)
+
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """The log times of the messages that count.
 

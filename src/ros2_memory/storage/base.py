@@ -145,6 +145,15 @@ class BagReader(ABC):
                 `complete=False` the early end is known, and simply ends the iteration.
         """
 
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """The first of `records(path, [topic], window, newest_first=True)`; None without any.
+
+        Raises:
+            BagVanishedError: the file is not there.
+            BagError: it cannot be read.
+        """
+        return next(self.records(path, [topic], window, newest_first=True), None)
+
     @abstractmethod
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """The log times that `records(path, [topic], window)` would give, without the payloads.
