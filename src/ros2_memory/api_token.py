@@ -83,10 +83,12 @@ def _content(path: Path, source: str) -> str:
     """The file's text without the line's end; never waits, as opening a pipe would."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-        with os.fdopen(descriptor, "rb") as stream:
+        try:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise ConfigError(f"{source}: {str(path)!r} is not a regular file")
-            data = stream.read(LONGEST + 3)
+            data = os.read(descriptor, LONGEST + 3)
+        finally:
+            os.close(descriptor)
     except OSError as error:
         raise ConfigError(
             f"{source}: {str(path)!r} cannot be read: {error.strerror}; "

@@ -20,6 +20,7 @@ from ros2_memory.filling import Filler
 from ros2_memory.instructions import instructions
 from ros2_memory.memory import Limits, Memory
 from ros2_memory.recall import Recall
+from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.replies import Replies
@@ -39,9 +40,10 @@ def build_memory(settings: Settings) -> Memory:
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.
     """
-    reader, clock = CountingReader(build_reader(settings)), WallClock()
+    clock = WallClock()
     extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
     bag_dir = settings.recording.bag_dir
+    reader = ConfinedReader(CountingReader(build_reader(settings)), bag_dir)
     catalogue = Catalogue(catalogue_places(settings), way_of_reading(settings), waits_for=bag_dir)
     index = IndexManager(
         bag_dir,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sqlite3
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -105,6 +106,7 @@ def open_file(places: Sequence[Path], *, again: bool = False) -> Opened | str:
     for path in places:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            _refuse_links(path)
             base = _ready(path)
             base.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
             return Opened(base, path, _identity(path), _identity(_beside(path, _WAL)))
@@ -117,6 +119,17 @@ def open_file(places: Sequence[Path], *, again: bool = False) -> Opened | str:
             tell("catalogue_place_refused", path=str(path), reason=str(error))
             reason = str(error.strerror if isinstance(error, OSError) else error)
     return f"no file can be written for it ({reason})"
+
+
+def _refuse_links(path: Path) -> None:
+    """Refuses a file that lies elsewhere: it would be written, or set aside, where it lies.
+
+    Raises:
+        OSError: the file, one that goes with it, or its folder is a link.
+    """
+    for each in (path.parent, path, *(_beside(path, suffix) for suffix in (_WAL, "-shm"))):
+        if each.is_symlink():
+            raise OSError(errno.ELOOP, f"{each.name} is a symbolic link, which is not followed")
 
 
 def in_memory() -> Opened:

@@ -101,7 +101,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     assert "not a regular file" in refused({"MEMORY_API_TOKEN_FILE": str(pipe)})
-    assert "Is a directory" in refused({"MEMORY_API_TOKEN_FILE": str(tmp_path)})
+    assert "not a regular file" in refused({"MEMORY_API_TOKEN_FILE": str(tmp_path)})
     told = refused({"MEMORY_API_TOKEN_FILE": str(tmp_path / "none")})
     assert "No such file" in told
     assert "none" in told

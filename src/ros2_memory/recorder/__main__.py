@@ -12,6 +12,7 @@ from ros2_memory.adapters import build_housekeeper, build_reader, build_recorder
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.errors import ConfigError, EpisodicError
 from ros2_memory.logs import configure_logging
+from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.daemon import (
     Ticking,
     Upkeep,
@@ -66,7 +67,7 @@ def _record(settings: Settings) -> None:
     # A list that is refused stops it before anything is deleted.
     load_topics(settings.recording.topics_file)
     bag_dir = settings.recording.bag_dir.absolute()
-    reader = build_reader(settings)
+    reader = ConfinedReader(build_reader(settings), bag_dir)
     housekeeper = build_housekeeper(settings, bag_dir, reader)
     clear = settings.recording.clear_on_startup
     lock = lock_bag_dir(bag_dir, clear=clear)

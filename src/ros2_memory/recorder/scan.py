@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -169,7 +170,8 @@ class Tree:
         while waiting:
             path = waiting.pop()
             try:
-                folder = _visit(path, before.get(path), now, walked.looked_at)
+                is_root = path == self._root
+                folder = _visit(path, before.get(path), now, walked.looked_at, is_root=is_root)
             except OSError as error:
                 if path == self._root:
                     return error
@@ -205,12 +207,18 @@ class Tree:
             self.distrust(path)
 
 
-def _visit(path: str, known: _Folder | None, now: Ns, looked_at: dict[str, Stamp]) -> _Folder:
+def _visit(
+    path: str, known: _Folder | None, now: Ns, looked_at: dict[str, Stamp], *, is_root: bool
+) -> _Folder:
     """The folder as it is known where nothing came or went; otherwise as it is listed.
 
-    Its mtime is taken first: what changes during the listing is then found by the next walk.
+    Its mtime is taken first: what changes during the listing is then found by the next walk. Only
+    the root may be a link: one that took a folder's place since that was found is none.
     """
-    status = os.stat(path)  # noqa: PTH116  a Path for each of 1,000 folders costs more
+    # A Path for each of 1,000 folders costs more.
+    status = os.stat(path, follow_symlinks=is_root)  # noqa: PTH116
+    if not stat.S_ISDIR(status.st_mode):
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), path)
     mtime_ns, device = status.st_mtime_ns, status.st_dev
     if known is not None and known.trusted and (known.mtime_ns, known.device) == (mtime_ns, device):
         return known

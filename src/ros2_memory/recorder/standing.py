@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.model import BagFile, BagState, BagSummary, SetAside
 from ros2_memory.recorder.scan import YOUNG_NS, bag_kind, settled
+from ros2_memory.recorder.sync import open_plain
 from ros2_memory.storage.base import Closing
 from ros2_memory.timebase import NS_PER_S, Ns
 
@@ -229,11 +230,9 @@ def files_in_metadata(path: Path) -> frozenset[str]:
     parsing the YAML of a long recording takes seconds.
     """
     try:
-        if not path.is_file():
-            return frozenset()
-        with path.open("rb") as stream:
+        with open_plain(path) as stream:
             text = stream.read(_METADATA_LIMIT).decode("utf-8", errors="replace")
-    except OSError:
+    except (OSError, ValueError):
         return frozenset()
     entries = (
         line.strip().removeprefix("- ").removeprefix("path:").strip().strip("'\"")

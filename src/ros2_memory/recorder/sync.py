@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import stat
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, BinaryIO, Final
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -55,6 +55,20 @@ def write_all_durably(texts: Mapping[Path, str]) -> None:
         raise
 
 
+def open_plain(path: Path) -> BinaryIO:
+    """Opens a regular file for reading. Never waits, as opening a FIFO would; follows no link.
+
+    Raises:
+        OSError: it cannot be opened.
+        ValueError: it is no regular file.
+    """
+    descriptor = os.open(path, _AS_IT_IS)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise ValueError("it is not a regular file")
+    return os.fdopen(descriptor, "rb")
+
+
 def read_small_file(path: Path) -> str:
     """The text of a small regular file. Never waits, as opening a FIFO would.
 
@@ -62,10 +76,7 @@ def read_small_file(path: Path) -> str:
         OSError: it cannot be read.
         ValueError: it is no regular file, no text, or larger than `MAX_SMALL_FILE`.
     """
-    descriptor = os.open(path, _AS_IT_IS)
-    with os.fdopen(descriptor, "rb") as stream:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise ValueError("it is not a regular file")
+    with open_plain(path) as stream:
         data = stream.read(MAX_SMALL_FILE + 1)
     if len(data) > MAX_SMALL_FILE:
         raise ValueError(f"it is larger than {MAX_SMALL_FILE} bytes")

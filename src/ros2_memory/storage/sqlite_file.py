@@ -7,8 +7,10 @@ beyond the oldest ones, and whether definitions lie in the file, is looked up in
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
+import stat
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -17,7 +19,7 @@ from ros2_memory.storage.base import Channel, Closing, Record, Schema
 from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_records import offered_as_latched
-from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile
+from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
 from ros2_memory.timebase import MAX_NS, MIN_NS
@@ -136,6 +138,9 @@ class SqliteBags:
         address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         # A generator of records may be resumed on another thread.
         with closing(sqlite3.connect(address, uri=True, check_same_thread=False)) as base:
+            # SQLite opens by name, and has by now: it must be the file that was looked at.
+            if path.lstat().st_ino != key.inode:
+                raise UnreadableError("it was replaced while it was being opened")
             # One name that is not UTF-8 must not hide the others.
             base.text_factory = _text
             topics = self._known.get(key)
@@ -219,7 +224,16 @@ def _full_type(name: str) -> str:
 def journals_beside(path: Path) -> list[Path]:
     """The journal and WAL that hold what the file itself does not, or not yet."""
     beside = [path.with_name(path.name + suffix) for suffix in JOURNALS]
-    return [journal for journal in beside if journal.is_file() and journal.stat().st_size]
+    return [journal for journal in beside if _holds_something(journal)]
+
+
+def _holds_something(journal: Path) -> bool:
+    """A link counts, and is then refused: what it leads to may be what the file lacks."""
+    try:
+        status = journal.lstat()
+    except OSError:
+        return False
+    return stat.S_ISLNK(status.st_mode) or (stat.S_ISREG(status.st_mode) and status.st_size > 0)
 
 
 def closing_of_db3(path: Path) -> Closing:
@@ -244,7 +258,11 @@ def settled_copy(path: Path, folder: Path, reserve: Callable[[int], None]) -> tu
     """
     for source in (path, *journals_beside(path)):
         reserve(2 * source.stat().st_size)
-        shutil.copyfile(source, folder / source.name)
+        with (
+            os.fdopen(open_regular(source), "rb") as plain,
+            (folder / source.name).open("wb") as out,
+        ):
+            shutil.copyfileobj(plain, out)
     copy = folder / path.name
     with closing(sqlite3.connect(copy)) as base:
         base.execute("PRAGMA journal_mode=DELETE").fetchall()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Final
 
 import zstandard
 
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.faults import UnreadableError
-from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile
+from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.zstd import begins_as_zstd, ends_whole
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
 
 def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
     """Writes what can be decompressed; what is wrong with the rest, or nothing."""
-    with path.open("rb") as packed, target.open("wb") as out:
+    with os.fdopen(open_regular(path), "rb") as packed, target.open("wb") as out:
         reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
         while True:
             try:
