@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory import accounts
-from ros2_memory.figures import degrees, metres, moment, seconds, with_notes
+from ros2_memory.figures import degrees, metres, moment, rounded, seconds, with_notes
 from ros2_memory.geometry import normalised, yaw
 from ros2_memory.shapes import shown
 from ros2_memory.timebase import unix_rounded_up
@@ -52,6 +52,34 @@ def _sighting(sighting: accounts.Sighting, now: Ns) -> JsonObject:
     if not sighting.begun:
         reply["began_earlier"] = True
     return reply
+
+
+@shown.register(accounts.Recap)
+def _recap(answer: accounts.Recap, _bag_dir: Path) -> JsonObject:
+    reply: JsonObject = {
+        "start": moment(answer.start),
+        "end": moment(answer.end),
+        "duration_s": seconds(answer.end - answer.start),
+        "distance_m": None if answer.distance_m is None else rounded(answer.distance_m, 3),
+        "max_speed": None if answer.max_speed is None else rounded(answer.max_speed, 3),
+        "stood_s": None if answer.stood is None else seconds(answer.stood),
+        "frame_id": answer.frame_id or None,
+        "events": [_event(each, answer.now) for each in answer.events],
+    }
+    if answer.throughout:
+        reply["seen_throughout"] = [*answer.throughout]
+    return with_notes(reply, answer.notes)
+
+
+def _event(event: accounts.Event, now: Ns) -> JsonObject:
+    shown_event: JsonObject = {
+        "timestamp": moment(event.start),
+        "ago_s": round(seconds(now - event.start), 1),
+        "text": event.text,
+    }
+    if event.end is not None:
+        shown_event["duration_s"] = round(seconds(event.end - event.start), 1)
+    return shown_event
 
 
 def robot(pose: Pose) -> JsonObject:

@@ -57,4 +57,42 @@ class Sightings:
     notes: tuple[str, ...] = ()
 
 
-Account: TypeAlias = Sightings
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened at `start`, and went on until `end` where it took time."""
+
+    kind: str
+    start: Ns
+    end: Ns | None
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Recap:
+    """What happened in a window.
+
+    Attributes:
+        start: of the window, inclusive.
+        end: of the window, inclusive.
+        now: what ages count from.
+        distance_m: the way driven; None, as what follows, where no pose tells.
+        max_speed: in m/s.
+        stood: how long the robot stood in all.
+        frame_id: of the places in texts.
+        events: what happened, in order of time.
+        throughout: things that were in view all the time.
+    """
+
+    start: Ns
+    end: Ns
+    now: Ns
+    distance_m: float | None
+    max_speed: float | None
+    stood: Ns | None
+    frame_id: str | None
+    events: tuple[Event, ...]
+    throughout: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+Account: TypeAlias = Sightings | Recap

@@ -299,6 +299,12 @@ class WayOver(Arguments):
     topic: PoseTopic | None = None
 
 
+class Window(Arguments):
+    """A window."""
+
+    span: Span
+
+
 class Matches(Arguments):
     """A condition on a topic, in a window or in all history."""
 

@@ -58,6 +58,8 @@ MOST_EDGES: Final = 1_000
 _MOST_TEXT_CHARS: Final = 1 << 20
 """The words of a longer text alone would take more memory than it."""
 _ALWAYS_READ_BYTES: Final = 64 << 20
+_MESSAGE_BYTES: Final = 200
+"""What a message is counted as besides its payload: looking at it takes time too."""
 _MOST_TIMES_PACKED: Final = 100
 """A bag whose messages unpack to more times its size is left to be read when it is asked for."""
 
@@ -92,7 +94,7 @@ class TopicDigest:
         evidence: what rules conditions out.
         poses: what its poses amount to; None where some message carries none.
         rests: where they stand still; None where `poses` is None or has no valid one.
-        story: what its messages say; None where none can be decoded.
+        story: what its messages say; None where there is none.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
         undecodable: by type, why none of its messages can be decoded; for most nothing.
@@ -156,7 +158,7 @@ class Digester:
         }
         left = _ALWAYS_READ_BYTES + _MOST_TIMES_PACKED * _size(path)
         for record in self._reader.records(path, tuple(topics), TimeWindow.everything()):
-            left -= len(record.payload)
+            left -= len(record.payload) + _MESSAGE_BYTES
             if left < 0:
                 raise BagError(str(path), "its messages unpack to more than they can be worth")
             collectors[record.channel.topic].add(record)
@@ -294,7 +296,9 @@ class _Collector:
 
     def _take(self, record: Record, seen: _Seen | None) -> None:
         """Takes the pose of the next message, and what it says."""
-        if seen is not None:
+        if seen is None:
+            self._story.miss()
+        else:
             self._story.add(record.log_time, seen.state)
         if seen is None or seen.pose is None:
             self._poses = None

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.arguments import Matches, tested
+from ros2_memory.arguments import Between, Last, Matches, Window, tested
 from ros2_memory.entries import Entry, Variant
+from ros2_memory.recap import recap
 from ros2_memory.sightings import find_matches
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ def tools(facts: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
     """The tools, in order; `facts` fill the placeholders of descriptions."""
     del writing
     yield from _SIGHTINGS.tools(facts)
+    yield from _RECAP.tools(facts)
 
 
 _SIGHTINGS = Entry(
@@ -37,5 +39,16 @@ _SIGHTINGS = Entry(
         end_s=given.end,
         limit=given.limit,
     ),
+    blocking=True,
+)
+_RECAP = Entry(
+    (
+        Variant("recap", "What happened (blocking)", Between, "between two Unix times"),
+        Variant("recap_last", "What happened lately (blocking)", Last, "in the last seconds"),
+    ),
+    "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps. Reply: "
+    "{{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], ...}}.",
+    Window,
+    lambda memory, call, given: recap(memory, call, given.span),
     blocking=True,
 )

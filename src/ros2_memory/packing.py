@@ -137,7 +137,7 @@ def unpacked_story(text: str) -> Story:
         ValueError: it is of none.
     """
     try:
-        first, last, seen, from_start, to_end, known, flips, faults, left_out = json.loads(text)
+        first, last, seen, from_start, to_end, known, flips, faults, *counts = json.loads(text)
         return Story(
             first,
             last,
@@ -147,7 +147,7 @@ def unpacked_story(text: str) -> Story:
             tuple(Known(*each) for each in known),
             tuple(Flip(*each) for each in flips),
             tuple(Fault(*each) for each in faults),
-            left_out,
+            *counts,
         )
     except TypeError as error:
         raise ValueError(f"not a story: {error}") from error

@@ -45,7 +45,7 @@ from ros2_memory.timebase import (
     Ns,
     ns_from_unix,
 )
-from ros2_memory.unseen import note_unseen
+from ros2_memory.unseen import note_edges, note_unseen
 from ros2_memory.ways import carries_no, decoded, way_driven
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def topic_range(
     if len(chosen) < total:
         view.note(samples_note(len(chosen), total))
     note_unseen(view, window)
-    _note_edges(view, window)
+    note_edges(view, window)
     return answers.TopicRange(name, types[-1], total, samples, view.notes)
 
 
@@ -260,7 +260,7 @@ def trajectory_summary(
     if len(way.frames) > 1:
         view.note(f"poses in several frames were joined: {', '.join(way.frames)}")
     note_unseen(view, window)
-    _note_edges(view, window)
+    note_edges(view, window)
     return answers.TrajectorySummary(
         name, way.frames[0], way.first, way.last, way.trajectory, view.notes
     )
@@ -352,22 +352,3 @@ def _age(found: Found, now: Ns | None) -> Ns | None:
 
 def _around(at: Ns, reach: Ns) -> TimeWindow:
     return TimeWindow(max(at - reach, MIN_NS), min(at + reach + 1, MAX_NS))
-
-
-def _note_edges(view: View, window: TimeWindow) -> None:
-    """Says where a window was asked to reach past what the memory can answer."""
-    snapshot = view.snapshot
-    asked_from, earliest = window.start + START_SLACK_NS, snapshot.earliest
-    if earliest is not None and asked_from < earliest:
-        before = TimeWindow(asked_from, earliest)
-        if not any(before.overlaps(each.bag.start, each.bag.end) for each in snapshot.misdated):
-            view.note(f"the memory begins at {moment(earliest)}")
-    asked_to = window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    if snapshot.latest is None or asked_to <= snapshot.latest:
-        return
-    if snapshot.active:
-        view.note(
-            f"the split being written is not included: nothing after {moment(snapshot.latest)}"
-        )
-    else:
-        view.note(f"the memory ends at {moment(snapshot.latest)}")

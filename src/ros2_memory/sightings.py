@@ -25,7 +25,7 @@ from ros2_memory.geometry import rotate
 from ros2_memory.history import View
 from ros2_memory.model import TimeWindow
 from ros2_memory.moments import ns_argument
-from ros2_memory.search import Search, unsearched
+from ros2_memory.search import Search
 from ros2_memory.stories import SILENCE_NS
 from ros2_memory.things import things_of
 from ros2_memory.timebase import (
@@ -35,6 +35,7 @@ from ros2_memory.timebase import (
     START_SLACK_NS,
     Ns,
 )
+from ros2_memory.unseen import note_unseen
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -85,14 +86,20 @@ def find_matches(
     runs, more = _newest_runs(view, topic, condition, window, limit)
     pose_topic = memory.limits.pose_topic
     found = tuple(_told(view, condition, run, pose_topic) for run in runs)
+    note_unseen(view, _searched(window, found, more=more), nothing=not found)
     return Sightings(
         found,
         more,
         start=max(window.start, view.snapshot.earliest or window.start),
         end=min(window.stop, latest or window.stop),
         now=now if memory.limits.now == "wall" or latest is None else latest,
-        notes=view.notes if found else unsearched(view),
+        notes=view.notes,
     )
+
+
+def _searched(window: TimeWindow, found: Sequence[Sighting], *, more: bool) -> TimeWindow:
+    """The part of the window that had to be looked at."""
+    return TimeWindow(found[-1].first, window.stop) if more and found else window
 
 
 def _window(start_s: float | None, end_s: float | None) -> TimeWindow:

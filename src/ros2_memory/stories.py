@@ -101,6 +101,8 @@ class Story:
         flips: in order.
         faults: by the time of their first report.
         left_out: presences, flips and faults beyond what is kept.
+        undecodable: messages that cannot be decoded, of which nothing is told; where there are no
+            others, `first` lies after `last`.
     """
 
     first: Ns
@@ -112,11 +114,12 @@ class Story:
     flips: tuple[Flip, ...] = ()
     faults: tuple[Fault, ...] = ()
     left_out: int = 0
+    undecodable: int = 0
 
     @property
     def says_nothing(self) -> bool:
         """Whether it is only that there were messages."""
-        return not (self.seen or self.known or self.faults)
+        return not (self.seen or self.known or self.faults or self.undecodable)
 
 
 QUIET: Final = Story(0, 0)
@@ -153,6 +156,11 @@ class StoryBuilder:
         self._flips: list[Flip] = []
         self._faults: dict[str, Fault] = {}
         self._left_out = 0
+        self._undecodable = 0
+
+    def miss(self) -> None:
+        """Takes the next message, which cannot be decoded."""
+        self._undecodable += 1
 
     def add(self, time: Ns, state: State) -> None:
         """Takes the next message."""
@@ -168,6 +176,9 @@ class StoryBuilder:
 
     def join(self, story: Story) -> None:
         """Takes all messages of a bag that come next, as if they were added one by one."""
+        self._undecodable += story.undecodable
+        if story.first > story.last:
+            return
         if self._first is None:
             self._first, self._from_start = story.first, story.from_start
         spans: dict[str, list[Presence]] = {}
@@ -195,7 +206,7 @@ class StoryBuilder:
     def story(self, at_most: int | None = None) -> Story | None:
         """What was told so far, `at_most` of each kind; None without a message."""
         if self._first is None:
-            return None
+            return Story(1, 0, undecodable=self._undecodable) if self._undecodable else None
         seen = sorted(
             (*self._over, *self._open.values()), key=lambda each: (each.first, each.label)
         )
@@ -212,6 +223,7 @@ class StoryBuilder:
             tuple(self._flips[:at_most]),
             tuple(faults[:at_most]),
             self._left_out + left_out,
+            self._undecodable,
         )
 
     def _carry(self, time: Ns, present: Iterable[Presence]) -> None:

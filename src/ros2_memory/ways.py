@@ -7,7 +7,7 @@ does not depend on what the catalogue knows.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from ros2_memory.absence import undecodable
 from ros2_memory.errors import InvalidArgumentsError, UndecodableError
@@ -21,13 +21,20 @@ if TYPE_CHECKING:
 
     from ros2_memory.copies import Found
     from ros2_memory.history import View
-    from ros2_memory.model import TimeWindow
+    from ros2_memory.model import Pose, TimeWindow
     from ros2_memory.timebase import Ns
     from ros2_memory.trajectory import Trajectory
 
 _MOST_AT_ONCE: Final = 1024
 """Messages that are looked at together."""
 _MOST_BYTES_AT_ONCE: Final = 1 << 20
+
+
+class TakesPoses(Protocol):
+    """Something to which poses are given in order."""
+
+    def add(self, time: Ns, pose: Pose, speed_mps: float | None = None, /) -> None:
+        """Takes the next pose, and the speed that its message states, if it states one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,14 +73,14 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     for group in view.groups(topic, window):
         span: tuple[Ns, Ns] | None
         if not is_whole(group, window):
-            span = _added(view, builder, sights, group.once(), failures)
+            span = add_poses(view, builder, sights, group.once(), failures)
         elif (known := digests.of(group)) is not None:
             digest, span = known
             builder.join(digest)
         else:
             collector = PoseCollector(view.memory.limits.max_plausible_speed_mps)
             failed = len(failures)
-            span = _added(view, collector, sights, group.once(), failures)
+            span = add_poses(view, collector, sights, group.once(), failures)
             digest = collector.digest()
             builder.join(digest)
             if span is not None and failed == len(failures):
@@ -91,14 +98,20 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     return Way(builder.result(), builder.frames, first, last)
 
 
-def _added(
+def add_poses(
     view: View,
-    to: TrajectoryBuilder | PoseCollector,
+    to: TakesPoses,
     sights: Sights,
     messages: Iterable[Found],
     failures: list[UndecodableError],
 ) -> tuple[Ns, Ns] | None:
-    """Adds the poses of messages, and gives the times of the first and last; None without any."""
+    """Adds the poses of messages, and gives the times of the first and last; None without any.
+
+    Those that cannot be decoded are added to `failures`.
+
+    Raises:
+        InvalidArgumentsError: a message carries no position.
+    """
     first: Ns | None = None
     last: Ns | None = None
     for some in _batches(messages):

@@ -38,11 +38,13 @@ SPECIFIED = [
     "trajectory_summary",
     "recent_trajectory_summary",
 ]
-ADDED = ["find_matches"]
+ADDED = ["find_matches", "recap", "recap_last"]
 WRITING: list[str] = []
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 BLOCKING = {
     "find_matches",
+    "recap",
+    "recap_last",
     "list_frames",
     "find_last_match",
     "get_value_when",
@@ -72,6 +74,7 @@ PAIRS = [
     ("get_velocity_at", "get_velocity_seconds_ago"),
     ("get_transform_at", "get_transform_seconds_ago"),
     ("trajectory_summary", "recent_trajectory_summary"),
+    ("recap", "recap_last"),
 ]
 UNFOLDED = {"timestamp", "seconds_ago", "start", "end", "seconds"}
 

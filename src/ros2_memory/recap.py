@@ -1,0 +1,203 @@
+"""What happened in a window, from the data alone: a few sentences, each with its time.
+
+The robot stood, things came into view and left it, booleans flipped, errors were reported, and
+nothing was recorded. Where that is more than a planner wants to read, what matters least is left
+out, and counted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.absence import resolve_topic
+from ros2_memory.accounts import Event, Recap
+from ros2_memory.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.moments import open_span
+from ros2_memory.stories import tells
+from ros2_memory.tales import rests_in, story_in
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, ns_from_unix
+from ros2_memory.unseen import note_edges, note_unseen
+from ros2_memory.ways import way_driven
+from ros2_memory.wording import counted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.history import View
+    from ros2_memory.memory import Call, Memory
+    from ros2_memory.model import TimeWindow
+    from ros2_memory.moments import Span
+    from ros2_memory.rests import Rest
+    from ros2_memory.stories import Fault, Presence, Story
+    from ros2_memory.timebase import Ns
+    from ros2_memory.ways import Way
+
+MOST_EVENTS: Final = 25
+SHORTEST_STOP_NS: Final[Ns] = 3 * NS_PER_S
+"""A robot that stands for less is turning round, or minding its step."""
+FLICKER_NS: Final[Ns] = 3 * NS_PER_S
+"""A thing that is missed for less did not leave."""
+
+_KINDS: Final = ("gap", "error", "stop", "flip", "thing")
+"""Kinds of events, the one that matters most first."""
+_PLURALS: Final = {
+    "gap": "gaps",
+    "error": "errors",
+    "stop": "stops",
+    "flip": "flips",
+    "thing": "sights of things",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Drive:
+    """How the robot moved; `frame_id` is that of its poses."""
+
+    way: Way
+    rests: tuple[Rest, ...]
+
+
+def recap(memory: Memory, call: Call, span: Span) -> Recap:
+    """What happened in a window.
+
+    Raises:
+        InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length.
+        NoDataError: the memory holds nothing.
+        QueryTimeoutError: the call's time is over.
+    """
+    view, window = open_span(memory, call, span)
+    drive = _drive(view, window)
+    events = [] if drive is None else [*_stops(drive)]
+    throughout: dict[str, None] = {}
+    for topic, story in _stories(view, window):
+        events += [*_flips(topic, story), *map(_error, story.faults)]
+        for presence in _steady(story.seen):
+            if presence.first == story.first and presence.last == story.last:
+                throughout[presence.label] = None
+            else:
+                events.append(_thing(presence))
+        if story.undecodable:
+            messages = counted(story.undecodable, "message")
+            view.note(f"{messages} of {topic} could not be decoded: what they say is not told")
+        if story.left_out:
+            view.note(f"{topic} changes too often to tell each: {story.left_out} more")
+    events += _gaps(view, window)
+    note_unseen(view, window)
+    note_edges(view, window)
+    told = _most_important(view, events)
+    latest = view.snapshot.latest
+    trajectory = None if drive is None else drive.way.trajectory
+    return Recap(
+        start=window.start + START_SLACK_NS,
+        end=window.stop - 1 - AT_OR_BEFORE_SLACK_NS,
+        now=memory.clock.now() if memory.limits.now == "wall" or latest is None else latest,
+        distance_m=None if trajectory is None else trajectory.distance_m,
+        max_speed=None if trajectory is None else trajectory.max_speed,
+        stood=None if drive is None else sum(rest.end - rest.start for rest in drive.rests),
+        frame_id=None if drive is None else drive.way.frames[0],
+        events=tuple(told),
+        throughout=tuple(throughout),
+        notes=view.notes,
+    )
+
+
+def _drive(view: View, window: TimeWindow) -> _Drive | None:
+    """How the robot moved; None, with a note, where that is not known."""
+    try:
+        topic = resolve_topic(view, view.memory.limits.pose_topic)
+        way = way_driven(view, topic, window)
+        if way is None:
+            view.note(f"{topic} has no poses in this time: nothing is known of the way")
+            return None
+        rests = rests_in(view, topic, window)
+    except (InvalidArgumentsError, NoDataError) as error:
+        view.note(f"nothing is known of the way: {error}")
+        return None
+    return _Drive(way, tuple(rest for rest in rests if rest.end - rest.start >= SHORTEST_STOP_NS))
+
+
+def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, Story]]:
+    for topic in view.snapshot.topics():
+        if any(map(tells, view.snapshot.types_of(topic))):
+            story = story_in(view, topic, window)
+            if story is not None and not story.says_nothing:
+                yield topic, story
+
+
+def _stops(drive: _Drive) -> Iterator[Event]:
+    for rest in drive.rests:
+        x, y, _ = rest.box.centre
+        yield Event("stop", rest.start, rest.end, f"stood at x {x:.2f}, y {y:.2f}")
+
+
+def _flips(topic: str, story: Story) -> Iterator[Event]:
+    """Each flip, and how long it held; up to the end where it still did."""
+    until: dict[str, Ns] = {}
+    for flip in reversed(story.flips):
+        name = topic if flip.path == "value" else f"{topic} {flip.path}"
+        text = f"{name} became {'true' if flip.value else 'false'}"
+        yield Event("flip", flip.time, until.get(flip.path), text)
+        until[flip.path] = flip.time
+
+
+def _error(fault: Fault) -> Event:
+    again = f" ({fault.reports} times)" if fault.reports > 1 else ""
+    end = fault.last if fault.reports > 1 else None
+    return Event("error", fault.first, end, f"error: {fault.text}{again}")
+
+
+def _thing(presence: Presence) -> Event:
+    return Event("thing", presence.first, presence.last, f"{presence.label} in view")
+
+
+def _steady(seen: Sequence[Presence]) -> Iterator[Presence]:
+    """Presences, those of a thing joined between which it was missed for a moment alone."""
+    last: dict[str, Presence] = {}
+    for each in seen:
+        before = last.get(each.label)
+        if before is not None and each.first - before.last <= FLICKER_NS:
+            last[each.label] = before._replace(
+                last=each.last, messages=before.messages + each.messages
+            )
+            continue
+        if before is not None:
+            yield before
+        last[each.label] = each
+    yield from last.values()
+
+
+def _gaps(view: View, window: TimeWindow) -> Iterator[Event]:
+    """Where nothing was recorded for more than two splits, inside what the memory spans."""
+    longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
+    earliest, latest = view.snapshot.earliest, view.snapshot.latest
+    if earliest is None or latest is None:
+        return
+    reach = max(window.start, earliest)
+    misdated = view.snapshot.dating.misdated
+    for bag in view.snapshot.overlapping(window):
+        if bag.file in misdated:
+            continue
+        if bag.start - reach > longest:
+            yield Event("gap", reach, bag.start, "nothing was recorded")
+        reach = max(reach, bag.end)
+    end = min(window.stop, latest)
+    if end - reach > longest:
+        yield Event("gap", reach, end, "nothing was recorded")
+
+
+def _most_important(view: View, events: Sequence[Event]) -> list[Event]:
+    """At most `MOST_EVENTS`, in order of time: of a kind those that lasted longest."""
+    ranked = sorted(
+        events, key=lambda each: (_KINDS.index(each.kind), each.start - (each.end or each.start))
+    )
+    left_out = Counter(each.kind for each in ranked[MOST_EVENTS:])
+    if left_out:
+        named = ", ".join(
+            counted(left_out[kind], kind if kind != "thing" else "sight of a thing", _PLURALS[kind])
+            for kind in _KINDS
+            if left_out[kind]
+        )
+        view.note(f"left out, since they are too many: {named}; ask for a shorter time")
+    return sorted(ranked[:MOST_EVENTS], key=lambda each: (each.start, _KINDS.index(each.kind)))

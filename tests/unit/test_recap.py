@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+import json
+import math
+import random
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.accounts import Event, Recap
+from ros2_memory.demo import robot as demo_robot
+from ros2_memory.demo.recording import DemoRecorder
+from ros2_memory.demo.streams import Timeline
+from ros2_memory.errors import EpisodicError
+from ros2_memory.memory import Call
+from ros2_memory.moments import Span
+from ros2_memory.recap import MOST_EVENTS, recap
+from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.replies import Replies
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.timebase import FixedClock, unix_from_ns
+from tests.bags import Msg, boolean, detections, make, odom, stamp, write_mcap
+from tests.closed_form import SESSIONS, SPEED
+from tests.histories import write_history
+from tests.memories import SettableClock, memory_of
+from tests.recalled import recalling
+from tests.shared_bags import needs_recorded
+
+if TYPE_CHECKING:
+    from ros2_memory.memory import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def over(memory: Memory, begin: float, end: float) -> Recap:
+    """Of so many seconds after BEGIN."""
+    return recap(memory, Call(), Span(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
+
+
+def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
+    return [(each.text, (each.start - BEGIN) / S) for each in events if each.kind == kind]
+
+
+@needs_recorded
+@each_way
+def test_a_recorded_session_is_told_as_it_happened(tmp_path: Path, recalls: bool) -> None:
+    session = SESSIONS["session_mcap"]
+    for bag in session.folder.glob("*.mcap"):
+        (tmp_path / bag.name).write_bytes(bag.read_bytes())
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = recap(memory, Call(), Span(start_s=session.at(2.0), end_s=session.at(60.0)))
+    assert told.distance_m == pytest.approx(58 * SPEED, rel=0.002)
+    assert told.stood == 0
+    assert told.throughout == ("table",)
+    expected = [
+        ("cup in view", 5, 24),
+        ("scissors in view", 12, 5),
+        ("/bumper became true", 25, 1),
+        ("/bumper became false", 26, None),
+        ("scissors in view", 40, 5),
+    ]
+    assert [each.text for each in told.events] == [text for text, _, _ in expected]
+    for event, (_, start, length) in zip(told.events, expected, strict=True):
+        assert abs(session.since(unix_from_ns(event.start)) - start) < 0.05
+        if length is None:
+            assert event.end is None
+        else:
+            assert event.end is not None
+            assert abs(unix_from_ns(event.end - event.start) - length) < 0.05
+
+
+@each_way
+def test_the_demos_robot_stood_where_and_as_long_as_its_lap_says(
+    tmp_path: Path, recalls: bool
+) -> None:
+    now = BEGIN + 110 * S
+    recorder = DemoRecorder(tmp_path / "flat", Timeline(BEGIN, BEGIN), clock=FixedClock(now))
+    recorder.write_until(now)
+    recorder.stop()
+    memory = memory_of(tmp_path, clock=SettableClock(now))
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 5.0, 95.0)
+    standing = _standing(5.0, 95.0)
+    found = [((each.start - BEGIN) / S, each) for each in told.events if each.kind == "stop"]
+    assert {_span_of(start, standing) for start, _ in found} >= {
+        span for span in standing if span[1] - span[0] > 4.5
+    }
+    for start, stop in found:
+        began, ended = _span_of(start, standing)
+        assert stop.end is not None
+        assert abs((stop.end - BEGIN) / S - ended) <= 1.1
+        here = demo_robot.pose((began + ended) / 2)
+        x, y = (float(part.split()[-1]) for part in stop.text.split(","))
+        assert math.dist((x, y), (here.x, here.y)) < 0.05
+
+
+def _span_of(start: float, spans: list[tuple[float, float]]) -> tuple[float, float]:
+    return next(span for span in spans if abs(span[0] - start) <= 1.1)
+
+
+def _standing(begin: float, end: float) -> list[tuple[float, float]]:
+    """When the demo's robot moves slower than 5 cm/s for at least 3 s, from its closed form."""
+    step = 0.05
+    spans: list[tuple[float, float]] = []
+    t = begin
+    while t < end:
+        start = t
+        while t < end and abs(demo_robot.twist(t)[0]) < 0.05:
+            t += step
+        if t - start >= 3.0:
+            spans.append((start, t))
+        t += step
+    return spans
+
+
+def test_a_gap_in_the_memory_is_told(tmp_path: Path) -> None:
+    for nth, at in enumerate((0, 100)):
+        write_mcap(
+            tmp_path / f"bag_{nth}.mcap",
+            [odom(BEGIN + (at + t) * S, 0.1 * t, 0.0, 0.0) for t in range(10)],
+        )
+    told = over(memory_of(tmp_path), 0, 120)
+    [gap] = [each for each in told.events if each.kind == "gap"]
+    assert ((gap.start - BEGIN) / S, ((gap.end or 0) - BEGIN) / S) == (9.0, 100.0)
+
+
+def test_errors_in_logs_are_told_once_with_their_count(tmp_path: Path) -> None:
+    def log(at: int, level: int, msg: str) -> object:
+        return make(
+            "rcl_interfaces/msg/Log",
+            stamp=stamp(at),
+            level=level,
+            name="planner",
+            msg=msg,
+            file="",
+            function="",
+            line=0,
+        )
+
+    said = [(1, 20, "all well"), (2, 40, "no path"), (3, 40, "no path"), (4, 50, "giving up")]
+    messages = [
+        Msg("/rosout", "rcl_interfaces/msg/Log", BEGIN + at * S, log(BEGIN, level, msg))
+        for at, level, msg in said
+    ]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    told = over(memory_of(tmp_path), 0, 10)
+    assert times(told.events, "error") == [
+        ("error: planner: no path (2 times)", 2.0),
+        ("error: planner: giving up", 4.0),
+    ]
+    assert told.distance_m is None
+    assert any("nothing is known of the way" in note for note in told.notes)
+
+
+def test_a_thing_that_was_missed_for_a_moment_did_not_leave(tmp_path: Path) -> None:
+    seen = [(1, "cup"), (2, ""), (3, "cup"), (4, ""), (5, ""), (8, "cup"), (9, "")]
+    messages = [detections(BEGIN + at * S, names.split()) for at, names in seen]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    told = over(memory_of(tmp_path), 0, 10)
+    assert times(told.events, "thing") == [("cup in view", 1.0), ("cup in view", 8.0)]
+
+
+def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
+    blinking = [boolean(BEGIN + at * S, at % 2 == 0) for at in range(20)]
+    things = [
+        detections(BEGIN + at * S, [f"thing {at // 5}"] if at % 5 == 0 else []) for at in range(100)
+    ]
+    messages = sorted([*blinking, *things], key=lambda each: each.log_time)
+    write_mcap(tmp_path / "bag.mcap", messages)
+    told = over(memory_of(tmp_path), 0, 100)
+    assert len(told.events) == MOST_EVENTS
+    assert len(times(told.events, "flip")) == 19
+    assert any("left out, since they are too many: 14 sights of things" in n for n in told.notes)
+    assert [each.start for each in told.events] == sorted(each.start for each in told.events)
+    reply = Replies(tmp_path, 24_000).answer(told).text
+    assert len(reply) < 3_500
+    assert set(json.loads(reply)["events"][0]) == {"timestamp", "ago_s", "text", "duration_s"}
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
+def test_a_recap_is_the_same_whatever_the_catalogue_knows(seed: int, part: float) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        moments = write_history(bag_dir, draw).moments
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        memory = recalling(replace(plain), bag_dir, part=part)
+        for _ in range(3):
+            first, last = sorted(draw.choices(moments, k=2))
+            span = Span(start_s=first / S, end_s=last / S)
+            assert _answer(memory, span) == _answer(plain, span)
+
+
+def _answer(memory: Memory, span: Span) -> str:
+    try:
+        return repr(recap(memory, Call(), span))
+    except EpisodicError as error:
+        return repr(error)
