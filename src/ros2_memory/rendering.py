@@ -2,7 +2,7 @@
 
 Shown means: thinned evenly, cut, rounded by context, finite, and each loss noted once for its
 path. Exact means the whole value, NaN included; only what is not for reading (the data of images
-and their like, long byte arrays) is a summary there too.
+and their like, long byte arrays, a million numbers) is a summary there too.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 MAX_DEPTH: Final = 24
 MAX_NOTES: Final = 20
 MAX_SQUEEZE: Final = 64
+MAX_EXACT_NUMBERS: Final = 1_000_000
+"""A longer array is no list to look for something in, and as one takes ten times its memory."""
 MAX_TEXT: Final = 2000
 """Characters of one string that leave in a reply."""
 
@@ -176,6 +178,8 @@ class Exact(Rendering):
         return unix_from_ns(time)
 
     def _numbers(self, array: Array, _path: str, /) -> JsonValue:
+        if array.size > MAX_EXACT_NUMBERS:
+            return {"numbers": int(array.size)}
         numbers: JsonValue = _standard(array).tolist()
         return numbers
 

@@ -39,6 +39,11 @@ _FLOATS: Final = {"float32": 4, "float64": 8}
 _TIME: Final = ((("int32", 0), ("uint32", 0)), ("sec", "nanosec"))
 
 
+MOST_ELEMENTS: Final = 200_000
+"""Texts and messages in one message; each is an object when it is decoded."""
+_COUNTED_FROM_BYTES: Final = 256 << 10
+
+
 class _NoLayoutError(Exception):
     """The numbers are too many, or something of the payload is not understood here."""
 
@@ -56,6 +61,24 @@ def layout_of(definitions: Typesdict, root: str, payload: bytes) -> Layout | Non
     if not 0 <= len(payload) - walk.position < 4:
         return None
     return Layout(len(payload), tuple(walk.doubles), tuple(walk.singles), tuple(walk.times))
+
+
+def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
+    """Whether decoding a payload would make more objects than memory and patience have room for.
+
+    A byte of it can stand for an object of a hundred. One that does not fit its definition is left
+    to decoding, which says so.
+    """
+    if len(payload) < _COUNTED_FROM_BYTES:
+        return False
+    walk = _Count(definitions, payload)
+    try:
+        walk.message(root)
+    except _TooManyError:
+        return True
+    except (_NoLayoutError, struct.error, IndexError):
+        return False
+    return False
 
 
 class _Walk:
@@ -127,6 +150,57 @@ class _Walk:
         self.position += size
         if self.position > len(self._payload):
             raise _NoLayoutError
+
+
+class _TooManyError(Exception):
+    """More elements than are decoded."""
+
+
+class _Count(_Walk):
+    """Counts texts and messages, whatever the byte order."""
+
+    def __init__(self, definitions: Typesdict, payload: bytes) -> None:
+        super().__init__(definitions, payload)
+        self._elements_seen = 0
+        self._length_of = struct.Struct("<I" if payload[1] & 1 else ">I")
+
+    def message(self, name: str) -> None:
+        self._seen()
+        fields = self._definitions[name][1]
+        if not fields:
+            self._advance(1)
+        for _, field in fields:
+            self._field(field)
+
+    def _elements(self, element: FieldDesc, count: int) -> None:
+        if element[0] == Nodetype.BASE and element[1][0] != "string":
+            if count:
+                size = _SIZES.get(element[1][0]) or _FLOATS.get(element[1][0], 1)
+                self._aligned(size)
+                self._advance(size * count)
+            return
+        for _ in range(count):
+            self._field(element)
+
+    def _primitive(self, name: str) -> None:
+        if name == "string":
+            self._seen()
+            self._advance(self._length())
+        else:
+            size = _SIZES.get(name) or _FLOATS.get(name, 1)
+            self._aligned(size)
+            self._advance(size)
+
+    def _length(self) -> int:
+        self._aligned(4)
+        length: int = self._length_of.unpack_from(self._payload, self.position)[0]
+        self._advance(4)
+        return length
+
+    def _seen(self) -> None:
+        self._elements_seen += 1
+        if self._elements_seen > MOST_ELEMENTS:
+            raise _TooManyError
 
 
 def _is_time(name: str, fields: list[tuple[str, FieldDesc]]) -> bool:

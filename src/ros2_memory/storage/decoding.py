@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING
 
 from ros2_memory.errors import UndecodableError
-from ros2_memory.storage.cdr import layout_of
+from ros2_memory.storage.cdr import MOST_ELEMENTS, holds_too_many, layout_of
 from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.zstd import FRAME_MAGIC
 from ros2_memory.typestore import Typestores, full_name
@@ -15,9 +15,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from rosbags.interfaces.typing import Typesdict
+
     from ros2_memory.storage.base import Channel, Layout, Record
 
 _MAX_KNOWN = 10_000
+_MAX_JSON_BYTES = 4 << 20
+"""A byte of JSON can become thirty of memory."""
 _EMPTY_MESSAGE_BYTES = 8
 """CDR's header, the byte that stands for no fields, and padding."""
 
@@ -83,14 +87,38 @@ class Decoding:
 
     def _find(self, channel: Channel) -> Callable[[bytes], object] | str:
         if channel.encoding == "json":
-            return json.loads
+            return _json
         if channel.encoding != "cdr":
             return f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
         schema = channel.schema
         found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
         if found.deserialize is None:
             return found.reason or "its definition cannot be used"
-        return _of_nothing(found.deserialize) if found.fieldless else found.deserialize
+        if found.fieldless:
+            return _of_nothing(found.deserialize)
+        if found.definitions is None:
+            return found.deserialize
+        return _bounded(found.deserialize, found.definitions, full_name(schema.name))
+
+
+def _json(payload: bytes) -> object:
+    if len(payload) > _MAX_JSON_BYTES:
+        raise UnreadableError(f"it is longer than the {_MAX_JSON_BYTES >> 20} MiB that are read")
+    value: object = json.loads(payload)
+    return value
+
+
+def _bounded(
+    deserialize: Callable[[bytes], object], definitions: Typesdict, root: str
+) -> Callable[[bytes], object]:
+    """Decodes what does not hold more objects than there is room for."""
+
+    def decode(payload: bytes) -> object:
+        if holds_too_many(definitions, root, payload):
+            raise UnreadableError(f"it holds more than {MOST_ELEMENTS} texts or messages")
+        return deserialize(payload)
+
+    return decode
 
 
 def _of_nothing(deserialize: Callable[[bytes], object]) -> Callable[[bytes], object]:
@@ -111,6 +139,8 @@ def _why(record: Record, error: Exception) -> str:
     if record.payload[:4] == FRAME_MAGIC and record.channel.encoding == "cdr":
         return "its compressed payload is damaged or too large"
     words = " ".join(str(error).split())[:160] or type(error).__name__
+    if isinstance(error, UnreadableError):
+        return f"the payload is not decoded: {words}"
     if record.channel.encoding == "json":
         return f"the payload is not JSON: {words}"
     return f"the payload does not fit the definition: {words}"

@@ -14,6 +14,7 @@ from mcap.opcode import Opcode
 
 from ros2_memory.storage.base import Channel, Closing, Record
 from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_chunk import Column, joined, walk
 from ros2_memory.storage.mcap_file import closing_of, is_finished
@@ -50,7 +51,7 @@ class McapBags:
         max_chunk_mb: what one chunk may hold, decompressed.
     """
 
-    def __init__(self, cache_mb: int = 64, max_chunk_mb: int = 256) -> None:
+    def __init__(self, cache_mb: int = 64, max_chunk_mb: int = MAX_CHUNK_MB) -> None:
         self._max_chunk_bytes = max_chunk_mb << 20
         self._found: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
@@ -115,7 +116,8 @@ class McapBags:
                 if not column.times.size:
                     return Rows([], [], _nothing)
                 data = self._chunk_data(file, chunk)
-                return _rows(column, _from_bytes(data, wanted), newest_first=newest_first)
+                fetch = _from_bytes(data, wanted, self._max_chunk_bytes)
+                return _rows(column, fetch, newest_first=newest_first)
 
             return Run(chunk.start, chunk.end, chunk.offset, rows)
 
@@ -124,7 +126,8 @@ class McapBags:
         loose = [column for channel, column in index.loose.items() if channel in wanted]
         column = joined([part.between(window.start, window.stop) for part in loose])
         if column.times.size:
-            rows = _rows(column, _from_file(file, wanted), newest_first=newest_first)
+            fetch = _from_file(file, wanted, self._max_chunk_bytes)
+            rows = _rows(column, fetch, newest_first=newest_first)
             yield Run(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
 
     def _index(self, file: OpenFile) -> McapIndex:
@@ -208,7 +211,9 @@ def _nothing(_place: int, _time: Ns) -> Record:
     raise UnreadableError("damaged: a message is not where its index says")
 
 
-def _from_bytes(data: bytes, channels: dict[int, Channel]) -> Callable[[int, Ns], Record]:
+def _from_bytes(
+    data: bytes, channels: dict[int, Channel], max_bytes: int
+) -> Callable[[int, Ns], Record]:
     """Fetches messages from a decompressed chunk."""
     unpack = MESSAGE.unpack_from
     last = len(data) - MESSAGE.size
@@ -220,28 +225,37 @@ def _from_bytes(data: bytes, channels: dict[int, Channel]) -> Callable[[int, Ns]
         end = place + RECORD.size + length
         if opcode != Opcode.MESSAGE or log_time != time or end > len(data):
             raise UnreadableError("damaged: a message is not where its index says")
-        return _record(channels, number, log_time, publish_time, data[place + MESSAGE.size : end])
+        payload = data[place + MESSAGE.size : end]
+        return _record(channels, number, log_time, publish_time, payload, max_bytes=max_bytes)
 
     return fetch
 
 
-def _from_file(file: OpenFile, channels: dict[int, Channel]) -> Callable[[int, Ns], Record]:
+def _from_file(
+    file: OpenFile, channels: dict[int, Channel], max_bytes: int
+) -> Callable[[int, Ns], Record]:
     """Fetches messages that stand outside chunks."""
 
     def fetch(place: int, time: Ns) -> Record:
         head = MESSAGE.unpack(file.read(place, MESSAGE.size))
         payload = file.read(place + MESSAGE.size, head[1] + RECORD.size - MESSAGE.size)
-        return _record(channels, head[2], time, head[5], payload)
+        return _record(channels, head[2], time, head[5], payload, max_bytes=max_bytes)
 
     return fetch
 
 
 def _record(
-    channels: dict[int, Channel], number: int, log_time: Ns, publish_time: Ns, payload: bytes
+    channels: dict[int, Channel],
+    number: int,
+    log_time: Ns,
+    publish_time: Ns,
+    payload: bytes,
+    *,
+    max_bytes: int,
 ) -> Record:
     channel = channels.get(number)
     if channel is None:
         raise UnreadableError("damaged: a message is not of the channel that its index says")
     if channel.encoding == "cdr":
-        payload = plain_payload(payload)
+        payload = plain_payload(payload, max_bytes)
     return Record(channel, log_time, publish_time if publish_time < MAX_NS else log_time, payload)

@@ -14,6 +14,7 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.limits import MAX_CHUNK_MESSAGES, too_large
 from ros2_memory.storage.mcap_records import (
     CHUNK_TIMES,
     MESSAGE,
@@ -148,7 +149,13 @@ def _index_at(region: bytes, channel: int, at: int) -> tuple[int, int]:
     opcode, length, number, size = _index_head(region, at)
     if opcode != _MESSAGE_INDEX or number != channel or length != size + 6 or size % _PAIR_BYTES:
         raise UnreadableError("damaged: a message index is not what its chunk index says")
-    return pairs_at, size // _PAIR_BYTES
+    count = size // _PAIR_BYTES
+    if count > MAX_CHUNK_MESSAGES or pairs_at + size > len(region):
+        raise UnreadableError("damaged: a message index holds more than a chunk can")
+    return pairs_at, count
+
+
+_COUNTED_EVERY: Final = 1 << 20
 
 
 @dataclass(slots=True)
@@ -165,12 +172,20 @@ class Walked:
 
 
 def walk(data: bytes) -> Walked:
-    """The messages of a decompressed chunk, as far as whole records reach."""
+    """The messages of a decompressed chunk, as far as whole records reach.
+
+    Raises:
+        UnreadableError: they are more than can be kept in mind.
+    """
     found: dict[int, tuple[list[int], list[int]]] = {}
     declarations: list[tuple[int, bytes]] = []
     position, end = 0, len(data)
     record, message = RECORD.unpack_from, MESSAGE.unpack_from
+    counted = MAX_CHUNK_MESSAGES * MESSAGE.size  # where there can first be too many
     while position + RECORD.size <= end:
+        if position > counted:
+            _require_few(found)
+            counted += _COUNTED_EVERY
         opcode, length = record(data, position)
         following = position + RECORD.size + length
         if following > end or opcode == 0:
@@ -190,6 +205,11 @@ def walk(data: bytes) -> Walked:
     columns = {channel: column_of(*lists) for channel, lists in found.items()}
     messages = sum(len(times) for times, _ in found.values())
     return Walked(columns, position, messages, declarations)
+
+
+def _require_few(found: Mapping[int, tuple[list[int], list[int]]]) -> None:
+    if sum(len(times) for times, _ in found.values()) > MAX_CHUNK_MESSAGES:
+        raise UnreadableError(f"a chunk holds more than {MAX_CHUNK_MESSAGES} messages")
 
 
 def column_of(times: Sequence[int], places: Sequence[int]) -> Column:
@@ -234,7 +254,7 @@ def packed_chunk(
 
 
 def _too_large(max_bytes: int) -> UnreadableError:
-    return UnreadableError(f"a chunk is larger than the {max_bytes >> 20} MiB allowed")
+    return UnreadableError(too_large("a chunk", max_bytes))
 
 
 def chunk_head(body: bytes) -> ChunkHead:

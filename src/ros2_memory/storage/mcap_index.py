@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.storage.faults import UnreadableError, reason_of
+from ros2_memory.storage.limits import MAX_SECTION_BYTES
 from ros2_memory.storage.mcap_chunk import (
     Column,
     Extent,
@@ -24,7 +25,7 @@ from ros2_memory.storage.mcap_chunk import (
     unpacked_in_part,
 )
 from ros2_memory.storage.mcap_records import RECORD, Statistics
-from ros2_memory.storage.mcap_summary import MAX_SECTION_BYTES, Chunk, DoubtError, read_summary
+from ros2_memory.storage.mcap_summary import Chunk, DoubtError, read_summary
 from ros2_memory.timebase import MAX_NS, unix_from_ns
 
 if TYPE_CHECKING:

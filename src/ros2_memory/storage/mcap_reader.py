@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
 from ros2_memory.storage.faults import reading
+from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap_bags import McapBags
 
 if TYPE_CHECKING:
@@ -24,7 +25,8 @@ class McapReader(BagReader):
     Args:
         custom_msg_paths: folders of `.msg` files for types that a bag holds no definition of.
         cache_mb: what indexes and decompressed chunks may take of memory between calls.
-        max_chunk_mb: what one chunk may hold, decompressed; a larger one is not read.
+        max_chunk_mb: what one chunk or one message may hold, decompressed; a larger one is not
+            read.
 
     Raises:
         ConfigError: one of the paths cannot be used.
@@ -34,7 +36,7 @@ class McapReader(BagReader):
         self,
         custom_msg_paths: Sequence[Path | str] = (),
         cache_mb: int = 64,
-        max_chunk_mb: int = 256,
+        max_chunk_mb: int = MAX_CHUNK_MB,
     ) -> None:
         self._decoding = Decoding(custom_msg_paths)
         self._bags = McapBags(cache_mb, max_chunk_mb)

@@ -16,6 +16,7 @@ from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 
 from ros2_memory.storage.faults import UnreadableError, damage
+from ros2_memory.storage.limits import MAX_SECTION_BYTES, most_unpacked
 from ros2_memory.storage.mcap_chunk import (
     packed_chunk,
     unpacked,
@@ -24,7 +25,6 @@ from ros2_memory.storage.mcap_chunk import (
 )
 from ros2_memory.storage.mcap_file import require_mcap
 from ros2_memory.storage.mcap_records import MAGIC_SIZE, MESSAGE_FIELDS, RECORD, Opcode
-from ros2_memory.storage.mcap_summary import MAX_SECTION_BYTES
 from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ class Salvage:
     def __init__(self, file: OpenFile, max_chunk_bytes: int) -> None:
         self._file = file
         self._max_chunk_bytes = max_chunk_bytes
+        self._unpacked = 0
         self.lost_bytes = 0
 
     def records(self, progress: Callable[[int], None] | None = None) -> Iterator[tuple[int, bytes]]:
@@ -84,7 +85,8 @@ class Salvage:
         if opcode == Opcode.CHUNK:
             yield from self._chunk(start, end)
         elif opcode in _CONTENT:
-            if end - start <= MAX_SECTION_BYTES:
+            whole = end - start + RECORD.size <= self._max_chunk_bytes
+            if whole if opcode == Opcode.MESSAGE else end - start <= MAX_SECTION_BYTES:
                 yield opcode, self._file.read(start, end - start)
             else:
                 self.lost_bytes += end - start
@@ -94,13 +96,20 @@ class Salvage:
             with damage():
                 head, packed = packed_chunk(self._file, start, end - start, self._max_chunk_bytes)
                 data = unpacked(head, packed, self._max_chunk_bytes)
+                usable = self._usable(data)
         except UnreadableError:
             # Those behind it may be whole.
             self.lost_bytes += end - start
             return
-        usable = walk(data).usable
         self.lost_bytes += len(data) - usable
         yield from _whole_records(data, usable)
+
+    def _usable(self, data: bytes) -> int:
+        """How much of a chunk is whole records; none of it is used where the file does harm."""
+        if self._unpacked > most_unpacked(self._file.size):
+            raise UnreadableError("its chunks hold more than such a file can")
+        self._unpacked += len(data)
+        return walk(data).usable
 
     def _cut_chunk(self, start: int) -> Iterator[tuple[int, bytes]]:
         """The chunk inside which the file ends."""
@@ -109,10 +118,10 @@ class Salvage:
             with damage():
                 head, packed = packed_chunk(self._file, start, held, self._max_chunk_bytes)
                 data = unpacked_in_part(head, packed, self._max_chunk_bytes)
+                usable = self._usable(data)
         except UnreadableError:
             self.lost_bytes += held
             return
-        usable = walk(data).usable
         self.lost_bytes += len(data) - usable if usable else held
         yield from _whole_records(data, usable)
 

@@ -14,6 +14,12 @@ from mcap.opcode import Opcode
 
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.faults import UnreadableError, damage
+from ros2_memory.storage.limits import (
+    MAX_SECTION_BYTES,
+    MAX_TIMES_PACKED,
+    most_unpacked,
+    too_large,
+)
 from ros2_memory.storage.mcap_chunk import (
     Walked,
     column_of,
@@ -38,7 +44,7 @@ from ros2_memory.storage.mcap_records import (
     Statistics,
     statistics,
 )
-from ros2_memory.storage.mcap_summary import MAX_SECTION_BYTES, Chunk
+from ros2_memory.storage.mcap_summary import Chunk
 
 if TYPE_CHECKING:
     from ros2_memory.storage.mcap_chunk import ChunkHead, Column
@@ -79,6 +85,7 @@ class _Scan:
     messages: int = 0
     damaged: list[str] = field(default_factory=list)
     partial: int = 0  # bytes of a last, compressed chunk that was read in part
+    unpacked: int = 0  # bytes that the chunks so far have come to
     _block: bytes = b""
     _block_at: int = 0
 
@@ -101,6 +108,9 @@ class _Scan:
 
     def _record(self, opcode: int, end: int) -> None:
         if opcode == Opcode.MESSAGE:
+            if end - self.position > self.max_chunk_bytes:
+                self.damaged.append(too_large("a message", self.max_chunk_bytes))
+                return
             head = MESSAGE.unpack(self._peek(self.position, MESSAGE.size))
             times, places = self.loose.setdefault(head[2], (array("Q"), array("q")))
             times.append(head[4])
@@ -131,8 +141,10 @@ class _Scan:
         return self.file.read(start, end - start)
 
     def _whole_chunk(self, end: int) -> None:
+        self._require_harmless()
         with damage():
             data = unpacked(*self._packed(end), self.max_chunk_bytes)
+        self.unpacked += len(data)
         walked = walk(data)
         if walked.usable < len(data):
             self.damaged.append("damaged: a chunk holds something that is no record")
@@ -141,6 +153,7 @@ class _Scan:
     def _cut_chunk(self, size: int) -> None:
         """The chunk inside which the file ends."""
         try:
+            self._require_harmless()
             head, packed = self._packed(size)
             with damage():
                 walked = walk(unpacked_in_part(head, packed, self.max_chunk_bytes))
@@ -154,6 +167,13 @@ class _Scan:
             self.position = size
         else:
             self.position += RECORD.size + head.data_at + walked.usable
+
+    def _require_harmless(self) -> None:
+        """Looks into no more chunks where those so far came to more than a robot's ever do."""
+        if self.unpacked > most_unpacked(self.file.size):
+            raise UnreadableError(
+                f"its chunks hold more than {MAX_TIMES_PACKED} times what the file does"
+            )
 
     def _packed(self, end: int) -> tuple[ChunkHead, bytes]:
         body_at = self.position + RECORD.size

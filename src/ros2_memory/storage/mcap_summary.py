@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from mcap.opcode import Opcode
 
 from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.limits import MAX_SECTION_BYTES
 from ros2_memory.storage.mcap_records import (
     FOOTER,
     MAGIC_SIZE,
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.open_file import OpenFile
     from ros2_memory.timebase import Ns
 
-MAX_SECTION_BYTES = 256 << 20
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
 _CHUNK_INDEX_BYTES: Final = _CHUNK_INDEX.size

@@ -11,6 +11,7 @@ from mcap.writer import CompressionType, Writer
 
 from ros2_memory.errors import BagError, EpisodicError
 from ros2_memory.storage.faults import UnreadableError, reading, reason_of
+from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap_bags import McapBags
 from ros2_memory.storage.mcap_salvage import Salvage, Tally, parsed
 from ros2_memory.storage.open_file import OpenFile
@@ -37,7 +38,7 @@ class McapWriter(BagWriter):
         max_chunk_mb: what one chunk of a file that is rewritten may hold, decompressed.
     """
 
-    def __init__(self, max_chunk_mb: int = 256) -> None:
+    def __init__(self, max_chunk_mb: int = MAX_CHUNK_MB) -> None:
         self._max_chunk_mb = max_chunk_mb
 
     def write(self, path: Path, records: Iterable[Record]) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
 from ros2_memory.storage.faults import UnreadableError, reading
+from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap_bags import McapBags
 from ros2_memory.storage.open_file import OpenFile
 from ros2_memory.storage.scratch import Scratch
@@ -57,7 +58,8 @@ class Rosbag2Reader(BagReader):
         custom_msg_paths: folders of `.msg` files for types that a bag holds no definition of.
         cache_mb: what indexes and decompressed chunks may take of memory between calls.
         unpack_max_mb: what unpacked files may take of the folder for temporary files.
-        max_chunk_mb: what one MCAP chunk may hold, decompressed; a larger one is not read.
+        max_chunk_mb: what one MCAP chunk or one message may hold, decompressed; a larger one is
+            not read.
 
     Raises:
         ConfigError: one of the paths cannot be used.
@@ -68,11 +70,11 @@ class Rosbag2Reader(BagReader):
         custom_msg_paths: Sequence[Path | str] = (),
         cache_mb: int = 64,
         unpack_max_mb: int = 1024,
-        max_chunk_mb: int = 256,
+        max_chunk_mb: int = MAX_CHUNK_MB,
     ) -> None:
         self._decoding = Decoding(custom_msg_paths)
         self._mcap = McapBags(cache_mb, max_chunk_mb)
-        self._sqlite = SqliteBags()
+        self._sqlite = SqliteBags(max_chunk_mb)
         self._scratch = Scratch(unpack_max_mb << 20)
 
     def reads(self, path: Path) -> bool:

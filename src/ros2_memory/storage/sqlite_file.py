@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.storage.base import Channel, Closing, Record, Schema
 from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_records import offered_as_latched
 from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile, open_regular
+from ros2_memory.storage.sqlite_guard import guard, require_plain_tables
 from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
 from ros2_memory.timebase import MAX_NS, MIN_NS
@@ -55,6 +57,9 @@ _METADATA: Final = (
 _PAYLOAD: Final = "SELECT data FROM messages WHERE rowid = ?"
 
 
+_MESSAGE_COLUMNS: Final = {"topic_id", "timestamp", "data"}
+
+
 @dataclass(frozen=True, slots=True)
 class _Topics:
     """The channels of a file by topic id."""
@@ -72,9 +77,13 @@ class SqliteBags:
 
     Nothing is written or locked; a connection is opened for each call. Safe to use from several
     threads at once. What goes wrong is raised as it comes (`faults.reading` translates it).
+
+    Args:
+        max_message_mb: what one message, or any one value of a file, may hold.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, max_message_mb: int = MAX_CHUNK_MB) -> None:
+        self._max_message_bytes = max_message_mb << 20
         self._known: ByteLru[_Topics] = ByteLru(_KEPT_BYTES)
         self._shared: Shared[Channel] = Shared()
 
@@ -118,7 +127,7 @@ class SqliteBags:
                 if found is None or not isinstance(found[0], bytes):
                     raise UnreadableError("damaged: a message without a binary payload")
                 channel = wanted[number]
-                payload = plain_payload(found[0]) if channel.encoding == "cdr" else found[0]
+                payload = self._plain(found[0]) if channel.encoding == "cdr" else found[0]
                 yield Record(channel, time, time, payload)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
@@ -128,12 +137,15 @@ class SqliteBags:
             rows = _sorted(base.execute(_ASCENDING, arguments), newest_first=False)
             return [time for time, _, _ in rows]
 
+    def _plain(self, payload: bytes) -> bytes:
+        return plain_payload(payload, self._max_message_bytes)
+
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
         with OpenFile(path) as file:
             if not file.size:
                 raise UnreadableError(EMPTY_FILE)
-            key = file.key
+            key, size = file.key, file.size
         # Immutable: nothing is locked, and no file appears beside the bag.
         address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         # A generator of records may be resumed on another thread.
@@ -143,8 +155,10 @@ class SqliteBags:
                 raise UnreadableError("it was replaced while it was being opened")
             # One name that is not UTF-8 must not hide the others.
             base.text_factory = _text
+            guard(base, self._max_message_bytes, size)
             topics = self._known.get(key)
             if topics is None:
+                require_plain_tables(base)
                 topics = self._topics(base)
                 size = 1000 + sum(300 + len(c.schema.text) for c in topics.channels.values())
                 self._known.put(key, topics, size)
@@ -152,7 +166,7 @@ class SqliteBags:
 
     def _topics(self, base: sqlite3.Connection) -> _Topics:
         have = _columns(base, "topics")
-        if not {"id", "name", "type"} <= have or not _columns(base, "messages"):
+        if not {"id", "name", "type"} <= have or not _columns(base, "messages") >= _MESSAGE_COLUMNS:
             raise UnreadableError("not a rosbag2 file: it lacks the tables topics and messages")
         definitions = _definitions(base)
         rows = base.execute("SELECT * FROM topics ORDER BY id")
@@ -265,6 +279,7 @@ def settled_copy(path: Path, folder: Path, reserve: Callable[[int], None]) -> tu
             shutil.copyfileobj(plain, out)
     copy = folder / path.name
     with closing(sqlite3.connect(copy)) as base:
+        guard(base, MAX_CHUNK_MB << 20, copy.stat().st_size)
         base.execute("PRAGMA journal_mode=DELETE").fetchall()
-        base.execute("SELECT count(*) FROM sqlite_master").fetchall()
+        base.execute("SELECT name FROM sqlite_master LIMIT 1").fetchall()
     return copy, "its writer did not finish it: a journal lay beside it and was played back"

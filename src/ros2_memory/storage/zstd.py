@@ -8,15 +8,17 @@ from typing import TYPE_CHECKING, Final
 import zstandard
 
 from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.limits import too_large
 
 if TYPE_CHECKING:
     from ros2_memory.storage.open_file import OpenFile
 
 FRAME_MAGIC: Final = b"\x28\xb5\x2f\xfd"
-MAX_MESSAGE_BYTES: Final = 256 << 20
 _SKIPPABLE: Final = b"\x2a\x4d\x18"
 _HEADER_BYTES: Final = 18
 _RLE_BLOCK: Final = 1
+_MAX_BLOCK_BYTES: Final = 128 << 10
+_MIN_BLOCK_BYTES: Final = 4
 
 
 class _Own(threading.local):
@@ -33,30 +35,35 @@ def unpacked_zstd(packed: bytes, max_bytes: int) -> bytes:
     """One zstd frame, decompressed.
 
     Raises:
-        UnreadableError: it holds, or states to hold, more than `max_bytes`.
+        UnreadableError: it holds, or states to hold, more than `max_bytes`, or states more than
+            its blocks can hold.
     """
     stated = zstandard.frame_content_size(packed)
     if stated > max_bytes:
-        raise UnreadableError(f"compressed data is larger than the {max_bytes >> 20} MiB allowed")
+        raise UnreadableError(too_large("compressed data", max_bytes))
+    # What is stated is allocated: no block takes fewer bytes, or holds more (RFC 8878, 3.1.1.2).
+    if stated > (len(packed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES:
+        raise UnreadableError("damaged: compressed data states more than it can hold")
     if stated >= 0:
         return _OWN.decompressor.decompress(packed)
     with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
         data = stream.read(max_bytes + 1)
     if len(data) > max_bytes:
-        raise UnreadableError(f"compressed data is larger than the {max_bytes >> 20} MiB allowed")
+        raise UnreadableError(too_large("compressed data", max_bytes))
     return data
 
 
-def plain_payload(payload: bytes) -> bytes:
+def plain_payload(payload: bytes, max_bytes: int) -> bytes:
     """A serialized message as it was before rosbag2's message compression.
 
     Nothing but the frame's magic says that a payload is compressed; no CDR message begins so. One
-    that cannot be decompressed is given as it stands, for decoding to say so.
+    that cannot be decompressed, or holds more than `max_bytes`, is given as it stands, for
+    decoding to say so.
     """
     if payload[:4] != FRAME_MAGIC:
         return payload
     try:
-        return unpacked_zstd(payload, MAX_MESSAGE_BYTES)
+        return unpacked_zstd(payload, max_bytes)
     except (UnreadableError, zstandard.ZstdError, MemoryError):
         return payload
 

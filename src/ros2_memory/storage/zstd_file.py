@@ -9,6 +9,7 @@ import zstandard
 
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.limits import MAX_TIMES_PACKED, most_unpacked
 from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.zstd import begins_as_zstd, ends_whole
 
@@ -49,12 +50,29 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
             raise UnreadableError("not a zstd file: it does not begin as one")
         whole = ends_whole(file)
     target = folder / path.stem
-    damage = _unpack(path, target, reserve)
+    damage = _unpack(path, target, _harmless(reserve, path.stat().st_size))
     if not target.stat().st_size:
         raise UnreadableError(f"nothing of it can be decompressed ({damage or 'it ends early'})")
     if damage:
         return target, f"its compressed file is damaged ({damage}); what comes after is lost"
     return target, "" if whole else "its compressed file ends early"
+
+
+def _harmless(reserve: Callable[[int], None], packed: int) -> Callable[[int], None]:
+    """`reserve`, up to what a file of this size may unpack to.
+
+    Its caller raises `UnreadableError` for more.
+    """
+    left = most_unpacked(packed)
+
+    def reserve_some(size: int) -> None:
+        nonlocal left
+        left -= size
+        if left < 0:
+            raise UnreadableError(f"it unpacks to more than {MAX_TIMES_PACKED} times its size")
+        reserve(size)
+
+    return reserve_some
 
 
 def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
