@@ -258,8 +258,10 @@ def _is_active(notes: FileNotes, scene: Scene) -> bool:
 def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
     closed = notes.closing is Closing.CLOSED and summary.complete
     if summary.empty:
-        if closed:
+        if closed and not summary.notes:
             return Verdict(Standing.EMPTY, silent=summary.silent)
+        if closed:
+            return _aside(Standing.DAMAGED, notes, "; ".join(summary.notes))
         return _aside(Standing.DAMAGED, notes, _NO_MESSAGE)
     state = BagState.CLOSED if closed else BagState.INCOMPLETE
     stamp = notes.stamp
