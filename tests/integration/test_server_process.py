@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,7 @@ from mcp.client.sse import sse_client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from tests.questions import ANSWERED, REFUSED, T0_S, ask, ask_everything, write_run
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 ATTEMPTS = 600
 BETWEEN_ATTEMPTS_S = 0.05
+STARTS_WITHIN_S = 90.0
 ENDS_WITHIN_S = 5.0
 """Far above the second that it should take, so that a busy machine does not fail the test."""
 
@@ -86,13 +87,13 @@ def serving(bag_dir: Path, log: Path, *overrides: str, **more: str) -> Iterator[
         )
     try:
         served = Served(process, 0, log)
-        for _ in range(ATTEMPTS):
+
+        def port() -> int | None:
             assert process.poll() is None, log.read_text(encoding="utf-8")
-            ports = [each["port"] for each in served.events() if each["event"] == "listening"]
-            if ports:
-                served.port = ports[0]
-                break
-            time.sleep(BETWEEN_ATTEMPTS_S)
+            heard = (each["port"] for each in served.events() if each["event"] == "listening")
+            return next(heard, None)
+
+        served.port = until(port, timeout_s=STARTS_WITHIN_S)
         assert served.get("/health")[0] == 200
         yield served
     finally:

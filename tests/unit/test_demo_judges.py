@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import os
 from dataclasses import dataclass
 
 import pytest
@@ -78,6 +79,8 @@ def replied(tmp_path_factory: pytest.TempPathFactory) -> Replied:
     timeline = Timeline(now - 145 * NS_PER_S, now - 123 * NS_PER_S)
     recorder = DemoRecorder(folder / "flat", timeline, clock=FixedClock(now))
     recorder.write_until(now)
+    for path in folder.rglob("*.mcap"):
+        os.utime(path, ns=(now, now))  # however long it took to write them
     memory = memory_of(folder, clock=FixedClock(now))
     tools = {tool.name: tool for tool in build_tools(memory.limits, 25.0)}
     replies = Replies(folder, 24_000)
