@@ -10,7 +10,7 @@ import structlog
 from hypothesis import settings
 from xdist.remote import Producer
 
-from tests.workers import Groups, place
+from tests.workers import Groups, give_way, place
 
 # A loaded machine is slow, not wrong.
 settings.register_profile("steady", deadline=None)
@@ -29,6 +29,11 @@ def pytest_unconfigure() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest first, so that the others are done meanwhile."""
     items.sort(key=lambda item: place(item.nodeid))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Programs that wait for real time come before what burns processor time."""
+    give_way(item.nodeid)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -6,6 +6,7 @@ All other tests run on whichever worker is free. Node ids stay as they are, for 
 
 from __future__ import annotations
 
+import os
 import re
 from functools import cache
 from pathlib import Path
@@ -31,6 +32,9 @@ GROUPS: Final[Mapping[str, Sequence[str]]] = {
 The first two mostly wait for real time, and take longest. "heavy" burns processor time: one such
 test at a time leaves some to those that wait.
 """
+
+PUNCTUAL: Final = ("live", "recorder")
+"""Groups whose programs are to run when their time has come, whatever else there is to do."""
 
 _MARK: Final = re.compile(r'xdist_group\("(\w+)"\)')
 _LASTING: Final = re.compile(r'scope="(module|session)"')
@@ -60,6 +64,20 @@ def place(nodeid: str) -> int:
     if group in order:
         return order.index(group)
     return len(order) + (group is None)
+
+
+def give_way(nodeid: str) -> None:
+    """Puts this worker behind those of the punctual groups, once a test of another one begins.
+
+    It stays there, for priority is not given back; the punctual groups are over by then.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ and group_of(_file(nodeid)) not in PUNCTUAL:
+        _be_nice()
+
+
+@cache
+def _be_nice() -> None:
+    os.nice(10)
 
 
 class Groups(LoadScopeScheduling):

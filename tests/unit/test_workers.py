@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -62,3 +65,20 @@ def test_what_takes_longest_begins_first() -> None:
     order = [f"{LIVE}::test_x[a]", "tests/fuzz/test_bags.py::test_x", lasting, f"{HERE}::test_x"]
     shuffled = order[::-1]
     assert sorted(shuffled, key=place) == order
+
+
+def test_a_worker_gives_way_once_it_is_done_with_what_waits_for_real_time() -> None:
+    program = (
+        "import os\n"
+        "from tests.workers import give_way\n"
+        "first = os.nice(0)\n"
+        f"for file in ({LIVE!r}, {HERE!r}, {HERE!r}):\n"
+        "    give_way(f'{file}::test_x')\n"
+        "    print(os.nice(0) - first)\n"
+    )
+    env = {**os.environ, "PYTEST_XDIST_WORKER": "gw0", "PYTHONPATH": str(TESTS.parent)}
+    ran = subprocess.run(
+        [sys.executable, "-c", program], env=env, check=True, capture_output=True, text=True
+    )
+    after = str(min(10, 19 - os.nice(0)))
+    assert ran.stdout.split() == ["0", after, after]
