@@ -52,6 +52,7 @@ def _dot_path(path: str) -> str:
 Text: TypeAlias = Annotated[str, Field(strict=True, min_length=1)]
 Switch: TypeAlias = Annotated[bool, Field(strict=True)]
 Count: TypeAlias = Annotated[int, Field(strict=True, gt=0)]
+Megabytes: TypeAlias = Annotated[int, Field(strict=True, gt=0, le=1024)]
 Port: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=65535)]
 Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Tolerance: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
@@ -107,6 +108,7 @@ class ReaderSettings:
     index_refresh_s: Positive
     custom_msg_paths: tuple[Folder, ...]
     chunk_cache_mb: Count
+    max_chunk_mb: Megabytes
     schemas_file: ConfigFile
 
 
@@ -168,6 +170,7 @@ class McapNode(AdapterNode):
     target: Literal["ros2_memory.storage.mcap_reader.McapReader"] = Field(alias="_target_")
     custom_msg_paths: tuple[Folder, ...]
     cache_mb: Count
+    max_chunk_mb: Megabytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -177,6 +180,7 @@ class Rosbag2Node(AdapterNode):
     target: Literal["ros2_memory.storage.rosbag2_reader.Rosbag2Reader"] = Field(alias="_target_")
     custom_msg_paths: tuple[Folder, ...]
     cache_mb: Count
+    max_chunk_mb: Megabytes
     unpack_max_mb: Count
 
 

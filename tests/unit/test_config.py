@@ -78,6 +78,7 @@ class TestDefaults:
                 "index_refresh_s": 5.0,
                 "custom_msg_paths": (),
                 "chunk_cache_mb": 64,
+                "max_chunk_mb": 64,
                 "schemas_file": ROOT / "config/message_schemas.yaml",
             },
             "retention": {"max_total_gb": 5.0, "max_age_h": 168.0, "min_free_gb": 1.0},
@@ -92,7 +93,12 @@ class TestDefaults:
                 "write_tools": False,
             },
             "logging": {"level": "info", "format": "json"},
-            "storage": {"target": MCAP, "custom_msg_paths": (), "cache_mb": 64},
+            "storage": {
+                "target": MCAP,
+                "custom_msg_paths": (),
+                "cache_mb": 64,
+                "max_chunk_mb": 64,
+            },
             "recorder": {
                 "target": ROS2BAG,
                 "bag_dir": Path("data/bags"),
@@ -279,11 +285,13 @@ class TestPresets:
 
 class TestAdapters:
     def test_the_node_carries_what_the_constructor_takes(self) -> None:
-        settings = load_settings(["storage=rosbag2", "reader.chunk_cache_mb=7"], {})
+        overrides = ["storage=rosbag2", "reader.chunk_cache_mb=7", "reader.max_chunk_mb=9"]
+        settings = load_settings(overrides, {})
         assert settings.storage.target == ROSBAG2
         assert settings.storage.arguments == {
             "custom_msg_paths": (),
             "cache_mb": 7,
+            "max_chunk_mb": 9,
             "unpack_max_mb": 1024,
         }
 
@@ -303,7 +311,7 @@ class TestAdapters:
         assert f"{ROS2BAG}, {NONE}" in refusal(f"recorder._target_={MCAP}")
 
     def test_an_argument_that_it_does_not_take_is_refused(self) -> None:
-        assert "_target_, custom_msg_paths, cache_mb" in refusal("storage.unpack_max_mb=3")
+        assert "_target_, custom_msg_paths, cache_mb, max_chunk_mb" in refusal("storage.unpack_max_mb=3")
 
 
 class TestRefusals:
