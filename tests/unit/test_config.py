@@ -311,7 +311,8 @@ class TestAdapters:
         assert f"{ROS2BAG}, {NONE}" in refusal(f"recorder._target_={MCAP}")
 
     def test_an_argument_that_it_does_not_take_is_refused(self) -> None:
-        assert "_target_, custom_msg_paths, cache_mb, max_chunk_mb" in refusal("storage.unpack_max_mb=3")
+        said = refusal("storage.unpack_max_mb=3")
+        assert "_target_, custom_msg_paths, cache_mb, max_chunk_mb" in said
 
 
 class TestRefusals:
