@@ -38,12 +38,16 @@ class Tool:
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One name of a question. `said` takes the place of {when} in the description."""
+    """One name of a question.
+
+    `said` takes the place of {when} in the description, `more` of {more}: what the reply has more.
+    """
 
     name: str
     title: str
     when: type[When] | None = None
     said: str = ""
+    more: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +64,7 @@ class Entry(Generic[A]):
         """The tools; `facts` fill the description's placeholders."""
         for variant in self.variants:
             signature = Signature(self.arguments, variant.when)
-            what = self.description.format(when=variant.said, **facts)
+            what = self.description.format(when=variant.said, more=variant.more, **facts)
             text = f"{what} Example: {compact(signature.example)}"
             if self.blocking:
                 text = f"Blocking: may take up to {facts['timeout']} s. {text}"

@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.absence import beyond, moment, not_recorded, nothing_at, seconds
 from ros2_memory.copies import united
-from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
+from ros2_memory.errors import (
+    NoDataError,
+    NoDataReason,
+    QueryTimeoutError,
+    UndecodableError,
+)
 from ros2_memory.model import StampedTransform, TimeWindow
 from ros2_memory.tf_tree import (
     TF_CACHE_NS,
@@ -21,7 +26,7 @@ from ros2_memory.tf_tree import (
     TfClock,
     agreeing_clock,
 )
-from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, NS_PER_MS, Ns
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -34,6 +39,9 @@ if TYPE_CHECKING:
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment dynamic transforms are read; the last is as far as tf2 remembers."""
 
+
+_LONGER_NS: Final[Ns] = 3600 * NS_PER_S
+"""How far around the moment it is looked for frames that were not known then."""
 
 _OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAMES_NOT_CONNECTED})
 
@@ -71,7 +79,7 @@ def transform_at(view: View, parent: str, child: str, at: Ns) -> FoundTransform:
             return _lookup(static, dynamic, "stamp", (parent, child), at)
         except NoDataError as error:
             raise _of_stamps(error, at, nothing_near=not dynamic) from error
-    raise _explained(view, failure, at, nothing_near=not dynamic) from failure
+    raise _explained(view, failure, (parent, child), at, nothing_near=not dynamic) from failure
 
 
 def edges(view: View) -> tuple[FrameEdge, ...]:
@@ -88,14 +96,19 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     )
 
 
-def _pairs(view: View, topics: Iterable[str], *, static: bool) -> set[tuple[str, str]]:
-    """The pairs of these topics: of which the catalogue says none, their bags are read."""
+def _pairs(
+    view: View, topics: Iterable[str], *, static: bool, window: TimeWindow | None = None
+) -> set[tuple[str, str]]:
+    """The pairs of these topics: of which the catalogue says none, their bags are read.
+
+    With a window, those of the bags that have something of a topic in it.
+    """
     pairs: set[tuple[str, str]] = set()
     recorded = _recorded(view, topics)
     unknown: list[tuple[Ns, Ns]] = []
     for topic in recorded:
         for run in view.snapshot.runs:
-            known, spans = _known_pairs(view, run, topic)
+            known, spans = _known_pairs(view, run, topic, window or TimeWindow.everything())
             pairs |= known
             unknown += spans
     for span in united(unknown):
@@ -105,18 +118,21 @@ def _pairs(view: View, topics: Iterable[str], *, static: bool) -> set[tuple[str,
 
 
 def _known_pairs(
-    view: View, run: Run, topic: str
+    view: View, run: Run, topic: str, window: TimeWindow
 ) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
     """The pairs that the catalogue has of a run of bags, and the time of bags it has none of."""
     notes = view.recalled(run) if topic in run.spans else None
     numbers = {} if notes is None else notes.numbers
     edges = {} if notes is None else notes.edges(topic)
-    known = {pair for each in edges.values() for pair in each.pairs}
-    rest = [
-        (first, last + 1)
-        for bag, first, last in run.extents(topic)
-        if numbers.get(bag.file, 0) not in edges
-    ]
+    known: set[tuple[str, str]] = set()
+    rest: list[tuple[Ns, Ns]] = []
+    for bag, first, last in run.extents(topic):
+        if window.overlaps(first, last):
+            edge = edges.get(numbers.get(bag.file, 0))
+            if edge is None:
+                rest.append((first, last + 1))
+            else:
+                known.update(edge.pairs)
     return known, rest
 
 
@@ -134,13 +150,23 @@ def _lookup(
     return FoundTransform(graph.lookup(*frames, at), clock)
 
 
-def _explained(view: View, failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:
-    """The failure of a lookup in its neighbourhood, said of the whole memory."""
+def _explained(
+    view: View, failure: NoDataError, frames: tuple[str, str], at: Ns, *, nothing_near: bool
+) -> NoDataError:
+    """The failure of a lookup in its neighbourhood, said of the whole memory.
+
+    A frame that is not known there is a gap where it is within `_LONGER_NS`.
+    """
     topics = _recorded(view, view.memory.limits.tf_topics)
     if topics and nothing_near:
         return nothing_at(view, topics, at, None, around=TF_CACHE_NS)
     if failure.reason in _OF_ALL_TIMES:
-        return _of_then(failure, at)
+        then = _of_then(failure, at)
+        unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
+        if not (unknown and _connected(view, frames, _around(at, _LONGER_NS))):
+            return then
+        told = f"{then.detail}; within {seconds(_LONGER_NS)} the two were connected: ask about then"
+        return NoDataError(NoDataReason.GAP, told)
     if failure.reason is not NoDataReason.OUTSIDE_RANGE:
         return failure
     between = topics and all(
@@ -151,6 +177,28 @@ def _explained(view: View, failure: NoDataError, at: Ns, *, nothing_near: bool) 
         )
     )
     return NoDataError(NoDataReason.GAP if between else beyond(view, at), failure.detail)
+
+
+def _connected(view: View, frames: tuple[str, str], window: TimeWindow) -> bool:
+    """Whether transforms recorded in a window, and static ones, lead from one frame to the other.
+
+    Not known where the time for the answer is over before.
+    """
+    limits = view.memory.limits
+    try:
+        pairs = _pairs(view, limits.tf_topics, static=False, window=window)
+        pairs |= _pairs(view, limits.tf_static_topics, static=True)
+    except QueryTimeoutError:
+        return False
+    origin, target = (name.lstrip("/") for name in frames)
+    pairs = {(parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs}
+    reached, waiting = {origin}, [origin]
+    while waiting:
+        here = waiting.pop()
+        beside = {b if a == here else a for a, b in pairs if here in {a, b}} - reached
+        reached |= beside
+        waiting += beside
+    return target in reached and len(reached) > 1
 
 
 def _of_stamps(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:

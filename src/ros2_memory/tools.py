@@ -81,7 +81,13 @@ def _list_topics(memory: Memory, call: Call, given: Listing) -> tuple[answers.To
 def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[Variant, ...]:
     return (
         Variant(f"get_{name}_{at}", f"{title} at a time", At, "at a Unix time"),
-        Variant(f"get_{name}_seconds_ago", f"{title} some seconds ago", Ago, "some seconds ago"),
+        Variant(
+            f"get_{name}_seconds_ago",
+            f"{title} some seconds ago",
+            Ago,
+            "some seconds ago",
+            ", age_s (before now)",
+        ),
     )
 
 
@@ -95,7 +101,8 @@ _LIST = Entry(
 _RANGE = Entry(
     (Variant("data_time_range", "Span of the memory"),),
     "What time span the memory covers, with its holes, and what time it is now. "
-    "Reply: {{earliest, latest, now, bags, gaps, ...}}, times in Unix s and local ISO; "
+    "Reply: {{earliest, latest, now, bags, gaps, damaged, clock_faults, ...}}, times in Unix s and "
+    "local ISO; "
     "earliest and latest are null while the memory is empty.",
     Nothing,
     lambda memory, call, _: queries.data_time_range(memory, call),
@@ -103,7 +110,8 @@ _RANGE = Entry(
 _TOPIC_AT = Entry(
     _at_and_ago("topic", "A topic's value", at="at_time"),
     "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
-    "(default {tolerance}; latched topics: any age). Reply: {{topic, type, timestamp, value}}.",
+    "(default {tolerance}; latched topics: any age). Reply: {{topic, type, timestamp, "
+    "value{more}}}.",
     TopicAt,
     lambda memory, call, given: queries.topic_value(
         memory,
@@ -134,7 +142,7 @@ _TOPIC_OVER = Entry(
 _POSITION = Entry(
     _at_and_ago("position", "Robot position"),
     "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
-    "(counter-clockwise from x), timestamp, topic, frame_id}}.",
+    "(counter-clockwise from x), timestamp, topic, frame_id{more}}}.",
     MotionAt,
     lambda memory, call, given: queries.position(
         memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
@@ -143,8 +151,8 @@ _POSITION = Entry(
 _VELOCITY = Entry(
     _at_and_ago("velocity", "Robot velocity"),
     "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
-    "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame x is "
-    "ahead and angular z turns left.",
+    "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id{more}}}; in the robot's own frame "
+    "x is ahead and angular z turns left.",
     MotionAt,
     lambda memory, call, given: queries.velocity(
         memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
@@ -153,7 +161,8 @@ _VELOCITY = Entry(
 _TRANSFORM = Entry(
     _at_and_ago("transform", "Transform"),
     "The pose of frame child in frame parent {when}, through any chain of frames, interpolated. "
-    "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock}}.",
+    "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock"
+    "{more}}}.",
     TransformAt,
     lambda memory, call, given: queries.transform(
         memory, call, given.parent, given.child, given.moment
@@ -173,8 +182,8 @@ _CONDITIONS = (
 _LAST_MATCH = Entry(
     (Variant("find_last_match", "Last time something held (blocking)"),),
     "When a condition last held, e.g. when scissors were last seen: searches all history, newest "
-    f"first. Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type}}}}, or null if "
-    "it never held.",
+    f"first. Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
+    "age_s}}}}, or null if it never held ({{{{match: null, notes}}}} where not all could be read).",
     Search,
     lambda memory, call, given: queries.find_last_match(
         memory,
@@ -192,7 +201,8 @@ _VALUE_WHEN = Entry(
     (Variant("get_value_when", "A topic when another matched (blocking)"),),
     "What value_topic held when condition_topic last met a condition (as in find_last_match), "
     "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
-    "value_timestamp, condition_topic, value_topic}}, or null if it never held.",
+    "value_timestamp, condition_topic, value_topic}}, or null if it never held ({{match: null, "
+    "notes}} where not all could be read).",
     Correlation,
     lambda memory, call, given: queries.value_when(
         memory,

@@ -19,6 +19,7 @@ from ros2_memory.shapes import shown
 from ros2_memory.timebase import NS_PER_MS, NS_PER_S
 from tests.bags import boolean, odom, text, tf, transform, write_mcap
 from tests.memories import SettableClock, memory_of
+from tests.recalled import recalling
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,6 +51,30 @@ def test_a_frame_that_is_not_told_of_around_a_time_is_not_said_to_be_unknown_at_
         queries.transform(memory_of(tmp_path), Call(), "map", "base_link", after(50))
     assert f"within 10 s of {T0_S + 50}" in caught.value.detail
     assert "list_frames" in caught.value.detail
+    assert caught.value.reason is NoDataReason.GAP
+    assert "within 3600 s the two were connected" in caught.value.detail
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "later", "reason"),
+    [
+        ("map", "nobody", 50, NoDataReason.FRAME_UNKNOWN),
+        ("/map", "base_link", 50, NoDataReason.GAP),
+        ("map", "base_link", 3 * 3600 + 50, NoDataReason.FRAME_UNKNOWN),
+    ],
+)
+def test_a_frame_that_is_told_of_within_an_hour_is_not_unknown_but_silent(
+    tmp_path: Path, parent: str, child: str, later: float, reason: NoDataReason
+) -> None:
+    frames_that_part(tmp_path)
+    at = T0 + 3 * 3600 * NS_PER_S + 50 * NS_PER_S
+    moved = [tf(at, transform(at, "odom", "base_link", (0.0, 0.0, 0.0)))]
+    write_mcap(tmp_path / "late" / "late_0.mcap", moved)
+    plain = memory_of(tmp_path)
+    for memory in (plain, recalling(plain, tmp_path)):
+        with pytest.raises(NoDataError) as caught:
+            queries.transform(memory, Call(), parent, child, after(later))
+        assert caught.value.reason is reason
 
 
 def test_the_reach_of_a_transform_is_told_of_the_time_asked_alone(tmp_path: Path) -> None:
