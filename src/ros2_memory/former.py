@@ -1,0 +1,59 @@
+"""What the catalogue knows of all files at once: a start reads it for a week of bags."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ros2_memory.packing import shape_of_text
+from ros2_memory.recorder.standing import FormerFile
+from ros2_memory.summaries import BagSummary
+
+if TYPE_CHECKING:
+    import sqlite3
+    from collections.abc import Sequence
+
+    from ros2_memory.summaries import Shape
+    from ros2_memory.timebase import Ns
+
+
+def former_files(base: sqlite3.Connection, config: str, root: str) -> dict[str, FormerFile]:
+    """The files that have an entry, by `root` and their path; those of one shape in time order.
+
+    Raises:
+        sqlite3.Error: the base cannot be read.
+        ValueError: it holds what is no summary.
+    """
+    found: dict[str, FormerFile] = {}
+    for number, text in base.execute("SELECT id, text FROM shapes").fetchall():
+        shape = shape_of_text(text)
+        rows = base.execute(
+            "SELECT path, size, mtime, sidecar, counts FROM bags WHERE config = ? AND shape = ?",
+            (config, number),
+        ).fetchall()
+        starts, ends = _spans(shape, [row[4] for row in rows])
+        packed = BagSummary.packed
+        # Bags are sorted by time later, which takes no time where they are.
+        for at in np.argsort(np.array(starts, np.int64), kind="stable").tolist():
+            path, size, mtime, sidecar, counts = rows[at]
+            summary = packed(shape, counts)
+            found[root + path] = FormerFile(size, mtime, sidecar, summary, starts[at], ends[at])
+    return found
+
+
+def _spans(shape: Shape, counts: Sequence[bytes]) -> tuple[list[Ns], list[Ns]]:
+    """Of bags of one shape, given by their numbers, the log times of the first and last message.
+
+    0 for bags without a message.
+
+    Raises:
+        ValueError: the numbers are of another shape.
+    """
+    size = shape.layout.size
+    if any(len(each) != size for each in counts):
+        raise ValueError(f"not the numbers of bags that hold {len(shape.topics)} topics")
+    if not size or not counts:
+        return [0] * len(counts), [0] * len(counts)
+    numbers = np.frombuffer(b"".join(counts), "<i8").reshape(len(counts), -1, 3)
+    return numbers[:, :, 1].min(axis=1).tolist(), numbers[:, :, 2].max(axis=1).tolist()
