@@ -183,7 +183,7 @@ _LAST_MATCH = Entry(
     (Variant("find_last_match", "Last time something held (blocking)"),),
     "When a condition last held, e.g. when scissors were last seen: searches all history, newest "
     f"first. Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
-    "age_s}}}}, or null if it never held ({{{{match: null, notes}}}} where not all could be read).",
+    "age_s}}, or null if it never held ({{match: null, notes}} where not all could be read).",
     Search,
     lambda memory, call, given: queries.find_last_match(
         memory,

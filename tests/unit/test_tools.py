@@ -38,7 +38,7 @@ SPECIFIED = [
     "trajectory_summary",
     "recent_trajectory_summary",
 ]
-ADDED = ["find_matches", "recap", "recap_last"]
+ADDED = ["find_matches", "recap", "recap_last", "memory_status"]
 WRITING: list[str] = []
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 BLOCKING = {
@@ -103,6 +103,18 @@ def refusal(name: str, **given: Any) -> str:
 def test_the_seventeen_tools_of_the_specification_come_first_and_in_its_order() -> None:
     assert list(TOOLS) == NAMES
     assert len(SPECIFIED) == 17
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_a_description_shows_the_braces_of_a_reply_once(name: str) -> None:
+    shown = TOOLS[name].description.partition("Example:")[0]
+    assert "{{" not in shown
+    assert shown.count("{") == shown.count("}")
+
+
+@pytest.mark.parametrize("name", [name for name in TOOLS if name.endswith("_seconds_ago")])
+def test_a_description_names_the_age_that_the_reply_tells(name: str) -> None:
+    assert "age_s" in TOOLS[name].description
 
 
 def test_additions_and_what_writes_can_be_left_out() -> None:
