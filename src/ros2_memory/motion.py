@@ -57,7 +57,8 @@ class PoseDigest:
         measured_from: where the next measurement begins.
         twist: the highest speed (m/s) that a message states; None where none states one.
         frames: the frames of all poses, in order of appearance.
-        vertices: the drawn path, first and last pose among them.
+        vertices: the drawn path, first and last pose among them; parted where the robot jumped
+            (see `paths.PARTED`).
         error_m: no valid pose lies farther than this from the drawn path.
     """
 

@@ -16,12 +16,14 @@ from ros2_memory.figures import degrees, local, metres, moment, rounded, seconds
 from ros2_memory.fitting import compact, without_constant_zeros
 from ros2_memory.geometry import normalised, yaw
 from ros2_memory.timebase import Ns, unix_rounded_up
+from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.fitting import JsonObject
     from ros2_memory.model import JsonValue, Quaternion, SetAside
+    from ros2_memory.trajectory import Trajectory
 
 Answer: TypeAlias = (
     tuple[answers.TopicRow, ...]
@@ -264,16 +266,18 @@ def _no_match(notes: Sequence[str]) -> JsonObject | None:
 @shown.register(answers.TrajectorySummary)
 def _trajectory(answer: answers.TrajectorySummary, _bag_dir: Path) -> JsonObject:
     way = answer.trajectory
+    known = way.poses > 0
     reply: JsonObject = {
-        "distance_m": rounded(way.distance_m, 4),
-        "avg_speed": rounded(way.avg_speed, 4),
-        "max_speed": rounded(way.max_speed, 4),
-        "duration_s": rounded(way.duration_s, 3),
+        "distance_m": rounded(way.distance_m, 4) if known else None,
+        "avg_speed": rounded(way.avg_speed, 4) if known else None,
+        "max_speed": rounded(way.max_speed, 4) if known else None,
+        "duration_s": rounded(way.duration_s, 3) if known else None,
         "waypoints": [
             {
                 "timestamp": unix_rounded_up(point.time),
                 **metres(point.position),
                 "yaw_deg": degrees(point.yaw_rad),
+                **({"jump": True} if point.jump else {}),
             }
             for point in way.waypoints
         ],
@@ -283,21 +287,32 @@ def _trajectory(answer: answers.TrajectorySummary, _bag_dir: Path) -> JsonObject
         "end": unix_rounded_up(answer.end),
         "poses": way.poses,
     }
-    notes = [*answer.notes]
+    return with_notes(reply, (*answer.notes, *_notes_of_way(way)))
+
+
+def _notes_of_way(way: Trajectory) -> Iterator[str]:
     if way.invalid:
-        notes.append(
-            f"{way.invalid} poses left out: their coordinates are no place (NaN or beyond)"
-        )
+        poses = counted(way.invalid, "pose")
+        yield f"{poses} left out: the coordinates are no place (NaN or beyond)"
     if way.jumps:
-        notes.append(
-            f"{way.jumps} jumps of {way.jumped_m:.2f} m in all, faster than is plausible, "
-            "left out of distance and speed"
+        yield (
+            f"{counted(way.jumps, 'jump')} of {way.jumped_m:.2f} m in all, faster than is "
+            "plausible, left out of distance and speed"
         )
-    if way.max_speed_from == "positions":
-        notes.append("max_speed is measured from positions: the messages state no speed")
+        drawn = sum(point.jump for point in way.waypoints)
+        if drawn:
+            longest = "the longest lead" if drawn < way.jumps else "each leads"
+            yield f"of the jumps {longest} to a waypoint with jump: true; no way was driven there"
+    if way.poses and way.max_speed_from == "positions":
+        yield "max_speed is measured from positions: the messages state no speed"
+    # Beyond what the rounding of both may come to.
+    if way.avg_speed > way.max_speed + 0.01:
+        yield (
+            "avg_speed, by the positions, is above max_speed, which the messages state: "
+            "one of the two is wrong"
+        )
     if way.waypoint_error_m > FINE_PATH_M:
-        notes.append(f"the path lies within {way.waypoint_error_m:.2f} m of the waypoints' line")
-    return with_notes(reply, notes)
+        yield f"the path lies within {way.waypoint_error_m:.2f} m of the waypoints' line"
 
 
 def _finished(reply: JsonObject, age: Ns | None, notes: Sequence[str]) -> JsonObject:

@@ -1,8 +1,8 @@
 """The way driven, summed up pose by pose in bounded memory.
 
-Distances and speeds are exact over all poses. The drawn path is simplified on the way: standing
-still is merged, each full block of poses is simplified, and the whole again at the end; the
-deviations of these stages add up to at most the tolerance, unless a limit on count widens it.
+Distances and speeds are exact over all poses. The drawn path is simplified on the way (see
+`paths`); the deviations of all stages add up to at most the tolerance, unless a limit on count
+widens it. Where the robot jumped the path is parted.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
-from ros2_memory.geometry import distance, normalised, simplify_to, yaw
+from ros2_memory.geometry import normalised, yaw
 from ros2_memory.motion import Motion, PoseDigest, Vertex, faster, is_place
+from ros2_memory.paths import DrawnPath
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -22,19 +23,21 @@ if TYPE_CHECKING:
 TOLERANCE_M: Final = 0.05
 """How far a pose may lie from the drawn path, unless a limit on count widens it."""
 
-_BLOCK: Final = 4096
-_MOST_VERTICES: Final = 20_000
 _BAG_VERTICES: Final = 32
 """Vertices of the path that is kept of one bag."""
 
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """One vertex of the drawn path: a pose as recorded (m, rad; no yaw without orientation)."""
+    """One vertex of the drawn path: a pose as recorded (m, rad; no yaw without orientation).
+
+    `jump`: the robot jumped here from the waypoint before it, and did not drive.
+    """
 
     time: Ns
     position: Vector3
     yaw_rad: float | None
+    jump: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +50,8 @@ class Trajectory:
         avg_speed: `distance_m / duration_s` (m/s); 0 where there is no duration.
         max_speed: the highest speed (m/s), from `max_speed_from`.
         max_speed_from: `twist`: the messages' own; `positions`: from poses at least 0.1 s apart.
-        waypoints: vertices of the drawn path, first and last pose among them.
+        waypoints: vertices of the drawn path, first and last pose among them, and both ends of
+            the longest jumps.
         waypoint_error_m: no pose lies farther than this from the drawn path.
         poses: valid poses counted.
         invalid: poses left out, since a coordinate is NaN, infinite or beyond any place.
@@ -105,7 +109,7 @@ class TrajectoryBuilder:
                 f" ({max_plausible_speed_mps} m/s) and a tolerance ({tolerance_m} m) above 0"
             )
         self._motion = Motion(max_plausible_speed_mps)
-        self._path = _Path(tolerance_m)
+        self._path = DrawnPath(tolerance_m)
         self._max_waypoints = max_waypoints
         self._invalid = 0
         self._twist: float | None = None
@@ -123,15 +127,17 @@ class TrajectoryBuilder:
             self._invalid += 1
             return
         self._twist = faster(self._twist, speed_mps)
-        self._motion.add(time, pose.position)
-        self._path.add((time, pose.position, pose.orientation))
+        _append(self._motion, self._path, (time, pose.position, pose.orientation))
 
     def join(self, whole: PoseDigest) -> None:
         """Takes all poses of a bag that come next, as if they were added one by one."""
         self._frames.update(dict.fromkeys(whole.frames))
         self._invalid += whole.invalid
         self._twist = faster(self._twist, whole.twist)
+        jumps = self._motion.jumps
         self._motion.join(whole)
+        if self._motion.jumps - jumps > whole.jumps:
+            self._path.part()
         self._path.extend(whole.vertices, whole.error_m)
 
     @property
@@ -146,15 +152,19 @@ class TrajectoryBuilder:
         avg_speed = motion.distance_m / duration_s if duration_s > 0 else 0.0
         # Drivers that know no twist leave it zero: then it says nothing of a robot that moved.
         stated = self._twist if self._twist or not motion.distance_m else None
-        vertices, error = self._path.drawn(self._max_waypoints)
+        drawn = self._path.drawn(self._max_waypoints)
         return Trajectory(
             distance_m=motion.distance_m,
             duration_s=duration_s,
             avg_speed=avg_speed,
             max_speed=max(motion.max_speed, avg_speed) if stated is None else stated,
             max_speed_from="positions" if stated is None else "twist",
-            waypoints=tuple(_waypoint(vertex) for vertex in vertices),
-            waypoint_error_m=error,
+            waypoints=tuple(
+                Waypoint(time, position, _heading(turn), jump=place == 0 and number > 0)
+                for number, piece in enumerate(drawn.pieces)
+                for place, (time, position, turn) in enumerate(piece)
+            ),
+            waypoint_error_m=drawn.error_m,
             poses=motion.poses,
             invalid=self._invalid,
             jumps=motion.jumps,
@@ -170,7 +180,7 @@ class PoseCollector:
 
     def __init__(self, max_plausible_speed_mps: float) -> None:
         self._motion = Motion(max_plausible_speed_mps)
-        self._path = _Path(TOLERANCE_M / 8)
+        self._path = DrawnPath(TOLERANCE_M / 8)
         self._invalid = 0
         self._twist: float | None = None
         self._frames: dict[str, None] = {}
@@ -182,14 +192,13 @@ class PoseCollector:
             self._invalid += 1
             return
         self._twist = faster(self._twist, speed_mps)
-        self._motion.add(time, pose.position)
-        self._path.add((time, pose.position, pose.orientation))
+        _append(self._motion, self._path, (time, pose.position, pose.orientation))
 
     def digest(self) -> PoseDigest:
         """What the poses amount to."""
         motion = self._motion
-        kept, error = self._path.drawn(_BAG_VERTICES)
-        vertices = ((time, position, _heading(turn)) for time, position, turn in kept)
+        drawn = self._path.drawn(_BAG_VERTICES)
+        vertices = ((time, position, _heading(turn)) for time, position, turn in drawn.row())
         return PoseDigest(
             poses=motion.poses,
             invalid=self._invalid,
@@ -205,86 +214,17 @@ class PoseCollector:
             twist=self._twist,
             frames=tuple(self._frames),
             vertices=tuple(vertices),
-            error_m=error,
+            error_m=drawn.error_m,
         )
 
 
-class _Path:
-    """The drawn path: vertices that are enough, and how far any pose may lie off them.
-
-    A simplification of a simplification: the deviations add and do no more, since a vertex that
-    the second drops lies beside the same kept segment as its neighbours. A quarter of the
-    tolerance goes to merging small steps, a quarter to the blocks, and what is left to the whole;
-    paths that are kept of bags have taken an eighth of it. Where that keeps too many vertices the
-    first two quarters are doubled.
-    """
-
-    def __init__(self, tolerance_m: float) -> None:
-        self._tolerance_m = tolerance_m
-        self._stage_m = tolerance_m / 4
-        self._kept: list[Vertex] = []
-        self._block: list[Vertex] = []
-        self._merged: Vertex | None = None
-        self._merged_m = 0.0
-        self._dropped_m = 0.0
-        self._given_m = 0.0
-
-    @property
-    def size(self) -> int:
-        return len(self._kept) + len(self._block)
-
-    def add(self, vertex: Vertex) -> None:
-        if self._block:
-            off = distance(self._block[-1][1], vertex[1])
-            if off <= self._stage_m:
-                self._merged_m = max(self._merged_m, off)
-                self._merged = vertex
-                return
-        self._merged = None
-        self._block.append(vertex)
-        if len(self._block) == _BLOCK:
-            self._close_block()
-
-    def extend(self, vertices: Iterable[Vertex], error_m: float) -> None:
-        """Takes a path that is drawn already, from which poses lie `error_m` off at most."""
-        self._given_m = max(self._given_m, error_m)
-        for vertex in vertices:
-            self.add(vertex)
-
-    def drawn(self, at_most: int) -> tuple[list[Vertex], float]:
-        """The vertices, and the bound on how far (m) any pose lies from their polyline."""
-        vertices = [*self._kept, *self._block]
-        if self._merged is not None:
-            vertices.append(self._merged)
-        so_far = self._given_m + self._merged_m + self._dropped_m
-        kept, error = _thinned(
-            vertices, max(self._tolerance_m - so_far, self._tolerance_m / 4), at_most
-        )
-        return kept, so_far + error
-
-    def _close_block(self) -> None:
-        """Keeps the vertices that draw the block; its last one begins the next block."""
-        kept, error = _thinned(self._block, self._stage_m, _BLOCK)
-        self._dropped_m = max(self._dropped_m, error)
-        self._kept += kept[:-1]
-        self._block = kept[-1:]
-        if len(self._kept) > _MOST_VERTICES:
-            while len(self._kept) > _MOST_VERTICES // 2:
-                self._stage_m *= 2
-                self._kept, error = _thinned(self._kept, self._stage_m, len(self._kept))
-                self._dropped_m += error
-
-
-def _thinned(
-    vertices: list[Vertex], tolerance_m: float, at_most: int
-) -> tuple[list[Vertex], float]:
-    indices, error = simplify_to([vertex[1] for vertex in vertices], tolerance_m, at_most)
-    return [vertices[index] for index in indices], error
-
-
-def _waypoint(vertex: Vertex) -> Waypoint:
-    time, position, turn = vertex
-    return Waypoint(time, position, _heading(turn))
+def _append(motion: Motion, path: DrawnPath, vertex: Vertex) -> None:
+    """Takes a pose; a jump to it parts the path."""
+    jumps = motion.jumps
+    motion.add(vertex[0], vertex[1])
+    if motion.jumps > jumps:
+        path.part()
+    path.add(vertex)
 
 
 def _heading(turn: Quaternion | float | None) -> float | None:

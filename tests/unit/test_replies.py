@@ -339,6 +339,53 @@ def test_a_trajectory_says_what_was_left_out_and_how_it_was_measured() -> None:
     assert "0.31 m" in notes[3]
 
 
+def test_a_jump_is_marked_at_the_waypoint_it_led_to() -> None:
+    waypoints = (Waypoint(T0, (0, 0, 0), None), Waypoint(T0 + 1, (90, 0, 0), None, jump=True))
+    told = said(trajectory(waypoints=waypoints, jumps=1, jumped_m=90.0))
+    assert [point.get("jump") for point in told["waypoints"]] == [None, True]
+    assert told["notes"] == [
+        ("1 jump of 90.00 m in all, faster than is plausible, left out of distance and speed"),
+        "of the jumps each leads to a waypoint with jump: true; no way was driven there",
+    ]
+    told = said(trajectory(waypoints=waypoints, jumps=9, jumped_m=99.0))
+    assert told["notes"][1].startswith("of the jumps the longest lead to a waypoint")
+
+
+def test_without_a_single_valid_pose_nothing_is_said_of_the_way() -> None:
+    told = said(
+        trajectory(
+            poses=0,
+            invalid=1,
+            waypoints=(),
+            distance_m=0.0,
+            avg_speed=0.0,
+            max_speed=0.0,
+            max_speed_from="positions",
+        )
+    )
+    assert [told[key] for key in ("distance_m", "avg_speed", "max_speed", "duration_s")] == [
+        None
+    ] * 4
+    assert told["notes"] == ["1 pose left out: the coordinates are no place (NaN or beyond)"]
+
+
+def test_a_mean_above_the_highest_speed_is_told() -> None:
+    [note] = said(trajectory(avg_speed=0.9, max_speed=0.5))["notes"]
+    assert note.startswith("avg_speed, by the positions, is above max_speed")
+    assert "notes" not in said(trajectory(avg_speed=0.501, max_speed=0.5))
+
+
+def test_no_data_tells_what_could_not_be_read() -> None:
+    error = NoDataError(NoDataReason.GAP, "nothing", ("1 bag file could not be read",))
+    told = json.loads(REPLIES.error(error).text)
+    assert told["notes"] == ["1 bag file could not be read"]
+
+
+def test_a_topic_of_bags_that_are_not_whole_says_so_in_its_row() -> None:
+    row = answers.TopicRow("/odom", "nav_msgs/msg/Odometry", T0, T0, 1, None, ("cut short",))
+    assert said((row,))[0]["notes"] == ["cut short"]
+
+
 def test_what_is_no_answer_is_refused() -> None:
     with pytest.raises(TypeError, match="str is not an answer"):
         shown("text", BAGS)

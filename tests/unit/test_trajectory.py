@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import math
 import random
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from ros2_memory.geometry import path_length, quaternion_from_yaw
 from ros2_memory.model import Pose
 from ros2_memory.timebase import NS_PER_MS, NS_PER_S
-from ros2_memory.trajectory import Trajectory, TrajectoryBuilder, summarise
+from ros2_memory.trajectory import PoseCollector, Trajectory, TrajectoryBuilder, summarise
 from tests.real_messages import messages
 from tests.shared_bags import REAL, needs_real
 from tests.strategies import points
@@ -157,6 +158,68 @@ def test_a_jump_is_left_out_of_distance_and_speed_and_is_counted() -> None:
     assert found.duration_s == 5.0
 
 
+def test_both_ends_of_a_jump_are_drawn_and_nothing_between_them() -> None:
+    found = summarise(driven(along_x(0, 1, 2, 102, 103, 104, 5, 6)), LIMIT_MPS)
+    assert [(point.position[0], point.jump) for point in found.waypoints] == [
+        (0.0, False),
+        (2.0, False),
+        (102.0, True),
+        (104.0, False),
+        (5.0, True),
+        (6.0, False),
+    ]
+
+
+def test_a_robot_that_stands_before_and_after_a_jump_is_drawn_until_it_jumps() -> None:
+    poses = driven([*[(0.001 * (i % 2), 0.0, 0.0) for i in range(9)], *along_x(90, 90, 91)])
+    found = summarise(poses, LIMIT_MPS)
+    assert [(point.time, point.jump) for point in found.waypoints] == [
+        (poses[0][0], False),
+        (poses[8][0], False),
+        (poses[9][0], True),
+        (poses[-1][0], False),
+    ]
+
+
+def test_of_more_jumps_than_can_be_drawn_the_longest_are() -> None:
+    jumping = [100.0 * (n % 2) + n * (n == 31) for n in range(60)]
+    found = summarise(driven(along_x(*jumping)), LIMIT_MPS, 12)
+    assert found.jumps == 59
+    assert len(found.waypoints) <= 12
+    assert sum(point.jump for point in found.waypoints) == 5
+    assert 131.0 in [point.position[0] for point in found.waypoints if point.jump]
+
+
+@given(
+    st.lists(st.sampled_from([0.0, 0.5, 1.0, 40.0, 90.0]), min_size=2, max_size=40),
+    st.integers(1, 38),
+)
+def test_jumps_are_drawn_alike_pose_by_pose_and_from_parts(steps: list[float], cut: int) -> None:
+    poses = driven(along_x(*accumulate(steps)))
+    builder, digests = TrajectoryBuilder(LIMIT_MPS, 200), []
+    for part in (poses[:cut], poses[cut:]):
+        collector = PoseCollector(LIMIT_MPS)
+        for time, pose, speed in part:
+            collector.add(time, pose, speed)
+        digests.append(collector.digest())
+    for digest in digests:
+        builder.join(digest)
+    whole, joined = summarise(poses, LIMIT_MPS, 200), builder.result()
+    drawable = all(digest.jumps <= 15 for digest in digests)
+    assert [point.position for point in joined.waypoints if point.jump] == [
+        point.position for point in whole.waypoints if point.jump
+    ] or not drawable
+
+
+def test_a_path_in_very_many_pieces_is_held_in_bounded_memory() -> None:
+    builder = TrajectoryBuilder(LIMIT_MPS)
+    for n in range(6000):
+        builder.add(n * S, Pose((100.0 * (n % 3), 0.0, 0.0), None))
+    assert builder.vertices < 25_000
+    found = builder.result()
+    assert (found.jumps, len(found.waypoints) <= 50) == (5999, True)
+
+
 def test_exactly_the_plausible_speed_is_no_jump() -> None:
     found = summarise(driven(along_x(*(0.1 * i for i in range(50))), 10 * MS * 10), 1.0)
     assert found.jumps == 0
@@ -193,7 +256,7 @@ def test_no_pose_lies_farther_from_the_waypoints_than_is_told(
     found = summarise(driven(positions), LIMIT_MPS, at_most)
     assert farthest_off(positions, found) <= found.waypoint_error_m + 1e-7
     assert len(found.waypoints) <= at_most
-    assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most
+    assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most or found.jumps
 
 
 @given(st.lists(points, min_size=1, max_size=60), st.floats(0.01, 100.0))
