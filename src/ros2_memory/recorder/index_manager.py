@@ -20,6 +20,7 @@ import structlog
 
 from ros2_memory.errors import BagVanishedError
 from ros2_memory.recorder.disposal import Disposed
+from ros2_memory.recorder.dormant import Dormant
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.inventory import Known
 from ros2_memory.recorder.scan import COMPRESSED, Tree, other_form
@@ -145,6 +146,7 @@ class IndexManager:
 
     def _start_over(self) -> None:
         self._tree = Tree(self._bag_dir)
+        self._dormant = Dormant()
         self._files: dict[str, FileNotes] = {}
         self._verdicts: dict[str, Verdict] = {}
         self._counted: dict[str, Verdict] = {}  # of x.mcap and x.mcap.zstd only one
@@ -167,17 +169,21 @@ class IndexManager:
         try:
             patrol = self._next_on_patrol() if patrolling else ()
             walked = self._tree.walk(scene.now, [*self._watched, *patrol])
-            changed = self._forget(walked.gone) | self._examine(walked.looked_at, scene)
+            self._rouse(walked, scene)
+            known = self._known_at_first()
+            recalled = self._recall(walked.looked_at, known, scene)
+            changed = self._forget(walked.gone) | self._examine(walked.looked_at, known, scene)
             hidden = frozenset(self._hidden)
             removed, added = self._recount(changed | hidden, scene)
             changed |= hidden - self._hidden
+            added = [*recalled, *added]
             self._timeline = self._timeline.changed(removed, added)
         except BaseException:
             # The walk does not show a second time what it has shown once.
             self._start_over()
             raise
         before, odd = self._published, _oddities(walked)
-        if before is not None and not changed and odd == self._odd:
+        if before is not None and not (changed or recalled) and odd == self._odd:
             self._published = replace(before, scanned_at=scene.now)
             return self._published
         self._odd = odd
@@ -194,10 +200,46 @@ class IndexManager:
 
     def _next_on_patrol(self) -> list[str]:
         if not self._patrol:
-            self._patrol = list(self._files)
+            self._patrol = [*self._files, *self._dormant]
         following = self._patrol[-PATROL:]
         del self._patrol[-PATROL:]
-        return [path for path in following if path in self._files]
+        return [path for path in following if path in self._files or path in self._dormant]
+
+    def _known_at_first(self) -> Mapping[str, FormerFile]:
+        """What was known earlier, where the scan begins anew."""
+        begun = self._files or self._dormant
+        return {} if self._known is None or begun else self._known()
+
+    def _recall(
+        self, stamps: dict[str, Stamp], known: Mapping[str, FormerFile], scene: Scene
+    ) -> list[BagFile]:
+        """The bags of files that look as they are known, which need no further look.
+
+        Disposal weighs more than bags, so with it all files stay awake.
+        """
+        if self._disposal is not None or not known:
+            return []
+        return self._dormant.take(stamps, known, self._reader, scene)
+
+    def _rouse(self, walked: Walked, scene: Scene) -> None:
+        """Wakes the files that went, look otherwise, or have got another form."""
+        if not self._dormant:
+            return
+        for path, stamp in [*walked.looked_at.items()]:
+            if self._dormant.is_undisturbed(path, stamp, scene.now):
+                del walked.looked_at[path]
+            else:
+                self._wake(path, scene)
+                self._wake(other_form(path), scene)
+        for path in walked.gone:
+            self._wake(path, scene)
+
+    def _wake(self, path: str, scene: Scene) -> None:
+        woken = self._dormant.wake(path, scene.now)
+        if woken is not None:
+            notes, verdict = woken
+            self._files[path] = notes
+            self._verdicts[path] = self._counted[path] = verdict
 
     def _forget(self, paths: Iterable[str]) -> set[str]:
         """Drops what is known of these files; gives those that had a verdict."""
@@ -209,10 +251,11 @@ class IndexManager:
                 forgotten.add(path)
         return forgotten
 
-    def _examine(self, stamps: dict[str, Stamp], scene: Scene) -> set[str]:
+    def _examine(
+        self, stamps: dict[str, Stamp], known: Mapping[str, FormerFile], scene: Scene
+    ) -> set[str]:
         """Judges these files; gives those of which the verdict changed."""
         changed = set()
-        known = self._known() if self._known is not None and not self._files else {}
         for path, stamp in stamps.items():
             notes = self._files.get(path)
             if notes is None:
