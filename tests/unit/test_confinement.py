@@ -23,6 +23,7 @@ from ros2_memory.catalogue_file import open_file
 from ros2_memory.config import load_settings
 from ros2_memory.errors import BagError, RecorderError
 from ros2_memory.memory import Limits
+from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.handover import read_handover
 from ros2_memory.recorder.heartbeat import read_heartbeat
@@ -221,6 +222,8 @@ def test_the_reader_of_a_bag_directory_opens_nothing_beside_it(
     reader = ConfinedReader(McapReader(), bags)
     with pytest.raises(BagError, match="does not lie in the bag directory"):
         reader.summarize(bags / path)
+    with pytest.raises(BagError, match="does not lie in the bag directory"):
+        reader.newest(bags / path, "/odom", TimeWindow.everything())
 
 
 async def test_the_bag_directory_may_be_a_link_itself(bags: Path, tmp_path: Path) -> None:

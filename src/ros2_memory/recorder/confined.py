@@ -61,6 +61,11 @@ class ConfinedReader(BagReader):
         self._require_inside(path)
         yield from self._reader.records(path, topics, window, newest_first=newest_first)
 
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """As the reader beneath."""
+        self._require_inside(path)
+        return self._reader.newest(path, topic, window)
+
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """As the reader beneath."""
         self._require_inside(path)

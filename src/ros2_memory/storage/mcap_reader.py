@@ -67,6 +67,11 @@ class McapReader(BagReader):
         with reading(path):
             yield from self._bags.records(path, topics, window, newest_first=newest_first)
 
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """The latest message of the topic inside the window."""
+        with reading(path):
+            return self._bags.newest(path, topic, window)
+
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """The log times of the topic inside the window, from the message indexes."""
         with reading(path):
