@@ -17,6 +17,7 @@ from starlette.routing import Route
 
 from ros2_memory.gate import ADMITTED, HEALTH_PATH, TokenGate
 from ros2_memory.intake import Intake
+from ros2_memory.session_names import SessionNames
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
@@ -72,7 +73,7 @@ def web_app(
             tasks.cancel_scope.cancel()
 
     routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
-    app: ASGIApp = Intake(Starlette(routes=routes, lifespan=lifespan))
+    app: ASGIApp = Intake(SessionNames(Starlette(routes=routes, lifespan=lifespan)))
     if api_token is not None:
         app = TokenGate(app, api_token)
     return WebApp(Guard(app, host))
