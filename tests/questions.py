@@ -60,6 +60,14 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
     ),
     ("trajectory_summary", {"start": T0_S, "end": T0_S + LENGTH_S}, "waypoints"),
     ("recent_trajectory_summary", {"seconds": 5}, "distance_m"),
+    (
+        "find_matches",
+        {"topic": "/vision/*/scene_objects", "condition_type": "contains", "value": "cup"},
+        "sightings",
+    ),
+    ("recap", {"start": T0_S, "end": T0_S + LENGTH_S}, "events"),
+    ("recap_last", {"seconds": 5}, "stood_s"),
+    ("memory_status", {}, "trust"),
 ]
 REFUSED: list[tuple[str, dict[str, Any], str, bool]] = [
     ("get_position_at", {"timestamp": 5}, "no_data", False),

@@ -5,7 +5,7 @@ Whatever has a time also says how long before now that was, so that nobody has t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory import accounts
 from ros2_memory.figures import degrees, metres, moment, rounded, seconds, with_notes
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 
 __all__ = ["robot", "shown"]
+
+_MOST_TOPICS: Final = 10
 
 
 @shown.register(accounts.Sightings)
@@ -80,6 +82,54 @@ def _event(event: accounts.Event, now: Ns) -> JsonObject:
     if event.end is not None:
         shown_event["duration_s"] = round(seconds(event.end - event.start), 1)
     return shown_event
+
+
+@shown.register(accounts.Status)
+def _status(answer: accounts.Status, _bag_dir: Path) -> JsonObject:
+    latest = answer.latest
+    reply: JsonObject = {
+        "trust": "; ".join(answer.problems) or "nothing is known to be missing",
+        "recorder": answer.recorder,
+        "recorder_alive": answer.live,
+        "now": moment(answer.now),
+        "earliest": moment(answer.earliest),
+        "latest": moment(latest),
+        "newest_age_s": None if latest is None else seconds(answer.now - latest),
+        "fell_silent": [
+            {
+                "topic": each.topic,
+                "last_ts": moment(each.last),
+                "ago_s": seconds(answer.now - each.last),
+            }
+            for each in answer.fell_silent[:_MOST_TOPICS]
+        ],
+        "never_heard": [*answer.never_heard[:_MOST_TOPICS]],
+        "damaged": answer.damaged,
+        "incomplete": answer.incomplete,
+        "unread": answer.unread,
+        "budget": _budget(answer),
+    }
+    for name, topics in (("fell_silent", answer.fell_silent), ("never_heard", answer.never_heard)):
+        if len(topics) > _MOST_TOPICS:
+            reply[f"{name}_count"] = len(topics)
+    return with_notes(reply, answer.notes)
+
+
+def _budget(answer: accounts.Status) -> JsonObject:
+    """Gigabytes, and for how many days they last: what is older is deleted then."""
+    budget, gigabyte = answer.budget, 1e9
+    most, per_day = budget.most, budget.per_day
+    shown_budget: JsonObject = {
+        "used_gb": round(budget.used / gigabyte, 3),
+        "max_gb": None if most is None else round(most / gigabyte, 3),
+        "growth_gb_per_day": None if per_day is None else round(per_day / gigabyte, 3),
+    }
+    if most is not None and per_day:
+        shown_budget["full_in_days"] = round(max(most - budget.used, 0) / per_day, 2)
+        kept = most / per_day
+        aged = kept if budget.max_age is None else seconds(budget.max_age) / 86_400
+        shown_budget["keeps_days"] = round(min(kept, aged), 2)
+    return shown_budget
 
 
 def robot(pose: Pose) -> JsonObject:

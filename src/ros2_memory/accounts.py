@@ -95,4 +95,57 @@ class Recap:
     notes: tuple[str, ...] = ()
 
 
-Account: TypeAlias = Sightings | Recap
+@dataclass(frozen=True, slots=True)
+class Stillness:
+    """A topic that fell silent: its last message, and how far apart they usually are."""
+
+    topic: str
+    last: Ns
+    usual: Ns
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """Bytes of all bags, how many may be kept, and what a day adds; None where not known."""
+
+    used: int
+    most: int | None
+    per_day: int | None
+    max_age: Ns | None
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How far the memory can be trusted.
+
+    Attributes:
+        now: what ages count from.
+        earliest: the oldest moment that can be asked about; None where the memory is empty.
+        latest: the newest one.
+        recorder: its state; None where no recorder has written here.
+        live: whether it is there still.
+        never_heard: topics it subscribed to that brought no message.
+        fell_silent: topics that brought some, and none lately.
+        damaged: files that cannot be read.
+        incomplete: bags that a crash left open.
+        unread: files of a kind that is not read here.
+        budget: how long the disk lasts.
+        problems: why answers may be missing something.
+    """
+
+    now: Ns
+    earliest: Ns | None
+    latest: Ns | None
+    recorder: str | None
+    live: bool
+    never_heard: tuple[str, ...]
+    fell_silent: tuple[Stillness, ...]
+    damaged: int
+    incomplete: int
+    unread: int
+    budget: Budget
+    problems: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+Account: TypeAlias = Sightings | Recap | Status

@@ -53,14 +53,19 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
     return _built("recorder", settings.recorder, Recorder, **collaborators)  # type: ignore[type-abstract]
 
 
-def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> Housekeeper:
-    """What repairs and deletes in the bag directory of the recorder; nobody else may delete."""
+def retention_limits(settings: Settings) -> RetentionLimits:
+    """How much the recorder keeps."""
     kept = settings.retention
-    limits = RetentionLimits(
+    return RetentionLimits(
         max_total_bytes=round(kept.max_total_gb * GB),
         max_age_ns=ns_from_unix(kept.max_age_h * 3600),
         min_free_bytes=round(kept.min_free_gb * GB),
     )
+
+
+def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> Housekeeper:
+    """What repairs and deletes in the bag directory of the recorder; nobody else may delete."""
+    limits = retention_limits(settings)
     return InBackground(
         Housekeeping(
             bag_dir,

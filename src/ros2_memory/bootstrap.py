@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.adapters import build_reader
+from ros2_memory.adapters import build_reader, retention_limits
 from ros2_memory.catalogue import FILE, FOLDER, Catalogue
 from ros2_memory.config import load_message_schemas
 from ros2_memory.digest import DIGEST_VERSION, Digester
@@ -109,6 +109,7 @@ def build_filler(settings: Settings, memory: Memory) -> Filler:
 def limits_of(settings: Settings) -> Limits:
     """What questions need of the configuration."""
     data = settings.data
+    records = not isinstance(settings.recorder, NullRecorderNode)
     return Limits(
         position_tolerance_m=data.position_tolerance_m,
         time_tolerance_s=data.time_tolerance_s,
@@ -120,6 +121,7 @@ def limits_of(settings: Settings) -> Limits:
         tf_clock=data.tf_clock,
         max_plausible_speed_mps=data.max_plausible_speed_mps,
         split_duration_s=settings.recording.split_duration_s,
+        kept=retention_limits(settings) if records else None,
     )
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.arguments import Between, Last, Matches, Window, tested
+from ros2_memory.arguments import Between, Last, Matches, Nothing, Window, tested
 from ros2_memory.entries import Entry, Variant
 from ros2_memory.recap import recap
 from ros2_memory.sightings import find_matches
+from ros2_memory.status import memory_status
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -20,6 +21,7 @@ def tools(facts: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
     del writing
     yield from _SIGHTINGS.tools(facts)
     yield from _RECAP.tools(facts)
+    yield from _STATUS.tools(facts)
 
 
 _SIGHTINGS = Entry(
@@ -51,4 +53,11 @@ _RECAP = Entry(
     Window,
     lambda memory, call, given: recap(memory, call, given.span),
     blocking=True,
+)
+_STATUS = Entry(
+    (Variant("memory_status", "How far to trust the memory"),),
+    "Whether the recorder is alive, how old the newest data is, which topics fell silent, what is "
+    "damaged, and for how long the disk lasts.",
+    Nothing,
+    lambda memory, call, _: memory_status(memory, call),
 )

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.recall import Recall
     from ros2_memory.recorder.index_manager import IndexManager
+    from ros2_memory.recorder.retention import RetentionLimits
     from ros2_memory.storage.base import BagReader
     from ros2_memory.timebase import Clock, Ns
 
@@ -24,7 +25,10 @@ NowOfMemory = Literal["wall", "latest"]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The knobs of the configuration's `data` section that questions need."""
+    """The knobs of the configuration that questions need.
+
+    `kept` is how much the recorder keeps; None where nothing is recorded, and nothing deleted.
+    """
 
     position_tolerance_m: float = 0.5
     time_tolerance_s: float = 0.1
@@ -36,6 +40,7 @@ class Limits:
     tf_clock: ClockOfTransforms = "auto"
     max_plausible_speed_mps: float = 10.0
     split_duration_s: float = 10.0
+    kept: RetentionLimits | None = None
 
 
 @dataclass(frozen=True, slots=True)

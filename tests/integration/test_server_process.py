@@ -162,7 +162,7 @@ async def test_a_question_that_takes_too_long_is_answered_with_timeout(
         async with Client(served.url("/mcp")) as client:
             told, is_error = await ask(client, "trajectory_summary", {"start": 0, "end": 2e9})
             assert (told["error"], is_error) == ("timeout", True)
-            assert len((await client.list_tools()).tools) == 17
+            assert len((await client.list_tools()).tools) >= 17
 
 
 def test_health_tells_what_there_is(bag_dir: Path, tmp_path: Path) -> None:

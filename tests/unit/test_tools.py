@@ -38,7 +38,7 @@ SPECIFIED = [
     "trajectory_summary",
     "recent_trajectory_summary",
 ]
-ADDED = ["find_matches", "recap", "recap_last"]
+ADDED = ["find_matches", "recap", "recap_last", "memory_status"]
 WRITING: list[str] = []
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 BLOCKING = {

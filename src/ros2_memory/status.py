@@ -1,0 +1,108 @@
+"""How far the memory can be trusted just now: what records, how fresh and how whole it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.accounts import Budget, Status, Stillness
+from ros2_memory.history import View
+from ros2_memory.model import BagState
+from ros2_memory.recorder.heartbeat import RecorderState
+from ros2_memory.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.memory import Call, Memory
+    from ros2_memory.recorder.heartbeat import Heartbeat
+    from ros2_memory.recorder.snapshot import Snapshot
+
+SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
+_SILENT_PERIODS: Final = 10
+"""A topic is silent after so many times the spacing that its messages had."""
+_FEW: Final = 5
+"""A topic with fewer messages has no usual spacing."""
+_GROWTH_NS: Final[Ns] = 24 * 3600 * NS_PER_S
+"""Growth is measured over the newest data of this length."""
+
+
+def memory_status(memory: Memory, call: Call) -> Status:
+    """What the recorder does, how old the newest data is, what fell silent, what is amiss."""
+    wall = memory.clock.now()
+    view = View(memory, call, wall)
+    snapshot, heartbeat = view.snapshot, memory.index.heartbeat()
+    latest = snapshot.dating.latest
+    now = wall if memory.limits.now == "wall" or latest is None else latest
+    return Status(
+        now=now,
+        earliest=snapshot.dating.earliest,
+        latest=latest,
+        recorder=None if heartbeat is None else str(heartbeat.state),
+        live=heartbeat is not None and heartbeat.is_live(wall),
+        never_heard=() if heartbeat is None else heartbeat.silent,
+        fell_silent=tuple(_fallen_silent(snapshot)),
+        damaged=len(snapshot.damaged),
+        incomplete=sum(bag.state is BagState.INCOMPLETE for bag in snapshot.bags),
+        unread=len(snapshot.unread),
+        budget=_budget(memory, snapshot),
+        problems=tuple(_problems(snapshot, heartbeat, wall)),
+        notes=view.notes,
+    )
+
+
+def _problems(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
+    """Why answers may be missing something, in sentences."""
+    if snapshot.problem:
+        yield snapshot.problem
+    if snapshot.dating.note:
+        yield snapshot.dating.note
+    yield from recorder_problems(heartbeat, wall)
+    if snapshot.damaged:
+        yield f"{len(snapshot.damaged)} damaged bag files; data_time_range lists them"
+
+
+def recorder_problems(heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
+    """What is wrong with a recorder that should be recording; a stopped one was stopped."""
+    if heartbeat is None or heartbeat.state is RecorderState.STOPPED:
+        return
+    if not heartbeat.is_live(wall):
+        yield "the recorder has stopped without saying so"
+    elif heartbeat.state is RecorderState.PAUSED:
+        yield f"the recorder is paused: {heartbeat.last_error or 'it does not say why'}"
+
+
+def _fallen_silent(snapshot: Snapshot) -> Iterator[Stillness]:
+    """Topics that were heard often, and not any more when the newest data was recorded."""
+    latest = snapshot.dating.latest
+    if latest is None:
+        return
+    for topic in snapshot.topics():
+        if snapshot.is_latched(topic):
+            continue
+        stated = [*snapshot.stated(topic).values()]
+        messages = sum(each.messages for each in stated)
+        first, last = min(each.first for each in stated), max(each.last for each in stated)
+        if messages < _FEW:
+            continue
+        usual = (last - first) // (messages - 1)
+        if latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual):
+            yield Stillness(topic, last, usual)
+
+
+def _budget(memory: Memory, snapshot: Snapshot) -> Budget:
+    """What the bags take, how fast that grows, and for how long the budget lasts."""
+    limits, latest = memory.limits, snapshot.dating.latest
+    used = sum(bag.size for bag in snapshot.bags)
+    grown, since = 0, latest
+    if latest is not None:
+        for bag in reversed(snapshot.bags):
+            if bag.end < latest - _GROWTH_NS:
+                break
+            grown += bag.size
+            since = min(bag.start, latest if since is None else since)
+    span = 0 if latest is None or since is None else latest - since
+    per_day = grown * _GROWTH_NS // span if span > 0 else None
+    kept = limits.kept
+    if kept is None:
+        return Budget(used, None, per_day, None)
+    return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns)

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory.accounts import Stillness
+from ros2_memory.memory import Call
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.recorder.retention import RetentionLimits
+from ros2_memory.replies import Replies
+from ros2_memory.status import memory_status
+from tests.bags import Msg, boolean, odom, text, tf, transform, write_mcap
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.memory import Memory
+
+S = 10**9
+DAY = 86_400 * S
+BEGIN = 1_784_000_000 * S
+
+
+def remembering(folder: Path, messages: list[Msg], *, seconds: float = 60) -> Memory:
+    write_mcap(folder / "bag.mcap", sorted(messages, key=lambda each: each.log_time))
+    return memory_of(folder, clock=SettableClock(BEGIN + round(seconds * S)))
+
+
+def beating(folder: Path, state: RecorderState, at: float, **more: Any) -> None:
+    beat = Heartbeat(
+        pid=1,
+        updated=BEGIN + round(at * S),
+        state=state,
+        recordings=(),
+        since=BEGIN,
+        bytes_written=0,
+        subscribed=("/a", "/b"),
+        silent=("/b",),
+        last_error=None,
+        interval_s=2.0,
+    )
+    write_heartbeat(folder, replace(beat, **more))
+
+
+def shown(memory: Memory, folder: Path) -> dict[str, Any]:
+    reply: dict[str, Any] = json.loads(
+        Replies(folder, 24_000).answer(memory_status(memory, Call())).text
+    )
+    return reply
+
+
+def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
+    beating(tmp_path, RecorderState.RECORDING, 59)
+    told = shown(memory, tmp_path)
+    assert told["trust"] == "nothing is known to be missing"
+    assert (told["recorder"], told["recorder_alive"]) == ("recording", True)
+    assert told["newest_age_s"] == 11.0
+    assert told["never_heard"] == ["/b"]
+    assert told["fell_silent"] == []
+
+
+@pytest.mark.parametrize(
+    ("state", "at", "trust"),
+    [
+        (RecorderState.RECORDING, -100, "the recorder has stopped without saying so"),
+        (RecorderState.PAUSED, 59, "the recorder is paused: it does not say why"),
+        (RecorderState.STOPPED, 59, "nothing is known to be missing"),
+    ],
+)
+def test_a_recorder_that_does_not_record_is_told(
+    tmp_path: Path, state: RecorderState, at: float, trust: str
+) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    beating(tmp_path, state, at)
+    assert shown(memory, tmp_path)["trust"] == trust
+
+
+def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Path) -> None:
+    messages = [
+        *(odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(100)),
+        *(boolean(BEGIN + t * S, True) for t in range(80)),  # a second apart, silent for 20
+        *(text(BEGIN + t * S, "hi") for t in range(0, 90, 15)),  # 15 apart, silent for 24
+        tf(BEGIN, transform(BEGIN, "a", "b", (0, 0, 0)), topic="/tf_static"),
+    ]
+    answer = memory_status(remembering(tmp_path, messages), Call())
+    assert answer.fell_silent == (Stillness("/bumper", BEGIN + 79 * S, S),)
+
+
+def test_damaged_files_are_counted_and_told(tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"no bag at all, whatever its name says")
+    told = shown(remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=9e6), tmp_path)
+    assert told["damaged"] == 1
+    assert "1 damaged bag file" in told["trust"]
+
+
+def test_an_empty_memory_has_a_status_too(tmp_path: Path) -> None:
+    told = shown(memory_of(tmp_path), tmp_path)
+    assert (told["earliest"], told["latest"], told["newest_age_s"]) == (None, None, None)
+    assert told["recorder"] is None
+    assert told["budget"] == {"used_gb": 0.0, "max_gb": None, "growth_gb_per_day": None}
+
+
+def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
+    size = (tmp_path / "bag.mcap").stat().st_size
+    budget = RetentionLimits(max_total_bytes=size * 49, max_age_ns=7 * DAY)
+    memory = replace(memory, limits=replace(memory.limits, kept=budget))
+    answer = memory_status(memory, Call())
+    assert (answer.budget.used, answer.budget.per_day) == (size, size * 24)  # all within an hour
+    told = shown(memory, tmp_path)["budget"]
+    assert told["full_in_days"] == 2.0
+    assert told["keeps_days"] == 2.04
+    older = replace(memory.limits, kept=replace(budget, max_age_ns=DAY))
+    assert shown(replace(memory, limits=older), tmp_path)["budget"]["keeps_days"] == 1.0
