@@ -22,6 +22,7 @@ from ros2_memory.memory import Call
 from ros2_memory.timebase import NS_PER_S, FixedClock
 from tests.bags import detections, odom, tf, transform, write_mcap
 from tests.memories import memory_of
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from ros2_memory.memory import Memory
@@ -64,12 +65,8 @@ def test_after_a_kill_every_answer_is_right_and_the_rest_gets_done(
     child = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
     catalogue = tmp_path / FOLDER / FILE
     draw = random.Random(seed)
-    begun = time.monotonic()
-    while not catalogue.exists() and child.poll() is None:
-        assert time.monotonic() - begun < PATIENCE_S
-    moment = time.monotonic() + draw.uniform(0, 0.3)
-    while time.monotonic() < moment:
-        pass
+    until(lambda: catalogue.exists() or child.poll() is not None, timeout_s=PATIENCE_S)
+    time.sleep(draw.uniform(0, 0.3))
     child.send_signal(signal.SIGKILL)
     child.wait()
 
