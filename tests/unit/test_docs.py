@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, get_type_hints
 
 import pytest
@@ -67,3 +69,49 @@ def test_every_key_that_readme_tells_of_exists() -> None:
     known = set(keys(Settings)) | {f"recorder.{each.name}" for each in fields(Ros2BagNode)}
     known.add("recorder.json")  # a file
     assert {key for key in told if key.split(".")[0] in sections} <= known
+
+
+DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+NAMED = sorted(
+    {
+        (document.name, reference)
+        for document in DOCUMENTS
+        for reference in re.findall(
+            r"tests/[\w/]+\.py(?:::\w+)*", document.read_text(encoding="utf-8")
+        )
+    }
+)
+
+
+def held_by(path: Path) -> set[str]:
+    """What a file of tests holds: `test_x`, `TestY`, `TestY::test_x`."""
+    held = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            held.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            held |= {
+                f"{node.name}::{inner.name}"
+                for inner in node.body
+                if isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef)
+            }
+    return held
+
+
+@pytest.mark.parametrize(("document", "reference"), NAMED)
+def test_every_test_that_a_document_names_exists(document: str, reference: str) -> None:
+    file, _, name = reference.partition("::")
+    assert (ROOT / file).is_file(), f"{document} names {file}"
+    if name:
+        assert name.rpartition("::")[2].startswith("test_"), f"{document} names {reference}"
+        assert name in held_by(ROOT / file), f"{document} names {reference}"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: document.name)
+def test_every_file_that_a_document_links_to_or_names_exists(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    linked = re.findall(r"\]\((?!https?://|#)([^)#\s]+)", text)
+    named = re.findall(r"`((?:docs|deploy|tests|benchmarks|config)/[\w./-]+\.\w+)`", text)
+    folder = document.parent
+    assert [each for each in linked if not (folder / each).exists()] == []
+    assert [each for each in named if not (ROOT / each).exists()] == []
