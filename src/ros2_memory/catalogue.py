@@ -115,9 +115,13 @@ class Catalogue:
         """How often it could not be asked: what was read meanwhile may lack something."""
         return self._base.failures
 
-    def look_after(self) -> None:
-        """Goes back to the file where it was lost; may wait for another program."""
-        self._base.look_after()
+    def look_after(self, *, thorough: bool = False) -> None:
+        """Goes back to the file where it was lost, or is damaged; may take a while.
+
+        Args:
+            thorough: whether all of the file is read to see that it is whole.
+        """
+        self._base.look_after(thorough=thorough)
 
     def close(self) -> None:
         """Ends; afterwards nothing is known of any bag."""

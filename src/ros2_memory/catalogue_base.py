@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.catalogue_file import (
     BUSY_S,
+    fault_of,
     in_memory,
     is_busy,
     is_passing,
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.catalogue_file import Opened
 
-RETRY_S: Final = 30.0
+RETRY_S: Final = 10.0
 """How often a file is tried again that could not be opened."""
 
 _PAUSE_S: Final = 0.02
@@ -146,20 +147,30 @@ class KeptBase:
             # Those who only ask do not wait for who else writes.
             time.sleep(_PAUSE_S)
 
-    def look_after(self) -> None:
+    def look_after(self, *, thorough: bool = False) -> None:
         """Goes on with the file where it was deleted, replaced, or could not be opened before.
 
-        It may wait for another program, so no question should wait for it.
+        It may take a while, so no question should wait for it.
+
+        Args:
+            thorough: whether all of the file is read to see that it is whole.
         """
         with self._lock:
             opened = self._opened
             if opened is None or not self._may_open():
                 return
-            if opened.path is not None:
-                if not opened.is_in_place():
-                    self._lose("its file was deleted or replaced", aside=opened.is_mixed())
+            if not opened.is_in_place():
+                self._lose("its file was deleted or replaced", aside=opened.is_mixed())
                 return
-        self._leave_memory()
+        if opened.path is None:
+            self._leave_memory()
+            return
+        # What is kept in memory of a file hides that it was overwritten.
+        fault = fault_of(opened.path, thorough=thorough)
+        if fault is not None and not is_passing(fault):
+            with self._lock:
+                if self._opened is opened:
+                    self._failed(fault)
 
     # What follows runs under the lock, but for `_leave_memory`.
 

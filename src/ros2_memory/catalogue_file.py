@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import sqlite3
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -35,7 +36,11 @@ _PASSING: Final = frozenset(
     }
 )
 """Faults of the machine, or of the moment: the file may be whole."""
-_WAL: Final = "-wal"
+_BESIDE: Final = ("-wal", "-shm")
+_FIRST_ROWS: Final = """
+SELECT (SELECT 1 FROM bags), (SELECT 1 FROM held), (SELECT 1 FROM tales), (SELECT 1 FROM kept),
+  (SELECT 1 FROM payloads), (SELECT 1 FROM channels), (SELECT 1 FROM edges), (SELECT 1 FROM shapes)
+"""
 _TABLES: Final = """
 CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, path TEXT NOT NULL,
   size INTEGER NOT NULL, mtime INTEGER NOT NULL, sidecar INTEGER NOT NULL,
@@ -68,13 +73,14 @@ log = get_logger(__name__)
 class Opened:
     """An open base, and its file; None in memory.
 
-    `file` and `log` tell the file and its write-ahead log from others of the same name.
+    `file` and `beside` tell the file, its write-ahead log and the index of that from others of the
+    same names.
     """
 
     base: sqlite3.Connection
     path: Path | None
     file: tuple[int, int] | None = None
-    log: tuple[int, int] | None = None
+    beside: tuple[tuple[int, int] | None, ...] = ()
 
     def is_in_place(self) -> bool:
         """Whether the names still lead to what is open; also where that cannot be told."""
@@ -86,13 +92,13 @@ class Opened:
             return True
 
     def is_mixed(self) -> bool:
-        """Whether the file lies there and its write-ahead log is another, or gone.
+        """Whether the file lies there, and what belongs to it is another's, or gone.
 
-        What another program makes of the two is no base.
+        What several programs make of that is no base.
         """
-        if self.path is None or self.log is None or self.file != _identity(self.path):
+        if self.path is None or self.file != _identity(self.path):
             return False
-        return self.log != _identity(_beside(self.path, _WAL))
+        return self.beside != _identities(self.path)
 
 
 def open_file(places: Sequence[Path], *, again: bool = False) -> Opened | str:
@@ -109,7 +115,7 @@ def open_file(places: Sequence[Path], *, again: bool = False) -> Opened | str:
             _refuse_links(path)
             base = _ready(path)
             base.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
-            return Opened(base, path, _identity(path), _identity(_beside(path, _WAL)))
+            return Opened(base, path, _identity(path), _identities(path))
         except _LockedError:
             tell = log.debug if again else log.warning
             tell("catalogue_locked", path=str(path), instead="memory")
@@ -127,9 +133,27 @@ def _refuse_links(path: Path) -> None:
     Raises:
         OSError: the file, one that goes with it, or its folder is a link.
     """
-    for each in (path.parent, path, *(_beside(path, suffix) for suffix in (_WAL, "-shm"))):
+    for each in (path.parent, path, *(_beside(path, suffix) for suffix in _BESIDE)):
         if each.is_symlink():
             raise OSError(errno.ELOOP, f"{each.name} is a symbolic link, which is not followed")
+
+
+def fault_of(path: Path, *, thorough: bool = False) -> sqlite3.Error | None:
+    """What is wrong with a base that is open, as another program would find it in its file.
+
+    Args:
+        path: where it lies.
+        thorough: whether all of it is read; else only where its tables begin.
+    """
+    # Not made where it has just gone.
+    address = f"{path.absolute().as_uri()}?mode=rw"
+    try:
+        with closing(sqlite3.connect(address, uri=True, timeout=_SHORT_MS / 1000)) as base:
+            base.execute(_FIRST_ROWS).fetchall()
+            found = base.execute("PRAGMA quick_check(1)").fetchone()[0] if thorough else "ok"
+    except sqlite3.Error as error:
+        return error
+    return None if found == "ok" else sqlite3.DatabaseError(found)
 
 
 def in_memory() -> Opened:
@@ -161,6 +185,10 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     return status.st_dev, status.st_ino
+
+
+def _identities(path: Path) -> tuple[tuple[int, int] | None, ...]:
+    return tuple(_identity(_beside(path, suffix)) for suffix in _BESIDE)
 
 
 def _beside(path: Path, suffix: str) -> Path:
@@ -222,13 +250,13 @@ def _prepare(base: sqlite3.Connection) -> None:
     base.execute("COMMIT")
     if tables and version != VERSION:
         raise _OtherError(f"it is of version {version}, and {VERSION} is what is known")
-    base.execute("SELECT 1 FROM bags, held, tales, kept, payloads, channels, edges, shapes LIMIT 1")
+    base.execute(_FIRST_ROWS).fetchall()
 
 
 def set_aside(path: Path, reason: str) -> None:
     """Makes room for a new file; the old one stays beside it for whoever wants to look."""
     aside = path.with_name(f"{path.name}.aside")
     log.warning("catalogue_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
-    for suffix in (_WAL, "-shm"):
+    for suffix in _BESIDE:
         _beside(path, suffix).unlink(missing_ok=True)
     path.rename(aside)

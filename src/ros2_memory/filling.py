@@ -11,6 +11,7 @@ import subprocess
 import time
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import anyio
@@ -132,11 +133,15 @@ class Filler:
         recall = self._memory.recall
         return None if recall is None else recall.catalogue.trouble
 
-    def look_after(self) -> None:
-        """Has the catalogue go back to its file, unless the bag directory itself is away."""
+    def look_after(self, *, thorough: bool = False) -> None:
+        """Has the catalogue go back to its file, unless the bag directory itself is away.
+
+        Args:
+            thorough: whether all of the file is read to see that it is whole.
+        """
         recall = self._memory.recall
         if recall is not None and self._memory.index.snapshot().problem is None:
-            recall.catalogue.look_after()
+            recall.catalogue.look_after(thorough=thorough)
 
     @property
     def in_memory(self) -> bool:
@@ -201,7 +206,9 @@ async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> 
     tidied, warmed = -math.inf, False
     while True:
         try:
-            await anyio.to_thread.run_sync(filler.look_after, abandon_on_cancel=True)
+            due = time.monotonic() - tidied > TIDY_S
+            look_after = partial(filler.look_after, thorough=due)
+            await anyio.to_thread.run_sync(look_after, abandon_on_cancel=True)
             waiting = await anyio.to_thread.run_sync(filler.waiting, abandon_on_cancel=True)
             if len(waiting) > BACKLOG and not filler.in_memory and await _helped(helper):
                 # What it could not digest is tried here, and refused if need be.
@@ -211,7 +218,7 @@ async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> 
             if (done or not warmed) and len(waiting) <= BACKLOG:
                 await anyio.to_thread.run_sync(filler.warm, abandon_on_cancel=True)
                 warmed = True
-            if time.monotonic() - tidied > TIDY_S:
+            if due:
                 await anyio.to_thread.run_sync(filler.tidy, abandon_on_cancel=True)
                 tidied = time.monotonic()
         except Exception:

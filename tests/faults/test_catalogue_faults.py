@@ -81,6 +81,10 @@ def delete_log(path: Path) -> None:
     path.with_name(f"{path.name}-wal").unlink()
 
 
+def delete_index_of_log(path: Path) -> None:
+    path.with_name(f"{path.name}-shm").unlink()
+
+
 def overwrite_log(path: Path) -> None:
     path.with_name(f"{path.name}-wal").write_bytes(os.urandom(9000))
 
@@ -96,6 +100,7 @@ FAULTS: tuple[Callable[[Path], None], ...] = (
     overwrite_by_another,
     become_a_folder,
     delete_log,
+    delete_index_of_log,
     overwrite_log,
 )
 

@@ -1,0 +1,97 @@
+"""SIGKILL of the server at any moment, while clients ask and its helper digests.
+
+`FAULTS_KILLS` is how many (3 unless given): `FAULTS_KILLS=200 uv run pytest -n0 -s
+tests/faults/test_kills.py` takes some minutes, and prints how long the next start took to answer.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import sqlite3
+import statistics
+import sys
+import time
+from contextlib import closing
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.catalogue import FILE, FOLDER
+from tests.faults.running import children_of, is_alive, load, serving, start, stop
+from tests.faults.world import write_bags
+from tests.waiting import until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+KILLS = int(os.environ.get("FAULTS_KILLS", "3"))
+COUNT = 60
+"""Bags: more than the server digests by itself, so that its helper runs."""
+LONGEST_S = 2.0
+
+
+def gone(number: int) -> bool:
+    return not is_alive(number)
+
+
+def sound(bag_dir: Path) -> bool:
+    path = bag_dir / FOLDER / FILE
+    if not path.exists():
+        return True
+    with closing(sqlite3.connect(path)) as base:
+        return base.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+
+
+def test_after_a_kill_at_any_moment_the_next_start_answers_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag_dir, log = tmp_path / "bags", tmp_path / "log"
+    write_bags(bag_dir, COUNT)
+    shutil.copytree(bag_dir, tmp_path / "untouched")
+    with serving(tmp_path / "untouched", log) as running:
+        right = running.ask_all(COUNT)
+    draw = random.Random(COUNT)
+    recovered, helped = [], 0
+    running = start(bag_dir, log)
+    try:
+        for nth in range(KILLS):
+            with load(running, COUNT) as answered:
+                time.sleep(draw.uniform(0, LONGEST_S))
+                helpers = children_of(bag_dir)
+                running.kill()
+            helped += bool(helpers)
+            assert set(answered) <= set(right)
+            for helper in helpers:
+                until(partial(gone, helper))
+            assert sound(bag_dir), nth
+            if nth % 2:
+                # So that there is something to digest when it is killed again.
+                shutil.rmtree(bag_dir / FOLDER, ignore_errors=True)
+            begun = time.monotonic()
+            running = start(bag_dir, log)
+            assert running.ask("get_topic_at_time", {"topic": "/odom", "timestamp": 1700000042})
+            recovered.append(time.monotonic() - begun)
+            assert running.ask_all(COUNT) == right
+    finally:
+        running.kill()
+        stop(children_of(bag_dir))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\n{KILLS} kills, {helped} of them while the helper ran; from start to first answer"
+            f" {statistics.median(recovered):.2f} s (median), {max(recovered):.2f} s (most)\n"
+        )
+
+
+def test_the_helper_that_digests_dies_with_its_server(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    write_bags(bag_dir, COUNT)
+    running = start(bag_dir, tmp_path / "log")
+    try:
+        helpers = until(lambda: children_of(bag_dir))
+    finally:
+        running.kill()
+    for helper in helpers:
+        until(partial(gone, helper), timeout_s=5.0)

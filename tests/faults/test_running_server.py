@@ -1,0 +1,225 @@
+"""A running server whose files are taken, filled, locked and given back.
+
+What is promised of each: right answers or honest ones meanwhile, the reason in `/health`, and
+everything as it was when the fault is over, without a restart. With `FAULTS_ALL=1` every fault of a
+catalogue is tried on a server, which takes a minute, and otherwise a few.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import sqlite3
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ros2_memory.catalogue import FILE, FOLDER
+from tests.faults import test_catalogue_faults as faults
+from tests.faults.running import PATIENCE_S, Running, questions, serving
+from tests.faults.small_disk import filled, mount, needs_mounts, small_disk, unmount
+from tests.faults.world import write_bag, write_bags
+from tests.waiting import until
+
+COUNT = 12
+FAULTS = (
+    faults.FAULTS
+    if os.environ.get("FAULTS_ALL")
+    else (faults.delete, faults.garbage, faults.overwrite_by_another)
+)
+
+
+def is_ready(running: Running, bags: int) -> bool:
+    """Whether nothing is amiss, and all these bags are in the catalogue."""
+    told = running.health()
+    catalogue = told.get("catalogue", {})
+    known = (catalogue.get("bags"), catalogue.get("waiting"), catalogue.get("state"))
+    return told["status"] == "ok" and known == (bags, 0, "ready")
+
+
+def holds(path: Path, bags: int) -> bool:
+    """Whether another program finds a whole catalogue there, with so many bags in it."""
+    try:
+        with closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True)) as base:
+            [(count,)] = base.execute("SELECT count(*) FROM bags").fetchall()
+            return bool(count == bags) and base.execute("PRAGMA quick_check").fetchone() == ("ok",)
+    except sqlite3.Error:
+        return False
+
+
+def recovers(running: Running, bags: int) -> None:
+    until(partial(is_ready, running, bags), timeout_s=PATIENCE_S)
+
+
+def problem(running: Running, words: str) -> str | None:
+    """The problem in `/health` that has these words."""
+    told = running.health()
+    assert told["status"] == ("degraded" if told.get("problems") else "ok")
+    return next((each for each in told.get("problems", ()) if words in each), None)
+
+
+def says(running: Running, words: str) -> None:
+    until(partial(problem, running, words), timeout_s=PATIENCE_S)
+
+
+def is_honest(answer: str) -> bool:
+    """Whether an answer claims nothing of what cannot be seen: it is an error, or has a note."""
+    told: Any = json.loads(answer)
+    return isinstance(told, dict) and ("error" in told or bool(told.get("notes")))
+
+
+def test_the_catalogue_comes_back_whatever_becomes_of_it(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    write_bags(bag_dir, COUNT)
+    path = bag_dir / FOLDER / FILE
+    with serving(bag_dir, tmp_path / "log") as running:
+        recovers(running, COUNT)
+        right = running.ask_all(COUNT)
+        for fault in FAULTS:
+            fault(path)
+            assert running.ask_all(COUNT) == right, fault.__name__
+            if path.is_dir():
+                path.rmdir()
+            until(partial(holds, path, COUNT), timeout_s=PATIENCE_S)
+            recovers(running, COUNT)
+            assert running.ask_all(COUNT) == right, fault.__name__
+    with serving(bag_dir, tmp_path / "log") as running:
+        recovers(running, COUNT)
+        assert running.ask_all(COUNT) == right
+    faults.assert_sound(path)
+
+
+def test_a_catalogue_that_another_program_holds_is_said_and_waited_for(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    write_bags(bag_dir, COUNT)
+    path = bag_dir / FOLDER / FILE
+    with serving(bag_dir, tmp_path / "log") as running:
+        recovers(running, COUNT)
+        with closing(sqlite3.connect(path, isolation_level=None)) as other:
+            other.execute("BEGIN EXCLUSIVE")
+            before = len(running.events("catalogue_failed"))
+            write_bag(bag_dir, COUNT)
+            says(running, "the catalogue is cannot be used: database is locked")
+            answers = running.ask_all(COUNT + 1)
+        recovers(running, COUNT + 1)
+        assert running.ask_all(COUNT + 1) == answers
+        assert "thing12" in answers[3]
+        assert len(running.events("catalogue_failed")) == before + 1
+
+
+def test_a_bag_directory_that_is_renamed_away_and_back_is_the_same_again(tmp_path: Path) -> None:
+    bag_dir, away = tmp_path / "bags", tmp_path / "away"
+    write_bags(bag_dir, COUNT)
+    with serving(bag_dir, tmp_path / "log") as running:
+        recovers(running, COUNT)
+        right = running.ask_all(COUNT)
+        bag_dir.rename(away)
+        says(running, "the bag directory does not exist")
+        for (tool, given), answer in zip(questions(COUNT), running.ask_all(COUNT), strict=True):
+            assert is_honest(answer) or tool == "list_recorded_topics", (tool, given, answer)
+        assert not bag_dir.exists()
+        away.rename(bag_dir)
+        recovers(running, COUNT)
+        assert running.ask_all(COUNT) == right
+
+
+@needs_mounts
+def test_a_disk_that_is_unmounted_and_mounted_again_loses_nothing(tmp_path: Path) -> None:
+    bag_dir, kept = tmp_path / "bags", tmp_path / "kept"
+    kept.mkdir()
+    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    with small_disk(bag_dir, "16m"):
+        mount(kept, "--bind", str(bag_dir))
+        try:
+            write_bags(bag_dir, COUNT)
+            # The catalogue in the cache folder is the one that could be purged meanwhile.
+            with serving(bag_dir, tmp_path / "log", "recorder=none", environment=cache) as running:
+                recovers(running, COUNT)
+                right = running.ask_all(COUNT)
+                unmount(bag_dir)
+                says(running, "the disk of the bags has been unmounted")
+                for (tool, given), answer in zip(
+                    questions(COUNT), running.ask_all(COUNT), strict=True
+                ):
+                    assert is_honest(answer) or tool == "list_recorded_topics", (given, answer)
+                assert not list(bag_dir.iterdir())
+                digested = len(running.events("bag_digested"))
+                mount(bag_dir, "--bind", str(kept))
+                recovers(running, COUNT)
+                assert running.ask_all(COUNT) == right
+                assert len(running.events("bag_digested")) == digested
+        finally:
+            unmount(kept)
+
+
+@needs_mounts
+@pytest.mark.parametrize("full_at_start", [False, True])
+def test_a_full_disk_under_the_catalogue_is_said_and_got_over(
+    tmp_path: Path, *, full_at_start: bool
+) -> None:
+    bag_dir = tmp_path / "bags"
+    write_bags(bag_dir, COUNT + 8)
+    with serving(bag_dir, tmp_path / "plain") as running:
+        plain = running.ask_all(COUNT + 8)
+    shutil.rmtree(bag_dir)
+    write_bags(bag_dir, COUNT)
+    with small_disk(tmp_path / "cache", "4m") as cache, ExitStack() as stack:
+        place = {"XDG_CACHE_HOME": str(cache)}
+        if full_at_start:
+            stack.enter_context(filled(cache))
+        running = stack.enter_context(
+            serving(bag_dir, tmp_path / "log", "recorder=none", environment=place)
+        )
+        if full_at_start:
+            says(running, "the catalogue is kept in memory: no file can be written for it")
+            write_bags(bag_dir, 8, first=COUNT)
+        else:
+            recovers(running, COUNT)
+            stack.enter_context(filled(cache))
+            write_bags(bag_dir, 8, first=COUNT)
+            says(running, "database or disk is full")
+        until(lambda: running.health()["bags"] == COUNT + 8, timeout_s=PATIENCE_S)
+        assert running.ask_all(COUNT + 8) == plain
+        (cache / "filler").unlink()
+        recovers(running, COUNT + 8)
+        assert running.ask_all(COUNT + 8) == plain
+
+
+def test_too_many_open_files_are_said_and_got_over(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    write_bags(bag_dir, COUNT)
+    with serving(bag_dir, tmp_path / "log") as running:
+        recovers(running, COUNT)
+        right = running.ask_all(COUNT)
+        pid = running.process.pid
+        limits = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+        most = max(int(each.name) for each in Path(f"/proc/{pid}/fd").iterdir())
+        # One more is enough to be asked, and to ask with; none is left for a bag.
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (most + 2, limits[1]))
+        answers = running.ask_all(COUNT)
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, limits)
+        for given, expected in zip(answers, right, strict=True):
+            assert given == expected or is_honest(given), given
+        recovers(running, COUNT)
+        assert running.ask_all(COUNT) == right
+
+
+def test_after_a_crash_by_a_truncated_shared_memory_file_the_next_start_is_right(
+    tmp_path: Path,
+) -> None:
+    """The system ends a program whose mapped file is cut: nothing can be done but to start anew."""
+    bag_dir = tmp_path / "bags"
+    write_bags(bag_dir, COUNT)
+    path = bag_dir / FOLDER / FILE
+    with serving(bag_dir, tmp_path / "log") as running:
+        recovers(running, COUNT)
+        right = running.ask_all(COUNT)
+        os.truncate(path.with_name(f"{FILE}-shm"), 0)
+    with serving(bag_dir, tmp_path / "log") as running:
+        recovers(running, COUNT)
+        assert running.ask_all(COUNT) == right
