@@ -23,7 +23,7 @@ from ros2_memory.ways import way_driven
 from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.history import View
     from ros2_memory.memory import Call, Memory
@@ -70,19 +70,21 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     view, window = open_span(memory, call, span)
     drive = _drive(view, window)
     events = [] if drive is None else [*_stops(drive)]
-    throughout: dict[str, None] = {}
+    seen: list[Presence] = []
+    throughout: set[str] = set()
     for topic, story in _stories(view, window):
         events += [*_flips(topic, story), *map(_error, story.faults)]
-        for presence in _steady(story.seen):
-            if presence.first == story.first and presence.last == story.last:
-                throughout[presence.label] = None
-            else:
-                events.append(_thing(presence))
+        here = [*_steady(story.seen)]
+        seen += here
+        throughout.update(
+            each.label for each in here if (each.first, each.last) == (story.first, story.last)
+        )
         if story.undecodable:
             messages = counted(story.undecodable, "message")
             view.note(f"{messages} of {topic} could not be decoded: what they say is not told")
         if story.left_out:
             view.note(f"{topic} changes too often to tell each: {story.left_out} more")
+    events += [_thing(each) for each in _steady(seen) if each.label not in throughout]
     events += _gaps(view, window)
     note_unseen(view, window)
     note_edges(view, window)
@@ -98,7 +100,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         stood=None if drive is None else sum(rest.end - rest.start for rest in drive.rests),
         frame_id=None if drive is None else drive.way.frames[0],
         events=tuple(told),
-        throughout=tuple(throughout),
+        throughout=tuple(sorted(throughout)),
         notes=view.notes,
     )
 
@@ -152,19 +154,20 @@ def _thing(presence: Presence) -> Event:
     return Event("thing", presence.first, presence.last, f"{presence.label} in view")
 
 
-def _steady(seen: Sequence[Presence]) -> Iterator[Presence]:
-    """Presences, those of a thing joined between which it was missed for a moment alone."""
+def _steady(seen: Iterable[Presence]) -> Iterator[Presence]:
+    """Presences, those of a thing joined that overlap, or between which it was missed for a moment.
+
+    Several detectors may see the same thing, and each misses it now and then.
+    """
     last: dict[str, Presence] = {}
-    for each in seen:
+    for each in sorted(seen, key=lambda presence: presence.first):
         before = last.get(each.label)
-        if before is not None and each.first - before.last <= FLICKER_NS:
-            last[each.label] = before._replace(
-                last=each.last, messages=before.messages + each.messages
-            )
-            continue
-        if before is not None:
-            yield before
-        last[each.label] = each
+        if before is None or each.first - before.last > FLICKER_NS:
+            if before is not None:
+                yield before
+            last[each.label] = each
+        else:
+            last[each.label] = before._replace(last=max(before.last, each.last))
     yield from last.values()
 
 

@@ -171,6 +171,18 @@ def test_a_thing_that_was_missed_for_a_moment_did_not_leave(tmp_path: Path) -> N
     assert times(told.events, "thing") == [("cup in view", 1.0), ("cup in view", 8.0)]
 
 
+def test_a_thing_that_several_detectors_see_is_told_once(tmp_path: Path) -> None:
+    one = [detections(BEGIN + at * S, ["cup"] if at in {2, 3} else []) for at in range(10)]
+    other = [
+        detections(BEGIN + at * S, ["cup"] if at in {3, 4} else [], topic="/vision/other")
+        for at in range(10)
+    ]
+    messages = sorted([*one, *other], key=lambda each: each.log_time)
+    write_mcap(tmp_path / "bag.mcap", messages)
+    [event] = over(memory_of(tmp_path), 0, 10).events
+    assert (event.text, event.start, event.end) == ("cup in view", BEGIN + 2 * S, BEGIN + 4 * S)
+
+
 def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
     blinking = [boolean(BEGIN + at * S, at % 2 == 0) for at in range(20)]
     things = [
