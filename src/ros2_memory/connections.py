@@ -20,6 +20,8 @@ BODY_S: Final = 30.0
 """From there to the last byte of the request."""
 UNREAD_S: Final = 30.0
 """How long a client may leave what was sent to it unread, or a vanished one unacknowledged."""
+KEPT_BYTES: Final = 128 << 10
+"""Of what was sent and is not acknowledged: several replies of usual length."""
 LINGER_S: Final = 1.0
 MOST_CONNECTIONS: Final = 256
 
@@ -36,13 +38,14 @@ class BoundedConnection(H11Protocol):
     _phase: _Phase = "reply"
     _deadline: asyncio.TimerHandle | None = None
     _unread: asyncio.TimerHandle | None = None
+    _is_refused = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """A client has connected."""
         super().connection_made(transport)
         # Zero: any unsent byte counts as unread, and none is kept for long.
         transport.set_write_buffer_limits(high=0)
-        _forget_the_vanished(transport)
+        _bound_the_system(transport)
         if len(self.connections) > MOST_CONNECTIONS:
             self._refuse(503, "Service Unavailable", "Too many connections; close some.\n")
             return
@@ -57,8 +60,9 @@ class BoundedConnection(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Some bytes of a request, perhaps its last."""
-        super().data_received(data)
-        self._watch()
+        if not self._is_refused:
+            super().data_received(data)
+            self._watch()
 
     def on_response_complete(self) -> None:
         """The reply is on its way; another request may follow."""
@@ -113,20 +117,32 @@ class BoundedConnection(H11Protocol):
             self._refuse(408, "Request Timeout", "The request did not come to its end in time.\n")
 
     def _refuse(self, status: int, reason: str, sentence: str) -> None:
-        """Answers outside of the protocol's state, which need not allow for an answer, and ends."""
+        """Answers outside of the protocol's state, which need not allow for an answer, and ends.
+
+        Closing at once would reset the connection of a client that still sends, and with it what
+        the client has not read: so it is read for a moment longer, and thrown away.
+        """
+        self._is_refused = True
+        if self._has_begun():
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
         self.transport.write(
             f"HTTP/1.1 {status} {reason}\r\ncontent-type: text/plain; charset=utf-8\r\n"
             f"content-length: {len(sentence)}\r\nconnection: close\r\n\r\n{sentence}".encode()
         )
-        self.transport.close()
+        self.transport.write_eof()
         self.loop.call_later(LINGER_S, self.transport.abort)
 
 
-def _forget_the_vanished(transport: asyncio.Transport) -> None:
-    """Has the system give up a peer that acknowledges nothing: one that lost power, or its network.
+def _bound_the_system(transport: asyncio.Transport) -> None:
+    """Has the system keep little of what was sent, and give up a peer that acknowledges nothing.
 
-    Unasked it takes Linux about 15 minutes.
+    Unasked Linux keeps megabytes for each client that does not read, and waits 15 minutes for one
+    that lost its power or its network.
     """
     connected = transport.get_extra_info("socket")
-    if connected is not None and hasattr(socket, "TCP_USER_TIMEOUT"):
+    if connected is None:
+        return
+    connected.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KEPT_BYTES)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1000))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from urllib.parse import urlsplit
 
 import anyio
+import anyio.to_thread
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
@@ -33,6 +34,9 @@ Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 STREAM_PATH: Final = "/sse"
 GRACE_S: Final = 0.4
 """How long requests under way may still take when the server stops; event streams end at once."""
+
+THREADS: Final = 4
+"""For what is not a question, such as `/health`. One that was needed once stays for a while."""
 
 _LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 _ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104
@@ -67,6 +71,7 @@ def web_app(
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
+        anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
         async with server.session_manager.run(), anyio.create_task_group() as tasks:
             tasks.start_soon(background)
             yield

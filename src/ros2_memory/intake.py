@@ -70,8 +70,7 @@ class Intake:
     async def _post(self, exchange: _Exchange, held: _Held) -> None:
         refusal = self._unread(exchange.scope) or await self._read(exchange, held)
         if refusal is not None:
-            # What is left of the body is not waited for.
-            refusal.headers["connection"] = "close"
+            # The server throws away what is left of the body: a client may read only afterwards.
             await refusal(exchange.scope, exchange.receive, exchange.send)
         elif not exchange.left:
             await exchange.run(self._app)

@@ -123,9 +123,12 @@ class Lane:
         last.turn.set_exception(refusal)
 
     def _forget(self, client: Hashable, waiting: _Waiting) -> None:
-        self._waiting[client].remove(waiting)
-        if not self._waiting[client]:
-            del self._waiting[client]
+        """Takes it out of the queue, where it may not be any more: its turn may just have come."""
+        left = self._waiting.get(client, deque())
+        if waiting in left:
+            left.remove(waiting)
+            if not left:
+                del self._waiting[client]
 
     def _take(self, client: Hashable) -> None:
         self._free -= 1

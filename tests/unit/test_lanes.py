@@ -120,13 +120,17 @@ async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -
     await until(lambda: lane.running == 0)
 
 
-async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next() -> None:
+@pytest.mark.parametrize("has_turn", [True, False])
+async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn: bool) -> None:
     lane, gates = Lane("test", 1), Gates()
     first, leaving, last = started(lane, gates, "a", 3)
     await until(lambda: lane.waiting == 2)
     gates.release("a0")
     lane._threads.submit(int).result(BOUND_S)  # so the first is done, which the loop learns next
-    asyncio.get_running_loop().call_soon(leaving.cancel)
+    if has_turn:
+        asyncio.get_running_loop().call_soon(leaving.cancel)
+    else:
+        leaving.cancel()
     gates.release()
     assert [await first, await last] == ["a0", "a2"]
     assert leaving.cancelled()
