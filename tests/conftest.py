@@ -10,7 +10,7 @@ import structlog
 from hypothesis import settings
 from xdist.remote import Producer
 
-from tests.workers import Groups, give_way, place
+from tests.workers import Groups, give_way, place, workers_for
 
 # A loaded machine is slow, not wrong.
 settings.register_profile("steady", deadline=None)
@@ -34,6 +34,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Programs that wait for real time come before what burns processor time."""
     give_way(item.nodeid)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Workers for many tests, see `tests/workers.py`; a few files are run without."""
+    return workers_for(config.args)
 
 
 @pytest.hookimpl(optionalhook=True)

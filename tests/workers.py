@@ -33,11 +33,23 @@ The first two mostly wait for real time, and take longest. "heavy" burns process
 test at a time leaves some to those that wait.
 """
 
+WORKERS: Final = 3
+"""On two cores: most of a whole run is waiting, and two of them do little else."""
+
 PUNCTUAL: Final = ("live", "recorder")
 """Groups whose programs are to run when their time has come, whatever else there is to do."""
 
 _MARK: Final = re.compile(r'xdist_group\("(\w+)"\)')
 _LASTING: Final = re.compile(r'scope="(module|session)"')
+
+
+def workers_for(args: Sequence[str]) -> int:
+    """How many workers run what pytest was asked for; 0: none, for a few files they begin too late.
+
+    Args:
+        args: folders, files and node ids, as pytest takes them.
+    """
+    return WORKERS if any(Path(arg).is_dir() for arg in args) else 0
 
 
 @cache

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from tests.workers import GROUPS, TESTS, group_of, place
+from tests.workers import GROUPS, TESTS, WORKERS, group_of, place, workers_for
 
 HERE = "tests/unit/test_workers.py"
 LIVE = "tests/integration/test_live_memory.py"
@@ -65,6 +65,21 @@ def test_what_takes_longest_begins_first() -> None:
     order = [f"{LIVE}::test_x[a]", "tests/fuzz/test_bags.py::test_x", lasting, f"{HERE}::test_x"]
     shuffled = order[::-1]
     assert sorted(shuffled, key=place) == order
+
+
+@pytest.mark.parametrize(
+    ("args", "workers"),
+    [
+        ([TESTS], WORKERS),
+        ([TESTS / "unit", __file__], WORKERS),
+        ([__file__], 0),
+        ([f"{__file__}::test_what_takes_longest_begins_first"], 0),
+    ],
+)
+def test_folders_are_run_by_several_workers_and_files_by_none(
+    args: list[object], workers: int
+) -> None:
+    assert workers_for([str(arg) for arg in args]) == workers
 
 
 def test_a_worker_gives_way_once_it_is_done_with_what_waits_for_real_time() -> None:
