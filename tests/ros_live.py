@@ -187,7 +187,7 @@ def wait_for(
     condition: Callable[[], object],
     what: str,
     *,
-    timeout_s: float = 20.0,
+    timeout_s: float = 60.0,
     alive: subprocess.Popen[bytes] | None = None,
 ) -> None:
     """Returns once the condition holds; fails where it does not in time, or `alive` died."""
