@@ -1,0 +1,1 @@
+"""A real server under clients of every bad habit, with its memory, threads and files counted."""

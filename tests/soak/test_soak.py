@@ -1,0 +1,36 @@
+"""A bounded soak: what the server holds in the end is what it held at the start."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tests.questions import write_run
+from tests.soak.clients import slow_loris
+from tests.soak.rounds import SHORT, soaked
+from tests.soak.server import serving
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SECONDS = 2.0
+"""Of rounds, besides the one that warms the server up and the slow requests that it waits for."""
+
+GROWTH_MB = 24.0
+"""Far less than one reply kept for each of the calls, or one buffer for each of the connections."""
+
+MOST_THREADS = 24
+
+
+async def test_bad_clients_leave_no_files_threads_or_memory_behind(tmp_path: Path) -> None:
+    write_run(tmp_path / "bags")
+    with serving(tmp_path / "bags", tmp_path / "log") as served:
+        soak = await soaked(served, SECONDS, slow=(slow_loris,))
+        faults = [each for each in served.events() if each["level"] in {"error", "critical"}]
+    assert soak.end is not None
+    assert soak.most is not None
+    assert soak.end.files <= soak.start.files
+    assert soak.end.threads <= soak.start.threads <= MOST_THREADS
+    assert soak.growth_mb < GROWTH_MB
+    assert soak.end.rss_mb - soak.start.rss_mb < GROWTH_MB
+    assert {habit.__name__ for habit in (*SHORT, slow_loris)} <= soak.seen.keys()
+    assert not faults
