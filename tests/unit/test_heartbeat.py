@@ -19,6 +19,7 @@ from ros2_memory.recorder.heartbeat import (
     read_heartbeat,
     write_heartbeat,
 )
+from tests.faults.small_disk import filled, needs_mounts, small_disk
 
 S = 10**9
 NOW = 1_800_000_000 * S
@@ -216,3 +217,18 @@ def _reason_without(folder: Path, key: str) -> str | None:
     fields = {name: value for name, value in _raw().items() if name != key}
     (folder / HEARTBEAT_FILE).write_text(json.dumps(fields), encoding="utf-8")
     return read_heartbeat(folder).reason
+
+
+@needs_mounts
+def test_on_a_full_disk_the_one_that_lies_there_is_overwritten(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", "128k") as disk:
+        write_heartbeat(disk, replace(BEAT, last_error="x" * 700))
+        with filled(disk):
+            for error in ("the disk is full", None):
+                write_heartbeat(disk, replace(BEAT, last_error=error))
+                assert read_heartbeat(disk).heartbeat == replace(BEAT, last_error=error)
+            with pytest.raises(RecorderError, match="No space left"):
+                write_heartbeat(disk, replace(BEAT, last_error="y" * 10_000))
+            assert read_heartbeat(disk).heartbeat == replace(BEAT, last_error=None)
+        write_heartbeat(disk, BEAT)
+        assert read_heartbeat(disk).heartbeat == BEAT

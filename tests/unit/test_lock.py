@@ -14,6 +14,7 @@ import pytest
 from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.layout import LOCK_FILE
 from ros2_memory.recorder.lock import BagDirLock
+from tests.faults.small_disk import needs_mounts, small_disk
 
 
 def held_by(bag_dir: Path, text: str) -> int:
@@ -167,4 +168,18 @@ class TestRenewal:
             disk.setattr(os, "stat", fails)
             assert not lock.renew()
         assert f"process {os.getpid()} on" in refusal(tmp_path)
+        lock.release()
+
+
+@needs_mounts
+def test_below_an_unmounted_disk_no_lock_is_made(tmp_path: Path) -> None:
+    bag_dir = tmp_path / "bags"
+    with small_disk(bag_dir, "128k"):
+        lock = BagDirLock.acquire(bag_dir)
+        with small_disk(bag_dir, "64k"):
+            assert not lock.renew()
+            assert list(bag_dir.iterdir()) == []
+            # The same disk under another number has the file, which is then locked.
+            (bag_dir / LOCK_FILE).touch()
+            assert lock.renew()
         lock.release()

@@ -468,6 +468,7 @@ class Housekeeping:
         self.frees_to = 0
         self.fails = False
         self.making = False
+        self.failed: dict[str, str] = {}
 
     def repair(self, bag_dir: Path) -> None:
         self.asked.append("repair")
@@ -484,6 +485,9 @@ class Housekeeping:
         self.asked.append("apply")
         if self.fails:
             raise RecorderError("the catalogue is locked")
+
+    def faults(self) -> dict[str, str]:
+        return self.failed
 
 
 class TestSpace:
@@ -625,10 +629,8 @@ class TestUnmounted:
         assert world.running == []
         assert len(world.recorders) == 1
         assert housekeeping.asked == []
-        assert [path.name for path in world.bag_dir.iterdir()] == ["recorder.json"]
-        beat = world.heartbeat()
-        assert beat["state"] == "paused"
-        assert "has been unmounted" in beat["last_error"]
+        world.supervisor.stop()
+        assert list(world.bag_dir.iterdir()) == []
 
     def test_it_goes_on_by_itself_when_the_disk_is_back(self, tmp_path: Path) -> None:
         world = World(tmp_path / "bags")
@@ -645,7 +647,9 @@ class TestUnmounted:
             world.run(5)
         assert len(events(logs, "disk_back")) == 1
         assert world.supervisor.is_recording
-        assert world.heartbeat()["state"] == "recording"
+        beat = world.heartbeat()
+        assert beat["state"] == "recording"
+        assert "has been unmounted" in beat["last_error"]
 
     def test_one_that_comes_and_goes_is_waited_for_longer_each_time(self, tmp_path: Path) -> None:
         world = World(tmp_path / "bags")
@@ -663,6 +667,20 @@ class TestUnmounted:
 
 
 class TestHouse:
+    def test_what_failed_while_nobody_waited_is_told_once_and_in_the_heartbeat(
+        self, tmp_path: Path
+    ) -> None:
+        housekeeping = Housekeeping()
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(3)
+        housekeeping.failed = {"make_room": "the oldest bags cannot be deleted"}
+        with capture_logs() as logs:
+            world.run(130)
+        (told,) = events(logs, "housekeeping_failed")
+        assert (told["task"], told["reason"]) == ("make_room", "the oldest bags cannot be deleted")
+        assert world.heartbeat()["last_error"] == "the oldest bags cannot be deleted"
+
     def test_it_is_kept_after_splits_were_closed(self, tmp_path: Path) -> None:
         housekeeping = Housekeeping()
         world = World(tmp_path, housekeeper=housekeeping)

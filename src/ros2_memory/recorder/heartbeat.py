@@ -8,7 +8,9 @@ file of a recording that is not named counts as left behind by a crash.
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -24,6 +26,8 @@ HEARTBEAT_FILE: Final = "recorder.json"
 MAX_INTERVAL_S: Final = 3600.0
 """A heartbeat that claims to come more rarely is not believed: it would count as live for days."""
 
+_NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+_BLOCK: Final = 512  # that is what `st_blocks` counts, whatever the file system
 _PATIENCE_INTERVALS: Final = 3
 _PATIENCE_AT_LEAST_NS: Final[Ns] = 15 * NS_PER_S
 
@@ -94,6 +98,9 @@ def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
 def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
     """Replaces `recorder.json` at once: a reader sees the old one or this one, never a part.
 
+    On a full disk it is overwritten where it lies, which needs no room: whoever reads it at that
+    very moment may find no heartbeat, and finds this one when it looks again.
+
     Raises:
         RecorderError: it cannot be written, e.g. because the disk is full; the old one stands.
     """
@@ -102,10 +109,30 @@ def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
     try:
         write_durably(target, text)
     except OSError as error:
+        if error.errno in _NO_ROOM and _overwritten(target, text.encode()):
+            return
         raise RecorderError(
             f"{target} cannot be written: {error.strerror or error}; "
             "free disk space or correct the permissions of the bag directory"
         ) from error
+
+
+def _overwritten(target: Path, data: bytes) -> bool:
+    """Whether the file could take the text without a further block of the disk."""
+    try:
+        descriptor = os.open(target, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        status = os.fstat(descriptor)
+        if len(data) > status.st_blocks * _BLOCK:
+            return False
+        # Blanks behind it, in the same write, cover what was there before.
+        return os.pwrite(descriptor, data.ljust(status.st_size), 0) >= len(data)
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
 
 
 def _parsed(text: str) -> Heartbeat:

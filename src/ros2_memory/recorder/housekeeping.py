@@ -28,7 +28,7 @@ from ros2_memory.recorder.repair import Repairer, open_files
 from ros2_memory.timebase import ms_from_ns, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
     from ros2_memory.recorder.disposal import Disposed
@@ -138,6 +138,10 @@ class Housekeeping:
         self._tell_shortage(done)
         if self._repair_left(bag_dir, self._index.snapshot()):
             self._index.refresh()
+
+    def faults(self) -> Mapping[str, str]:
+        """None: what fails is raised."""
+        return {}
 
     def _repair_recording(self, bag_dir: Path, directory: Path) -> None:
         try:
@@ -255,6 +259,7 @@ class InBackground:
     def __init__(self, housekeeper: Housekeeper) -> None:
         self._housekeeper = housekeeper
         self._threads: dict[str, threading.Thread] = {}
+        self._faults: dict[str, str] = {}
 
     def repair(self, bag_dir: Path) -> None:
         """Puts right what a crash left, and returns when that is done."""
@@ -272,6 +277,10 @@ class InBackground:
         """Begins to apply the limits, unless that is still under way."""
         self._begin("apply", lambda: self._housekeeper.apply(bag_dir))
 
+    def faults(self) -> Mapping[str, str]:
+        """By task why it failed the last time; what has since been done is not among them."""
+        return dict(self._faults)
+
     def wait(self) -> None:
         """Waits until nothing is under way."""
         for thread in self._threads.values():
@@ -281,21 +290,22 @@ class InBackground:
         if self._is_under_way(task):
             return
         thread = threading.Thread(
-            target=_reported, args=(task, do), name=f"housekeeping {task}", daemon=True
+            target=self._run, args=(task, do), name=f"housekeeping {task}", daemon=True
         )
         self._threads[task] = thread
         thread.start()
 
+    def _run(self, task: str, do: Callable[[], None]) -> None:
+        try:
+            do()
+        except (EpisodicError, OSError) as error:
+            self._faults[task] = str(error)
+        else:
+            self._faults.pop(task, None)
+
     def _is_under_way(self, task: str) -> bool:
         thread = self._threads.get(task)
         return thread is not None and thread.is_alive()
-
-
-def _reported(task: str, do: Callable[[], None]) -> None:
-    try:
-        do()
-    except (EpisodicError, OSError) as error:
-        _log.error("housekeeping_failed", task=task, reason=str(error))
 
 
 def _named(bag_dir: Path) -> frozenset[Path]:

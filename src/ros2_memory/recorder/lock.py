@@ -63,7 +63,8 @@ class BagDirLock:
 
         Somebody emptied the directory, moved it, or mounted another: what is locked then keeps
         nobody out. The descriptor stays the same number, so that children inherit what it holds.
-        Gives whether it was taken anew. Where that cannot be done, this time nothing is.
+        Gives whether it was taken anew. Where that cannot be done, this time nothing is. On another
+        disk than before no file is made: it may be what lies below the one that was unmounted.
 
         Raises:
             RecorderError: another recorder has taken it since, and the sentence says who.
@@ -71,7 +72,9 @@ class BagDirLock:
         try:
             if not self._path.parent.is_dir() or _is_file(self._path, self.descriptor):
                 return False
-            descriptor = os.open(self._path, _FLAGS, 0o644)
+            at_home = self._path.parent.stat().st_dev == os.fstat(self.descriptor).st_dev
+            flags = _FLAGS if at_home else _FLAGS & ~os.O_CREAT
+            descriptor = os.open(self._path, flags, 0o644)
         except OSError:
             return False
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 
@@ -51,6 +52,9 @@ class Housekeeper(Protocol):
     def apply(self, bag_dir: Path) -> None:
         """Deletes what is beyond the budget or too old. Called when splits have been closed."""
 
+    def faults(self) -> Mapping[str, str]:
+        """By task (`make_room`, `apply`) why it failed the last time, where it went on unseen."""
+
 
 class NoHousekeeping:
     """Repairs and deletes nothing."""
@@ -67,3 +71,7 @@ class NoHousekeeping:
 
     def apply(self, bag_dir: Path) -> None:
         """Does nothing."""
+
+    def faults(self) -> Mapping[str, str]:
+        """None."""
+        return {}

@@ -148,7 +148,7 @@ class Supervisor:
         self._mind_all(now)
         if self._is_due("beat", self._orders.heartbeat_s, now):
             self._beat()
-        else:
+        elif not self._away:
             self._pulse.beat_if_news(self._state, self._crew)
 
     def stop(self) -> None:
@@ -156,10 +156,10 @@ class Supervisor:
         if self._stopped:
             return
         self._stopped = True
-        self._pulse.beat(RecorderState.STOPPING, self._crew)
+        self._beat(RecorderState.STOPPING)
         self._crew.end(self._now())
         self._paused = False
-        self._pulse.beat(RecorderState.STOPPED, self._crew)
+        self._beat(RecorderState.STOPPED)
 
     def _mind_all(self, now: Moment) -> None:
         tasks: dict[str, Callable[[Moment], object]] = {
@@ -197,7 +197,6 @@ class Supervisor:
                 "lies there; recording resumes by itself when it is mounted again (to record onto "
                 "the other one, start the recorder anew)",
             )
-            self._beat()
         elif before and not self._away:
             self._put_off("restart", self._backoff.failed(0.0), now)
             self._journal.note("disk_back", bag_dir=str(self._bag_dir))
@@ -327,6 +326,7 @@ class Supervisor:
         self._keep("make_room", lambda: self._housekeeper.make_room(self._bag_dir, wanted))
 
     def _keep_house(self, now: Moment) -> None:
+        self._tell_of_house()
         every_s = HOUSE_S if self._splits_closed else QUIET_HOUSE_S
         if self._away or now.monotonic_s - self._house_kept_s < every_s:
             return
@@ -341,7 +341,13 @@ class Supervisor:
         except (EpisodicError, OSError) as error:
             self._journal.fail_once("housekeeping_failed", task, str(error), task=task)
         else:
-            self._journal.over("housekeeping_failed", task)
+            if task not in self._housekeeper.faults():
+                self._journal.over("housekeeping_failed", task)
+
+    def _tell_of_house(self) -> None:
+        """Reports what the housekeeper could not do where nobody waited for it."""
+        for task, sentence in self._housekeeper.faults().items():
+            self._journal.fail_once("housekeeping_failed", task, sentence, task=task)
 
     def _announce(self, name: str) -> None:
         self._pulse.announce(name)
@@ -349,8 +355,10 @@ class Supervisor:
         # It stays in that heartbeat until the next, and then is one of the crew's.
         self._pulse.arrived()
 
-    def _beat(self) -> None:
-        self._pulse.beat(self._state, self._crew)
+    def _beat(self, state: RecorderState | None = None) -> None:
+        # Below where the bags' own disk is unmounted nothing is written, as nothing is recorded.
+        if not self._away:
+            self._pulse.beat(state or self._state, self._crew)
 
     @property
     def _state(self) -> RecorderState:
