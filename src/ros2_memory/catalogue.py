@@ -131,6 +131,10 @@ class Catalogue:
         """Whether two numbers are of one file: those of another say nothing of this one."""
         return self._base.is_same(number, other)
 
+    def is_current(self, number: int) -> bool:
+        """Whether a number is of the file that is open, and of none that was open before."""
+        return self._base.is_same(number, self._base.first)
+
     def newest(self) -> int:
         """The greatest number of any entry: it grows with each one that is added, by whomever."""
 

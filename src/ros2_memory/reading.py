@@ -62,8 +62,11 @@ class Reading:
         recall = self.memory.recall
         if recall is None:
             return None
+        settled = recall.settled(run)
+        if settled is not None:
+            return settled
         if self._as_of is None:
-            # Once for each question, and only for one that the catalogue can bear on.
+            # Once for each question, and only where the catalogue may have come to know more.
             self._as_of = recall.as_of()
         return recall.notes(run, self._as_of)
 

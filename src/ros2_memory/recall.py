@@ -151,6 +151,17 @@ class Recall:
                 self._runs[run] = known
         return known
 
+    def settled(self, run: Run) -> RunNotes | None:
+        """The notes on a run that speak of all its bags: no state of the catalogue adds to them.
+
+        None where there are none yet. Asks nothing of the catalogue's file.
+        """
+        with self._lock:
+            known = self._runs.get(run)
+        if known is None or not known.whole or not self.catalogue.is_current(known.as_of):
+            return None
+        return known
+
     def remembered(self, question: str, numbers: Sequence[int]) -> str | None:
         """What was once worked out from these entries."""
         return self.catalogue.remembered(question, numbers)

@@ -173,3 +173,8 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
             and topic.first < window.stop
             and topic.last >= start
         )
+
+
+def test_a_timeline_to_which_nothing_happens_stays_itself() -> None:
+    timeline = Timeline.of([_bag("a", ("/odom", 0, 9))])
+    assert timeline.changed([], iter(())) is timeline

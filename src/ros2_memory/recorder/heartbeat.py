@@ -13,6 +13,7 @@ import json
 import os
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.errors import RecorderError
@@ -84,7 +85,7 @@ class HeartbeatReading(NamedTuple):
 def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
     """What the recorder last wrote into `recorder.json`, live or not. Raises nothing."""
     try:
-        text = read_small_file(bag_dir / HEARTBEAT_FILE)
+        text = read_small_file(f"{bag_dir}/{HEARTBEAT_FILE}")
         return HeartbeatReading(_parsed(text), None)
     except FileNotFoundError:
         return HeartbeatReading(None, f"there is no {HEARTBEAT_FILE}: no recorder has written here")
@@ -135,6 +136,8 @@ def _overwritten(target: Path, data: bytes) -> bool:
         os.close(descriptor)
 
 
+# Read for every question about now, and written every few seconds.
+@lru_cache(4)
 def _parsed(text: str) -> Heartbeat:
     """The heartbeat in the text; a ValueError or TypeError names the key that is wrong."""
     value: object = json.loads(text)

@@ -55,7 +55,7 @@ def write_all_durably(texts: Mapping[Path, str]) -> None:
         raise
 
 
-def open_plain(path: Path) -> BinaryIO:
+def open_plain(path: Path | str) -> BinaryIO:
     """Opens a regular file for reading. Never waits, as opening a FIFO would; follows no link.
 
     Raises:
@@ -69,7 +69,7 @@ def open_plain(path: Path) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
-def read_small_file(path: Path) -> str:
+def read_small_file(path: Path | str) -> str:
     """The text of a small regular file. Never waits, as opening a FIFO would.
 
     Raises:

@@ -252,11 +252,14 @@ class Timeline:
         return cls(_runs_of(sorted(bags, key=in_time)))
 
     def changed(self, removed: Iterable[BagFile], added: Iterable[BagFile]) -> Timeline:
-        """This timeline without some of its bags and with some others.
+        """This timeline without some of its bags and with some others; itself where none are.
 
         Raises:
             ValueError: a removed bag is not in it.
         """
+        removed, added = tuple(removed), tuple(added)
+        if not removed and not added:
+            return self
         if not self._runs:
             return Timeline.of(added)
         firsts = self._firsts
