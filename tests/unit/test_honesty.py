@@ -13,7 +13,7 @@ from ros2_memory.memory import Call, Limits
 from ros2_memory.replies import Replies
 from ros2_memory.timebase import FixedClock
 from ros2_memory.tools import build_tools
-from tests.bags import McapLayout, boolean, detections, odom, tf, transform, write_mcap
+from tests.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
 from tests.mcap_surgery import spoil_chunk
 from tests.memories import memory_of
 from tests.recalled import recalling
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.memory import Memory
-    from tests.bags import Msg
 
 S = 10**9
 T0_S = 1_784_023_200
@@ -220,17 +219,21 @@ def test_a_chunk_that_is_lost_of_a_closed_bag_is_told_in_windows_that_touch_the_
 def test_what_does_not_answer_is_listed_with_reasons(tmp_path: Path) -> None:
     tear(write_splits(tmp_path, 3)[1])
     write_mcap(tmp_path / "boot" / "boot_0.mcap", [odom(0, 0, 0), odom(5 * S, 1, 0)])
-    write_mcap(
-        tmp_path / "odd" / "odd_0.mcap",
-        [odom(T0, 0, 0, topic="/other")],
-        McapLayout(definitions=False),
-    )
+    foreign = Msg("/foreign", "nobody_msgs/msg/Unknown", T0 + 5 * S, b"\x00\x01\x00\x00abc")
+    write_mcap(tmp_path / "odd" / "odd_0.mcap", [foreign], McapLayout(definitions=False))
     memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
     told = asked(memory, tmp_path, "data_time_range")
     assert (told["earliest"], told["latest"]) == (at(0), at(29))
     assert [each["file"] for each in told["damaged"]] == ["rec/rec_1.mcap"]
     assert [each["file"] for each in told["clock_faults"]] == ["boot/boot_0.mcap"]
+    [undecodable] = told["undecodable"]
+    assert (undecodable["topic"], undecodable["type"]) == ("/foreign", "nobody_msgs/msg/Unknown")
+    assert undecodable["reason"]
     assert all(gap["start"] >= at(0) for gap in told["gaps"])
+    rows = asked(memory, tmp_path, "list_recorded_topics")
+    [odometry] = [row for row in rows if row["topic"] == "/odom"]
+    assert odometry["first_ts"] == 0.0
+    assert odometry["notes"][0].startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
 
 
 def test_what_a_wrong_clock_dated_is_found_by_its_times_and_told_so(tmp_path: Path) -> None:

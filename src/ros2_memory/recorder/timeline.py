@@ -121,7 +121,7 @@ class Run:
     def odd(self) -> tuple[BagFile, ...]:
         """The bags of which not all could be read, or that contradict themselves."""
         return tuple(
-            bag for bag in self.bags if bag.state is BagState.INCOMPLETE or bag.summary.notes
+            bag for bag in self.bags if bag.summary.shape.notes or bag.state is BagState.INCOMPLETE
         )
 
     @cached_property
