@@ -95,7 +95,11 @@ class Dispatcher:
         outcome, chars = "cancelled", 0
         with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
             try:
-                outcome, reply = await self._outcome(name, given, call, client)
+                try:
+                    outcome, reply = await self._outcome(name, given, call, client)
+                except Exception:
+                    log.exception("tool_failed")
+                    outcome, reply = self._fault()
                 chars = len(reply.text)
             finally:
                 over.set()
@@ -159,6 +163,14 @@ class Dispatcher:
         """Runs in a worker thread: the query, and the rendering of what it gives."""
         waits.end()
         try:
+            return self._told(question, call, waits)
+        except Exception:
+            # Here too, for a thread that nobody waits for any more.
+            log.exception("tool_failed")
+            return self._fault()
+
+    def _told(self, question: Question, call: Call, waits: _Waits) -> tuple[str, Reply]:
+        try:
             return "ok", self._replies.answer(question(self._memory, call))
         except NoDataError as error:
             return f"{error.code}: {error.reason}", self._replies.error(error)
@@ -167,10 +179,11 @@ class Dispatcher:
             return told.code, self._replies.error(told)
         except EpisodicError as error:
             return error.code, self._replies.error(error)
-        except Exception:
-            log.exception("tool_failed")
-            context = structlog.contextvars.get_contextvars()
-            return "internal", self._replies.internal(str(context.get("correlation_id")))
+
+    def _fault(self) -> tuple[str, Reply]:
+        """The reply to a call that failed through a fault of this program."""
+        context = structlog.contextvars.get_contextvars()
+        return "internal", self._replies.internal(str(context.get("correlation_id")))
 
 
 class _Waits:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections import Counter
 from contextlib import suppress
 from itertools import count
@@ -78,11 +79,26 @@ def hostile_bodies() -> Iterator[tuple[bytes, str]]:
     yield b"\xff\xfe\x00", ""
 
 
+def modern(body: bytes) -> tuple[bytes, str]:
+    """The request in the protocol of 2026, which another parser of the library reads."""
+    about = (
+        b'"params": {"_meta": {"io.modelcontextprotocol/protocolVersion": "2026-07-28", '
+        b'"io.modelcontextprotocol/clientCapabilities": {}}, '
+    )
+    named = re.search(rb'"name": "([^"]{0,100})"', body)
+    name = named[1].decode() if named else "none"
+    return body.replace(b'"params": {', about, 1), (
+        f"mcp-protocol-version: 2026-07-28\r\nmcp-method: tools/call\r\nmcp-name: {name}\r\n"
+    )
+
+
 async def hostile(port: int) -> Seen:
     """Each is answered with what is wrong in it, shortly."""
     seen: Seen = Counter()
-    for body, wrong in hostile_bodies():
-        status, told = await posted(port, body)
+    bodies = [(body, "", wrong) for body, wrong in hostile_bodies()]
+    bodies += [(*modern(body), wrong) for body, wrong in hostile_bodies()]
+    for body, more, wrong in bodies:
+        status, told = await posted(port, body, more=more)
         if status == 202:  # taken for a notification, which has no answer
             seen["accepted"] += 1
             continue

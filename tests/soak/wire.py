@@ -70,10 +70,10 @@ async def answer(reader: asyncio.StreamReader) -> tuple[int, bytes]:
         return status, await reader.readexactly(lengths[0]) if lengths else b""
 
 
-async def posted(port: int, body: bytes, path: str = "/mcp") -> tuple[int, bytes]:
+async def posted(port: int, body: bytes, path: str = "/mcp", more: str = "") -> tuple[int, bytes]:
     """The answer to one request on a connection of its own."""
     async with connected(port) as (reader, writer):
-        writer.write(head("POST", path, len(body)) + body)
+        writer.write(head("POST", path, len(body), more) + body)
         return await answer(reader)
 
 

@@ -15,11 +15,17 @@ from structlog.testing import LogCapture
 from ros2_memory import answers
 from ros2_memory.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher, EpisodicServer
 from ros2_memory.entries import Tool
-from ros2_memory.errors import InvalidArgumentsError, NoDataError, NoDataReason, QueryTimeoutError
+from ros2_memory.errors import (
+    EpisodicError,
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    QueryTimeoutError,
+)
 from ros2_memory.lanes import MOST_WAITING
 from ros2_memory.memory import Memory
 from ros2_memory.model import Sample
-from ros2_memory.replies import Replies
+from ros2_memory.replies import Replies, Reply
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -161,6 +167,24 @@ async def test_a_fault_is_logged_and_told_without_its_inside(
     assert failed["exc_info"] is True
     assert failed["correlation_id"] == called["correlation_id"]
     assert failed["correlation_id"] in told(result)["detail"]
+
+
+class BrokenReplies(Replies):
+    def error(self, error: EpisodicError) -> Reply:
+        raise KeyError("secret")
+
+
+@pytest.mark.parametrize("given", [{}, {"bad": 1}])
+async def test_a_fault_in_telling_an_error_is_told_as_any_other(
+    given: dict[str, Any], log: LogCapture
+) -> None:
+    tools = [tool("none", raising(NoDataError(NoDataReason.GAP, "a hole")))]
+    replies = BrokenReplies(Path("bags"), 24_000)
+    reply = await Dispatcher(NOBODY, tools, replies, call_timeout_s=25).answer("none", given)
+    assert reply.is_error
+    assert json.loads(reply.text)["error"] == "internal"
+    assert "secret" not in reply.text
+    assert [entry["event"] for entry in log.entries] == ["tool_failed", "tool_call"]
 
 
 async def test_each_call_is_logged_once_with_its_outcome_and_times(log: LogCapture) -> None:
