@@ -1,0 +1,1 @@
+"""Damages good bags in every way there is, and asks questions beside them."""

@@ -1,0 +1,184 @@
+"""Runs mutants through child processes, and adds up what became of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Final
+
+from tests.fuzz.classes import Job
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+HANG_S: Final = 60.0
+"""After so long without a word a child hangs: it asks seven questions, of 10 s each at most."""
+_ROOT: Final = Path(__file__).resolve().parents[2]
+_MOST_FAULTS: Final = 200
+_MOST_LEFT_MB: Final = 200
+
+
+@dataclass
+class Tally:
+    """What became of the mutants of one class."""
+
+    name: str
+    mutants: int = 0
+    served: int = 0
+    reasons: int = 0
+    questions: int = 0
+    crashes: int = 0
+    hangs: int = 0
+    faults: int = 0
+    peak_mb: float = 0.0
+    slowest_s: float = 0.0
+    cpu_s: float = 0.0
+    digest_s: float = 0.0
+    recover_s: float = 0.0
+    found: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, verdict: dict[str, Any]) -> None:
+        """Counts one verdict in."""
+        self.mutants += 1
+        if verdict.get("died"):
+            self.crashes += verdict["died"] == "crash"
+            self.hangs += verdict["died"] == "hang"
+        else:
+            self.served += verdict["served"]
+            self.reasons += not verdict["served"]
+            self.questions += verdict["asked"]
+            self.peak_mb = max(self.peak_mb, verdict["peak_mb"])
+            self.slowest_s = max(self.slowest_s, verdict["seconds"])
+            self.cpu_s = max(self.cpu_s, verdict["cpu_s"])
+            self.digest_s = max(self.digest_s, verdict["digest_s"])
+            self.recover_s = max(self.recover_s, verdict["recover_s"])
+        if verdict["faults"]:
+            self.faults += 1
+            if len(self.found) < _MOST_FAULTS:
+                self.found.append(verdict)
+
+
+class Child:
+    """One worker process in a folder of its own; a context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.fuzz.worker", str(folder)],
+            cwd=_ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "TMPDIR": str(folder)},
+        )
+        self._kept = b""
+
+    def close(self) -> None:
+        """Ends it."""
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                with suppress(OSError):
+                    stream.close()
+        self.kill()
+
+    def kill(self) -> None:
+        """Has it die at once."""
+        self._process.kill()
+        self._process.wait()
+
+    def try_one(self, job: Job) -> dict[str, Any]:
+        """The verdict, or what the child died of."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps(asdict(job)).encode() + b"\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            return self._died(job, "crash")
+        while True:
+            line = self._line()
+            if line is None:
+                return self._died(job, "hang")
+            if not line:
+                return self._died(job, "crash")
+            told: dict[str, Any] = json.loads(line)
+            if "begun" not in told:
+                return told
+
+    def _died(self, job: Job, how: str) -> dict[str, Any]:
+        self.close()
+        reason = f"{how}: exit code {self._process.returncode}"
+        return {**asdict(job), "died": how, "faults": [reason]}
+
+    def _line(self) -> bytes | None:
+        """The next line; empty at its end, None where it says nothing for too long."""
+        assert self._process.stdout is not None
+        while b"\n" not in self._kept:
+            ready, _, _ = select.select([self._process.stdout], [], [], HANG_S)
+            if not ready:
+                return None
+            piece = os.read(self._process.stdout.fileno(), 1 << 16)
+            if not piece:
+                return b""
+            self._kept += piece
+        line, _, self._kept = self._kept.partition(b"\n")
+        return line
+
+
+def run(jobs: Iterable[Job]) -> Iterator[dict[str, Any]]:
+    """The verdicts; a child that died is replaced, and its mutant tried once more alone."""
+    with TemporaryDirectory(prefix="ros2-memory-fuzz-") as root:
+        child, made = None, 0
+        try:
+            for job in jobs:
+                if child is None:
+                    made += 1
+                    child = Child(_folder(root, made))
+                verdict = child.try_one(job)
+                if verdict.get("died"):
+                    # Alone: whether it is this one, or what the ones before had left behind.
+                    made += 1
+                    child = Child(_folder(root, made))
+                    again = child.try_one(job)
+                    if again.get("died"):
+                        child = None
+                    else:
+                        verdict["faults"].append("not when it is tried alone")
+                elif verdict["left_mb"] > _MOST_LEFT_MB and child is not None:
+                    # What one mutant leaves behind must not be counted as the next one's.
+                    child.close()
+                    child = None
+                yield verdict
+        finally:
+            if child is not None:
+                child.close()
+
+
+def _folder(root: str, number: int) -> Path:
+    folder = Path(root) / str(number)
+    folder.mkdir()
+    return folder
+
+
+def campaign(
+    names: Sequence[str],
+    mutants: int,
+    seed: int,
+    *,
+    first: int = 0,
+    tell: Callable[[Tally], None] = lambda _tally: None,
+) -> list[Tally]:
+    """Tries so many mutants of each class; `tell` hears of each class when it is done."""
+    jobs = (Job(name, number, seed) for name in names for number in range(first, first + mutants))
+    tallies: list[Tally] = []
+    for verdict in run(jobs):
+        if not tallies or tallies[-1].name != verdict["name"]:
+            tallies.append(Tally(verdict["name"]))
+        tallies[-1].add(verdict)
+        if tallies[-1].mutants == mutants:
+            tell(tallies[-1])
+    return tallies

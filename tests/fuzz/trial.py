@@ -1,0 +1,321 @@
+"""One mutant beside two good bags: asked, digested, sometimes recovered, and judged."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import os
+import shutil
+import time
+import traceback
+from contextlib import redirect_stderr, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import structlog
+
+from ros2_memory import cli
+from ros2_memory.bootstrap import build_filler, build_memory, build_server
+from ros2_memory.config import load_settings
+from ros2_memory.errors import EpisodicError
+from ros2_memory.indexing import Bar, fill
+from ros2_memory.model import BagState, TimeWindow
+from ros2_memory.recovery import recover
+from tests.fuzz.asking import OF_GOOD, ask, comparable, of_mutant
+from tests.fuzz.good import neighbours
+from tests.fuzz.mutant import LONG_AGO_S
+from tests.fuzz.traps import sprung
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, MutableMapping
+
+    from ros2_memory.dispatch import EpisodicServer
+    from ros2_memory.memory import Memory
+    from ros2_memory.settings import Settings
+    from tests.fuzz.classes import Job
+    from tests.fuzz.mutant import Mutant
+
+MOST_S: Final = 10.0
+MOST_MB: Final = 512
+_ASKED_OF_GOOD: Final = 2
+_ASKED_OF_MUTANT: Final = 4
+_RECOVERED_EVERY: Final = 4
+_INDEXED_EVERY: Final = 50
+_MOST_COUNTED: Final = 20_000
+_SERVED_AT_MOST: Final = 20
+
+
+@dataclass
+class Verdict:
+    """What became of one mutant. `faults` are what must not happen.
+
+    `seconds` are of the slowest question by the clock on the wall; the others are of the processor,
+    since a machine that is busy otherwise is no fault.
+    """
+
+    served: bool = False
+    state: str = ""
+    asked: int = 0
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    digest_s: float = 0.0
+    recover_s: float = 0.0
+    peak_mb: float = 0.0
+    left_mb: float = 0.0
+    faults: list[str] = field(default_factory=list)
+
+
+class World:
+    """A bag directory with two good bags, one storage, with a catalogue or without."""
+
+    def __init__(self, root: Path, storage: str, *, catalogue: bool) -> None:
+        self.bag_dir = root / f"bags {storage} {catalogue}"
+        self.settings: Settings = load_settings(
+            [f"storage={storage}", "recorder=none", f"recording.bag_dir='{self.bag_dir}'"], env={}
+        )
+        self.storage = storage
+        self.catalogue = catalogue
+        self.clear()
+        self._known: list[Any] = []
+        self._served = 0
+        self._memory = build_memory(self.settings)
+        self._server = build_server(self.settings, self._memory)
+
+    def clear(self) -> None:
+        """Removes all that is not one of the two good bags."""
+        self.bag_dir.mkdir(exist_ok=True)
+        good = {name.split("/")[0] for name in neighbours()}
+        for entry in self.bag_dir.iterdir():
+            if entry.name not in good:
+                _remove(entry)
+        for name, data in neighbours().items():
+            path = self.bag_dir / name
+            if not path.is_file():
+                path.parent.mkdir(exist_ok=True)
+                path.write_bytes(data)
+                os.utime(path, (LONG_AGO_S, LONG_AGO_S))
+
+    def serving(self) -> tuple[Memory, EpisodicServer]:
+        """A memory and a server; the same for some mutants, as a server outlives its bags."""
+        self._served += 1
+        if self._served % _SERVED_AT_MOST == 0:
+            self._memory = build_memory(self.settings)
+            self._server = build_server(self.settings, self._memory)
+        self._memory.index.refresh()
+        return self._memory, self._server
+
+    def answers(self) -> list[Any]:
+        """What the good bags answer when they are alone."""
+        if not self._known:
+            _, server = self.serving()
+            self._known = [
+                comparable(asyncio.run(ask(server, name, given))) for name, given in OF_GOOD
+            ]
+            for answer in self._known:
+                if answer is None or "error" in answer:
+                    raise AssertionError(f"the good bags do not answer: {answer}")
+        return self._known
+
+
+def tried(world: World, job: Job, mutant: Mutant) -> Verdict:
+    """Lays the mutant down, asks, and judges; takes it away again."""
+    verdict = Verdict()
+    world.clear()
+    with _failures_in(verdict.faults):
+        known = world.answers()
+    bag = mutant.place(world.bag_dir, job.place)
+    # What was used to make it is not the program's.
+    reset_peak()
+    with _failures_in(verdict.faults), sprung(mutant.trap, bag):
+        try:
+            asyncio.run(_asked(world, job, known, bag, verdict, trapped=mutant.trap is not None))
+            if job.number % _RECOVERED_EVERY == 0:
+                _recovered(world, verdict)
+            if job.number % _INDEXED_EVERY == 0:
+                _indexed(world)
+        except Exception:  # noqa: BLE001  whatever it is, it is what is looked for
+            verdict.faults.append(f"raised: {traceback.format_exc()[-1500:]}")
+    verdict.peak_mb = peak_mb()
+    verdict.left_mb = resident_mb()
+    if verdict.peak_mb > MOST_MB:
+        verdict.faults.append(f"memory: {verdict.peak_mb:.0f} MB")
+    world.clear()
+    return verdict
+
+
+async def _asked(
+    world: World, job: Job, known: list[Any], bag: Path, verdict: Verdict, *, trapped: bool
+) -> None:
+    memory, server = world.serving()
+    rng = job.rng
+    if world.catalogue and job.number % 2:
+        _digested(world, memory, verdict)
+    for name, given in of_mutant(rng)[:_ASKED_OF_MUTANT]:
+        await _timed(server, name, given, verdict)
+    told = await _timed(server, "data_time_range", {}, verdict)
+    _look_for(memory, bag, told, verdict, trapped=trapped)
+    if world.catalogue and not job.number % 2:
+        _digested(world, memory, verdict)
+    for at in rng.sample(range(len(OF_GOOD)), _ASKED_OF_GOOD):
+        name, given = OF_GOOD[at]
+        answer = comparable(await _timed(server, name, given, verdict))
+        if answer != known[at]:
+            verdict.faults.append(
+                f"good bags answer otherwise: {name} {str(answer)[:300]},"
+                f" not {str(known[at])[:300]}"
+            )
+
+
+async def _timed(server: EpisodicServer, name: str, given: dict[str, Any], verdict: Verdict) -> Any:
+    begun, busy = time.monotonic(), time.process_time()
+    try:
+        answer = await ask(server, name, given)
+    except Exception as error:  # noqa: BLE001
+        verdict.faults.append(f"no reply: {name}: {error!r}"[:500])
+        answer = None
+    spent = time.process_time() - busy
+    verdict.asked += 1
+    verdict.seconds = max(verdict.seconds, time.monotonic() - begun)
+    verdict.cpu_s = max(verdict.cpu_s, spent)
+    if spent > MOST_S:
+        verdict.faults.append(f"slow: {name} {given} took {spent:.1f} s")
+    if isinstance(answer, dict) and answer.get("error") in {"internal", "timeout"}:
+        verdict.faults.append(f"{answer['error']}: {name} {given}")
+    if isinstance(answer, dict) and "error" in answer and not answer.get("detail"):
+        verdict.faults.append(f"no reason: {name} {answer}")
+    return answer
+
+
+def _look_for(memory: Memory, bag: Path, told: Any, verdict: Verdict, *, trapped: bool) -> None:
+    """Whether the mutant answers, or is listed with a reason."""
+    snapshot = memory.index.snapshot()
+    served = {each.path: each for each in snapshot.bags}
+    aside = {each.path: each for each in (*snapshot.active, *snapshot.damaged, *snapshot.unread)}
+    if bag in served:
+        verdict.served = True
+        verdict.state = served[bag].state.value
+        if not trapped:
+            _count(memory, bag, served[bag].summary.notes, verdict)
+        incomplete = isinstance(told, dict) and told.get("incomplete")
+        if served[bag].state is BagState.INCOMPLETE and not incomplete:
+            verdict.faults.append("an incomplete bag is not listed")
+        return
+    if bag in aside:
+        verdict.state = aside[bag].reason[:160]
+        if not aside[bag].reason:
+            verdict.faults.append("set aside without a reason")
+        if not isinstance(told, dict) or not any(
+            told.get(each) for each in ("damaged", "unread", "active")
+        ):
+            verdict.faults.append(f"set aside, and not listed: {str(told)[:300]}")
+        return
+    verdict.state = "empty" if snapshot.empty else "absent"
+    # A folder may be called as it likes.
+    if trapped or bag.is_dir() or not (bag.exists() or bag.is_symlink()):
+        return
+    if not snapshot.empty:
+        verdict.faults.append("silently absent")
+    else:
+        summary = memory.reader.summarize(bag)
+        if not summary.empty or summary.notes:
+            verdict.faults.append(f"counts as empty: {summary}"[:500])
+
+
+def _count(memory: Memory, bag: Path, notes: tuple[str, ...], verdict: Verdict) -> None:
+    """Whether a bag of which nothing is said holds what its summary states."""
+    summary = memory.reader.summarize(bag)
+    if notes or not summary.complete or summary.count > _MOST_COUNTED:
+        return
+    topics = {each.topic for each in summary.topics}
+    try:
+        read = sum(1 for _ in memory.reader.records(bag, topics, TimeWindow.everything()))
+    except EpisodicError:
+        return
+    if read != summary.count:
+        verdict.faults.append(f"states {summary.count} messages, gives {read}, says nothing")
+
+
+def _digested(world: World, memory: Memory, verdict: Verdict) -> None:
+    begun = time.process_time()
+    fill(build_filler(world.settings, memory), Bar(io.StringIO()), lambda: False)
+    verdict.digest_s = time.process_time() - begun
+    if verdict.digest_s > MOST_S:
+        verdict.faults.append(f"slow: digesting took {verdict.digest_s:.1f} s")
+
+
+def _recovered(world: World, verdict: Verdict) -> None:
+    begun = time.process_time()
+    with suppress(EpisodicError):
+        recover(world.bag_dir, _quiet, force=True, stream=io.StringIO())
+    verdict.recover_s = time.process_time() - begun
+    if verdict.recover_s > MOST_S:
+        verdict.faults.append(f"slow: recovering took {verdict.recover_s:.1f} s")
+
+
+def _indexed(world: World) -> None:
+    with redirect_stderr(io.StringIO()):
+        code = cli.main(
+            [
+                "index",
+                f"storage={world.storage}",
+                "recorder=none",
+                f"recording.bag_dir='{world.bag_dir}'",
+            ]
+        )
+    if code:
+        raise AssertionError(f"ros2-memory index ended with {code}")
+
+
+def _quiet(_line: str) -> None:
+    pass
+
+
+class _failures_in:  # noqa: N801  reads as the statement that it is
+    """Within the block what the program logs as its own failure is a fault."""
+
+    def __init__(self, faults: list[str]) -> None:
+        self._faults = faults
+
+    def __enter__(self) -> None:
+        structlog.configure(processors=[self._heard], cache_logger_on_first_use=False)
+
+    def __exit__(self, *_: object) -> None:
+        structlog.reset_defaults()
+
+    def _heard(
+        self, _logger: object, _method: str, event: MutableMapping[str, Any]
+    ) -> Mapping[str, Any]:
+        if event.get("exc_info"):
+            told = traceback.format_exc()
+            self._faults.append(f"{event['event']}: {told[-1500:]}")
+        raise structlog.DropEvent
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+
+
+def reset_peak() -> None:
+    """Has the peak of this process's memory measured anew (proc(5), clear_refs)."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def peak_mb() -> float:
+    """The most memory that this process had since the last reset, in MB of 2^20 bytes."""
+    return _status_mb("VmHWM:")
+
+
+def resident_mb() -> float:
+    """The memory that this process has."""
+    return _status_mb("VmRSS:")
+
+
+def _status_mb(name: str) -> float:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(name):
+            return int(line.split()[1]) / 1024
+    return 0.0
