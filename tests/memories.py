@@ -20,6 +20,8 @@ from ros2_memory.timebase import NS_PER_S, Clock
 if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
+LAST_WRITTEN = 1_800_000_000 * NS_PER_S
+"""Tests date no bag later, unless that is what they test."""
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -50,10 +52,11 @@ def memory_of(
 ) -> Memory:
     """The memory over `bag_dir`, rescanned at every question.
 
-    Unless a clock is given it is an hour later: what is unfinished was left so by a crash.
+    Unless a clock is given it is later by an hour, and than all that tests write: what is
+    unfinished was left so by a crash, and nothing is dated in the future.
     """
     if reader is None:
         reader = McapReader() if storage == "mcap" else Rosbag2Reader()
-    timed = clock or SettableClock(time.time_ns() + 3600 * NS_PER_S)
+    timed = clock or SettableClock(max(time.time_ns(), LAST_WRITTEN) + 3600 * NS_PER_S)
     index = IndexManager(bag_dir, reader, timed, refresh_s=0.0, split_duration_s=10.0)
     return Memory(index, reader, extractor(), timed, limits or Limits())

@@ -131,6 +131,27 @@ class TestRetention:
         keeper_of(tmp_path, max_age_h=2).apply(tmp_path)
         assert files_in(tmp_path) == ["a", "a/a_0.mcap"]
 
+    def test_a_wrong_clock_neither_deletes_a_bag_before_its_time_nor_keeps_it_for_good(
+        self, tmp_path: Path
+    ) -> None:
+        bags = {name: bag(tmp_path / f"{name}/{name}_0.mcap", 0) for name in ("old", "new")}
+        ten_years = 87_600 * HOUR
+        for name, dated, written in (
+            ("old", T0, T0),
+            ("new", T0 + HOUR, T0 + HOUR),
+            ("boot", 40 * S, T0 + HOUR // 2),
+            ("ahead", T0 + ten_years, T0 + ten_years),
+        ):
+            bags[name] = bag(tmp_path / f"{name}/{name}_0.mcap", (dated - T0) // S)
+            os.utime(bags[name], ns=(written, written))
+        size = bags["old"].stat().st_size
+        left = []
+        for count in (3, 2, 1):
+            keeper = keeper_of(tmp_path, max_bytes=count * size + size // 2, max_age_h=168)
+            keeper.apply(tmp_path)
+            left.append([name for name, path in bags.items() if path.exists()])
+        assert left == [["old", "new", "boot"], ["new", "boot"], ["new"]]
+
     def test_a_plain_bag_goes_with_its_unfinished_compressed_form(self, tmp_path: Path) -> None:
         first, *_ = recording(tmp_path, "a", 0)
         packed = zstandard.compress(first.read_bytes())
