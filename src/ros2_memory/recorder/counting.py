@@ -12,8 +12,14 @@ from dataclasses import replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.errors import BagUnreachableError
 from ros2_memory.model import BagSummary, TimeWindow, TopicSummary
-from ros2_memory.recorder.handover import Handover, HandoverReading, read_handover
+from ros2_memory.recorder.handover import (
+    Handover,
+    HandoverReading,
+    read_handover,
+    sure_handover,
+)
 from ros2_memory.recorder.layout import HANDOVER_FILE
 from ros2_memory.storage.base import BagReader
 
@@ -134,20 +140,28 @@ class CountingReader(BagReader):
         return [record.log_time for record in self.records(path, [topic], window)]
 
     def _handover(self, path: Path) -> HandoverReading:
-        """The sidecar of a file's recording; parsed again when it is another one than before."""
+        """The sidecar of a file's recording; parsed again when it is another one than before.
+
+        Raises:
+            BagUnreachableError: the disk fails: which messages count is not known.
+        """
         file = str(path)
         sidecar = file[: file.rfind("/") + 1] + HANDOVER_FILE
         try:
             stat = os.stat(sidecar)  # noqa: PTH116 - before every reading; a Path costs more
+            stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+            known = self._known.get(sidecar)
+            if known is not None and known[0] == stamp:
+                return known[1]
+            reading = sure_handover(path.parent)
         except (FileNotFoundError, NotADirectoryError):
             return _NONE
-        except OSError:
+        except PermissionError:
             return read_handover(path.parent)
-        stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
-        known = self._known.get(sidecar)
-        if known is not None and known[0] == stamp:
-            return known[1]
-        reading = read_handover(path.parent)
+        except OSError as error:
+            # Taken for missing, it would have messages count twice.
+            reason = f"{HANDOVER_FILE} cannot be read: {error.strerror or error}"
+            raise BagUnreachableError(file, reason) from error
         if len(self._known) >= _KNOWN_SIDECARS:
             self._known.clear()
         self._known[sidecar] = (stamp, reading)

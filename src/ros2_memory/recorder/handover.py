@@ -21,6 +21,7 @@ apply `Exclusion` to a latched channel.
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import dataclass
 from enum import StrEnum
@@ -121,6 +122,10 @@ class Exclusion(NamedTuple):
         )
 
 
+_LASTING: Final = frozenset({errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG})
+"""Of a sidecar that cannot be read because of what it is, however often that is tried."""
+
+
 class HandoverReading(NamedTuple):
     """What was read, and what was wrong with it: then everything counts."""
 
@@ -131,16 +136,46 @@ class HandoverReading(NamedTuple):
 def read_handover(recording: Path) -> HandoverReading:
     """What the sidecar of a recording says; without one everything counts. Raises nothing."""
     try:
+        return sure_handover(recording)
+    except OSError as error:
+        return HandoverReading(Handover(), _unreadable(error))
+
+
+def sure_handover(recording: Path) -> HandoverReading:
+    """As `read_handover`, where it must not be taken for missing because a disk fails.
+
+    Raises:
+        OSError: the disk fails, or the machine lacks something.
+    """
+    try:
         text = read_small_file(recording / HANDOVER_FILE)
         return HandoverReading(_parsed(text), None)
     except (FileNotFoundError, NotADirectoryError):
         return HandoverReading(Handover(), None)
     except OSError as error:
-        reason = f"{HANDOVER_FILE} cannot be read: {error.strerror or error}"
+        if error.errno not in _LASTING:
+            raise
+        reason = _unreadable(error)
     # json raises RecursionError for a file of nothing but brackets.
     except (ValueError, RecursionError) as error:
         reason = f"{HANDOVER_FILE} is no sidecar of a recording: {error}"
     return HandoverReading(Handover(), reason)
+
+
+def standing_handover(recording: Path) -> Handover:
+    """What the sidecar of a recording says, to be written anew with a change.
+
+    Raises:
+        RecorderError: the disk fails: what would be written would lose what stands there.
+    """
+    try:
+        return sure_handover(recording).handover
+    except OSError as error:
+        raise RecorderError(f"{recording}: {_unreadable(error)}") from error
+
+
+def _unreadable(error: OSError) -> str:
+    return f"{HANDOVER_FILE} cannot be read: {error.strerror or error}"
 
 
 def write_handover(recording: Path, handover: Handover) -> None:

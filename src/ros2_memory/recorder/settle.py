@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
-from ros2_memory.errors import BagError, RecorderError
+from ros2_memory.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.handover import (
     Counting,
     CutClock,
     Overlap,
     read_handover,
+    standing_handover,
     write_handover,
 )
 from ros2_memory.recorder.rotation import Sidecars, withdrawn
@@ -81,15 +82,18 @@ def settle(old: Path, new: Path, reader: BagReader) -> None:
         _settle(old, new, reader)
     except OSError as error:
         raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
+    except BagUnreachableError as error:
+        # What a disk hides for the moment must not be written down as missing.
+        raise RecorderError(str(error)) from error
     _log.info("handover_settled", recording=old.name, next=new.name)
 
 
 def _settle(old: Path, new: Path, reader: BagReader) -> None:
-    before = read_handover(old).handover
+    before = standing_handover(old)
     if not _is_folder(new):
         write_handover(old, withdrawn(before))
         return
-    after = read_handover(new).handover
+    after = standing_handover(new)
     if after.state is Counting.VOID:
         write_handover(old, withdrawn(before))
     elif after.state is Counting.COUNTS and after.counts_from is not None:
@@ -103,9 +107,15 @@ def _settle(old: Path, new: Path, reader: BagReader) -> None:
 
 
 def cut_clock(bag: Path, reader: BagReader) -> CutClock:
-    """Whether publish times differ from log times in a bag file; they do where it is empty."""
+    """Whether publish times differ from log times in a bag file; they do where it is empty.
+
+    Raises:
+        RecorderError: the disk fails.
+    """
     try:
         records = list(islice(_records(bag, reader), SAMPLE))
+    except BagUnreachableError as error:
+        raise RecorderError(str(error)) from error
     except BagError:
         return CutClock.PUBLISH
     equal = bool(records) and all(each.publish_time == each.log_time for each in records)
@@ -156,6 +166,8 @@ def _reach(recording: Path, reader: BagReader) -> _Reach | None:
                 max(newest.publish_time, record.publish_time),
                 max(newest.log_time, record.log_time),
             )
+    except BagUnreachableError:
+        raise
     except BagError:
         return newest
     return newest
@@ -167,6 +179,8 @@ def _bags(recording: Path, reader: BagReader) -> list[tuple[str, BagSummary]]:
     for path in _files(recording, reader):
         try:
             summary = reader.summarize(path)
+        except BagUnreachableError:
+            raise
         except BagError:
             continue
         if not summary.empty:

@@ -14,7 +14,7 @@ from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.handover import (
     CutClock,
     Handover,
-    read_handover,
+    standing_handover,
     write_handover,
     write_handovers,
 )
@@ -54,7 +54,7 @@ class Takeover:
             RecorderError: it cannot be written.
         """
         directory = old.splits.directory
-        write_handover(directory, intended(read_handover(directory).handover, new_name))
+        write_handover(directory, intended(standing_handover(directory), new_name))
 
     @staticmethod
     def withdraw(old: Session) -> None:
@@ -65,7 +65,7 @@ class Takeover:
         """
         directory = old.splits.directory
         if _is_there(directory):
-            write_handover(directory, withdrawn(read_handover(directory).handover))
+            write_handover(directory, withdrawn(standing_handover(directory)))
 
     @property
     def missing(self) -> frozenset[str]:
@@ -94,7 +94,7 @@ class Takeover:
         if bounds is None:
             return False
         sidecars = handed_over(
-            read_handover(self.old.splits.directory).handover,
+            standing_handover(self.old.splits.directory),
             self.old.name,
             self.new.name,
             bounds,
@@ -128,7 +128,7 @@ class Takeover:
             RecorderError: the sidecar cannot be written.
         """
         directory = self.old.splits.directory
-        handover = read_handover(directory).handover
+        handover = standing_handover(directory)
         if handover.end is not None:
             files = tuple(sorted(self._old_files() | frozenset(handover.end.files)))
             write_handover(directory, replace(handover, end=replace(handover.end, files=files)))

@@ -1,0 +1,77 @@
+"""A sidecar that cannot be read for a moment is not taken for one that is not there."""
+
+from __future__ import annotations
+
+import errno
+import os
+from typing import TYPE_CHECKING, NoReturn
+
+import pytest
+
+from ros2_memory.errors import BagUnreachableError, RecorderError
+from ros2_memory.model import TimeWindow
+from ros2_memory.recorder import handover as handovers
+from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.recorder.handover import Counting, Handover, read_handover, write_handover
+from ros2_memory.recorder.settle import settle, settle_all
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.faults.world import write_bag
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+HIDDEN = Handover(state=Counting.VOID)
+
+
+def fails(_path: Path) -> NoReturn:
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+def test_messages_that_do_not_count_do_not_come_in_because_the_disk_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_bag(tmp_path, 0)
+    write_handover(path.parent, HIDDEN)
+    everything = TimeWindow.everything()
+    reader = CountingReader(McapReader())
+    with monkeypatch.context() as patched:
+        patched.setattr(handovers, "read_small_file", fails)
+        with pytest.raises(BagUnreachableError, match=r"handover\.json cannot be read: Input"):
+            reader.summarize(path)
+        with pytest.raises(BagUnreachableError):
+            list(reader.records(path, ["/odom"], everything))
+    assert list(reader.records(path, ["/odom"], everything)) == []
+    assert reader.summarize(path).empty
+
+
+def test_a_handover_is_not_settled_from_what_a_failing_disk_hides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_bag(tmp_path, 0)
+    old, new = path.parent, tmp_path / "rec_2"
+    new.mkdir()
+    begun = Handover(next="rec_2", notes=("a note",))
+    write_handover(old, begun)
+    write_handover(new, Handover(state=Counting.PENDING, previous="rec"))
+    with monkeypatch.context() as patched:
+        patched.setattr("ros2_memory.storage.open_file.os.open", fails_to_open)
+        with pytest.raises(RecorderError, match="Input/output error"):
+            settle(old, new, McapReader())
+        settle_all(tmp_path, McapReader())
+    assert read_handover(old).handover == begun
+    with monkeypatch.context() as patched:
+        patched.setattr(handovers, "read_small_file", fails)
+        with pytest.raises(RecorderError, match="cannot be read"):
+            settle(old, new, McapReader())
+    assert read_handover(old).handover == begun
+    settle(old, new, McapReader())
+    assert read_handover(new).handover.state is Counting.COUNTS
+
+
+real_open = os.open
+
+
+def fails_to_open(path: str | Path, *arguments: int, **named: int) -> int:
+    if str(path).endswith(".mcap"):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+    return real_open(path, *arguments, **named)
