@@ -67,6 +67,7 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
     ),
     ("recap", {"start": T0_S, "end": T0_S + LENGTH_S}, "events"),
     ("recap_last", {"seconds": 5}, "stood_s"),
+    ("visits", {"x": 0.0, "y": 0.0}, "there_now"),
     ("memory_status", {}, "trust"),
 ]
 REFUSED: list[tuple[str, dict[str, Any], str, bool]] = [

@@ -84,6 +84,35 @@ def _event(event: accounts.Event, now: Ns) -> JsonObject:
     return shown_event
 
 
+@shown.register(accounts.Visits)
+def _visits(answer: accounts.Visits, _bag_dir: Path) -> JsonObject:
+    reply: JsonObject = {
+        "frame_id": answer.frame_id or None,
+        "x": answer.x,
+        "y": answer.y,
+        "radius_m": answer.radius_m,
+        "there_now": any(each.departed is None for each in answer.visits),
+        "visits": [_visit(each, answer.now) for each in answer.visits],
+    }
+    if answer.more:
+        reply["more"] = True
+    return with_notes(reply, answer.notes)
+
+
+def _visit(visit: accounts.Visit, now: Ns) -> JsonObject:
+    reply: JsonObject = {
+        "arrived": moment(visit.arrived),
+        "departed": moment(visit.departed),
+        "duration_s": seconds(visit.duration),
+        "closest_m": rounded(visit.closest_m, 3),
+        "closest_at": moment(visit.closest_at),
+        "ago_s": 0.0 if visit.departed is None else seconds(now - visit.departed),
+    }
+    if visit.restarts:
+        reply["restarts_since"] = visit.restarts
+    return reply
+
+
 @shown.register(accounts.Status)
 def _status(answer: accounts.Status, _bag_dir: Path) -> JsonObject:
     latest = answer.latest

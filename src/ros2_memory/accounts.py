@@ -148,4 +148,39 @@ class Status:
     notes: tuple[str, ...] = ()
 
 
-Account: TypeAlias = Sightings | Recap | Status
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """A time in which the robot was near a place.
+
+    Attributes:
+        arrived: log time of its first pose there; None where it was there before what was searched.
+        departed: of its last one; None where it is there still.
+        duration: between the first and the last that are known.
+        closest_m: how near it came, in the plane.
+        closest_at: when.
+        restarts: how often odometry began anew since.
+    """
+
+    arrived: Ns | None
+    departed: Ns | None
+    duration: Ns
+    closest_m: float
+    closest_at: Ns
+    restarts: int
+
+
+@dataclass(frozen=True, slots=True)
+class Visits:
+    """Visits to a place (m) of a frame, newest first; `more`: there are older ones."""
+
+    frame_id: str
+    x: float
+    y: float
+    radius_m: float
+    visits: tuple[Visit, ...]
+    more: bool
+    now: Ns
+    notes: tuple[str, ...] = ()
+
+
+Account: TypeAlias = Sightings | Recap | Status | Visits

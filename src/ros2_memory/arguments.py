@@ -137,6 +137,12 @@ Fields: TypeAlias = Annotated[
 ]
 Since: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing before.")]
 Until: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing after.")]
+Coordinate: TypeAlias = Annotated[
+    float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")
+]
+Radius: TypeAlias = Annotated[
+    float, Field(strict=True, gt=0, allow_inf_nan=False), Field(description="How near is there, m.")
+]
 Limit: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_whole)
 ]
@@ -303,6 +309,15 @@ class Window(Arguments):
     """A window."""
 
     span: Span
+
+
+class Place(Arguments):
+    """A place of the plane."""
+
+    x: Coordinate
+    y: Coordinate
+    radius_m: Radius | None = None
+    limit: Limit = 10
 
 
 class Matches(Arguments):

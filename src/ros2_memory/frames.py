@@ -82,6 +82,25 @@ def transform_at(view: View, parent: str, child: str, at: Ns) -> FoundTransform:
     raise _explained(view, failure, (parent, child), at, nothing_near=not dynamic) from failure
 
 
+def graph_over(view: View, window: TimeWindow) -> FrameGraph:
+    """The transforms with which any moment of a window can be looked up."""
+    limits = view.memory.limits
+    wider = TimeWindow(
+        max(window.start - TF_CACHE_NS, MIN_NS), min(window.stop + TF_CACHE_NS, MAX_NS)
+    )
+    dynamic = list(_transforms(view, limits.tf_topics, wider, static=False))
+    clock: TfClock = "log" if limits.tf_clock == "log" else "stamp"
+    if limits.tf_clock == "auto":
+        clock = agreeing_clock(dynamic)
+    return FrameGraph([*_static_at(view, window.stop - 1), *dynamic], clock)
+
+
+def statics(view: View) -> list[StampedTransform]:
+    """Every static transform that was ever recorded, in order."""
+    topics = view.memory.limits.tf_static_topics
+    return list(_transforms(view, topics, TimeWindow.everything(), static=True))
+
+
 def edges(view: View) -> tuple[FrameEdge, ...]:
     """Every parent and child pair that was recorded, sorted; `static` where it was so published.
 
@@ -163,7 +182,7 @@ def _explained(
     if failure.reason in _OF_ALL_TIMES:
         then = _of_then(failure, at)
         unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
-        if not (unknown and _connected(view, frames, _around(at, _LONGER_NS))):
+        if not (unknown and connected(view, frames, _around(at, _LONGER_NS))):
             return then
         told = f"{then.detail}; within {seconds(_LONGER_NS)} the two were connected: ask about then"
         return NoDataError(NoDataReason.GAP, told)
@@ -179,7 +198,7 @@ def _explained(
     return NoDataError(NoDataReason.GAP if between else beyond(view, at), failure.detail)
 
 
-def _connected(view: View, frames: tuple[str, str], window: TimeWindow) -> bool:
+def connected(view: View, frames: tuple[str, str], window: TimeWindow | None = None) -> bool:
     """Whether transforms recorded in a window, and static ones, lead from one frame to the other.
 
     Not known where the time for the answer is over before.

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.arguments import Between, Last, Matches, Nothing, Window, tested
+from ros2_memory.arguments import Between, Last, Matches, Nothing, Place, Window, tested
 from ros2_memory.entries import Entry, Variant
 from ros2_memory.recap import recap
 from ros2_memory.sightings import find_matches
 from ros2_memory.status import memory_status
+from ros2_memory.visits import visits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -21,6 +22,7 @@ def tools(facts: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
     del writing
     yield from _SIGHTINGS.tools(facts)
     yield from _RECAP.tools(facts)
+    yield from _VISITS.tools(facts)
     yield from _STATUS.tools(facts)
 
 
@@ -60,4 +62,15 @@ _STATUS = Entry(
     "damaged, and for how long the disk lasts.",
     Nothing,
     lambda memory, call, _: memory_status(memory, call),
+)
+_VISITS = Entry(
+    (Variant("visits", "Visits to a place (blocking)"),),
+    "When the robot was near a place, newest first, in {map_frame} where transforms lead there, "
+    "else in the frame of {pose_topic}. Reply: {{frame_id, there_now, visits: [{{arrived, "
+    "departed, duration_s, closest_m, ago_s}}]}}.",
+    Place,
+    lambda memory, call, given: visits(
+        memory, call, given.x, given.y, radius_m=given.radius_m, limit=given.limit
+    ),
+    blocking=True,
 )

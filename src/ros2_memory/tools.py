@@ -46,6 +46,7 @@ def build_tools(
         "pose_topic": limits.pose_topic,
         "tolerance": f"{limits.time_tolerance_s:g}",
         "near": f"{limits.position_tolerance_m:g}",
+        "map_frame": limits.map_frame or "no map",
     }
     return (
         *_LIST.tools(facts),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from ros2_memory.absence import undecodable
 from ros2_memory.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.motion import Stop, is_place
 from ros2_memory.packing import packed_poses, unpacked_poses
 from ros2_memory.portions import Kept, Kind, is_whole
 from ros2_memory.sights import Sights
@@ -140,6 +141,18 @@ def _batches(messages: Iterable[Found]) -> Iterator[list[Found]]:
             some, size = [], 0
     if some:
         yield some
+
+
+def stops(view: View, messages: Iterable[Found]) -> Iterator[Stop]:
+    """Where the poses of messages are; those left out that are no place or cannot be decoded."""
+    for found in messages:
+        try:
+            message = view.memory.reader.decode(found.record)
+        except UndecodableError:
+            continue
+        pose = view.memory.extractor.pose(message, found.record.channel.type)
+        if pose is not None and is_place(pose.position):
+            yield Stop(found.time, pose.position)
 
 
 def decoded(view: View, found: Found) -> object:

@@ -38,10 +38,11 @@ SPECIFIED = [
     "trajectory_summary",
     "recent_trajectory_summary",
 ]
-ADDED = ["find_matches", "recap", "recap_last", "memory_status"]
+ADDED = ["find_matches", "recap", "recap_last", "visits", "memory_status"]
 WRITING: list[str] = []
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 BLOCKING = {
+    "visits",
     "find_matches",
     "recap",
     "recap_last",
@@ -52,6 +53,7 @@ BLOCKING = {
     "recent_trajectory_summary",
 }
 OPTIONAL = {
+    "visits": {"radius_m", "limit"},
     "find_matches": {"field", "start", "end", "limit"},
     "list_recorded_topics": {"pattern"},
     "get_topic_at_time": {"tolerance_s", "fields"},

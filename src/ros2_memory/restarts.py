@@ -1,0 +1,53 @@
+"""When odometry began anew: from then on the same coordinates are another place.
+
+It does when the robot is switched on: after a silence its poses go on elsewhere, by more than
+`MOVED_M`; or without one they step, faster than is plausible, to the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.model import TimeWindow
+from ros2_memory.portions import Kept, is_whole
+from ros2_memory.stories import SILENCE_NS
+from ros2_memory.timebase import MAX_NS, unix_from_ns
+from ros2_memory.ways import POSES, stops
+
+if TYPE_CHECKING:
+    from ros2_memory.history import View
+    from ros2_memory.motion import PoseDigest, Stop
+    from ros2_memory.timebase import Ns
+
+MOVED_M: Final = 1.0
+
+
+def restarts(view: View, topic: str, since: Ns) -> list[Ns]:
+    """The times of the first poses of odometry that began anew after a moment, in order."""
+    window = TimeWindow(since, MAX_NS)
+    kept: Kept[PoseDigest] = Kept(view, topic, POSES)
+    fastest = view.memory.limits.max_plausible_speed_mps
+    found: list[Ns] = []
+    before: Stop | None = None
+    for group in view.groups(topic, window):
+        known = kept.of(group) if is_whole(group, window) else None
+        digest = None if known is None else known[0]
+        whole = digest is not None and not digest.jumps and not digest.invalid
+        ends = (digest.first, digest.last) if digest is not None and whole else ()
+        for stop in filter(None, ends or stops(view, group.once())):
+            if before is not None and _is_anew(before, stop, fastest):
+                found.append(stop.time)
+            before = stop
+    return found
+
+
+def _is_anew(before: Stop, after: Stop, fastest_mps: float) -> bool:
+    step = math.dist(before.position, after.position)
+    if step <= MOVED_M:
+        return False
+    apart = after.time - before.time
+    if apart > SILENCE_NS:
+        return True
+    jumped = step > fastest_mps * unix_from_ns(apart)
+    return jumped and math.hypot(*after.position) <= MOVED_M

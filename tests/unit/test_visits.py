@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+import json
+import math
+import random
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.demo import robot as demo_robot
+from ros2_memory.demo.recording import DemoRecorder
+from ros2_memory.demo.streams import Timeline
+from ros2_memory.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.memory import Call
+from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.replies import Replies
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.timebase import Deadline, FixedClock
+from ros2_memory.visits import visits
+from tests.bags import Msg, odom, tf, transform, write_mcap
+from tests.closed_form import SESSIONS
+from tests.histories import write_history
+from tests.memories import SettableClock, memory_of
+from tests.recalled import recalling
+from tests.shared_bags import needs_recorded
+
+if TYPE_CHECKING:
+    from ros2_memory.memory import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def line(*legs: tuple[float, float], begin: float = 0.0, x: float = 0.0) -> list[Msg]:
+    """Odometry at 5 Hz along x: legs of (seconds, metres per second)."""
+    messages = []
+    for length, speed in legs:
+        for _ in range(round(length * 5)):
+            messages.append(odom(BEGIN + round(begin * S), x, 0.0, 0.0))
+            begin += 0.2
+            x += speed * 0.2
+    return messages
+
+
+def remembering(folder: Path, messages: list[Msg], *, split_s: float = 10.0) -> Memory:
+    by_split: dict[int, list[Msg]] = {}
+    for each in sorted(messages, key=lambda message: message.log_time):
+        by_split.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
+    for nth, some in by_split.items():
+        write_mcap(folder / f"bag_{nth}.mcap", some)
+    return memory_of(folder)
+
+
+def spans(memory: Memory, x: float, y: float = 0.0, **given: Any) -> list[tuple[float, float]]:
+    """Arrivals and departures in seconds after BEGIN; NaN where still there or not known."""
+    return [
+        (
+            math.nan if each.arrived is None else (each.arrived - BEGIN) / S,
+            math.nan if each.departed is None else (each.departed - BEGIN) / S,
+        )
+        for each in visits(memory, Call(), x, y, **given).visits
+    ]
+
+
+@needs_recorded
+@each_way
+def test_visits_of_a_recorded_session_are_the_closed_form(tmp_path: Path, recalls: bool) -> None:
+    session = SESSIONS["session_mcap"]
+    for bag in session.folder.glob("*.mcap"):
+        (tmp_path / bag.name).write_bytes(bag.read_bytes())
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    answer = visits(memory, Call(), 0.0, 4.0, radius_m=0.5)
+    lap, half = 2 * math.pi / 0.25, 2 * math.asin(0.5 / 4) / 0.25
+    middles = [lap / 2 + lap * nth for nth in range(3)]
+    assert answer.frame_id == "odom"
+    assert not answer.more
+    assert len(answer.visits) == len(middles)
+    for visit, middle in zip(answer.visits, reversed(middles), strict=True):
+        assert visit.arrived is not None
+        assert visit.departed is not None
+        assert abs(session.since(visit.arrived / S) - (middle - half)) < 0.06
+        assert abs(session.since(visit.departed / S) - (middle + half)) < 0.06
+        assert abs(session.since(visit.closest_at / S) - middle) < 0.06
+        assert visit.closest_m < 0.05
+        assert visit.restarts == 0
+
+
+@each_way
+def test_the_demos_robot_was_at_the_kitchen_counter_when_its_lap_says(
+    tmp_path: Path, recalls: bool
+) -> None:
+    now = BEGIN + 200 * S
+    recorder = DemoRecorder(tmp_path / "flat", Timeline(BEGIN, BEGIN), clock=FixedClock(now))
+    recorder.write_until(now)
+    recorder.stop()
+    memory = memory_of(tmp_path, clock=SettableClock(now))
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    counter = demo_robot.KITCHEN_COUNTER
+    answer = visits(memory, Call(), counter.x, counter.y)
+    assert answer.frame_id == "map"
+    times = [nth * 0.05 for nth in range(200 * 20)]
+    near = [
+        t
+        for t in times
+        if math.dist(demo_robot.pose_in_map(t)[:2], (counter.x, counter.y)) <= answer.radius_m
+    ]
+    starts = [t for before, t in pairwise([-1.0, *near]) if t - before > 0.06]
+    assert [(each.arrived or 0) / S - BEGIN / S for each in reversed(answer.visits)] == (
+        pytest.approx(starts, abs=0.1)
+    )
+    assert all(each.closest_m < 0.01 for each in answer.visits)
+
+
+def test_a_robot_that_is_there_still_has_not_departed(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
+    answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0)
+    shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    assert shown["there_now"] is True
+    [visit] = shown["visits"]
+    assert visit["departed"] is None
+    assert visit["ago_s"] == 0.0
+    assert visit["arrived"] == pytest.approx(BEGIN / S + 18.0, abs=0.21)
+
+
+def test_a_robot_that_was_outside_for_a_moment_did_not_leave(tmp_path: Path) -> None:
+    there = line((10, 0.0), (2, 1.0), (2, -1.0), (10, 0.0), (30, 1.0))
+    memory = remembering(tmp_path, there)
+    [(arrived, departed)] = spans(memory, 0.0, radius_m=1.0)
+    assert arrived == 0.0
+    assert departed == pytest.approx(25.0, abs=0.21)
+    longer = tmp_path / "longer"
+    longer.mkdir()
+    memory = remembering(longer, line((10, 0.0), (5, 1.0), (5, -1.0), (10, 0.0), (30, 1.0)))
+    assert len(spans(memory, 0.0, radius_m=1.0)) == 2
+
+
+def test_a_place_where_it_never_was_has_no_visits(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((20, 0.5)))
+    answer = visits(memory, Call(), 500.0, 0.0)
+    assert (answer.visits, answer.more) == ((), False)
+
+
+def test_the_newest_visits_come_first_and_more_are_told_of(tmp_path: Path) -> None:
+    there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
+    memory = remembering(tmp_path, line(*there_and_back))
+    answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0, limit=2)
+    assert answer.more
+    assert [round(((each.arrived or 0) - BEGIN) / S) for each in answer.visits] == [69, 49]
+
+
+def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_path: Path) -> None:
+    first = line((10, 0.0), (20, 0.5))
+    second = line((10, 0.0), (20, 0.5), begin=1000.0)
+    memory = remembering(tmp_path, first + second)
+    answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
+    assert [each.restarts for each in answer.visits] == [0, 1]
+    assert any("odometry began anew" in note for note in answer.notes)
+    recalled = recalling(replace(memory), tmp_path)
+    assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
+
+
+def test_in_a_map_a_restart_of_odometry_changes_nothing(tmp_path: Path) -> None:
+    first = line((10, 0.0), (20, 0.5))
+    second = line((10, 0.0), (20, 0.5), begin=1000.0)
+    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 1.0, 0.0)), topic="/tf_static")
+    memory = remembering(tmp_path, [fixed, *first, *second])
+    answer = visits(memory, Call(), 5.0, 1.0, radius_m=1.0)
+    assert answer.frame_id == "map"
+    assert [each.restarts for each in answer.visits] == [0, 0]
+
+
+@each_way
+def test_a_map_that_moves_under_odometry_is_followed(tmp_path: Path, recalls: bool) -> None:
+    """The robot drives on in odometry, which slips back as fast: it stands in the map."""
+    poses = line((40, 0.5))
+    moves = [
+        tf(at, transform(at, "map", "odom", (-(at - BEGIN) / S * 0.5, 0.0, 0.0)))
+        for at in (BEGIN + t * S // 2 for t in range(81))
+    ]
+    memory = remembering(tmp_path, [*poses, *moves])
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    answer = visits(memory, Call(), 0.0, 0.0, radius_m=0.3)
+    [visit] = answer.visits
+    assert answer.frame_id == "map"
+    assert (visit.arrived, visit.departed) == (BEGIN, None)
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, math.inf, math.nan])
+def test_a_radius_must_be_a_length(tmp_path: Path, radius: float) -> None:
+    memory = remembering(tmp_path, line((5, 0.5)))
+    with pytest.raises(InvalidArgumentsError, match="radius_m"):
+        visits(memory, Call(), 0.0, 0.0, radius_m=radius)
+
+
+def test_a_visit_whose_search_runs_out_of_time_has_no_arrival(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((100, 0.003)))
+    outcomes = set()
+    for looks in range(1, 120):
+        call = Call(Deadline.after(looks, iter(range(100_000)).__next__))
+        try:
+            answer = visits(memory, call, 0.0, 0.0, radius_m=0.28)
+        except QueryTimeoutError:
+            continue
+        for visit in answer.visits:
+            outcomes.add(visit.arrived is None)
+            assert (visit.arrived is None) == any("out of time" in note for note in answer.notes)
+    assert False in outcomes
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
+def test_visits_are_the_same_whatever_the_catalogue_knows(seed: int, part: float) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        write_history(bag_dir, draw)
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        memory = recalling(replace(plain), bag_dir, part=part)
+        for radius in (0.5, 3.0):
+            place = (draw.uniform(-2, 2), draw.uniform(-1, 1))
+            assert _answer(memory, place, radius) == _answer(plain, place, radius)
+
+
+def _answer(memory: Memory, place: tuple[float, float], radius: float) -> str:
+    try:
+        return repr(visits(memory, Call(), *place, radius_m=radius))
+    except EpisodicError as error:
+        return repr(error)
