@@ -79,7 +79,7 @@ class KeptBase:
 
     @property
     def trouble(self) -> str | None:
-        """Why it is not what it should be; None where nothing is amiss. Waits for nothing."""
+        """What is amiss, as the end of a sentence about it, or None. Waits for nothing."""
         return self._trouble
 
     @property
@@ -185,7 +185,7 @@ class KeptBase:
             self._opened = in_memory() if isinstance(found, str) else found
             self._trouble = None
             if isinstance(found, str) and self._places:
-                self._trouble = f"kept in memory: {found}"
+                self._trouble = f"is kept in memory: {found}"
         return self._opened
 
     def _leave_memory(self) -> None:

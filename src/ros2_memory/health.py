@@ -92,7 +92,7 @@ def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
     if filler is not None:
         shown |= _of_catalogue(filler)
         if filler.trouble is not None:
-            problems.append(_short(f"the catalogue is {filler.trouble}; no answer depends on it"))
+            problems.append(_short(f"the catalogue {filler.trouble}; no answer depends on it"))
     if heartbeat is not None:
         shown["recorder"] = _of_recorder(heartbeat, now)
     return _status(version, problems, shown)

@@ -71,7 +71,7 @@ def test_after_a_kill_at_any_moment_the_next_start_answers_the_same(
                 # So that there is something to digest when it is killed again.
                 shutil.rmtree(bag_dir / FOLDER, ignore_errors=True)
             begun = time.monotonic()
-            running = start(bag_dir, log)
+            running = start(bag_dir, tmp_path / f"log_{nth}")
             assert running.ask("get_topic_at_time", {"topic": "/odom", "timestamp": 1700000042})
             recovered.append(time.monotonic() - begun)
             assert running.ask_all(COUNT) == right

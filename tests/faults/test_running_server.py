@@ -104,7 +104,7 @@ def test_a_catalogue_that_another_program_holds_is_said_and_waited_for(tmp_path:
             other.execute("BEGIN EXCLUSIVE")
             before = len(running.events("catalogue_failed"))
             write_bag(bag_dir, COUNT)
-            says(running, "the catalogue is cannot be used: database is locked")
+            says(running, "the catalogue cannot be used: database is locked")
             answers = running.ask_all(COUNT + 1)
         recovers(running, COUNT + 1)
         assert running.ask_all(COUNT + 1) == answers
