@@ -7,7 +7,8 @@ import json
 import re
 from collections import Counter
 from contextlib import suppress
-from itertools import count
+from functools import partial
+from itertools import chain, count
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from mcp import Client
@@ -156,8 +157,8 @@ async def never_reading(port: int) -> Seen:
         stream._transport.pause_reading()  # type: ignore[attr-defined]
         path = f"/messages/?session_id={session}"
         async with connected(port) as (reader, posts):
-            for number in count(1):
-                body = _greeting(number) or call(LONG[0], json.dumps(LONG[1]), number)
+            question = partial(call, LONG[0], json.dumps(LONG[1]))
+            for number, body in enumerate(chain(opening(), map(question, count(1)))):
                 posts.write(head("POST", path, len(body)) + body)
                 status, _ = await answer(reader)
                 seen[str(status)] += 1
@@ -168,19 +169,15 @@ async def never_reading(port: int) -> Seen:
     return seen
 
 
-def _greeting(number: int) -> bytes | None:
+def opening() -> tuple[bytes, bytes]:
     """The two messages that open a session."""
-    if number == 1:
-        about = {
-            "protocolVersion": "2025-06-18",
-            "capabilities": {},
-            "clientInfo": {"name": "soak", "version": "1"},
-        }
-        opening = {"jsonrpc": "2.0", "id": 0, "method": "initialize", "params": about}
-        return json.dumps(opening).encode()
-    if number == 2:
-        return b'{"jsonrpc": "2.0", "method": "notifications/initialized"}'
-    return None
+    about = {
+        "protocolVersion": "2025-06-18",
+        "capabilities": {},
+        "clientInfo": {"name": "soak", "version": "1"},
+    }
+    hello = {"jsonrpc": "2.0", "id": 0, "method": "initialize", "params": about}
+    return json.dumps(hello).encode(), b'{"jsonrpc": "2.0", "method": "notifications/initialized"}'
 
 
 async def leaving(port: int) -> Seen:

@@ -8,15 +8,15 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
-import uvicorn
 
 from ros2_memory import connections
-from ros2_memory.connections import BoundedConnection
+from tests.webserver import BOUND_S, listening
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-BOUND_S = 20
+    import uvicorn
+
 GET = b"GET / HTTP/1.1\r\nhost: a\r\n\r\n"
 HALF = b"GET / HTTP/1.1\r\nhost: a\r\nx: "
 POST = b"POST / HTTP/1.1\r\nhost: a\r\ncontent-length: 10\r\n\r\n"
@@ -81,21 +81,8 @@ class Served:
 @asynccontextmanager
 async def serving() -> AsyncIterator[Served]:
     app = App()
-    config = uvicorn.Config(
-        app, http=BoundedConnection, lifespan="off", ws="none", log_config=None, access_log=False
-    )
-    server = uvicorn.Server(config)
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        task = asyncio.create_task(server._serve([listening]))
-        async with asyncio.timeout(BOUND_S):
-            while not server.started:
-                await asyncio.sleep(0.001)
-        try:
-            yield Served(server, app, listening.getsockname()[1])
-        finally:
-            server.should_exit = True
-            server.force_exit = True
-            await task
+    async with listening(app) as server:
+        yield Served(server, app, server.servers[0].sockets[0].getsockname()[1])
 
 
 @pytest.fixture

@@ -1,0 +1,105 @@
+"""Clients that leave in mid-call: the query that nobody waits for ends, and its place is free."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import anyio
+import pytest
+
+from ros2_memory.dispatch import Dispatcher, EpisodicServer
+from ros2_memory.entries import Tool
+from ros2_memory.errors import QueryTimeoutError
+from ros2_memory.http import web_app
+from ros2_memory.replies import Replies
+from tests.soak.clients import modern, opening
+from tests.soak.wire import call, connected, head, posted
+from tests.webserver import BOUND_S, listening
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from ros2_memory.memory import Call, Memory
+
+
+class Endless:
+    """A query that looks at its deadline, as all do, and otherwise never ends."""
+
+    def __init__(self) -> None:
+        self.begun = threading.Event()
+        self.ended = threading.Event()
+
+    def ask(self, call: Call) -> Any:
+        self.begun.set()
+        while not call.deadline.expired():
+            threading.Event().wait(0.001)
+        self.ended.set()
+        raise QueryTimeoutError("too long")
+
+
+@asynccontextmanager
+async def serving(query: Endless) -> AsyncIterator[tuple[int, Dispatcher]]:
+    schema: dict[str, Any] = {"type": "object", "properties": {}}
+    asked = Tool(
+        "endless", "Endless", "Never ends.", schema, True, lambda _: lambda _, call: query.ask(call)
+    )
+    replies = Replies(Path("bags"), 1000)
+    dispatcher = Dispatcher(cast("Memory", None), [asked], replies, call_timeout_s=3600)
+    server = EpisodicServer(dispatcher, [asked], name="x", version="1", instructions="")
+
+    async def health() -> Any:
+        return {"status": "ok"}
+
+    app = web_app(server, host="127.0.0.1", health=health, background=anyio.sleep_forever)
+    async with listening(app, lifespan="on") as running:
+        yield running.servers[0].sockets[0].getsockname()[1], dispatcher
+
+
+async def set_in_time(event: threading.Event) -> None:
+    assert await asyncio.to_thread(event.wait, BOUND_S)
+
+
+async def none_left(dispatcher: Dispatcher) -> None:
+    async with asyncio.timeout(BOUND_S):
+        while dispatcher.blocking.running or dispatcher.blocking.waiting:
+            await asyncio.sleep(0.001)
+
+
+@pytest.mark.parametrize("is_modern", [False, True])
+async def test_leaving_a_request_ends_its_query(is_modern: bool) -> None:
+    query = Endless()
+    body, more = call("endless", "{}"), ""
+    if is_modern:
+        body, more = modern(body)
+    async with serving(query) as (port, dispatcher):
+        async with connected(port) as (_, writer):
+            writer.write(head("POST", "/mcp", len(body), more) + body)
+            await set_in_time(query.begun)
+            assert not query.ended.is_set()
+        await set_in_time(query.ended)
+        await none_left(dispatcher)
+
+
+async def test_leaving_an_event_stream_ends_its_queries_and_those_that_wait() -> None:
+    query = Endless()
+    async with serving(query) as (port, dispatcher):
+        async with connected(port) as (stream, writer):
+            writer.write(head("GET", "/sse"))
+            async with asyncio.timeout(BOUND_S):
+                await stream.readuntil(b"session_id=")
+                session = (await stream.readuntil(b"\r\n")).strip().decode()
+            calls = [call("endless", "{}", number) for number in range(1, 11)]
+            for body in (*opening(), *calls):
+                status, _ = await posted(port, body, f"/messages/?session_id={session}")
+                assert status == 202
+            await set_in_time(query.begun)
+            async with asyncio.timeout(BOUND_S):
+                while dispatcher.blocking.running + dispatcher.blocking.waiting < len(calls):
+                    await asyncio.sleep(0.001)
+            assert not query.ended.is_set()
+        await set_in_time(query.ended)
+        await none_left(dispatcher)
