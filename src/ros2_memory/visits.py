@@ -14,6 +14,7 @@ from ros2_memory.absence import moment, require_bags, resolve_topic
 from ros2_memory.accounts import Visit, Visits
 from ros2_memory.candidates import Candidates
 from ros2_memory.conditions import Condition, NearPosition
+from ros2_memory.copies import COPY_HORIZON_NS
 from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.groups import groups_of
 from ros2_memory.history import View
@@ -22,7 +23,7 @@ from ros2_memory.places import placing
 from ros2_memory.portions import Kept, is_whole
 from ros2_memory.restarts import restarts
 from ros2_memory.stays import Stays
-from ros2_memory.timebase import MAX_NS, Ns
+from ros2_memory.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.trajectory import PoseCollector
 from ros2_memory.unseen import note_unseen
 from ros2_memory.ways import POSES, carries_no, stops
@@ -170,7 +171,8 @@ class _Looking:
 
     def _look(self, stays: Stays, part: TimeWindow) -> None:
         groups = groups_of(self._view, self._topic, part)
-        if len(groups) == 1 and is_whole(groups[0], part) and self._here is not None:
+        alone = len(groups) == 1 and is_whole(groups[0], part) and not self._contested(part)
+        if alone and self._here is not None:
             known = self._kept.of(groups[0])
             digest, span = known if known is not None else self._made(part)
             if span is not None and self._all_near(digest):
@@ -183,6 +185,11 @@ class _Looking:
                 stays.near(time, time, (off, time))
             else:
                 stays.away(time)
+
+    def _contested(self, part: TimeWindow) -> bool:
+        """Whether another recording may hold the original of a pose in a part."""
+        wider = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
+        return len({each.bag.recording for each in self._view.holdings([self._topic], wider)}) > 1
 
     def _made(self, part: TimeWindow) -> tuple[PoseDigest, tuple[Ns, Ns] | None]:
         """The digest of the poses of a part, as the catalogue would have it."""
