@@ -10,20 +10,31 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import time
 from typing import TYPE_CHECKING, Final
 
 from starlette.responses import PlainTextResponse
 
+from ros2_memory.logs import get_logger
+
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 HEALTH_PATH: Final = "/health"
 ADMITTED: Final = "ros2_memory.admitted"
 """In the scope of a request to `/health`: whether it showed the token."""
 
+TOLD_EVERY_S: Final = 60.0
+"""Refusals are logged this often at most: whoever guesses must not fill the disk with it."""
+
 _SCHEME: Final = b"bearer "
 _MISSING: Final = "A token is needed: send it as Authorization: Bearer TOKEN.\n"
 _WRONG: Final = "The token is not the one of this server.\n"
+
+
+log = get_logger(__name__)
 
 
 class TokenGate:
@@ -34,9 +45,14 @@ class TokenGate:
     Only the token's digest is kept, and digests are compared in constant time.
     """
 
-    def __init__(self, app: ASGIApp, token: str) -> None:
+    def __init__(
+        self, app: ASGIApp, token: str, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
         self._app = app
         self._digest = _digest(token.encode("ascii"))
+        self._monotonic = monotonic
+        self._refused = 0
+        self._told_until = float("-inf")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """ASGI."""
@@ -49,11 +65,27 @@ class TokenGate:
         elif not shown and scope["path"] == HEALTH_PATH:
             await self._app({**scope, ADMITTED: False}, receive, send)
         else:
+            self._tell(scope, is_wrong=bool(shown))
             await _refusal(is_wrong=bool(shown))(scope, receive, send)
 
     def _is_right(self, header: bytes) -> bool:
         scheme, token = header[: len(_SCHEME)].lower(), header[len(_SCHEME) :].strip(b" ")
         return hmac.compare_digest(_digest(token), self._digest) and scheme == _SCHEME
+
+    def _tell(self, scope: Scope, *, is_wrong: bool) -> None:
+        """Logs who was refused, and how many since; nothing of what was sent, not even the path."""
+        self._refused += 1
+        now = self._monotonic()
+        if now < self._told_until:
+            return
+        client = scope.get("client")
+        log.warning(
+            "refused_without_token",
+            reason="another token" if is_wrong else "no token",
+            client=client[0] if client else None,
+            refused=self._refused,
+        )
+        self._refused, self._told_until = 0, now + TOLD_EVERY_S
 
 
 def _digest(token: bytes) -> bytes:

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from starlette.responses import PlainTextResponse
+from structlog.testing import capture_logs
 
-from ros2_memory.gate import ADMITTED, TokenGate
+from ros2_memory.gate import ADMITTED, TOLD_EVERY_S, TokenGate
 
 GOOD = "kJ7-x._~+/0123456789=="
 
@@ -149,6 +150,25 @@ async def test_tokens_are_compared_in_constant_time(monkeypatch: pytest.MonkeyPa
         await asked(Inside(), authorization=f"Bearer {shown}")
     # As many bytes whatever was shown, so that not even the token's length can be timed.
     assert [(len(one), len(other)) for one, other in compared] == [(32, 32)] * 3
+
+
+async def test_refusals_are_logged_now_and_then_with_nothing_of_what_was_sent() -> None:
+    now = [0.0]
+    gate = TokenGate(Inside(), GOOD, monotonic=lambda: now[0])
+    transport = httpx2.ASGITransport(app=gate, client=("192.0.2.7", 4711))
+    with capture_logs() as events:
+        async with httpx2.AsyncClient(transport=transport, base_url="http://robot") as http:
+            for _ in range(5):
+                await http.get(f"/{GOOD}?token={GOOD}", headers={"authorization": "Bearer gUeSs"})
+            now[0] = TOLD_EVERY_S
+            await http.get("/mcp")
+            await http.get("/mcp", headers={"authorization": f"Bearer {GOOD}"})
+    assert [(event["reason"], event["client"], event["refused"]) for event in events] == [
+        ("another token", "192.0.2.7", 1),
+        ("no token", "192.0.2.7", 5),
+    ]
+    assert GOOD not in repr(events)
+    assert "gUeSs" not in repr(events)
 
 
 def test_it_keeps_no_token() -> None:
