@@ -151,8 +151,9 @@ class Filler:
 
     def warm(self) -> None:
         """Works out what recordings that overlap hold together, before somebody asks."""
-        rows = list_recorded_topics(self._memory, Call())
-        self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
+        with suppress(EpisodicError):
+            rows = list_recorded_topics(self._memory, Call())
+            self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
         with suppress(EpisodicError):
             trajectory_summary(self._memory, Call(), Span(start_s=0.0, end_s=LAST_S))
 

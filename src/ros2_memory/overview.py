@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import answers
+from ros2_memory.absence import require_bags
 from ros2_memory.history import View, short_name
 from ros2_memory.model import BagState, SetAside, TimeWindow
 from ros2_memory.timebase import Ns, ns_from_unix
@@ -25,8 +26,13 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, 
     """Every topic that was heard, under each of its types; empty for an empty memory.
 
     A row has notes where its numbers are of bags that are not whole, or that a wrong clock dated.
+
+    Raises:
+        NoDataError: the bag directory is not there, or its disk: what was heard is not known.
     """
     view = View(memory, call, memory.clock.now())
+    if view.snapshot.problem is not None:
+        require_bags(view)
     notes = _notes_by_topic(view.snapshot)
     rows = []
     for topic in view.snapshot.topics():

@@ -212,3 +212,10 @@ def test_what_is_listed_reaches_to_the_bag_that_closed_last(tmp_path: Path) -> N
     assert [row.count for row in queries.list_recorded_topics(memory, Call())] == [1]
     write_mcap(tmp_path / "b" / "b_0.mcap", [odom(T0 + 60 * S, 0, 0), boolean(T0 + 60 * S, True)])
     assert [row.count for row in queries.list_recorded_topics(memory, Call())] == [1, 2]
+
+
+def test_without_a_bag_directory_it_is_not_told_that_nothing_was_recorded(tmp_path: Path) -> None:
+    memory = memory_of(tmp_path / "away")
+    with pytest.raises(NoDataError, match="the bag directory does not exist"):
+        queries.list_recorded_topics(memory, Call())
+    assert queries.list_recorded_topics(memory_of(tmp_path), Call()) == ()
