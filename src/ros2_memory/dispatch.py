@@ -241,9 +241,10 @@ class EpisodicServer(MCPServer[object]):
 
 
 def _client(context: object) -> Hashable:
-    """Who asks, as far as it can be told: an event stream's session, or an address and a program.
+    """Who asks, as far as it can be told: a session, or else an address and a program.
 
-    Calls over `/mcp` have no session. None over stdio, which has one client.
+    None over stdio, which has one client. Nothing but turns is given by it: a client may say that
+    it is another.
     """
     request = context.request_context.request if isinstance(context, Context) else None
     if not isinstance(request, Request):
@@ -253,7 +254,9 @@ def _client(context: object) -> Hashable:
     session = request.query_params.get("session_id")
     if session is not None and request.url.path.startswith(MESSAGES_PATH):
         return session
-    return (request.client.host if request.client else "", request.headers.get("user-agent", ""))
+    address = request.client.host if request.client else ""
+    name = request.headers.get("mcp-session-id") or request.headers.get("user-agent", "")
+    return address, name[:_LONGEST_NAME]
 
 
 def _listed(tool: Tool) -> ListedTool:
