@@ -9,6 +9,7 @@ import json
 import math
 import struct
 from dataclasses import astuple
+from functools import lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -157,13 +158,14 @@ def _unpacked_poses(packed: bytes) -> PoseDigest:
     poses, invalid, jumps, count, length_m, jumped_m, stands, by_jump, states, *stops = (
         _HEAD.unpack_from(packed)
     )
-    first, last, anchor, measured_from = (
-        Stop(time, (x, y, z)) for time, x, y, z in zip(*[iter(stops)] * 4, strict=True)
-    )
+    first, last, anchor, measured_from = [
+        Stop(stops[at], (stops[at + 1], stops[at + 2], stops[at + 3])) for at in (0, 4, 8, 12)
+    ]
     begin = _HEAD.size
     end = begin + count * _VERTEX.size
+    isnan = math.isnan
     vertices: list[Vertex] = [
-        (time, (x, y, z), None if math.isnan(heading) else heading)
+        (time, (x, y, z), None if isnan(heading) else heading)
         for time, x, y, z, heading in _VERTEX.iter_unpack(packed[begin:end])
     ]
     max_speed, twist, error_m = struct.unpack_from("<ddd", packed, end)
@@ -180,10 +182,16 @@ def _unpacked_poses(packed: bytes) -> PoseDigest:
         max_speed=max_speed,
         measured_from=measured_from if stands & 1 else None,
         twist=twist if states else None,
-        frames=tuple(json.loads(packed[end + 24 :])),
+        frames=_frames(packed[end + 24 :]),
         vertices=tuple(vertices),
         error_m=error_m,
     )
+
+
+@lru_cache(256)
+def _frames(text: bytes) -> tuple[str, ...]:
+    """The frames that this text lists: those of nearly all bags are the same."""
+    return tuple(json.loads(text))
 
 
 def shape_text(shape: Shape) -> str:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.model import BagSummary, TopicSummary
+from ros2_memory.summaries import BagSummary, Heading, shared_shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -31,20 +32,26 @@ def bag_summary(
     notes: tuple[str, ...] = (),
 ) -> BagSummary:
     """The summary of a file: channels of one topic and type count as one."""
-    found: dict[tuple[str, str], TopicSummary] = {}
-    for channel, count, first, last in held:
-        key = (channel.topic, channel.type)
+    found: dict[tuple[str, str], Held] = {}
+    for each in held:
+        key = (each.channel.topic, each.channel.type)
         other = found.get(key)
-        if other is None:
-            found[key] = TopicSummary(*key, channel.encoding, count, first, last, channel.latched)
-        else:
-            found[key] = replace(
-                other,
-                count=other.count + count,
-                first=min(other.first, first),
-                last=max(other.last, last),
-                latched=other.latched or channel.latched,
-            )
+        found[key] = each if other is None else _together(other, each)
     silent = {channel.topic for channel in declared} - {topic for topic, _ in found}
-    topics = tuple(found[key] for key in sorted(found))
-    return BagSummary(topics, tuple(sorted(silent)), complete, notes)
+    headings: list[Heading] = []
+    numbers: list[int] = []
+    # Past the objects of single topics: an index makes one summary after the other.
+    for (topic, type_name), (channel, *stated) in sorted(found.items(), key=itemgetter(0)):
+        headings.append(Heading(topic, type_name, channel.encoding, channel.latched))
+        numbers += stated
+    shape = shared_shape(tuple(headings), tuple(sorted(silent)), complete, notes)
+    return BagSummary.packed(shape, shape.layout.pack(*numbers))
+
+
+def _together(one: Held, other: Held) -> Held:
+    """Two channels of one topic and type."""
+    channel = one.channel
+    if other.channel.latched and not channel.latched:
+        channel = replace(channel, latched=True)
+    first, last = min(one.first, other.first), max(one.last, other.last)
+    return Held(channel, one.messages + other.messages, first, last)
