@@ -1,0 +1,70 @@
+"""What no sound client writes on stdin: the server answers what can be answered, and goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from typing import TYPE_CHECKING
+
+from tests.questions import T0_S, write_run
+from tests.soak.clients import hostile_bodies, opening
+from tests.soak.wire import call
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import IO
+
+GARBAGE = (b"", b"\x00", b"\xff\xff", b'"x"', b"[]", b"7", b"{", b"[" * 100_000)
+LAST = 99
+
+
+def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
+    write_run(tmp_path / "bags")
+    ours = ("MEMORY_", "MCP_", "ROS_")
+    env = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
+    bodies = (*opening(), *(body for body, _ in hostile_bodies()), *GARBAGE)
+    lines = (*bodies, call("data_time_range", "{}", LAST))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ros2_memory.server", "data.now=latest"],
+        env=env | {"MEMORY_BAG_DIR": str(tmp_path / "bags")},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    try:
+        # Beside reading: neither pipe takes in all of it at once.
+        written = b"".join(line + b"\n" for line in lines)
+        writer = threading.Thread(target=_write, args=(process.stdin, written))
+        writer.start()
+        replies = []
+        for line in process.stdout:
+            replies.append(json.loads(line))
+            if replies[-1]["id"] == LAST:
+                break
+        assert process.poll() is None
+        writer.join()
+        process.stdin.close()
+        assert process.wait(timeout=20) == 0
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    told = json.loads(replies[-1]["result"]["content"][0]["text"])
+    assert told["earliest"] == T0_S
+    errors = [
+        json.loads(each["result"]["content"][0]["text"])["error"]
+        for each in replies[1:-1]
+        if "content" in each.get("result", {})
+    ]
+    assert len(errors) >= 15
+    assert set(errors) == {"invalid_arguments"}
+
+
+def _write(pipe: IO[bytes], data: bytes) -> None:
+    pipe.write(data)
+    pipe.flush()
