@@ -11,6 +11,7 @@ import random
 import shutil
 import sqlite3
 import statistics
+import subprocess
 import sys
 import time
 from contextlib import closing
@@ -95,3 +96,12 @@ def test_the_helper_that_digests_dies_with_its_server(tmp_path: Path) -> None:
         running.kill()
     for helper in helpers:
         until(partial(gone, helper), timeout_s=5.0)
+
+
+def test_a_helper_whose_server_is_gone_before_it_begins_does_nothing(tmp_path: Path) -> None:
+    write_bags(tmp_path, 1)
+    command = [sys.executable, "-m", "ros2_memory.cli", "index", "--for-server", str(1 << 22)]
+    environment = os.environ | {"MEMORY_BAG_DIR": str(tmp_path)}
+    ended = subprocess.run(command, env=environment, capture_output=True, check=False)
+    assert ended.returncode == 2
+    assert not (tmp_path / FOLDER).exists()
