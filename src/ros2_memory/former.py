@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -17,9 +17,12 @@ if TYPE_CHECKING:
     from ros2_memory.summaries import Shape
     from ros2_memory.timebase import Ns
 
+_AT_ONCE: Final = 4096
+"""Rows that are held besides what is made of them."""
+
 
 def former_files(base: sqlite3.Connection, config: str, root: str) -> dict[str, FormerFile]:
-    """The files that have an entry, by `root` and their path; those of one shape in time order.
+    """The files that have an entry, by `root` and their path.
 
     Raises:
         sqlite3.Error: the base cannot be read.
@@ -28,17 +31,16 @@ def former_files(base: sqlite3.Connection, config: str, root: str) -> dict[str, 
     found: dict[str, FormerFile] = {}
     for number, text in base.execute("SELECT id, text FROM shapes").fetchall():
         shape = shape_of_text(text)
-        rows = base.execute(
+        cursor = base.execute(
             "SELECT path, size, mtime, sidecar, counts FROM bags WHERE config = ? AND shape = ?",
             (config, number),
-        ).fetchall()
-        starts, ends = _spans(shape, [row[4] for row in rows])
-        packed = BagSummary.packed
-        # Bags are sorted by time later, which takes no time where they are.
-        for at in np.argsort(np.array(starts, np.int64), kind="stable").tolist():
-            path, size, mtime, sidecar, counts = rows[at]
-            summary = packed(shape, counts)
-            found[root + path] = FormerFile(size, mtime, sidecar, summary, starts[at], ends[at])
+        )
+        while rows := cursor.fetchmany(_AT_ONCE):
+            starts, ends = _spans(shape, [row[4] for row in rows])
+            for row, start, end in zip(rows, starts, ends, strict=True):
+                path, size, mtime, sidecar, counts = row
+                summary = BagSummary.packed(shape, counts)
+                found[root + path] = FormerFile(size, mtime, sidecar, summary, start, end)
     return found
 
 

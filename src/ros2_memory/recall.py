@@ -7,6 +7,7 @@ long as somebody has it; only a run with bags that have no entry yet is looked a
 from __future__ import annotations
 
 import threading
+from collections import OrderedDict
 from typing import TYPE_CHECKING, Final, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+_MOST_KEPT: Final = 64
+"""Runs of which the messages that the catalogue keeps are held: two days of splits."""
 _IN_DOUBT: Final = -1
 """The state of a catalogue that could not be asked."""
 
@@ -42,8 +45,16 @@ class RunNotes:
         whole: whether every bag of the run has one.
     """
 
-    def __init__(self, catalogue: Catalogue, run: Run, bag_dir: Path, as_of: int) -> None:
+    def __init__(
+        self,
+        catalogue: Catalogue,
+        run: Run,
+        bag_dir: Path,
+        as_of: int,
+        lately: Lately | None = None,
+    ) -> None:
         self._catalogue = catalogue
+        self._lately = Lately() if lately is None else lately
         before = catalogue.failures
         closed = [bag for bag in run.bags if bag.state is BagState.CLOSED]
         numbers = catalogue.find([BagKey.of(bag, bag_dir) for bag in closed])
@@ -99,7 +110,11 @@ class RunNotes:
         )
 
     def kept(self, topic: str) -> Mapping[int, tuple[Record, ...]]:
-        """For each entry that keeps them all messages of the topic."""
+        """For each entry that keeps them all messages of the topic.
+
+        They are many, so they are held of the runs that were asked lately.
+        """
+        self._lately.used(self)
         return self._kept_as(
             self._kept, topic, lambda: self._catalogue.kept(topic, self._of(topic))
         )
@@ -113,19 +128,40 @@ class RunNotes:
 
     def _kept_as(self, known: dict[str, T], topic: str, ask: Callable[[], T]) -> T:
         """What was worked out before, or is now; kept unless the catalogue failed meanwhile."""
-        if topic in known:
-            return known[topic]
+        there = known.get(topic)
+        if there is not None:
+            return there
         before = self._catalogue.failures
         found = ask()
         if self._catalogue.failures == before:
             known[topic] = found
         return found
 
+    def release(self) -> None:
+        """Lets go of the messages that are held; who has them still has them."""
+        self._kept = {}
+
     def _numbers_of(self, bags: Sequence[BagFile]) -> list[int]:
         return [self.numbers[bag.file] for bag in bags if bag.file in self.numbers]
 
     def _of(self, topic: str) -> list[int]:
         return self._holding.get(topic, [])
+
+
+class Lately:
+    """The notes whose messages are held. Safe for several threads at once."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._notes: OrderedDict[RunNotes, None] = OrderedDict()
+
+    def used(self, notes: RunNotes) -> None:
+        """Puts notes first; those that were used longest ago let go of their messages."""
+        with self._lock:
+            self._notes[notes] = None
+            self._notes.move_to_end(notes)
+            if len(self._notes) > _MOST_KEPT:
+                self._notes.popitem(last=False)[0].release()
 
 
 class Recall:
@@ -135,6 +171,7 @@ class Recall:
         self.catalogue = catalogue
         self._bag_dir = bag_dir
         self._lock = threading.Lock()
+        self._lately = Lately()
         self._runs: WeakKeyDictionary[Run, RunNotes] = WeakKeyDictionary()
 
     def as_of(self) -> int:
@@ -146,7 +183,7 @@ class Recall:
         with self._lock:
             known = self._runs.get(run)
         if known is None or not self._holds(known, as_of):
-            known = RunNotes(self.catalogue, run, self._bag_dir, as_of)
+            known = RunNotes(self.catalogue, run, self._bag_dir, as_of, self._lately)
             with self._lock:
                 self._runs[run] = known
         return known

@@ -1,6 +1,6 @@
 """Closed bags that lie there as they did when the catalogue learned of them: most of a week.
 
-Of each the index keeps the bag and how its file looked, no more. Should anything about the file
+Of each the index keeps the bag and the number of its file, no more. Should anything about the file
 change, it is woken: what is known of it is made as if it had been read, and judged anew.
 """
 
@@ -9,20 +9,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.model import BagFile, BagState
-from ros2_memory.recorder.scan import YOUNG_NS, other_form, settled
+from ros2_memory.recorder.scan import COMPRESSED, YOUNG_NS, Stamp, other_form, settled
 from ros2_memory.recorder.standing import FileNotes, Standing, Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from ros2_memory.recorder.scan import Stamp
     from ros2_memory.recorder.standing import FormerFile, Scene
     from ros2_memory.storage.base import BagReader
     from ros2_memory.timebase import Ns
 
 _KINDS: Final = (".mcap", ".db3")
 """A compressed one may lie beside what it was made from, and is judged together with it."""
+_CLOSED: Final = BagState.CLOSED
 
 
 class Dormant:
@@ -30,7 +32,7 @@ class Dormant:
 
     def __init__(self) -> None:
         self._bags: dict[str, BagFile] = {}
-        self._stamps: dict[str, Stamp] = {}
+        self._inodes: dict[str, int] = {}
 
     def __len__(self) -> int:
         return len(self._bags)
@@ -48,45 +50,58 @@ class Dormant:
         reader: BagReader,
         scene: Scene,
     ) -> list[BagFile]:
-        """Takes over, and out of `stamps`, the files that look as they are known; gives their bags.
+        """Takes over, and out of `stamps`, the files that look as they are known.
 
         Files of which more is to be weighed are left: young ones, and those that say nothing.
+        Gives the bags in the order of their starts.
         """
-        patience = max(scene.three_splits, YOUNG_NS)
-        reads = {kind: reader.reads(Path(f"bag{kind}")) for kind in _KINDS}
-        compressed = any(path.endswith(".zstd") for path in stamps)
-        taken = self._bags
-        for path, file in known.items():
-            stamp = stamps.get(path)
-            if stamp is None:
-                continue
-            size, mtime_ns, sidecar_ns, summary, start, end = file
+        last = scene.now - max(scene.three_splits, YOUNG_NS)
+        kinds = tuple(kind for kind in _KINDS if reader.reads(Path(f"bag{kind}")))
+        compressed = {path for path in stamps if path.endswith(COMPRESSED)}
+        taken, inodes = self._bags, self._inodes
+        for path, (size, mtime_ns, _, inode, sidecar_ns) in stamps.items():
+            file = known.get(path)
             if (
-                (size, mtime_ns, sidecar_ns) != (stamp.size, stamp.mtime_ns, stamp.sidecar_ns)
-                or scene.now - mtime_ns <= patience
-                or not reads.get(path[path.rfind(".") :])
-                or not (summary.shape.complete and summary.shape.topics)
-                or (compressed and other_form(path) in stamps)
+                file is not None
+                and file[:3] == (size, mtime_ns, sidecar_ns)
+                and mtime_ns < last
+                and path.endswith(kinds)
+                and (summary := file.summary).shape.complete
+                and summary.shape.topics
+                and not (compressed and other_form(path) in compressed)
             ):
-                continue
-            taken[path] = BagFile(
-                path, size, mtime_ns, BagState.CLOSED, summary, start, end, sidecar_ns
-            )
-        self._stamps = {path: stamps.pop(path) for path in taken}
-        return [*taken.values()]
+                taken[path] = BagFile(
+                    path, size, mtime_ns, _CLOSED, summary, file.start, file.end, sidecar_ns
+                )
+                inodes[path] = inode
+        rest = {path: stamp for path, stamp in stamps.items() if path not in taken}
+        stamps.clear()
+        stamps.update(rest)
+        return _in_time([*taken.values()])
 
     def is_undisturbed(self, path: str, stamp: Stamp, now: Ns) -> bool:
         """Whether a file is one of these, and looks as before."""
-        before = self._stamps.get(path)
-        if before is None or not settled(stamp.mtime_ns, now):
+        bag = self._bags.get(path)
+        if bag is None or not settled(stamp.mtime_ns, now):
             return False
-        return stamp.shows(before)
+        return stamp.shows(self._stamp(bag))
 
     def wake(self, path: str, now: Ns) -> tuple[FileNotes, Verdict] | None:
         """Gives up a file: what would be known of it, had it been read; None where it is none."""
         bag = self._bags.pop(path, None)
         if bag is None:
             return None
-        notes = FileNotes.first(Path(path), self._stamps.pop(path), now)
+        notes = FileNotes.first(Path(path), self._stamp(bag), now)
+        del self._inodes[path]
         notes.recall(bag.summary)
         return notes, Verdict(Standing.CLOSED, bag)
+
+    def _stamp(self, bag: BagFile) -> Stamp:
+        """How the file looked. The ctime counts only where a file could not be read."""
+        return Stamp(bag.size, bag.mtime_ns, 0, self._inodes[bag.file], bag.sidecar_ns)
+
+
+def _in_time(bags: list[BagFile]) -> list[BagFile]:
+    """The bags by their starts: sorting what is sorted takes no time later."""
+    order = np.argsort(np.array([bag.start for bag in bags], np.int64), kind="stable")
+    return [bags[at] for at in order.tolist()]

@@ -370,7 +370,7 @@ class IndexManager:
 
 @contextmanager
 def _collector_resting() -> Iterator[None]:
-    """Within the block no garbage is looked for.
+    """Within the block no garbage is looked for, and afterwards not among what it made.
 
     What the first scan makes of a week's files stays, and looking through all of it again and
     again takes longer than making it.
@@ -382,6 +382,9 @@ def _collector_resting() -> Iterator[None]:
     try:
         yield
     finally:
+        # From the youngest generation into the oldest, which is seldom looked through.
+        gc.freeze()
+        gc.unfreeze()
         gc.enable()
 
 

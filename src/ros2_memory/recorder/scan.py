@@ -106,7 +106,7 @@ class _Folder:
     trusted: bool
     device: int = 0
     folders: list[str] = field(default_factory=list)
-    files: set[str] = field(default_factory=set)
+    files: list[str] = field(default_factory=list)
     links: list[Path] = field(default_factory=list)
     odd: list[SetAside] = field(default_factory=list)
     sidecar_ns: Ns = 0
@@ -143,7 +143,7 @@ class Tree:
         for path, folder in before.items():
             after = self._folders.get(path)
             if after is not folder:
-                walked.gone.update(folder.files - (after.files if after else set()))
+                walked.gone.update(set(folder.files).difference(after.files if after else ()))
         for file in watched:
             self._look(file, walked)
         return walked
@@ -227,14 +227,18 @@ def _visit(
         for entry in entries:
             _enter(folder, entry, looked_at)
     if folder.sidecar_ns:
-        for file in folder.files & looked_at.keys():
-            looked_at[file] = looked_at[file]._replace(sidecar_ns=folder.sidecar_ns)
+        for file in folder.files:
+            if file in looked_at:
+                looked_at[file] = Stamp(*looked_at[file][:4], folder.sidecar_ns)
     return folder
 
 
 def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]) -> None:
     hidden = entry.name.startswith(".")
-    if entry.is_symlink():
+    # Nearly all that is listed, so it is asked for first.
+    if not hidden and entry.name.endswith(BAG_KINDS) and entry.is_file(follow_symlinks=False):
+        _enter_file(folder, entry, looked_at)
+    elif entry.is_symlink():
         if not hidden or bag_kind(entry.name):
             folder.links.append(Path(entry.path))
     elif entry.is_dir(follow_symlinks=False):
@@ -243,13 +247,13 @@ def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]
     elif entry.name == HANDOVER_FILE:
         _enter_sidecar(folder, entry)
     elif bag_kind(entry.name):
-        _enter_file(folder, entry, looked_at)
+        if entry.is_file(follow_symlinks=False):
+            _enter_file(folder, entry, looked_at)
+        else:
+            folder.odd.append(SetAside(Path(entry.path), "not a regular file"))
 
 
 def _enter_file(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]) -> None:
-    if not entry.is_file(follow_symlinks=False):
-        folder.odd.append(SetAside(Path(entry.path), "not a regular file"))
-        return
     try:
         looked_at[entry.path] = Stamp.of(entry.stat(follow_symlinks=False))
     except FileNotFoundError:
@@ -259,9 +263,9 @@ def _enter_file(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, S
         folder.odd.append(SetAside(Path(entry.path), reason))
         folder.trusted = False
         # One that is known is not gone because of it.
-        folder.files.add(entry.path)
+        folder.files.append(entry.path)
         return
-    folder.files.add(entry.path)
+    folder.files.append(entry.path)
 
 
 def _enter_sidecar(folder: _Folder, entry: os.DirEntry[str]) -> None:

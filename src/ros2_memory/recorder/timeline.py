@@ -8,7 +8,7 @@ falls into is worked out again.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -47,6 +47,8 @@ class Extent(NamedTuple):
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
 
+_RUNS_AT_HAND: Final = 64
+"""Two days of splits."""
 RUN_LIMIT: Final = 256
 """Bags in a run at most: few enough to work out in a millisecond, and 240 runs make a week."""
 
@@ -93,7 +95,6 @@ class Run:
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
-        self._columns: dict[str, _Column | None] = {}
 
     @cached_property
     def latest(self) -> Ns:
@@ -125,18 +126,15 @@ class Run:
         )
 
     @cached_property
-    def _alike(self) -> tuple[_Alike, ...]:
-        """The bags by shape. Most runs have one."""
-        places: dict[int, list[int]] = {}
-        for place, bag in enumerate(self.bags):
-            places.setdefault(id(bag.summary.shape), []).append(place)
-        return tuple(_alike([self.bags[place] for place in at], at) for at in places.values())
+    def _shapes(self) -> tuple[Shape, ...]:
+        """The shapes of the bags. Most runs have one."""
+        return tuple(each.shape for each in _at_hand(self).alike)
 
     @cached_property
     def stated(self) -> dict[str, dict[str, Stated]]:
         """By topic and type, what the summaries of the bags say."""
         stated: dict[str, dict[str, Stated]] = {}
-        for shape, _, numbers in self._alike:
+        for shape, _, numbers in _at_hand(self).alike:
             rows = zip(
                 shape.topics,
                 numbers[:, :, 1].min(axis=0).tolist(),
@@ -190,7 +188,7 @@ class Run:
 
     def bags_with(self, topic: str) -> tuple[BagFile, ...]:
         """The bags that hold messages of the topic, in order; `bags` itself where all do."""
-        if all(topic in alike.shape.places for alike in self._alike):
+        if all(topic in shape.places for shape in self._shapes):
             return self.bags
         column = self._column(topic)
         places = [] if column is None else column.at.tolist()
@@ -198,9 +196,10 @@ class Run:
 
     def _column(self, topic: str) -> _Column | None:
         """What is held of a topic; None where nothing is."""
-        if topic not in self._columns:
-            self._columns[topic] = _column_of(self._alike, topic)
-        return self._columns[topic]
+        numbers = _at_hand(self)
+        if topic not in numbers.columns:
+            numbers.columns[topic] = _column_of(numbers.alike, topic)
+        return numbers.columns[topic]
 
     @cached_property
     def spans(self) -> dict[str, Span]:
@@ -222,16 +221,13 @@ class Run:
     def latched(self) -> frozenset[str]:
         """The topics that some publisher offered as transient local."""
         return frozenset(
-            heading.topic
-            for alike in self._alike
-            for heading in alike.shape.topics
-            if heading.latched
+            heading.topic for shape in self._shapes for heading in shape.topics if heading.latched
         )
 
     @cached_property
     def silent(self) -> frozenset[str]:
         """The topics that some bag declares without a message."""
-        return frozenset(chain.from_iterable(alike.shape.silent for alike in self._alike))
+        return frozenset(chain.from_iterable(shape.silent for shape in self._shapes))
 
 
 class Timeline:
@@ -393,6 +389,23 @@ def _runs_of(bags: Sequence[BagFile]) -> list[Run]:
 
 def _wider(known: Span | None, span: Span) -> Span:
     return span if known is None else (min(known[0], span[0]), max(known[1], span[1]))
+
+
+class _Numbers:
+    """The numbers of a run's bags, and what of them was asked for."""
+
+    def __init__(self, alike: tuple[_Alike, ...]) -> None:
+        self.alike = alike
+        self.columns: dict[str, _Column | None] = {}
+
+
+@lru_cache(maxsize=_RUNS_AT_HAND)
+def _at_hand(run: Run) -> _Numbers:
+    """The numbers of a run: a copy of what its summaries say, so of a week few are held."""
+    places: dict[int, list[int]] = {}
+    for place, bag in enumerate(run.bags):
+        places.setdefault(id(bag.summary.shape), []).append(place)
+    return _Numbers(tuple(_alike([run.bags[place] for place in at], at) for at in places.values()))
 
 
 def _alike(bags: Sequence[BagFile], at: Sequence[int]) -> _Alike:
