@@ -113,6 +113,16 @@ def _visit(visit: accounts.Visit, now: Ns) -> JsonObject:
     return reply
 
 
+@shown.register(accounts.TypeFields)
+def _type_fields(answer: accounts.TypeFields, _bag_dir: Path) -> JsonObject:
+    reply: JsonObject = {
+        "type": answer.type,
+        "topics": [*answer.topics],
+        "fields": dict(answer.fields),
+    }
+    return with_notes(reply, answer.notes)
+
+
 @shown.register(accounts.Status)
 def _status(answer: accounts.Status, _bag_dir: Path) -> JsonObject:
     latest = answer.latest

@@ -183,4 +183,14 @@ class Visits:
     notes: tuple[str, ...] = ()
 
 
-Account: TypeAlias = Sightings | Recap | Status | Visits
+@dataclass(frozen=True, slots=True)
+class TypeFields:
+    """The fields that replies show of a message type, and the topics recorded under it."""
+
+    type: str
+    topics: tuple[str, ...]
+    fields: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
+
+
+Account: TypeAlias = Sightings | Recap | Status | Visits | TypeFields

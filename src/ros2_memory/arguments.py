@@ -311,6 +311,12 @@ class Window(Arguments):
     span: Span
 
 
+class OfType(Arguments):
+    """A message type."""
+
+    type: Annotated[_Text, Field(examples=["nav_msgs/msg/Odometry"])]
+
+
 class Place(Arguments):
     """A place of the plane."""
 

@@ -14,11 +14,12 @@ from ros2_memory.adapters import build_reader, retention_limits
 from ros2_memory.catalogue import FILE, FOLDER, Catalogue
 from ros2_memory.config import load_message_schemas
 from ros2_memory.digest import DIGEST_VERSION, Digester
-from ros2_memory.dispatch import Dispatcher, EpisodicServer
+from ros2_memory.dispatch import Dispatcher
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.filling import Filler
 from ros2_memory.instructions import instructions
 from ros2_memory.memory import Limits, Memory
+from ros2_memory.protocol import EpisodicServer
 from ros2_memory.recall import Recall
 from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.counting import CountingReader
@@ -26,7 +27,7 @@ from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.replies import Replies
 from ros2_memory.settings import NullRecorderNode
 from ros2_memory.timebase import WallClock
-from ros2_memory.tools import build_tools
+from ros2_memory.tools import build_tools, readable_tools
 
 if TYPE_CHECKING:
     from ros2_memory.settings import Settings
@@ -136,7 +137,7 @@ def build_server(settings: Settings, memory: Memory) -> EpisodicServer:
     )
     dispatcher = Dispatcher(
         memory,
-        tools,
+        (*tools, *readable_tools(memory.limits)),
         Replies(settings.recording.bag_dir, served.max_reply_chars),
         call_timeout_s=served.call_timeout_s,
     )
@@ -145,7 +146,7 @@ def build_server(settings: Settings, memory: Memory) -> EpisodicServer:
         tools,
         name=served.name,
         version=package_version(),
-        instructions=instructions(memory.limits),
+        instructions=instructions(memory.limits, additions=served.tools == "all"),
     )
 
 

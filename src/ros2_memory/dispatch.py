@@ -16,10 +16,6 @@ from typing import TYPE_CHECKING, Final
 
 import anyio
 import structlog
-from mcp.server.mcpserver import Context, MCPServer
-from mcp.types import CallToolResult, TextContent, ToolAnnotations
-from mcp.types import Tool as ListedTool
-from starlette.requests import Request
 
 from ros2_memory.errors import (
     BusyError,
@@ -47,9 +43,6 @@ BLOCKING_AT_ONCE: Final = 2
 
 Those that may take long have places of their own, so that a quick one never waits for them.
 """
-
-MESSAGES_PATH: Final = "/messages/"
-"""Where the clients of event streams post, each with its session in the query string."""
 
 _SOONER_S: Final = 0.5
 """How much before the call a query gives up, so that its own sentence is what the client reads."""
@@ -203,74 +196,3 @@ class _Waits:
         if waited < _WORTH_TELLING_S:
             return ""
         return f" (it waited {waited:.1f} s of its time behind other questions)"
-
-
-class EpisodicServer(MCPServer[object]):
-    """The MCP server over a dispatcher: lists the tools as declared, and answers with one text.
-
-    Text alone, without structured content: some clients forward only the latter where both exist,
-    and a JSON string is what the tools promise.
-    """
-
-    def __init__(
-        self,
-        dispatcher: Dispatcher,
-        tools: Sequence[Tool],
-        *,
-        name: str,
-        version: str,
-        instructions: str,
-    ) -> None:
-        super().__init__(name, version=version, instructions=instructions)
-        self.dispatcher = dispatcher
-        self._listed = [_listed(tool) for tool in tools]
-
-    async def list_tools(self) -> list[ListedTool]:
-        """The tools, in the order of their declaration."""
-        return self._listed
-
-    async def call_tool(
-        self, name: str, arguments: Mapping[str, object], context: object | None = None
-    ) -> CallToolResult:
-        """One call's reply as one text block. Raises nothing but cancellation."""
-        client = _client(context)
-        reply = await self.dispatcher.answer(name, arguments, client)
-        return CallToolResult(
-            content=[TextContent(type="text", text=reply.text)], is_error=reply.is_error
-        )
-
-
-def _client(context: object) -> Hashable:
-    """Who asks, as far as it can be told: a session, or else an address and a program.
-
-    None over stdio, which has one client. Nothing but turns is given by it: a client may say that
-    it is another.
-    """
-    request = context.request_context.request if isinstance(context, Context) else None
-    if not isinstance(request, Request):
-        return None
-    # It was parsed, and would be kept for as long as the call waits: up to 4 MiB for each.
-    request._body = b""
-    session = request.query_params.get("session_id")
-    if session is not None and request.url.path.startswith(MESSAGES_PATH):
-        return session
-    address = request.client.host if request.client else ""
-    name = request.headers.get("mcp-session-id") or request.headers.get("user-agent", "")
-    return address, name[:_LONGEST_NAME]
-
-
-def _listed(tool: Tool) -> ListedTool:
-    return ListedTool(
-        name=tool.name,
-        title=tool.title,
-        description=tool.description,
-        input_schema=dict(tool.schema),
-        annotations=ToolAnnotations(
-            title=tool.title,
-            read_only_hint=True,
-            destructive_hint=False,
-            idempotent_hint=True,
-            open_world_hint=False,
-        ),
-        _meta={"blocking": True} if tool.blocking else None,
-    )

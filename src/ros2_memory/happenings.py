@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.arguments import Between, Last, Matches, Nothing, Place, Window, tested
+from ros2_memory.arguments import Between, Last, Matches, Nothing, OfType, Place, Window, tested
 from ros2_memory.entries import Entry, Variant
+from ros2_memory.kinds import describe_type
 from ros2_memory.recap import recap
 from ros2_memory.sightings import find_matches
 from ros2_memory.status import memory_status
@@ -24,6 +25,11 @@ def tools(facts: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
     yield from _RECAP.tools(facts)
     yield from _VISITS.tools(facts)
     yield from _STATUS.tools(facts)
+
+
+def readable(facts: Mapping[str, object]) -> Iterator[Tool]:
+    """What is asked by reading a resource, and no tool."""
+    yield from _TYPE.tools(facts)
 
 
 _SIGHTINGS = Entry(
@@ -73,4 +79,10 @@ _VISITS = Entry(
         memory, call, given.x, given.y, radius_m=given.radius_m, limit=given.limit
     ),
     blocking=True,
+)
+_TYPE = Entry(
+    (Variant("describe_type", "Fields of a message type"),),
+    "The fields that replies show of a message type.",
+    OfType,
+    lambda memory, call, given: describe_type(memory, call, given.type),
 )

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
     from pydantic import SecretStr
 
-    from ros2_memory.dispatch import EpisodicServer
     from ros2_memory.filling import Filler
     from ros2_memory.http import Background, WebApp
     from ros2_memory.listening import Address
     from ros2_memory.memory import Memory
+    from ros2_memory.protocol import EpisodicServer
     from ros2_memory.settings import ServerSettings
 
 PROGRAM: Final = "ros2-memory-server"

@@ -34,6 +34,11 @@ if TYPE_CHECKING:
     from ros2_memory.memory import Call, Limits, Memory
 
 
+def readable_tools(limits: Limits) -> tuple[Tool, ...]:
+    """What is asked by reading a resource, and no tool."""
+    return tuple(happenings.readable({"pose_topic": limits.pose_topic}))
+
+
 def build_tools(
     limits: Limits, call_timeout_s: float, *, additions: bool = True, writing: bool = False
 ) -> tuple[Tool, ...]:

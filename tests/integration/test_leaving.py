@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, cast
 import anyio
 import pytest
 
-from ros2_memory.dispatch import Dispatcher, EpisodicServer
+from ros2_memory.dispatch import Dispatcher
 from ros2_memory.entries import Tool
 from ros2_memory.errors import QueryTimeoutError
 from ros2_memory.http import web_app
+from ros2_memory.protocol import EpisodicServer
 from ros2_memory.replies import Replies
 from tests.soak.clients import modern, opening
 from tests.soak.wire import call, connected, head, posted

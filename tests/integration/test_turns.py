@@ -12,8 +12,9 @@ import pytest
 from mcp import Client
 from mcp.client.sse import sse_client
 
-from ros2_memory.dispatch import Dispatcher, EpisodicServer
+from ros2_memory.dispatch import Dispatcher
 from ros2_memory.http import web_app
+from ros2_memory.protocol import EpisodicServer
 from ros2_memory.replies import Replies, Reply
 from tests.soak.wire import call, posted
 from tests.webserver import listening

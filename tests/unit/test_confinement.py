@@ -44,7 +44,7 @@ from tests.bags import boolean, text, write_db3, write_mcap
 from tests.questions import ANSWERED, T0, T0_S, write_run
 
 if TYPE_CHECKING:
-    from ros2_memory.dispatch import EpisodicServer
+    from ros2_memory.protocol import EpisodicServer
     from ros2_memory.settings import Settings
 
 SECRET = "/outside/secret"  # noqa: S105  the name of a topic

@@ -13,7 +13,7 @@ from mcp.types import TextContent
 from structlog.testing import LogCapture
 
 from ros2_memory import answers
-from ros2_memory.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher, EpisodicServer
+from ros2_memory.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher
 from ros2_memory.entries import Tool
 from ros2_memory.errors import (
     EpisodicError,
@@ -25,6 +25,7 @@ from ros2_memory.errors import (
 from ros2_memory.lanes import MOST_WAITING
 from ros2_memory.memory import Memory
 from ros2_memory.model import Sample
+from ros2_memory.protocol import EpisodicServer
 from ros2_memory.replies import Replies, Reply
 
 if TYPE_CHECKING:

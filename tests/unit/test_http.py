@@ -11,11 +11,12 @@ import httpx2
 import pytest
 
 from ros2_memory import answers
-from ros2_memory.dispatch import Dispatcher, EpisodicServer
+from ros2_memory.dispatch import Dispatcher
 from ros2_memory.entries import Tool
 from ros2_memory.http import GRACE_S, Guard, WebApp, web_app
 from ros2_memory.memory import Memory
 from ros2_memory.model import Sample
+from ros2_memory.protocol import EpisodicServer
 from ros2_memory.replies import Replies
 
 if TYPE_CHECKING:
