@@ -30,8 +30,8 @@ from tests.fuzz.traps import sprung
 if TYPE_CHECKING:
     from collections.abc import Mapping, MutableMapping
 
-    from ros2_memory.dispatch import EpisodicServer
     from ros2_memory.memory import Memory
+    from ros2_memory.protocol import EpisodicServer
     from ros2_memory.settings import Settings
     from tests.fuzz.classes import Job
     from tests.fuzz.mutant import Mutant
