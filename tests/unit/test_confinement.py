@@ -24,6 +24,7 @@ from ros2_memory.config import load_settings
 from ros2_memory.errors import BagError, RecorderError
 from ros2_memory.memory import Limits
 from ros2_memory.model import TimeWindow
+from ros2_memory.recorder import ros2bag
 from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.handover import read_handover
 from ros2_memory.recorder.heartbeat import read_heartbeat
@@ -325,6 +326,21 @@ class TestWhatTheRecorderKeepsBesideBags:
             BagDirLock.acquire(bags)
         with pytest.raises(BagError, match="File exists"):
             _write_through(bags / "x.mcap", kept)
+        assert contents(outside) == before
+
+    def test_old_logs_of_ros_are_deleted_and_none_behind_a_link(
+        self, bags: Path, outside: Path
+    ) -> None:
+        for folder in (bags / ".ros_log", outside / "logs"):
+            folder.mkdir()
+            for number in range(ros2bag.LOGS_KEPT + 3):
+                (folder / f"{number}.log").touch()
+        before = contents(outside)
+        ros2bag._prune(bags / ".ros_log")
+        assert len(list((bags / ".ros_log").iterdir())) == ros2bag.LOGS_KEPT
+        shutil.rmtree(bags / ".ros_log")
+        (bags / ".ros_log").symlink_to(outside / "logs")
+        ros2bag._prune(bags / ".ros_log")
         assert contents(outside) == before
 
     def test_no_handover_is_settled_behind_a_link(self, bags: Path, outside: Path) -> None:

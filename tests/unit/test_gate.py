@@ -58,6 +58,8 @@ async def test_who_shows_the_token_comes_in(scheme: str) -> None:
         f"Bearer {GOOD}, Bearer {GOOD}",
         f"Basic {GOOD}",
         f"Token {GOOD}",
+        f"Digest {GOOD}",
+        f"Bearer\t{GOOD}",
         GOOD,
         "",
     ],
