@@ -6,6 +6,7 @@ own. That process is stopped and let go on in turn, so that both are measured in
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -41,7 +42,8 @@ def figures(history: History) -> list[Figure]:
     case = Case(history, ours.settings_for(bare), known=False)
     _ask(case, Timed())
     quiet, busy = Timed(), Timed()
-    command = [sys.executable, "-m", "ros2_memory.cli", "index", "--for-server", "--"]
+    program = [sys.executable, "-m", "ros2_memory.cli", "index"]
+    command = [*program, "--for-server", str(os.getpid()), "--"]
     with subprocess.Popen([*command, *ours.overrides(bare)], stderr=subprocess.DEVNULL) as child:
         try:
             _wait_for_entries(case.memory)
