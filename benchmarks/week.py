@@ -20,6 +20,12 @@ from benchmarks.questions import Question, Target
 from benchmarks.timing import FLOOR, OURS
 from ros2_memory.bootstrap import build_filler
 from ros2_memory.catalogue import BagKey, relative
+from ros2_memory.memory import Call
+from ros2_memory.moments import Span
+from ros2_memory.recap import recap
+from ros2_memory.sightings import find_matches
+from ros2_memory.status import memory_status
+from ros2_memory.visits import visits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -47,7 +53,7 @@ class Week:
     def digests(self) -> list[Digest]:
         """Of the bags of the hour, oldest first."""
         digester = digests.digester_of(ours.memory(self.settings), self.settings)
-        return [digester.digest(split.path) for split in self.whole.hour.splits()]
+        return [digester.digest(link) for link, _, later in self.whole.links() if not later]
 
     @cached_property
     def filled(self) -> Settings:
@@ -132,11 +138,50 @@ def start(week: Week) -> Question:
     return Question(words, {OURS: lambda: [first]}, Target(seconds=0.5))
 
 
+def sightings(week: Week) -> Question:
+    """All sightings of a thing that was never seen."""
+
+    def found() -> object:
+        memory = week.memory
+        return find_matches(memory, Call(), SCENE.name, "contains", NEVER_SEEN).sightings
+
+    return _beside_a_search(week, f'find_matches "{NEVER_SEEN}"', found)
+
+
+def recap_of_an_hour(week: Week) -> Question:
+    """What happened in an hour in the middle of the week."""
+    hour = week.whole.hour
+    back = week.whole.recordings // 2 * (hour.end - hour.start)
+    span = Span(start_s=(hour.start - back) / 1e9, end_s=(hour.end - back) / 1e9 - 1e-3)
+    return _beside_a_search(
+        week, "recap of an hour", lambda: len(recap(week.memory, Call(), span).events)
+    )
+
+
+def visits_nowhere(week: Week) -> Question:
+    """Visits to a place where the robot never was."""
+    x, y = NOWHERE
+    return _beside_a_search(
+        week, "visits, never there", lambda: visits(week.memory, Call(), x, y).visits
+    )
+
+
+def status(week: Week) -> Question:
+    """How far the memory can be trusted."""
+    return _beside_a_search(
+        week, "memory_status", lambda: memory_status(week.memory, Call()).damaged
+    )
+
+
 WEEK_QUESTIONS: Final[Mapping[str, Callable[[Week], Question]]] = {
     "week-start": start,
     "week-rescan": rescan,
     "week-never-seen": never_seen,
     "week-never-near": never_near,
+    "week-sightings": sightings,
+    "week-recap": recap_of_an_hour,
+    "week-visits": visits_nowhere,
+    "week-status": status,
 }
 
 
@@ -149,6 +194,21 @@ def _never(week: Week, words: str, topic: str, value: JsonValue) -> Question:
             FLOOR: lambda: [partial(_searched, week.text)],
         },
         Target(floor=20),
+    )
+
+
+def _beside_a_search(week: Week, words: str, ask: Ask) -> Question:
+    """A question that should take little longer than a search for what was never seen."""
+    search = partial(ours.last_match, week.memory, SCENE.name, "contains", NEVER_SEEN)
+
+    def asked() -> None:
+        # What the two answer has nothing in common: they stand side by side for their time alone.
+        ask()
+
+    return Question(
+        f"{words}, {week.whole.bags} bags (floor: find_last_match, never seen)",
+        {OURS: lambda: [asked], FLOOR: lambda: [search]},
+        Target(floor=10),
     )
 
 
