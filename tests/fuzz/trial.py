@@ -96,12 +96,16 @@ class World:
                 path.write_bytes(data)
                 os.utime(path, (LONG_AGO_S, LONG_AGO_S))
 
+    def renew(self) -> None:
+        """Lets go of the memory and of what it keeps between questions."""
+        self._memory = build_memory(self.settings)
+        self._server = build_server(self.settings, self._memory)
+
     def serving(self) -> tuple[Memory, EpisodicServer]:
         """A memory and a server; the same for some mutants, as a server outlives its bags."""
         self._served += 1
         if self._served % _SERVED_AT_MOST == 0:
-            self._memory = build_memory(self.settings)
-            self._server = build_server(self.settings, self._memory)
+            self.renew()
         self._memory.index.refresh()
         return self._memory, self._server
 

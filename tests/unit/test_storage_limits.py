@@ -18,7 +18,12 @@ from ros2_memory.rendering import MAX_EXACT_NUMBERS
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.decoding import Decoding
 from ros2_memory.storage.faults import UnreadableError
-from ros2_memory.storage.limits import MAX_CHUNK_MESSAGES, most_unpacked
+from ros2_memory.storage.limits import (
+    MAX_CHANNELS,
+    MAX_CHUNK_MESSAGES,
+    MAX_CHUNKS,
+    most_unpacked,
+)
 from ros2_memory.storage.mcap_chunk import walk
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.mcap_writer import McapWriter
@@ -118,6 +123,18 @@ class TestChunks:
         assert rewritten.messages == 1
         assert rewritten.lost_bytes
 
+    def test_a_bag_of_more_topics_than_any_robot_has_is_not_read(self, tmp_path: Path) -> None:
+        many = [channel(n, 1, f"/t{n}") for n in range(1, MAX_CHANNELS + 2)]
+        with pytest.raises(BagError, match="declares more than 5000 topics"):
+            McapReader().summarize(bag(tmp_path, STRINGS[0], *many, said()))
+        assert McapReader().summarize(bag(tmp_path, STRINGS[0], *many[:-1], said())).count == 1
+
+    def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(self, tmp_path: Path) -> None:
+        first, each = chunk_of(bytes_of([*STRINGS, said()])), chunk_of(said().data)
+        summary = McapReader().summarize(bag(tmp_path, first, *[each] * (MAX_CHUNKS + 1)))
+        assert summary.count == MAX_CHUNKS
+        assert "more than 300000 chunks" in summary.notes[0]
+
 
 class TestMessages:
     def test_a_compressed_message_larger_than_allowed_cannot_be_decoded_and_the_next_can(
@@ -177,6 +194,15 @@ class TestWholeFiles:
         with pytest.raises(BagError, match="unpacks to more than 100 times its size"):
             Rosbag2Reader().summarize(path)
 
+    def test_a_file_of_more_frames_or_blocks_than_any_writer_makes_is_named(
+        self, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "bag.mcap.zstd"
+        for data in (rle_frame(1) * 10_001, rle_frame(10)[:6] + b"\x08\0\0x" * 1_000_001):
+            path.write_bytes(data)
+            with pytest.raises(BagError, match="it is made of more than"):
+                Rosbag2Reader().closing(path)
+
     def test_a_closed_bag_of_which_nothing_could_be_read_is_listed_as_damaged(
         self, tmp_path: Path
     ) -> None:
@@ -217,6 +243,29 @@ class TestSqlite:
     def test_a_table_of_messages_without_their_columns_is_refused(self, tmp_path: Path) -> None:
         path = self.edited(tmp_path, "ALTER TABLE messages RENAME COLUMN data TO other")
         with pytest.raises(BagError, match="lacks the tables topics and messages"):
+            Rosbag2Reader().summarize(path)
+
+    def test_more_topics_than_any_robot_has_and_enormous_definitions_are_refused(
+        self, tmp_path: Path
+    ) -> None:
+        path = self.edited(tmp_path)
+        text_of_mb = "x" * 1_000_000
+        with closing(sqlite3.connect(path)) as base:
+            base.executemany(
+                "INSERT INTO message_definitions VALUES (?, 'a/msg/B', 'ros2msg', ?, '')",
+                ((n, text_of_mb) for n in range(10, 80)),
+            )
+            base.commit()
+        with pytest.raises(BagError, match="definitions are larger"):
+            Rosbag2Reader().summarize(path)
+        with closing(sqlite3.connect(path)) as base:
+            base.execute("DELETE FROM message_definitions")
+            base.executemany(
+                "INSERT INTO topics VALUES (?, ?, 'a/msg/B', 'cdr', '', '')",
+                ((n, f"/t{n}") for n in range(10, 5010)),
+            )
+            base.commit()
+        with pytest.raises(BagError, match="declares more than 5000 topics"):
             Rosbag2Reader().summarize(path)
 
     def test_a_message_larger_than_allowed_is_named(self, tmp_path: Path) -> None:

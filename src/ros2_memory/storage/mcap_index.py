@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.storage.faults import UnreadableError, reason_of
-from ros2_memory.storage.limits import MAX_SECTION_BYTES
+from ros2_memory.storage.limits import MAX_CHUNKS, MAX_SECTION_BYTES
 from ros2_memory.storage.mcap_chunk import (
     Column,
     Extent,
@@ -145,7 +145,7 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     if stated is None or not resolved or stated.channels > len(channels):
         raise DoubtError
     counts = stated.counts
-    if not counts.keys() <= channels.keys():
+    if not counts.keys() <= channels.keys() or len(chunks) > MAX_CHUNKS:
         raise DoubtError
     held = [chunk for chunk in chunks if chunk.channels]
     if counts and len(held) < len(chunks):  # some have no index places

@@ -21,6 +21,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from ros2_memory.storage.base import Channel, Schema
 from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.limits import MAX_CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -137,7 +138,13 @@ class Declarations:
         )
 
     def channels(self) -> dict[int, Channel]:
-        """The channels by id; one whose schema is nowhere in the file has an empty schema."""
+        """The channels by id; one whose schema is nowhere in the file has an empty schema.
+
+        Raises:
+            UnreadableError: they are more than any robot has.
+        """
+        if len(self._channels) > MAX_CHANNELS:
+            raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
         return {
             number: Channel(
                 channel.topic,

@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.faults import UnreadableError, damage
 from ros2_memory.storage.limits import (
+    MAX_CHUNKS,
     MAX_SECTION_BYTES,
     MAX_TIMES_PACKED,
     most_unpacked,
@@ -170,6 +171,8 @@ class _Scan:
 
     def _require_harmless(self) -> None:
         """Looks into no more chunks where those so far came to more than a robot's ever do."""
+        if len(self.chunks) >= MAX_CHUNKS:
+            raise UnreadableError(f"it has more than {MAX_CHUNKS} chunks")
         if self.unpacked > most_unpacked(self.file.size):
             raise UnreadableError(
                 f"its chunks hold more than {MAX_TIMES_PACKED} times what the file does"

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.storage.base import Channel, Closing, Record, Schema
 from ros2_memory.storage.faults import UnreadableError
-from ros2_memory.storage.limits import MAX_CHUNK_MB
+from ros2_memory.storage.limits import MAX_CHANNELS, MAX_CHUNK_MB, MAX_SECTION_BYTES
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_records import offered_as_latched
 from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile, open_regular
@@ -54,6 +54,9 @@ _METADATA: Final = (
     ("type_description_hash", "topic_type_hash"),
 )
 """Columns of the table of topics, and what an MCAP file calls them in a channel's metadata."""
+_SIZE_OF_DEFINITIONS: Final = (
+    "SELECT total(length(encoded_message_definition)) FROM message_definitions"
+)
 _PAYLOAD: Final = "SELECT data FROM messages WHERE rowid = ?"
 
 
@@ -169,7 +172,7 @@ class SqliteBags:
         if not {"id", "name", "type"} <= have or not _columns(base, "messages") >= _MESSAGE_COLUMNS:
             raise UnreadableError("not a rosbag2 file: it lacks the tables topics and messages")
         definitions = _definitions(base)
-        rows = base.execute("SELECT * FROM topics ORDER BY id")
+        rows = base.execute("SELECT * FROM topics ORDER BY id LIMIT ?", (MAX_CHANNELS + 1,))
         names = [column[0] for column in rows.description]
         channels: dict[int, Channel] = {}
         for row in rows:
@@ -188,6 +191,8 @@ class SqliteBags:
                     ),
                 )
             )
+        if len(channels) > MAX_CHANNELS:
+            raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
         return _Topics(channels)
 
 
@@ -219,8 +224,12 @@ def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
     needed = {"topic_type", "encoding", "encoded_message_definition"}
     if not needed <= _columns(base, "message_definitions"):
         return {}
+    (size,) = base.execute(_SIZE_OF_DEFINITIONS).fetchone()
+    if size > MAX_SECTION_BYTES:
+        raise UnreadableError("damaged: its message definitions are larger than any can be")
     rows = base.execute(
-        "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?",
+        (MAX_CHANNELS,),
     )
     return {
         str(name): Schema(_full_type(str(name)), str(encoding), str(text).encode())

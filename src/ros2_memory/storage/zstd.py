@@ -19,6 +19,9 @@ _HEADER_BYTES: Final = 18
 _RLE_BLOCK: Final = 1
 _MAX_BLOCK_BYTES: Final = 128 << 10
 _MIN_BLOCK_BYTES: Final = 4
+_MAX_FRAMES: Final = 10_000
+_MAX_BLOCKS: Final = 1_000_000
+"""Of whole ones a file of 128 GB is made; small ones would be looked through for minutes."""
 
 
 class _Own(threading.local):
@@ -75,9 +78,16 @@ def begins_as_zstd(file: OpenFile) -> bool:
 
 
 def ends_whole(file: OpenFile) -> bool:
-    """Whether the file is made of whole frames, by their block headers alone (RFC 8878, 3.1)."""
-    position = 0
+    """Whether the file is made of whole frames, by their block headers alone (RFC 8878, 3.1).
+
+    Raises:
+        UnreadableError: it is made of more than any writer makes.
+    """
+    position, frames = 0, 0
     while position < file.size:
+        frames += 1
+        if frames > _MAX_FRAMES:
+            raise UnreadableError(f"damaged: it is made of more than {_MAX_FRAMES} frames")
         end = _frame_end(file, position)
         if end is None or end > file.size:
             return False
@@ -101,7 +111,11 @@ def _frame_end(file: OpenFile, start: int) -> int | None:
         checksum = 4 if zstandard.get_frame_parameters(head).has_checksum else 0
     except zstandard.ZstdError:
         return None
+    blocks = 0
     while position + 3 <= file.size:
+        blocks += 1
+        if blocks > _MAX_BLOCKS:
+            raise UnreadableError(f"damaged: it is made of more than {_MAX_BLOCKS} blocks")
         header = int.from_bytes(file.read(position, 3), "little")
         last, kind, size = header & 1, header >> 1 & 3, header >> 3
         position += 3 + (1 if kind == _RLE_BLOCK else size)
