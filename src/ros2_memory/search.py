@@ -140,7 +140,9 @@ class Search:
             self._tested = True
             return self._condition.matches(value)
         except UndecodableError as error:
-            self._failures.setdefault((channel.topic, channel.type), error)
+            # One that was raised keeps all that was on the way, the message with it.
+            alone = UndecodableError(error.topic, error.type_name, error.reason)
+            self._failures.setdefault((channel.topic, channel.type), alone)
             return False
         finally:
             self._view.call.stages.add("extract", time.perf_counter_ns() - begin)

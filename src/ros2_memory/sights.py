@@ -58,7 +58,8 @@ class Sights:
         try:
             message = self._reader.decode(record)
         except UndecodableError as error:
-            return error
+            # One that was raised keeps all that was on the way, the message with it.
+            return UndecodableError(error.topic, error.type_name, error.reason)
         pose = self._extractor.pose(message, type_name)
         twist = self._extractor.twist(message, type_name)
         return Sight(pose, None if twist is None else math.hypot(*twist.linear))

@@ -15,6 +15,7 @@ from ros2_memory.digest import Digester
 from ros2_memory.errors import BagError, UndecodableError
 from ros2_memory.model import TimeWindow
 from ros2_memory.rendering import MAX_EXACT_NUMBERS
+from ros2_memory.sights import Sights
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.decoding import Decoding
 from ros2_memory.storage.faults import UnreadableError
@@ -159,6 +160,15 @@ class TestMessages:
         assert len(getattr(few, "data", ())) == 1000
         with pytest.raises(UndecodableError, match="more than 200000 texts or messages"):
             Decoding().decode(record(300_000))
+
+    def test_messages_that_cannot_be_decoded_are_not_kept_with_their_errors(self) -> None:
+        known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
+        reader = McapReader()
+        record = Record(known, 1, 1, b"\0\1\0\0" + bytes([255] * 20))
+        [error] = Sights(reader, extractor()).of([record])
+        assert isinstance(error, UndecodableError)
+        assert error.__traceback__ is None
+        assert error.__cause__ is None
 
     def test_a_large_array_of_numbers_is_decoded(self) -> None:
         known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
