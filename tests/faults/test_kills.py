@@ -1,6 +1,6 @@
 """SIGKILL of the server at any moment, while clients ask and its helper digests.
 
-`FAULTS_KILLS` is how many (3 unless given): `FAULTS_KILLS=200 uv run pytest -n0 -s
+`FAULTS_KILLS` is how many (2 unless given): `FAULTS_KILLS=200 uv run pytest -n0 -s
 tests/faults/test_kills.py` takes some minutes, and prints how long the next start took to answer.
 """
 
@@ -28,7 +28,7 @@ from tests.waiting import until
 if TYPE_CHECKING:
     from pathlib import Path
 
-KILLS = int(os.environ.get("FAULTS_KILLS", "3"))
+KILLS = int(os.environ.get("FAULTS_KILLS", "2"))
 COUNT = 60
 """Bags: more than the server digests by itself, so that its helper runs."""
 LONGEST_S = 2.0
