@@ -51,7 +51,7 @@ def counts(memory: Memory) -> list[tuple[str, int]]:
     """Messages by topic, having indexed the folder."""
     snapshot = memory.index.refresh()
     return [
-        (topic, sum(summary.count for _, summary in snapshot.holding(topic)))
+        (topic, sum(each.messages for each in snapshot.stated(topic).values()))
         for topic in snapshot.topics()
     ]
 

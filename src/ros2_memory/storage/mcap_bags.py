@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.model import BagSummary, TimeWindow
+    from ros2_memory.storage.open_file import FileKey
     from ros2_memory.timebase import Ns
 
 
@@ -57,11 +58,16 @@ class McapBags:
         self._found: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self._shared: Shared[Channel] = Shared()
+        self._finished: FileKey | None = None
         self._last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel]] = {}, {}
 
     def closing(self, path: Path) -> Closing:
         """Whether the writer has finished the file."""
         with OpenFile(path) as file:
+            if is_finished(file):
+                # A bag is mostly asked for its summary next.
+                self._finished = file.key
+                return Closing.CLOSED
             return closing_of(file)
 
     def summarize(self, path: Path) -> BagSummary:
@@ -164,7 +170,8 @@ class McapBags:
     def _index(self, file: OpenFile) -> McapIndex:
         index = self._found.get(file.key)
         if not isinstance(index, McapIndex):
-            index = _index_of(file, self._max_chunk_bytes)
+            finished = file.key == self._finished or is_finished(file)
+            index = _index_of(file, self._max_chunk_bytes, finished=finished)
             index = index._replace(channels=self._shared_of(index.channels))
             self._found.put(file.key, index, index.bytes_held)
         return index
@@ -205,8 +212,8 @@ class McapBags:
         return data
 
 
-def _index_of(file: OpenFile, max_chunk_bytes: int) -> McapIndex:
-    if not is_finished(file):
+def _index_of(file: OpenFile, max_chunk_bytes: int, *, finished: bool) -> McapIndex:
+    if not finished:
         return index_by_scan(file, max_chunk_bytes)
     try:
         return index_from_summary(file)
