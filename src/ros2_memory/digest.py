@@ -142,22 +142,24 @@ class Digester:
             BagError: some of it cannot be read.
         """
         summary = self._reader.summarize(path)
-        topics = {each.topic: False for each in summary.topics}
+        latched: dict[str, bool] = {}
+        counts: dict[str, int] = {}
         for each in summary.topics:
-            topics[each.topic] |= each.latched
+            latched[each.topic] = latched.get(each.topic, False) or each.latched
+            counts[each.topic] = counts.get(each.topic, 0) + each.count
         collectors = {
             topic: _Collector(
                 topic,
                 self._reader,
                 self._extractor,
                 self._max_plausible_speed_mps,
-                latched=latched,
-                many=sum(each.count for each in summary.topics if each.topic == topic) > _FEW,
+                latched=latched[topic],
+                many=count > _FEW,
             )
-            for topic, latched in topics.items()
+            for topic, count in counts.items()
         }
         left = _ALWAYS_READ_BYTES + _MOST_TIMES_PACKED * _size(path)
-        for record in self._reader.records(path, tuple(topics), TimeWindow.everything()):
+        for record in self._reader.records(path, tuple(counts), TimeWindow.everything()):
             left -= len(record.payload) + _MESSAGE_BYTES
             if left < 0:
                 raise BagError(str(path), "its messages unpack to more than they can be worth")
