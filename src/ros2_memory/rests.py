@@ -100,6 +100,33 @@ class RestDigest:
     tail: Slot | None = None
 
 
+class _Growing:
+    """A slot to which poses are added one by one, for less than making it anew each time."""
+
+    __slots__ = ("first", "high", "last", "low", "number")
+
+    def __init__(self, time: Ns, position: Vector3) -> None:
+        self.number = time // SLOT_NS
+        self.first = Stop(time, position)
+        self.last = time
+        self.low = [*position]
+        self.high = [*position]
+
+    def add(self, time: Ns, position: Vector3) -> None:
+        self.last = time
+        low, high = self.low, self.high
+        for axis in (0, 1, 2):
+            value = position[axis]
+            if value < low[axis]:
+                low[axis] = value
+            elif value > high[axis]:
+                high[axis] = value
+
+    def slot(self) -> Slot:
+        (a, b, c), (d, e, f) = self.low, self.high
+        return Slot(self.number, self.first, self.last, Box3((a, b, c), (d, e, f)))
+
+
 class RestBuilder:
     """Takes poses, or whole bags of them, in log-time order, and says where the robot stood."""
 
@@ -107,13 +134,20 @@ class RestBuilder:
         self._done: list[Rest] = []
         self._rest: Rest | None = None
         self._open: Slot | None = None
+        self._growing: _Growing | None = None
 
     def add(self, time: Ns, position: Vector3) -> None:
         """Takes the next pose (m), which must be finite."""
-        self._take(slot_of(time, position))
+        growing = self._growing
+        if growing is not None and time // SLOT_NS == growing.number:
+            growing.add(time, position)
+        else:
+            self._settle()
+            self._growing = _Growing(time, position)
 
     def join(self, bag: RestDigest) -> None:
         """Takes all poses of a bag that come next, as if they were added one by one."""
+        self._settle()
         self._take(bag.head)
         if bag.second is None or bag.tail is None:
             return
@@ -133,12 +167,23 @@ class RestBuilder:
 
     def rests(self) -> tuple[Rest, ...]:
         """The rests so far, in order; more poses may be added after."""
-        done, rest, slot = list(self._done), self._rest, self._open
+        done, rest, slot = self.state()
         if slot is not None:
             own = Rest(slot.first.time, slot.last, slot.box)
             if own.is_still:
                 rest = own if rest is None else _joined(rest, own)
         return tuple(each for each in (*done, rest) if each is not None and each.end > each.start)
+
+    def state(self) -> tuple[tuple[Rest, ...], Rest | None, Slot | None]:
+        """What a digest is made of: the rests that are over, the one that is not, the last slot."""
+        self._settle()
+        return tuple(self._done), self._rest, self._open
+
+    def _settle(self) -> None:
+        """Takes the slot that was growing."""
+        if self._growing is not None:
+            slot, self._growing = self._growing.slot(), None
+            self._take(slot)
 
     def _take(self, slot: Slot) -> None:
         if self._open is None:
@@ -172,30 +217,25 @@ class RestBuilder:
             self._done.append(self._rest)
             self._rest = None
 
-    def state(self) -> tuple[tuple[Rest, ...], Rest | None, Slot | None]:
-        """What a digest is made of: the rests that are over, the one that is not, the last slot."""
-        return tuple(self._done), self._rest, self._open
-
 
 class RestCollector:
     """Makes the digest of one bag's poses, which come in log-time order."""
 
     def __init__(self) -> None:
-        self._head: Slot | None = None
+        self._head: _Growing | None = None
         self._second: Stop | None = None
         self._rest = RestBuilder()
 
     def add(self, time: Ns, position: Vector3) -> None:
         """Takes the next pose (m), which must be finite."""
         if self._second is None:
-            slot = slot_of(time, position)
             if self._head is None:
-                self._head = slot
+                self._head = _Growing(time, position)
                 return
-            if slot.number == self._head.number:
-                self._head = self._head.joined(slot)
+            if time // SLOT_NS == self._head.number:
+                self._head.add(time, position)
                 return
-            self._second = slot.first
+            self._second = Stop(time, position)
         self._rest.add(time, position)
 
     def digest(self) -> RestDigest | None:
@@ -205,7 +245,7 @@ class RestCollector:
         done, under_way, tail = self._rest.state()
         rests = done if under_way is None else (*done, under_way)
         return RestDigest(
-            head=self._head,
+            head=self._head.slot(),
             second=self._second,
             rests=rests,
             from_second=bool(
@@ -214,11 +254,6 @@ class RestCollector:
             to_tail=under_way is not None,
             tail=tail,
         )
-
-
-def slot_of(time: Ns, position: Vector3) -> Slot:
-    """The slot of one pose."""
-    return Slot(time // SLOT_NS, Stop(time, position), time, Box3(position, position))
 
 
 def _joined(rest: Rest, later: Rest) -> Rest:
