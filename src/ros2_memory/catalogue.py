@@ -196,22 +196,25 @@ class Catalogue:
         """Where the poses of the topic in the entries stand still; not where some have no pose."""
 
         def ask(base: sqlite3.Connection) -> dict[int, RestDigest]:
-            rows = tale_rows(base, "rests", topic, numbers)
-            return {number: unpacked_rests(packed) for number, packed in rows}
+            first, here = self._base.first, self._base.here(numbers)
+            rows = tale_rows(base, "rests", topic, here)
+            return {first + number: unpacked_rests(packed) for number, packed in rows}
 
         return self._read(ask, {})
 
     def stories(self, topic: str, numbers: Sequence[int]) -> dict[int, Story | None]:
         """What the messages of the topic in the entries say.
 
-        `QUIET` where they say nothing; None where none can be decoded. The entries must hold the
-        topic; none is left out but where the file fails.
+        `QUIET` where they say nothing; None where none can be decoded. Entries that hold none of
+        it are left out, and so are those that were dropped meanwhile.
         """
 
         def ask(base: sqlite3.Connection) -> dict[int, Story | None]:
-            found: dict[int, Story | None] = dict.fromkeys(numbers, QUIET)
-            for number, text in tale_rows(base, "story", topic, numbers):
-                found[number] = unpacked_story(text) if text else None
+            first, here = self._base.first, self._base.here(numbers)
+            held = held_rows(base, "NULL", topic, here)
+            found: dict[int, Story | None] = {first + number: QUIET for number, _ in held}
+            for number, text in tale_rows(base, "story", topic, here):
+                found[first + number] = unpacked_story(text) if text else None
             return found
 
         return self._read(ask, {})

@@ -115,6 +115,33 @@ def test_a_topic_that_cannot_be_decoded_has_no_story_and_is_not_taken_for_a_quie
     assert catalogue.stories("/tf_static", [number]) == {}
 
 
+def test_what_is_told_of_topics_comes_back_from_a_file_that_took_another_ones_place(
+    tmp_path: Path,
+) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.put(KEY, DIGEST)
+    [former] = catalogue.find([KEY])
+    assert catalogue.path is not None
+    catalogue.path.unlink()
+    catalogue.look_after()
+    assert catalogue.put(KEY, DIGEST)
+    [number] = catalogue.find([KEY])
+    assert former is not None
+    assert number is not None
+    assert catalogue.rests("/odom", [former, number]) == {number: topic(DIGEST, "/odom").rests}
+    story = topic(DIGEST, "/bumper").story
+    assert catalogue.stories("/bumper", [former, number]) == {number: story}
+
+
+def test_an_entry_that_was_dropped_is_not_taken_for_one_of_a_quiet_topic(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.put(KEY, DIGEST)
+    [number] = catalogue.find([KEY])
+    assert number is not None
+    catalogue_in(tmp_path, "another configuration").forget_other_configurations()
+    assert catalogue.stories("/bumper", [number]) == {}
+
+
 @pytest.mark.parametrize(
     "other",
     [
