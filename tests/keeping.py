@@ -37,6 +37,7 @@ def keeper_of(
     reader: BagReader | None = None,
     writer: BagWriter | None = None,
     grace_s: float = 0.0,
+    moments_bytes: int = PLENTY,
     monotonic: Callable[[], float] = time.monotonic,
     measure_free: Callable[[Path], int] = lambda _: PLENTY,
 ) -> Housekeeping:
@@ -48,6 +49,7 @@ def keeper_of(
         clock or later(),
         RetentionLimits(max_bytes, round(max_age_h * HOUR)),
         split_duration_s=10.0,
+        moments_bytes=moments_bytes,
         static_topics=("/tf_static",),
         grace_s=grace_s,
         monotonic=monotonic,

@@ -69,6 +69,7 @@ ANSWERED: list[tuple[str, dict[str, Any], str]] = [
     ("recap_last", {"seconds": 5}, "stood_s"),
     ("visits", {"x": 0.0, "y": 0.0}, "there_now"),
     ("memory_status", {}, "trust"),
+    ("list_moments", {}, "moments"),
 ]
 REFUSED: list[tuple[str, dict[str, Any], str, bool]] = [
     ("get_position_at", {"timestamp": 5}, "no_data", False),

@@ -171,6 +171,42 @@ def _budget(answer: accounts.Status) -> JsonObject:
     return shown_budget
 
 
+@shown.register(accounts.Remembered)
+def _remembered(answer: accounts.Remembered, _bag_dir: Path) -> JsonObject:
+    return {
+        "moment": answer.moment,
+        "label": answer.label,
+        "start": moment(answer.start),
+        "end": moment(answer.end),
+        "bags": answer.bags,
+        "pending": answer.pending,
+    }
+
+
+@shown.register(accounts.KeptMoments)
+def _kept_moments(answer: accounts.KeptMoments, _bag_dir: Path) -> JsonObject:
+    reply: JsonObject = {"moments": [_kept(each, answer.now) for each in answer.moments]}
+    if answer.more:
+        reply["more"] = answer.more
+    return reply
+
+
+def _kept(kept: accounts.KeptMoment, now: Ns) -> JsonObject:
+    shown_moment: JsonObject = {
+        "moment": kept.moment,
+        "label": kept.label,
+        "start": moment(kept.start),
+        "end": moment(kept.end),
+        "ago_s": seconds(now - kept.end),
+        "bags": kept.bags,
+        "size_gb": round(kept.size / 1e9, 6),
+        "complete": not (kept.pending or kept.missing),
+    }
+    if kept.pending:
+        shown_moment["pending"] = True
+    return with_notes(shown_moment, kept.missing)
+
+
 def robot(pose: Pose) -> JsonObject:
     """Where the robot was, and how it stood."""
     unit = None if pose.orientation is None else normalised(pose.orientation)

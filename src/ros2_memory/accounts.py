@@ -193,4 +193,42 @@ class TypeFields:
     notes: tuple[str, ...] = ()
 
 
-Account: TypeAlias = Sightings | Recap | Status | Visits | TypeFields
+@dataclass(frozen=True, slots=True)
+class Remembered:
+    """A moment that the recorder keeps: its name, and the bags that it has so far.
+
+    `start` and `end` (inclusive) are those asked for. `pending`: the rest is still being written.
+    """
+
+    moment: str
+    label: str
+    start: Ns
+    end: Ns
+    bags: int
+    pending: bool
+
+
+@dataclass(frozen=True, slots=True)
+class KeptMoment:
+    """A moment that is kept; `size` in bytes, `missing` says what of it is not kept."""
+
+    moment: str
+    label: str
+    start: Ns
+    end: Ns
+    bags: int
+    size: int
+    pending: bool
+    missing: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptMoments:
+    """The moments that are kept, newest first; `more` is how many there are besides."""
+
+    moments: tuple[KeptMoment, ...]
+    more: int
+    now: Ns
+
+
+Account: TypeAlias = Sightings | Recap | Status | Visits | TypeFields | Remembered | KeptMoments

@@ -63,6 +63,12 @@ def retention_limits(settings: Settings) -> RetentionLimits:
     )
 
 
+def moments_bytes(settings: Settings) -> int:
+    """What moments may take; never more than half the budget, so that there is room for today."""
+    kept = settings.retention
+    return round(min(kept.max_moments_gb, kept.max_total_gb / 2) * GB)
+
+
 def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> Housekeeper:
     """What repairs and deletes in the bag directory of the recorder; nobody else may delete."""
     limits = retention_limits(settings)
@@ -74,6 +80,7 @@ def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> H
             WallClock(),
             limits,
             split_duration_s=settings.recording.split_duration_s,
+            moments_bytes=moments_bytes(settings),
             static_topics=settings.data.tf_static_topics,
             grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
         )

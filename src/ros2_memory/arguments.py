@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from abc import ABC, abstractmethod
-from typing import Annotated, ClassVar, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import (
     AfterValidator,
@@ -23,6 +23,10 @@ from pydantic import (
 )
 
 from ros2_memory.moments import Moment, Span
+from ros2_memory.recorder.keepsake import fault_of_label
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 LATEST_MOMENT_S: Final = 9_223_372_036.0
 """The last second that a 64-bit clock of nanoseconds can tell; more is another unit."""
@@ -32,6 +36,9 @@ LONGEST_NAME: Final = 500
 """Characters: twice what DDS takes for a topic."""
 LONGEST_VALUE: Final = 2_000
 MOST_FIELDS: Final = 100
+MOST_BEFORE_S: Final = 3600.0
+MOST_AFTER_S: Final = 600.0
+"""Of a moment that is to be kept."""
 
 
 def _as_list(value: object) -> object:
@@ -79,6 +86,22 @@ def _reachable(seconds: float) -> float:
     if seconds > LATEST_MOMENT_S:
         raise ValueError("is too large for Unix seconds; is it in milliseconds or nanoseconds?")
     return seconds
+
+
+def _label(value: str) -> str:
+    fault = fault_of_label(value)
+    if fault is not None:
+        raise ValueError(fault)
+    return value
+
+
+def _within(most: float) -> Callable[[float], float]:
+    def check(seconds: float) -> float:
+        if seconds > most:
+            raise ValueError(f"is more than {most:g}")
+        return seconds
+
+    return check
 
 
 def _testable(value: JsonValue) -> JsonValue:
@@ -133,7 +156,7 @@ Child: TypeAlias = Annotated[
 Fields: TypeAlias = Annotated[
     tuple[_Text, ...],
     BeforeValidator(_as_list),
-    Field(description='Dot-paths that narrow value, e.g. ["position.x"].'),
+    Field(description='Parts of value, e.g. ["position.x"].'),
 ]
 Since: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing before.")]
 Until: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing after.")]
@@ -166,8 +189,13 @@ SearchField: TypeAlias = Annotated[
     _Text, Field(description="Dot-path in value that alone is tested.")
 ]
 Before: TypeAlias = Annotated[
-    _Unix, Field(description="Unix seconds; search only up to then, e.g. to go on after a timeout.")
+    _Unix, Field(description="Unix seconds; nothing after: goes on after a timeout.")
 ]
+Label: TypeAlias = Annotated[
+    str, Field(strict=True, examples=["charger found"]), AfterValidator(_label)
+]
+_Before: TypeAlias = Annotated[_Duration, AfterValidator(_within(MOST_BEFORE_S))]
+_After: TypeAlias = Annotated[_Duration, AfterValidator(_within(MOST_AFTER_S))]
 
 
 class Arguments(BaseModel):
@@ -309,6 +337,14 @@ class Window(Arguments):
     """A window."""
 
     span: Span
+
+
+class Remember(Arguments):
+    """A label, and how much around now is to be kept."""
+
+    label: Label
+    seconds_before: _Before = 30
+    seconds_after: _After = 0
 
 
 class OfType(Arguments):

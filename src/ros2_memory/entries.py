@@ -26,7 +26,10 @@ A = TypeVar("A", bound=Arguments)
 
 @dataclass(frozen=True, slots=True)
 class Tool:
-    """One tool as clients see it; `question` checks what is given and binds it to its query."""
+    """One tool as clients see it; `question` checks what is given and binds it to its query.
+
+    `writes`: it changes what is kept.
+    """
 
     name: str
     title: str
@@ -34,6 +37,7 @@ class Tool:
     schema: JsonObject
     blocking: bool
     question: Callable[[Mapping[str, object]], Question]
+    writes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +63,7 @@ class Entry(Generic[A]):
     arguments: type[A]
     ask: Callable[[Memory, Call, A], Answer | Account]
     blocking: bool = False
+    writes: bool = False
 
     def tools(self, facts: Mapping[str, object]) -> Iterator[Tool]:
         """The tools; `facts` fill the description's placeholders."""
@@ -75,6 +80,7 @@ class Entry(Generic[A]):
                 signature.json_schema(),
                 self.blocking,
                 partial(self._question, signature),
+                self.writes,
             )
 
     def _question(self, signature: Signature[A], given: Mapping[str, object]) -> Question:

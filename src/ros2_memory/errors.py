@@ -10,6 +10,7 @@
     |   |-- BagVanishedError      bag_unreadable     it is gone (retention, unmount)
     |   `-- BagUnreachableError   bag_unreadable     the disk or the machine fails, not the file
     |-- UndecodableError          undecodable        a message whose bytes mean nothing to us
+    |-- RefusedError              refused            something that is not done, and why
     `-- RecorderError             recorder           recording cannot start or go on
 
 Adapters translate every foreign exception into this tree; `tools.py` alone turns it into JSON.
@@ -116,6 +117,12 @@ class UndecodableError(EpisodicError):
         self.topic = topic
         self.type_name = type_name
         self.reason = reason
+
+
+class RefusedError(EpisodicError):
+    """What was asked for is not done; the sentence says why, and what to do instead."""
+
+    code = "refused"
 
 
 class RecorderError(EpisodicError):

@@ -4,8 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.arguments import Between, Last, Matches, Nothing, OfType, Place, Window, tested
+from ros2_memory.arguments import (
+    Between,
+    Last,
+    Matches,
+    Nothing,
+    OfType,
+    Place,
+    Remember,
+    Window,
+    tested,
+)
 from ros2_memory.entries import Entry, Variant
+from ros2_memory.keepsakes import list_moments, remember_moment
 from ros2_memory.kinds import describe_type
 from ros2_memory.recap import recap
 from ros2_memory.sightings import find_matches
@@ -20,11 +31,13 @@ if TYPE_CHECKING:
 
 def tools(facts: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
     """The tools, in order; `facts` fill the placeholders of descriptions."""
-    del writing
     yield from _SIGHTINGS.tools(facts)
     yield from _RECAP.tools(facts)
     yield from _VISITS.tools(facts)
     yield from _STATUS.tools(facts)
+    yield from _MOMENTS.tools(facts)
+    if writing:
+        yield from _REMEMBER.tools(facts)
 
 
 def readable(facts: Mapping[str, object]) -> Iterator[Tool]:
@@ -85,4 +98,25 @@ _TYPE = Entry(
     "The fields that replies show of a message type.",
     OfType,
     lambda memory, call, given: describe_type(memory, call, given.type),
+)
+_MOMENTS = Entry(
+    (Variant("list_moments", "Kept moments"),),
+    "Moments kept by remember_moment, newest first.",
+    Nothing,
+    lambda memory, call, _: list_moments(memory, call),
+)
+_REMEMBER = Entry(
+    (Variant("remember_moment", "Keep a moment (blocking)"),),
+    "Keeps what is recorded around now from deletion. Reply: {{moment, bags, pending: the rest is "
+    "being written}}.",
+    Remember,
+    lambda memory, call, given: remember_moment(
+        memory,
+        call,
+        given.label,
+        seconds_before=given.seconds_before,
+        seconds_after=given.seconds_after,
+    ),
+    blocking=True,
+    writes=True,
 )

@@ -163,9 +163,9 @@ def _listed(tool: Tool) -> ListedTool:
         input_schema=dict(tool.schema),
         annotations=ToolAnnotations(
             title=tool.title,
-            read_only_hint=True,
+            read_only_hint=not tool.writes,
             destructive_hint=False,
-            idempotent_hint=True,
+            idempotent_hint=not tool.writes,
             open_world_hint=False,
         ),
         _meta={"blocking": True} if tool.blocking else None,

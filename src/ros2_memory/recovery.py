@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.adapters import build_repairer
 from ros2_memory.errors import BagError, BagVanishedError, RecorderError
 from ros2_memory.recorder.heartbeat import read_heartbeat
+from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.layout import METADATA_FILE
 from ros2_memory.recorder.repair import open_files
 from ros2_memory.recorder.scan import Tree
@@ -217,7 +218,9 @@ def _files(path: Path, clock: Clock) -> tuple[list[Path], int]:
     walked = Tree(path).walk(clock.now(), ())
     if walked.problem is not None:
         raise RecorderError(f"{path} cannot be listed: {walked.problem}")
-    found = sorted(Path(each) for each in walked.looked_at)
+    # What a moment keeps is a second name of a bag that was whole.
+    kept = KeptNames(path)
+    found = sorted(Path(each) for each in walked.looked_at if not kept.is_kept(each))
     files = [file for file in found if file.suffix == _MCAP]
     return files, len(found) - len(files)
 

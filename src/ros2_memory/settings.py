@@ -114,11 +114,15 @@ class ReaderSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class RetentionSettings:
-    """How much history is kept."""
+    """How much history is kept.
+
+    `max_moments_gb`: of the total, for what was asked to be kept; at most half of it.
+    """
 
     max_total_gb: Positive
     max_age_h: Positive
     min_free_gb: Tolerance
+    max_moments_gb: Tolerance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

@@ -207,8 +207,7 @@ _VALUE_WHEN = Entry(
     (Variant("get_value_when", "A topic when another matched (blocking)"),),
     "What value_topic held when condition_topic last met a condition (as in find_last_match), "
     "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
-    "value_timestamp, condition_topic, value_topic}}, or null if it never held ({{match: null, "
-    "notes}} where not all could be read).",
+    "value_timestamp, condition_topic, value_topic}}, or null as there.",
     Correlation,
     lambda memory, call, given: queries.value_when(
         memory,

@@ -81,7 +81,12 @@ class TestDefaults:
                 "max_chunk_mb": 64,
                 "schemas_file": ROOT / "config/message_schemas.yaml",
             },
-            "retention": {"max_total_gb": 5.0, "max_age_h": 168.0, "min_free_gb": 1.0},
+            "retention": {
+                "max_total_gb": 5.0,
+                "max_age_h": 168.0,
+                "min_free_gb": 1.0,
+                "max_moments_gb": 1.0,
+            },
             "server": {
                 "name": "episodic",
                 "transport": "stdio",

@@ -371,6 +371,8 @@ class TestInTheBackground:
                 if not self.mended:
                     raise OSError("the disk is gone")
 
+            def keep_moments(self, bag_dir: Path) -> None: ...
+
             def faults(self) -> dict[str, str]:
                 return {}
 

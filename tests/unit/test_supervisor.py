@@ -468,6 +468,7 @@ class Housekeeping:
         self.frees_to = 0
         self.fails = False
         self.making = False
+        self.moments_kept = 0
         self.failed: dict[str, str] = {}
 
     def repair(self, bag_dir: Path) -> None:
@@ -485,6 +486,9 @@ class Housekeeping:
         self.asked.append("apply")
         if self.fails:
             raise RecorderError("the catalogue is locked")
+
+    def keep_moments(self, bag_dir: Path) -> None:
+        self.moments_kept += 1
 
     def faults(self) -> dict[str, str]:
         return self.failed

@@ -38,10 +38,11 @@ SPECIFIED = [
     "trajectory_summary",
     "recent_trajectory_summary",
 ]
-ADDED = ["find_matches", "recap", "recap_last", "visits", "memory_status"]
-WRITING: list[str] = []
+ADDED = ["find_matches", "recap", "recap_last", "visits", "memory_status", "list_moments"]
+WRITING = ["remember_moment"]
 NAMES = [*SPECIFIED, *ADDED, *WRITING]
 BLOCKING = {
+    "remember_moment",
     "visits",
     "find_matches",
     "recap",
@@ -53,6 +54,7 @@ BLOCKING = {
     "recent_trajectory_summary",
 }
 OPTIONAL = {
+    "remember_moment": {"seconds_before", "seconds_after"},
     "visits": {"radius_m", "limit"},
     "find_matches": {"field", "start", "end", "limit"},
     "list_recorded_topics": {"pattern"},

@@ -55,7 +55,7 @@ class Disposed:
 
 @dataclass(slots=True)
 class _Pass:
-    """One pass under way: bags that were deleted, and those that stay.
+    """One pass under way: bags that were deleted (`kept` of them in moments), and those that stay.
 
     Of these some are `waiting`: they could be deleted, and should be some moments later. When it is
     `urgent` nothing is waited for.
@@ -66,6 +66,7 @@ class _Pass:
     done: Disposed = field(default_factory=Disposed)
     gone: set[str] = field(default_factory=set)
     staying: set[str] = field(default_factory=set)
+    kept: set[Path] = field(default_factory=set)
 
     def hurry(self) -> None:
         """Waits no more."""
@@ -137,7 +138,8 @@ class Disposal:
             under_way.done.total_bytes, under_way.done.fits = found.total_bytes, found.fits
             doomed = found.doomed[: MOST_AT_ONCE - len(under_way.gone)]
             if doomed:
-                self._dispose(doomed, snapshot, under_way)
+                kept = {file.inode for file in stock.kept}
+                self._dispose(doomed, kept, snapshot, under_way)
             elif found.fits or not under_way.waiting:
                 break
             else:
@@ -145,11 +147,20 @@ class Disposal:
         self._tidy(known, under_way)
         return under_way.done
 
-    def _dispose(self, doomed: Sequence[StoredBag], snapshot: Snapshot, under_way: _Pass) -> None:
+    def _dispose(
+        self,
+        doomed: Sequence[StoredBag],
+        kept: Collection[tuple[int, int]],
+        snapshot: Snapshot,
+        under_way: _Pass,
+    ) -> None:
         leaving = {Path(bag.path) for bag in doomed} | {Path(path) for path in under_way.gone}
         latched = {str(bag.path) for bag in self._carrier.concerned(snapshot, leaving)}
         try:
-            carried = self._carrier.carry(snapshot, leaving)
+            under_way.kept |= {
+                Path(bag.path) for bag in doomed if any(each.inode in kept for each in bag.files)
+            }
+            carried = self._carrier.carry(snapshot, leaving, under_way.kept)
         except (EpisodicError, OSError) as error:
             # The others may go all the same, and make the room that was missing.
             reason = f"its latched messages cannot be carried on: {error}"
@@ -175,7 +186,8 @@ class Disposal:
         size = 0
         for path, file in zip((bag.path, other_form(bag.path)), bag.files, strict=False):
             try:
-                size += remove_bag(self._bag_dir, Path(path), Inode(*file.inode))
+                freed = remove_bag(self._bag_dir, Path(path), Inode(*file.inode))
+                size += 0 if Path(path) in under_way.kept else freed
             except FileNotFoundError:
                 continue
             except OSError as error:

@@ -86,6 +86,11 @@ class Dormant:
             return False
         return stamp.shows(self._stamp(bag))
 
+    def stamp(self, path: str) -> Stamp | None:
+        """How a file of these looked; None where it is none."""
+        bag = self._bags.get(path)
+        return None if bag is None else self._stamp(bag)
+
     def wake(self, path: str, now: Ns) -> tuple[FileNotes, Verdict] | None:
         """Gives up a file: what would be known of it, had it been read; None where it is none."""
         bag = self._bags.pop(path, None)

@@ -21,6 +21,8 @@ from ros2_memory.recorder.disposal import Disposal
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.recorder.inventory import is_own_recording
+from ros2_memory.recorder.keeper import Keeper
+from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.latched import Carrier
 from ros2_memory.recorder.layout import METADATA_FILE
 from ros2_memory.recorder.removal import left_by_repair, remove_emptied
@@ -58,6 +60,7 @@ class Housekeeping:
         clock: the wall clock.
         limits: how much is kept.
         split_duration_s: how long the recorder writes one file.
+        moments_bytes: how much of it moments may take that were asked to be kept.
         static_topics: topics that are latched whatever their publishers say.
         grace_s: for how long a question may hold what was known of the bags before.
         measure_free: measures what the disk has left.
@@ -73,6 +76,7 @@ class Housekeeping:
         limits: RetentionLimits,
         *,
         split_duration_s: float,
+        moments_bytes: int = 0,
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
         measure_free: Callable[[Path], int] = free_bytes,
@@ -94,7 +98,9 @@ class Housekeeping:
             split_duration_s=split_duration_s,
             disposal=disposal,
         )
+        self._keeper = Keeper(bag_dir, moments_bytes, clock)
         self._repairer = Repairer(reader, writer)
+        self._names = KeptNames(bag_dir)
         self._clock = clock
         self._patience = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._measure_free = measure_free
@@ -121,6 +127,7 @@ class Housekeeping:
             OSError: what is free cannot be measured.
         """
         begun = time.perf_counter_ns()
+        self._mind_moments()
         done = self._index.apply_retention(
             free_bytes=lambda: self._measure_free(bag_dir), min_free_bytes=free_bytes_wanted
         )
@@ -133,15 +140,41 @@ class Housekeeping:
     def apply(self, bag_dir: Path) -> None:
         """Deletes what is beyond the budget or too old; repairs what nobody writes any more."""
         begun = time.perf_counter_ns()
+        self._mind_moments()
         done = self._index.apply_retention()
         self._report(done, begun)
         self._tell_shortage(done)
         if self._repair_left(bag_dir, self._index.snapshot()):
             self._index.refresh()
 
+    def keep_moments(self, bag_dir: Path) -> None:
+        """Keeps from deletion what is asked for, and goes on with moments that wait for bags.
+
+        Raises:
+            OSError: the folders of requests or moments cannot be listed or written to.
+        """
+        del bag_dir
+        self._keeper.open()
+        if self._keeper.has_work():
+            with self._index.undisturbed() as snapshot:
+                self._keeper.keep(snapshot)
+
     def faults(self) -> Mapping[str, str]:
         """None: what fails is raised."""
         return {}
+
+    def _mind_moments(self) -> None:
+        """Before anything is deleted: what is asked to be kept, and the sidecars of what is.
+
+        Deleting goes on all the same: else a fault here would fill the disk.
+        """
+        try:
+            with self._index.undisturbed() as snapshot:
+                if self._keeper.has_work():
+                    self._keeper.keep(snapshot)
+                self._keeper.follow()
+        except OSError as error:
+            _log.error("moments_not_minded", reason=str(error))
 
     def _repair_recording(self, bag_dir: Path, directory: Path) -> None:
         try:
@@ -182,7 +215,8 @@ class Housekeeping:
             status = path.lstat()
         except OSError:
             return False
-        if (path, status.st_size, status.st_mtime_ns) in self._tried:
+        tried = (path, status.st_size, status.st_mtime_ns) in self._tried
+        if tried or self._names.is_kept(str(path)):
             return False
         lay_still = abs(self._clock.now() - status.st_mtime_ns) > self._patience
         return lay_still or is_own_recording(path.parent.name)
@@ -276,6 +310,10 @@ class InBackground:
     def apply(self, bag_dir: Path) -> None:
         """Begins to apply the limits, unless that is still under way."""
         self._begin("apply", lambda: self._housekeeper.apply(bag_dir))
+
+    def keep_moments(self, bag_dir: Path) -> None:
+        """Begins to keep what is asked for, unless that is still under way."""
+        self._begin("keep_moments", lambda: self._housekeeper.keep_moments(bag_dir))
 
     def faults(self) -> Mapping[str, str]:
         """By task why it failed the last time; what has since been done is not among them."""

@@ -23,6 +23,7 @@ from ros2_memory.recorder.disposal import Disposed
 from ros2_memory.recorder.dormant import Dormant
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.inventory import Known
+from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.scan import COMPRESSED, Tree, other_form
 from ros2_memory.recorder.snapshot import Snapshot, Timeline
 from ros2_memory.recorder.standing import FileNotes, Scene, Standing, judge
@@ -65,6 +66,9 @@ class IndexManager:
     limits when it is told to; without it nothing here deletes anything. `known` tells, by path, of
     closed files that were read earlier: a scan that begins anew does not read them again while they
     look as they did.
+
+    Attributes:
+        bag_dir: the bag directory.
     """
 
     def __init__(
@@ -78,7 +82,7 @@ class IndexManager:
         disposal: Disposal | None = None,
         known: Callable[[], Mapping[str, FormerFile]] | None = None,
     ) -> None:
-        self._bag_dir = bag_dir
+        self.bag_dir = bag_dir
         self._known = known
         self._disposal = disposal
         self._reader = reader
@@ -111,6 +115,12 @@ class IndexManager:
         with self._lock:
             return self._scan()
 
+    @contextmanager
+    def undisturbed(self) -> Iterator[Snapshot]:
+        """The result of a scan, and nothing is deleted while it is looked at."""
+        with self._lock:
+            yield self._scan(patrolling=False)
+
     def apply_retention(
         self, *, free_bytes: Callable[[], int] | None = None, min_free_bytes: int | None = None
     ) -> Disposed:
@@ -125,7 +135,14 @@ class IndexManager:
             snapshot = self._scan()
             heartbeat = self.heartbeat()
             named = () if heartbeat is None else heartbeat.recordings
-            known = Known(self._counted, self._hidden, self._files, named, snapshot.scanned_at)
+            known = Known(
+                self._counted,
+                self._hidden,
+                self._files,
+                named,
+                snapshot.scanned_at,
+                self._names.known,
+            )
             done = self._disposal.apply(
                 known, snapshot, free_bytes=free_bytes, min_free_bytes=min_free_bytes
             )
@@ -135,7 +152,7 @@ class IndexManager:
 
     def heartbeat(self) -> Heartbeat | None:
         """What the recorder last wrote of itself, live or not; None where that cannot be read."""
-        return read_heartbeat(self._bag_dir).heartbeat
+        return read_heartbeat(self.bag_dir).heartbeat
 
     def _is_stale(self, snapshot: Snapshot, reach: Ns | None) -> bool:
         if not 0 <= self._clock.now() - snapshot.scanned_at < self._refresh:
@@ -145,13 +162,14 @@ class IndexManager:
     # What follows runs under the lock.
 
     def _start_over(self) -> None:
-        self._tree = Tree(self._bag_dir)
+        self._tree = Tree(self.bag_dir)
         self._dormant = Dormant()
         self._files: dict[str, FileNotes] = {}
         self._verdicts: dict[str, Verdict] = {}
         self._counted: dict[str, Verdict] = {}  # of x.mcap and x.mcap.zstd only one
         self._set_aside: dict[str, Verdict] = {}  # those of `_counted` that are no bags
         self._hidden: set[str] = set()  # the other form answers for these, for the time being
+        self._names = KeptNames(self.bag_dir)
         self._watched: set[str] = set()
         self._patrol: list[str] = []
         self._odd = _Oddities()
@@ -195,8 +213,8 @@ class IndexManager:
         now = self._clock.now()
         heartbeat = self.heartbeat()
         if heartbeat is None or not heartbeat.is_live(now):
-            return Scene(self._bag_dir, now, self._three_splits)
-        return Scene(self._bag_dir, now, self._three_splits, frozenset(heartbeat.recordings))
+            return Scene(self.bag_dir, now, self._three_splits)
+        return Scene(self.bag_dir, now, self._three_splits, frozenset(heartbeat.recordings))
 
     def _next_on_patrol(self) -> list[str]:
         if not self._patrol:
@@ -219,7 +237,11 @@ class IndexManager:
         """
         if self._disposal is not None or not known:
             return []
-        return self._dormant.take(stamps, known, self._reader, scene)
+        # Which of a bag's names answers is to be weighed.
+        kept = {path: stamps.pop(path) for path in [*stamps] if self._names.is_kept(path)}
+        bags = self._dormant.take(stamps, known, self._reader, scene)
+        stamps.update(kept)
+        return bags
 
     def _rouse(self, walked: Walked, scene: Scene) -> None:
         """Wakes the files that went, look otherwise, or have got another form."""
@@ -247,6 +269,7 @@ class IndexManager:
         for path in paths:
             self._watched.discard(path)
             self._files.pop(path, None)
+            self._names.leave(path)
             if self._verdicts.pop(path, None) is not None:
                 forgotten.add(path)
         return forgotten
@@ -261,6 +284,7 @@ class IndexManager:
             if notes is None:
                 notes = FileNotes.first(Path(path), stamp, scene.now)
                 self._files[path] = notes
+                self._names.enter(path)
                 file = known.get(path)
                 if file is not None and notes.trusted and file.looks_like(stamp):
                     notes.recall(file.summary)
@@ -284,7 +308,10 @@ class IndexManager:
     def _recount(self, changed: Iterable[str], scene: Scene) -> tuple[list[BagFile], list[BagFile]]:
         """Brings `_counted` up to date; gives the bags that left it and those that came."""
         removed, added = [], []
-        for path in {form for each in changed for form in (each, other_form(each))}:
+        forms = {form for each in changed for form in (each, other_form(each))}
+        if self._names.known:
+            forms.update(name for each in [*forms] for name in self._names.of(each))
+        for path in forms:
             before, after = self._counted.pop(path, None), self._verdict_that_counts(path, scene)
             self._set_aside.pop(path, None)
             if after is not None:
@@ -306,6 +333,8 @@ class IndexManager:
         whole ones that have lain there for three splits are two files that somebody keeps.
         """
         self._hidden.discard(path)
+        if any(self._is_same_file(path, name) for name in self._names.before(path)):
+            return None
         own, other = self._verdicts.get(path), self._verdicts.get(other_form(path))
         if own is None or other is None or own.standing > other.standing:
             return own
@@ -318,6 +347,18 @@ class IndexManager:
             return own
         self._hidden.add(path)
         return None
+
+    def _is_same_file(self, path: str, name: str) -> bool:
+        """Whether a known file's other name is known, too, and means the same file."""
+        notes = self._files.get(name)
+        stamp = self._dormant.stamp(name) if notes is None else notes.stamp
+        own = self._files.get(path)
+        return (
+            stamp is not None
+            and own is not None
+            and (own.stamp.size, own.stamp.mtime_ns, own.stamp.inode)
+            == (stamp.size, stamp.mtime_ns, stamp.inode)
+        )
 
     def _being_compressed(self, path: str, scene: Scene) -> bool:
         forms = [self._files[form] for form in (path, other_form(path)) if form in self._files]
@@ -355,7 +396,7 @@ class IndexManager:
                 self._log.warning("bag_damaged", path=str(each.path), reason=each.reason)
         self._log.info(
             "index_scanned",
-            bag_dir=str(self._bag_dir),
+            bag_dir=str(self.bag_dir),
             bags=len(after.bags),
             added=added,
             removed=removed,

@@ -8,13 +8,21 @@ changed since the last time, since a week is 60,000 bags.
 from __future__ import annotations
 
 import re
+import stat
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.recorder.layout import LOCK_FILE, OWN_FILES, ROS_LOG_DIR, is_carried
+from ros2_memory.recorder.layout import (
+    LOCK_FILE,
+    MOMENT_FILE,
+    MOMENTS_FOLDER,
+    OWN_FILES,
+    ROS_LOG_DIR,
+    is_carried,
+)
 from ros2_memory.recorder.removal import beside_bags
 from ros2_memory.recorder.retention import Span, Stock, StoredBag, StoredFile
 from ros2_memory.recorder.scan import other_form
@@ -46,7 +54,8 @@ class Known:
     """What the index knows of the bag directory, by path.
 
     `counted` are the verdicts on bags, of two forms of one only that which answers; `hidden` are
-    the other forms. `named` are the recordings that the recorder last said it is writing.
+    the other forms; `kept` are all files in moments, whether they answer or not. `named` are the
+    recordings that the recorder last said it is writing.
     """
 
     counted: Mapping[str, Verdict]
@@ -54,6 +63,7 @@ class Known:
     files: Mapping[str, FileNotes]
     named: Collection[str]
     now: Ns
+    kept: Collection[str] = ()
 
 
 class _Fate(Enum):
@@ -63,6 +73,7 @@ class _Fate(Enum):
     MAY_GO_UNNAMED = auto()  # where the recorder does not name its recording
     STAYS = auto()
     FROM_ELSEWHERE = auto()  # stays, and does not count
+    KEPT = auto()  # in a moment: stays, and counts with the others there
 
 
 class _Entry(NamedTuple):
@@ -129,18 +140,33 @@ class Inventory:
                 bags.append(bag)
             else:
                 occupied.add(bag.recording)
-                if fate is not _Fate.FROM_ELSEWHERE:
+                if fate not in {_Fate.FROM_ELSEWHERE, _Fate.KEPT}:
                     others += sum(file.size for file in bag.files)
         self._forget(known)
         emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
         sidecars = {each: self._folder(each, known.now).size for each in emptied}
         occupied.update(bag.recording for bag in bags)
         others += sum(self._folder(each, known.now).size for each in occupied - emptied)
-        return Stock(bags, known.now, sidecars, others)
+        return Stock(bags, known.now, sidecars, others, kept=self._kept(known))
 
     def _entered(self, path: str, verdict: Verdict, known: Known) -> _Entry:
         bag = self._stored(path, verdict, known)
-        return _Entry(verdict, known.files[path].stamp, bag, _fate(verdict, bag))
+        fate = _Fate.KEPT if path in known.kept else _fate(verdict, bag)
+        return _Entry(verdict, known.files[path].stamp, bag, fate)
+
+    def _kept(self, known: Known) -> tuple[StoredFile, ...]:
+        """The files of moments, each once."""
+        if not known.kept:
+            return ()
+        try:
+            device = (self._root / MOMENTS_FOLDER).stat().st_dev
+        except OSError:
+            device = -1
+        stamps = {known.files[path].stamp.inode: known.files[path].stamp for path in known.kept}
+        return tuple(
+            StoredFile((device, inode), stamp.size, _on_disk(stamp.size))
+            for inode, stamp in stamps.items()
+        )
 
     def _stored(self, path: str, verdict: Verdict, known: Known) -> StoredBag:
         recording = str(known.files[path].path.parent)
@@ -190,13 +216,16 @@ class Inventory:
     def _own_bytes(self) -> int:
         """The size of what this program keeps beside the recordings."""
         own = [self._root / name for name in (*OWN_FILES, LOCK_FILE)]
+        with suppress(OSError):
+            own += (self._root / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
         for folder in OWN_FOLDERS:
             with suppress(OSError):
                 own += (self._root / folder).iterdir()
         size = 0
         for path in own:
             with suppress(OSError):
-                size += path.lstat().st_size
+                status = path.lstat()
+                size += status.st_size if stat.S_ISREG(status.st_mode) else 0
         return size
 
 

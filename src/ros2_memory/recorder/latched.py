@@ -153,10 +153,13 @@ class Carrier:
             found.update((bag.file, bag) for bag, *_ in held if bag.file in leaving)
         return tuple(found.values())
 
-    def carry(self, snapshot: Snapshot, doomed: Collection[Path]) -> int | None:
+    def carry(
+        self, snapshot: Snapshot, doomed: Collection[Path], kept: Collection[Path] = ()
+    ) -> int | None:
         """Writes what must outlive these bags; how many messages are carried then.
 
-        None where nothing had to be written. All is on the disk when this returns.
+        Of the doomed some are `kept` under another name: what was recorded in them stays. None
+        where nothing had to be written. All is on the disk when this returns.
 
         Raises:
             BagError: it cannot be written; what was carried before still is.
@@ -168,9 +171,10 @@ class Carrier:
         topics = self._topics(snapshot)
         before = set(self._read(self.path, topics))
         messages = {*before, *(each for bag in leaving for each in self._read(bag.path, topics))}
-        kept = [bag for bag in snapshot.bags if bag.path not in doomed and not is_carried(bag.path)]
+        gone = {*doomed} - {*kept}
+        there = [bag for bag in snapshot.bags if bag.path not in gone and not is_carried(bag.path)]
         repeated = self._repeated(snapshot, topics, doomed)
-        wanted = worth_carrying(messages, _presence(kept), repeated)
+        wanted = worth_carrying(messages, _presence(there), repeated)
         if {each[:2] for each in wanted} == {each[:2] for each in before}:
             return None
         sources = [self.path, *(bag.path for bag in leaving)]

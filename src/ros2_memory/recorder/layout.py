@@ -11,6 +11,11 @@
         metadata.yaml                      written by it at a clean end
         handover.json                      which of it counts (see `handover`)
       latched/carried.mcap         latched messages of bags that were deleted (see `latched`)
+      moments/                     bags that were asked to be kept (see `keepsake`)
+        20261120T043012Z-charging/         one moment
+          moment.json                      what it is called, and when it was
+          rec_20261120T043000Z/            hard links, under the names that the bags have above
+      .episodic/requests/          what the query server asks of the recorder (see `mailbox`)
 
 The two YAML files stand beside the recordings, since a recording's own directory must not exist
 before `ros2 bag record` creates it, and it reads one of them again at every split. They say the
@@ -38,6 +43,9 @@ HANDOVER_FILE: Final = "handover.json"
 METADATA_FILE: Final = "metadata.yaml"
 CARRY_FOLDER: Final = "latched"
 CARRY_FILE: Final = "carried.mcap"
+MOMENTS_FOLDER: Final = "moments"
+MOMENT_FILE: Final = "moment.json"
+REQUESTS_FOLDER: Final = ".episodic/requests"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """What may be deleted from the bag directory itself, besides bags: it is written anew."""

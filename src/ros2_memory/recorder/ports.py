@@ -52,8 +52,11 @@ class Housekeeper(Protocol):
     def apply(self, bag_dir: Path) -> None:
         """Deletes what is beyond the budget or too old. Called when splits have been closed."""
 
+    def keep_moments(self, bag_dir: Path) -> None:
+        """Keeps from deletion what somebody asks to keep. Called about once a second."""
+
     def faults(self) -> Mapping[str, str]:
-        """By task (`make_room`, `apply`) why it failed the last time, where it went on unseen."""
+        """By task, such as `apply`, why it failed the last time, where it went on unseen."""
 
 
 class NoHousekeeping:
@@ -70,6 +73,9 @@ class NoHousekeeping:
         return False
 
     def apply(self, bag_dir: Path) -> None:
+        """Does nothing."""
+
+    def keep_moments(self, bag_dir: Path) -> None:
         """Does nothing."""
 
     def faults(self) -> Mapping[str, str]:

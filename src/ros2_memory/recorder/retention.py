@@ -79,6 +79,7 @@ class Stock:
 
     `sidecars` says, for each recording that goes with its last bag, how many bytes go with it.
     `other_bytes` is what nothing here may delete: open bags, and what is not worth deleting.
+    `kept` are the files of moments, which nothing here deletes; bags may be other names of them.
     `free_bytes` is what the disk has left; None where that is not to count.
     """
 
@@ -87,6 +88,7 @@ class Stock:
     sidecars: Mapping[str, int] = field(default_factory=dict)
     other_bytes: int = 0
     free_bytes: int | None = None
+    kept: Sequence[StoredFile] = ()
 
 
 class Weighed(NamedTuple):
@@ -125,7 +127,7 @@ def weighed(stock: Stock, limits: RetentionLimits) -> Weighed:
     for bag in order:
         if plan.fits(limits):
             break
-        if bag.path not in aged and kept.isdisjoint(_inodes(bag)):
+        if bag.path not in aged and kept.isdisjoint(_inodes(bag)) and plan.frees(bag):
             doomed.add(bag.path)
             plan.delete(bag)
     return Weighed(tuple(bag for bag in order if bag.path in doomed), total, fits=plan.fits(limits))
@@ -138,6 +140,9 @@ class _Plan:
         files = [each for bag in stock.bags for each in bag.files]
         sizes = {each.inode: each.size for each in files}
         self.shared = len(sizes) < len(files)
+        # What a moment keeps stays when every other name of it goes.
+        self._kept = {each.inode for each in stock.kept}
+        sizes.update((each.inode, each.size) for each in stock.kept)
         self._links = Counter(each.inode for each in files) if self.shared else Counter()
         self._bags_in = Counter(bag.recording for bag in stock.bags)
         self._sidecars = stock.sidecars
@@ -148,12 +153,16 @@ class _Plan:
         """Leaves one bag out."""
         for each in bag.files:
             self._links[each.inode] -= 1
-            if self._links[each.inode] <= 0:
+            if self._links[each.inode] <= 0 and each.inode not in self._kept:
                 self._release(each.size, each.disk)
         self._bags_in[bag.recording] -= 1
         if not self._bags_in[bag.recording]:
             size = self._sidecars.get(bag.recording, 0)
             self._release(size, size)
+
+    def frees(self, bag: StoredBag) -> bool:
+        """Whether any of a bag's files could go for good."""
+        return not self._kept or any(each.inode not in self._kept for each in bag.files)
 
     def fits(self, limits: RetentionLimits) -> bool:
         """Whether what is left is within the budget, and leaves enough of the disk."""

@@ -34,6 +34,8 @@ SPACE_S: Final = 1.0
 HOUSE_S: Final = 10.0
 QUIET_HOUSE_S: Final = 60.0
 """How often the house is kept when no split is closed: what is there grows old all the same."""
+MOMENTS_S: Final = 1.0
+"""How often it is looked whether somebody asks for a moment to be kept, and waits for the reply."""
 FAULT_S: Final = 60.0
 """How often it is told that a task fails, which is tried again with every tick."""
 SETTLE_S: Final = 5.0
@@ -172,6 +174,7 @@ class Supervisor:
             "restart": self._mind_restart,
             "reap": self._crew.reap,
             "house": self._keep_house,
+            "moments": self._keep_moments,
         }
         for task, mind in tasks.items():
             try:
@@ -333,6 +336,10 @@ class Supervisor:
         self._house_kept_s = now.monotonic_s
         self._splits_closed = False
         self._keep("apply", lambda: self._housekeeper.apply(self._bag_dir))
+
+    def _keep_moments(self, now: Moment) -> None:
+        if not self._away and self._is_due("moments", MOMENTS_S, now):
+            self._keep("keep_moments", lambda: self._housekeeper.keep_moments(self._bag_dir))
 
     def _keep(self, task: str, do: Callable[[], None]) -> None:
         """Has the housekeeper do something; recording goes on, whatever comes of it."""

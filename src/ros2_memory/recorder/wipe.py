@@ -1,8 +1,8 @@
 """Deletes what is not history: recordings without a byte, and all bags where that is asked for.
 
-`recording.clear_on_startup` is for simulation and tests. Only files that are known by name are
-deleted; a directory goes when that leaves it empty. Links are not followed, and another file system
-that is mounted below is left alone.
+`recording.clear_on_startup` is for simulation and tests, so moments go too. Only files that are
+known by name are deleted; a directory goes when that leaves it empty. Links are not followed, and
+another file system that is mounted below is left alone.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.layout import (
     HANDOVER_FILE,
     METADATA_FILE,
+    MOMENT_FILE,
+    MOMENTS_FOLDER,
     OWN_FILES,
     RECORDING_FILES,
 )
@@ -49,7 +51,7 @@ def clear_bags(bag_dir: Path) -> Wiped:
     wiped = Wiped()
     try:
         with _opened(root) as opened:
-            _clear(root, opened, os.fstat(opened).st_dev, wiped, is_root=True)
+            _clear(root, opened, os.fstat(opened).st_dev, wiped, root)
     except FileNotFoundError:
         pass
     except OSError as error:
@@ -102,25 +104,27 @@ def _is_nothing(entry: os.DirEntry[str]) -> bool:
     )
 
 
-def _clear(path: Path, opened: int, device: int, wiped: Wiped, *, is_root: bool) -> bool:
-    """Deletes the bags below an open directory; whether there were any in it.
+def _clear(path: Path, opened: int, device: int, wiped: Wiped, root: Path) -> bool:
+    """Deletes the bags below an open directory; whether there were any in it, or moments.
 
     Names are looked up in the open directory: whatever takes the place of its path meanwhile is
     not touched. A directory below goes too if nothing else is in it.
     """
     with os.scandir(opened) as listing:
         entries = list(listing)
-    had_bags = any(_is_bag(entry) for entry in entries)
+    moments = root / MOMENTS_FOLDER
+    had_bags = moments in {path, path.parent} or any(_is_bag(entry) for entry in entries)
+    beside = _beside_bags(path, root, had_bags=had_bags)
     for entry in entries:
         below = path / entry.name
         try:
             if _is_directory(entry, device):
                 with _opened(entry.name, opened) as inner:
-                    emptied = _clear(below, inner, device, wiped, is_root=False)
+                    emptied = _clear(below, inner, device, wiped, root)
                 if emptied:
                     with suppress(OSError):
                         os.rmdir(entry.name, dir_fd=opened)
-            elif _is_bag(entry) or _goes_with_bags(entry, is_root=is_root, had_bags=had_bags):
+            elif _is_bag(entry) or (entry.name in beside and entry.is_file(follow_symlinks=False)):
                 size = entry.stat(follow_symlinks=False).st_size
                 os.unlink(entry.name, dir_fd=opened)
                 wiped.files += 1
@@ -154,6 +158,9 @@ def _is_bag(entry: os.DirEntry[str]) -> bool:
     return bool(named) and entry.is_file(follow_symlinks=False)
 
 
-def _goes_with_bags(entry: os.DirEntry[str], *, is_root: bool, had_bags: bool) -> bool:
-    names = (OWN_FILES if is_root else frozenset()) | (RECORDING_FILES if had_bags else frozenset())
-    return entry.name in names and entry.is_file(follow_symlinks=False)
+def _beside_bags(path: Path, root: Path, *, had_bags: bool) -> frozenset[str]:
+    """The files of a directory that go with its bags."""
+    names = RECORDING_FILES if had_bags else frozenset()
+    if path == root:
+        return names | OWN_FILES
+    return names | {MOMENT_FILE} if path.parent == root / MOMENTS_FOLDER else names

@@ -1,0 +1,431 @@
+"""What is kept, over real files: by the keeper, past retention, and as the index finds it."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import structlog
+
+from ros2_memory import queries
+from ros2_memory.memory import Call
+from ros2_memory.moments import Moment, Span
+from ros2_memory.recorder.keeper import Keeper
+from ros2_memory.recorder.keepsake import Keepsake, Wish, held_in, make_folder, write_keepsake
+from ros2_memory.recorder.layout import MOMENT_FILE, REQUESTS_FOLDER
+from ros2_memory.recorder.mailbox import Slot
+from ros2_memory.recorder.wipe import clear_bags
+from ros2_memory.recovery import recover
+from tests.bags import McapLayout, odom, tf, transform, write_mcap
+from tests.keeping import PLENTY, files_in, keeper_of, recording_now, size_of
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from ros2_memory.model import Sample
+    from ros2_memory.recorder.housekeeping import Housekeeping
+    from ros2_memory.recorder.mailbox import Outcome
+
+S = 10**9
+T0 = 1_790_000_000 * S
+NOW = T0 + 4 * 3600 * S
+A, B = "rec_20260921T101320Z", "rec_20260921T102320Z"
+
+
+def bag(path: Path, start: int, layout: McapLayout | None = None) -> Path:
+    """A split of ten seconds; where the robot is tells the time."""
+    times = [T0 + (start + n) * S for n in range(10)]
+    return write_mcap(path, [odom(at, (at - T0) / S, 2.0) for at in times], layout)
+
+
+def recording(bag_dir: Path, name: str, start: int, splits: int = 6) -> list[Path]:
+    made = [bag(bag_dir / name / f"{name}_{n}.mcap", start + n * 10) for n in range(splits)]
+    (bag_dir / name / "handover.json").write_text('{"format": 1}')
+    return made
+
+
+def asked(bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW) -> Slot:
+    """Asks for what was recorded in these seconds."""
+    slot = Slot(bag_dir, label, T0 + start * S, T0 + end * S, at)
+    slot.post()
+    return slot
+
+
+def kept(
+    house: Housekeeping, bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW
+) -> Outcome:
+    slot = asked(bag_dir, start, end, label, at)
+    house.keep_moments(bag_dir)
+    outcome = slot.outcome()
+    slot.close()
+    assert outcome is not None
+    return outcome
+
+
+def house_of(bag_dir: Path, **limits: Any) -> Housekeeping:
+    return keeper_of(bag_dir, **{"clock": SettableClock(NOW), **limits})
+
+
+def in_moments(bag_dir: Path) -> list[str]:
+    """The bags that are kept, each as moment and name."""
+    return [
+        path.relative_to(bag_dir / "moments").as_posix()
+        for path in sorted((bag_dir / "moments").rglob("*.mcap"))
+    ]
+
+
+def told_of(bag_dir: Path) -> dict[str, Any]:
+    [path] = (bag_dir / "moments").glob(f"*/{MOMENT_FILE}")
+    told: dict[str, Any] = json.loads(path.read_text())
+    return told
+
+
+class TestKeeping:
+    def test_the_bags_of_the_moment_are_linked_under_their_names(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        outcome = kept(house_of(tmp_path), tmp_path, 15, 25, "Küche")
+        assert (outcome.bags, outcome.pending, outcome.refused) == (2, False, None)
+        folder = tmp_path / "moments" / str(outcome.moment)
+        assert sorted(path.name for path in (folder / A).iterdir()) == [
+            "handover.json",
+            f"{A}_1.mcap",
+            f"{A}_2.mcap",
+        ]
+        assert (folder / A / f"{A}_1.mcap").samefile(made[1])
+        told = told_of(tmp_path)
+        assert (told["label"], told["complete"], told["missing"]) == ("Küche", True, [])
+        assert (told["start_ns"], told["end_ns"]) == (T0 + 15 * S, T0 + 25 * S)
+        assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
+
+    def test_what_was_never_recorded_is_refused(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        outcome = kept(house_of(tmp_path), tmp_path, 500, 600)
+        assert outcome.refused is not None
+        assert "nothing was recorded then" in outcome.refused
+        assert not (tmp_path / "moments").exists()
+
+    def test_a_bag_that_two_moments_share_counts_once_in_the_share(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        share = sum(path.stat().st_size for path in made[:3])
+        house = house_of(tmp_path, moments_bytes=share)
+        assert kept(house, tmp_path, 0, 15).bags == 2
+        assert kept(house, tmp_path, 5, 25).bags == 3
+        refused = kept(house, tmp_path, 25, 35).refused
+        assert refused is not None
+        assert "retention.max_moments_gb" in refused
+        assert len(list(held_in(tmp_path))) == 2
+
+    def test_where_links_cannot_be_made_it_is_refused_and_nothing_is_left(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        recording(tmp_path, A, 0)
+
+        def refuse(*_args: object, **_options: object) -> None:
+            raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+        monkeypatch.setattr(os, "link", refuse)
+        outcome = kept(house_of(tmp_path), tmp_path, 15, 25)
+        assert outcome.refused is not None
+        assert "by hard links: Operation not permitted" in outcome.refused
+        assert files_in(tmp_path / "moments") == []
+
+    def test_a_wish_is_not_granted_twice(self, tmp_path: Path) -> None:
+        """As where the recorder was killed after it kept a moment, and before it answered."""
+        recording(tmp_path, A, 0)
+        slot = asked(tmp_path, 15, 25)
+        request = tmp_path / REQUESTS_FOLDER / f"{slot.wish.number}.json"
+        text = request.read_text()
+        house_of(tmp_path).keep_moments(tmp_path)
+        first = slot.outcome()
+        slot.close()
+        request.with_suffix(".taken").write_text(text)
+        house_of(tmp_path).keep_moments(tmp_path)
+        assert slot.outcome() == first
+        assert len(list(held_in(tmp_path))) == 1
+
+    def test_a_moment_in_a_moment_is_kept_under_the_name_that_it_was_recorded_by(
+        self, tmp_path: Path
+    ) -> None:
+        made = recording(tmp_path, A, 0)
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 0, 5, "one")
+        made[0].unlink()
+        assert kept(house, tmp_path, 2, 7, "two").bags == 1
+        one, two = in_moments(tmp_path)
+        assert one.partition("/")[2] == two.partition("/")[2] == f"{A}/{A}_0.mcap"
+
+    def test_moments_behind_a_link_are_neither_made_nor_followed(self, tmp_path: Path) -> None:
+        recording(tmp_path / "bags", A, 0)
+        (tmp_path / "else").mkdir()
+        (tmp_path / "bags/moments").symlink_to(tmp_path / "else")
+        refused = kept(house_of(tmp_path / "bags"), tmp_path / "bags", 0, 5).refused
+        assert refused is not None
+        assert "symbolic link" in refused
+        assert files_in(tmp_path / "else") == []
+
+
+class TestOpenBags:
+    def test_a_moment_waits_for_the_split_that_is_being_written(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0, splits=2)
+        layout = McapLayout(chunk_size=400, finish=False)
+        open_one = bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
+        now = SettableClock(open_one.stat().st_mtime_ns)
+        recording_now(tmp_path, A, clock=now)
+        house = house_of(tmp_path, clock=now)
+        outcome = kept(house, tmp_path, 15, 25, at=now.at)
+        assert (outcome.bags, outcome.pending) == (1, True)
+        assert told_of(tmp_path)["complete"] is False
+        bag(open_one, 20)
+        bag(tmp_path / A / f"{A}_3.mcap", 30, layout)
+        # Another recorder may be the one that goes on with it.
+        house_of(tmp_path, clock=now).keep_moments(tmp_path)
+        assert [name.rpartition("/")[2] for name in in_moments(tmp_path)] == [
+            f"{A}_1.mcap",
+            f"{A}_2.mcap",
+        ]
+
+    def test_a_moment_ends_when_nothing_of_it_is_open_any_more(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0, splits=2)
+        clock = SettableClock(T0 + 19 * S)
+        house = house_of(tmp_path, clock=clock)
+        outcome = kept(house, tmp_path, 0, 25, at=clock.at)
+        assert (outcome.bags, outcome.pending) == (2, True)
+        bag(tmp_path / A / f"{A}_2.mcap", 20)
+        clock.at = T0 + 26 * S
+        house.keep_moments(tmp_path)
+        assert told_of(tmp_path)["complete"] is True
+        assert len(in_moments(tmp_path)) == 3
+
+    def test_what_passes_the_share_when_it_closes_is_told_and_not_kept(
+        self, tmp_path: Path
+    ) -> None:
+        made = recording(tmp_path, A, 0, splits=2)
+        clock = SettableClock(T0 + 19 * S)
+        share = sum(path.stat().st_size for path in made)
+        house = house_of(tmp_path, clock=clock, moments_bytes=share)
+        kept(house, tmp_path, 0, 25, at=clock.at)
+        bag(tmp_path / A / f"{A}_2.mcap", 20)
+        clock.at = T0 + 26 * S
+        house.keep_moments(tmp_path)
+        told = told_of(tmp_path)
+        assert (told["pending"], told["complete"]) == (False, False)
+        assert "retention.max_moments_gb" in told["missing"][0]
+        assert len(in_moments(tmp_path)) == 2
+
+    def test_a_bag_that_a_crash_left_open_is_kept_when_it_is_repaired(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0, splits=1)
+        bag(tmp_path / A / f"{A}_1.mcap", 10, McapLayout(chunk_size=400, finish=False))
+        house = house_of(tmp_path)
+        assert kept(house, tmp_path, 0, 15).pending
+        house.apply(tmp_path)
+        house.keep_moments(tmp_path)
+        assert told_of(tmp_path)["complete"] is True
+        assert len(in_moments(tmp_path)) == 2
+
+    def test_before_anything_is_deleted_a_pending_moment_goes_on(self, tmp_path: Path) -> None:
+        """As after a night: the recorder that begins anew deletes before it records."""
+        recording(tmp_path, A, 0, splits=2)
+        clock = SettableClock(T0 + 19 * S)
+        kept(house_of(tmp_path, clock=clock), tmp_path, 0, 25, at=clock.at)
+        bag(tmp_path / A / f"{A}_2.mcap", 20)
+        recording(tmp_path, B, 100, splits=2)
+        clock.at = NOW
+        house_of(tmp_path, clock=clock, max_bytes=1).apply(tmp_path)
+        assert len(in_moments(tmp_path)) == 3
+        assert told_of(tmp_path)["complete"] is True
+
+
+class TestCrashes:
+    def test_a_moment_that_was_begun_without_a_link_is_brought_to_its_end(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, A, 0)
+        slot = asked(tmp_path, 15, 25)
+        folder = make_folder(tmp_path, slot.wish)
+        write_keepsake(folder, Keepsake.of(slot.wish))
+        house_of(tmp_path).keep_moments(tmp_path)
+        outcome = slot.outcome()
+        assert outcome is not None
+        assert (outcome.moment, outcome.bags, outcome.pending) == (folder.name, 2, False)
+        assert len(in_moments(tmp_path)) == 2
+
+    def test_a_folder_that_is_no_moment_yet_is_removed_and_nothing_else(
+        self, tmp_path: Path
+    ) -> None:
+        wish = Wish("0" * 32, "here", T0, T0, NOW)
+        begun = make_folder(tmp_path, wish)
+        (begun / f".{MOMENT_FILE}.tmp").write_text("{")
+        mine = tmp_path / "moments/mine"
+        mine.mkdir()
+        house_of(tmp_path).keep_moments(tmp_path)
+        assert (begun.exists(), mine.exists()) == (False, True)
+
+    def test_a_moment_that_cannot_be_written_holds_up_no_other(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        recording(tmp_path, A, 0)
+        clock = SettableClock(T0 + 19 * S)
+        house = house_of(tmp_path, clock=clock)
+        stuck = kept(house, tmp_path, 0, 25, "stuck", at=clock.at)
+        clock.at = NOW
+        folder = tmp_path / "moments" / str(stuck.moment)
+        (folder / f".{MOMENT_FILE}.tmp").mkdir()
+        with structlog.testing.capture_logs() as captured:
+            assert kept(house, tmp_path, 30, 35).bags == 1
+        assert "moment_not_written" in {event["event"] for event in captured}
+
+
+class TestRetention:
+    def test_a_moment_outlives_its_bags_and_answers_as_before(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        young = recording(tmp_path, B, 3 * 3600)
+        house = house_of(tmp_path, max_age_h=1)
+        memory = memory_of(tmp_path, clock=SettableClock(NOW))
+        questions: list[Callable[[], object]] = [
+            lambda: queries.position(memory, Call(), Moment(at_s=T0 / S + 17)),
+            lambda: queries.topic_range(
+                memory, Call(), "/odom", Span(start_s=T0 / S + 10, end_s=T0 / S + 29)
+            ),
+        ]
+        before = [ask() for ask in questions]
+        kept(house, tmp_path, 15, 25)
+        assert [ask() for ask in questions] == before
+        house.apply(tmp_path)
+        assert not any(path.exists() for path in made)
+        assert not (tmp_path / A).exists()
+        assert [ask() for ask in questions] == before
+        assert all(path.exists() for path in young)
+
+    def test_a_kept_bag_is_one_bag_wherever_it_is_counted(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        memory = memory_of(tmp_path)
+        plain = queries.list_recorded_topics(memory, Call())
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 15, 25, "one")
+        kept(house, tmp_path, 12, 38, "two")
+
+        def counted() -> tuple[int, int]:
+            snapshot = memory.index.refresh()
+            fresh = memory_of(tmp_path).index.snapshot()
+            assert [bag.file for bag in fresh.bags] == [bag.file for bag in snapshot.bags]
+            [row] = queries.list_recorded_topics(memory, Call())
+            return len(snapshot.bags), row.count
+
+        assert queries.list_recorded_topics(memory, Call()) == plain
+        assert counted() == (6, 60)
+        for path in made[1:3]:
+            path.unlink()
+        assert counted() == (6, 60)
+        shutil.rmtree(min((tmp_path / "moments").iterdir()))
+        assert counted() == (6, 60)
+        shutil.rmtree(tmp_path / "moments")
+        assert counted() == (4, 40)
+
+    def test_the_budget_counts_a_kept_bag_once_and_never_as_freed(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        kept(house_of(tmp_path), tmp_path, 0, 15)
+        total = size_of(tmp_path)
+        with structlog.testing.capture_logs() as captured:
+            house_of(tmp_path, max_bytes=total).apply(tmp_path)
+            assert all(path.exists() for path in made)
+            house_of(tmp_path, max_bytes=total - 1).apply(tmp_path)
+        # The first two would free nothing.
+        assert [path.exists() for path in made] == [True, True, False, True, True, True]
+        told = [event for event in captured if event["event"] == "retention_applied"]
+        assert [event["total_bytes"] for event in told] == [total, size_of(tmp_path)]
+
+    def test_moments_stay_where_the_budget_cannot_be_held(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        house = house_of(tmp_path, max_bytes=1)
+        kept(house, tmp_path, 0, 15)
+        for _ in range(2):
+            house.apply(tmp_path)
+            house.make_room(tmp_path, PLENTY * 2)
+        assert len(in_moments(tmp_path)) == 2
+
+    def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
+        self, tmp_path: Path
+    ) -> None:
+        def fixed(at: int, x: float) -> None:
+            mounted = transform(at, "base_link", "laser", (x, 0.0, 0.0))
+            path = tmp_path / A / f"{A}_{(at - T0) // S}.mcap"
+            write_mcap(path, [odom(at, 0.0, 0.0), tf(at, mounted, topic="/tf_static")])
+
+        fixed(T0 - 100 * S, 0.1)
+        recording(tmp_path, A, 0)
+        fixed(T0 + 100 * S, 0.2)
+        recording(tmp_path, B, 3 * 3600)
+        house = house_of(tmp_path, max_age_h=1)
+        kept(house, tmp_path, 15, 25)
+        memory = memory_of(tmp_path, clock=SettableClock(NOW))
+
+        def mounted() -> Sample:
+            moment = Moment(at_s=T0 / S + 17)
+            return queries.topic_value(memory, Call(), "/tf_static", moment).sample
+
+        before = mounted()
+        assert "0.1" in str(before.value)
+        for _ in range(2):
+            house.apply(tmp_path)
+            assert mounted() == before
+        assert not (tmp_path / A).exists()
+
+    def test_the_sidecar_of_a_recording_that_goes_on_is_followed(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 15, 25)
+        anew = tmp_path / A / "anew"
+        anew.write_text('{"format": 1, "state": "counts", "clock": "publish", "notes": ["x"]}')
+        anew.replace(tmp_path / A / "handover.json")
+        house.apply(tmp_path)
+        [sidecar] = (tmp_path / "moments").rglob("handover.json")
+        assert sidecar.samefile(tmp_path / A / "handover.json")
+
+    def test_what_is_kept_beside_bags_counts_in_the_budget(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        kept(house_of(tmp_path), tmp_path, 15, 25)
+        with structlog.testing.capture_logs() as captured:
+            house_of(tmp_path).apply(tmp_path)
+        [told] = [event for event in captured if event["event"] == "retention_applied"]
+        assert told["total_bytes"] == size_of(tmp_path)
+
+
+class TestOthers:
+    def test_a_wipe_takes_moments_too_and_leaves_what_is_not_of_them(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 15, 25, "one")
+        kept(house, tmp_path, 15, 25, "two")
+        mine = min((tmp_path / "moments").iterdir()) / "notes.txt"
+        mine.write_text("why this matters")
+        assert clear_bags(tmp_path).faults == []
+        assert mine.exists()
+        assert list(tmp_path.rglob("*.mcap")) == []
+        assert [path.name for path in (tmp_path / "moments").iterdir()] == [mine.parent.name]
+
+    def test_a_folder_called_moments_elsewhere_is_none(self, tmp_path: Path) -> None:
+        (tmp_path / "mine/moments").mkdir(parents=True)
+        (tmp_path / "mine/moments/metadata.yaml").write_text("of another program")
+        clear_bags(tmp_path)
+        assert (tmp_path / "mine/moments/metadata.yaml").exists()
+
+    def test_recover_leaves_moments_alone(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0, splits=1)
+        kept(house_of(tmp_path), tmp_path, 0, 5)
+        said: list[str] = []
+        assert recover(tmp_path, said.append).whole == 1
+
+    def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        keeper = Keeper(tmp_path, PLENTY, SettableClock(NOW))
+        assert keeper.has_work()
+        keeper.keep(memory_of(tmp_path).index.snapshot())
+        assert not keeper.has_work()
+        asked(tmp_path, 0, 5)
+        assert keeper.has_work()
