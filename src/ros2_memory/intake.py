@@ -11,10 +11,10 @@ import re
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
-from urllib.parse import parse_qs
+from uuid import UUID
 
 import anyio
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, QueryParams
 from starlette.responses import PlainTextResponse
 
 if TYPE_CHECKING:
@@ -91,8 +91,7 @@ class Intake:
 
     def _unread(self, scope: Scope) -> PlainTextResponse | None:
         """The refusal of a message whose sender has not read what it was sent."""
-        session = parse_qs(scope["query_string"][:200].decode("latin-1")).get("session_id", [""])[0]
-        stream = self._streams.get(session.replace("-", ""))
+        stream = self._streams.get(_session(scope))
         if stream is None or not stream.is_blocked:
             return None
         stream.taken += 1
@@ -112,6 +111,15 @@ class Intake:
             stream.is_blocked, stream.taken = False, 0
 
         return send
+
+
+def _session(scope: Scope) -> str:
+    """The session that a message is for, as the MCP library reads it, which takes any spelling."""
+    given = QueryParams(scope["query_string"]).get("session_id", "")
+    try:
+        return UUID(hex=given).hex
+    except ValueError:
+        return ""
 
 
 @dataclass(slots=True)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
+from uuid import UUID
 
 import anyio
 import pytest
@@ -213,8 +214,8 @@ def stream_and_messages() -> tuple[Intake, anyio.abc.ObjectSendStream[bytes]]:
     return Intake(app), events
 
 
-def message() -> Client:
-    return Client(b"{}", path="/messages/", query=f"session_id={SESSION}")
+def message(query: str = f"session_id={SESSION}") -> Client:
+    return Client(b"{}", path="/messages/", query=query)
 
 
 async def test_messages_are_taken_without_bound_while_the_stream_is_read() -> None:
@@ -246,6 +247,37 @@ async def test_few_messages_are_taken_from_a_client_that_does_not_read_its_strea
         assert (await asked(app, message())).status == 202
         await events.aclose()
     assert app._streams == {}
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        f"session_id={SESSION.upper()}",
+        f"session_id={UUID(SESSION)}",
+        f"session_id=urn:uuid:{UUID(SESSION)}",
+        f"session_id=%7B{SESSION}%7D",
+        f"session_id={'f' * 32}&session_id={SESSION}",
+        f"pad={'x' * 300}&session_id={SESSION}",
+    ],
+)
+async def test_messages_are_bounded_however_their_session_is_spelt(query: str) -> None:
+    app, events = stream_and_messages()
+    stream = Client(method="GET", path="/sse")
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(asked, app, stream)
+        await anyio.wait_all_tasks_blocked()
+        stream.reads = anyio.Event()
+        await events.send(b"unread")
+        await anyio.wait_all_tasks_blocked()
+        statuses = [(await asked(app, message(query))).status for _ in range(MOST_UNREAD + 1)]
+        assert statuses == [202] * MOST_UNREAD + [429]
+        stream.reads.set()
+        await events.aclose()
+
+
+async def test_a_message_for_what_is_no_session_is_left_to_the_application() -> None:
+    for query in ("", "session_id=", "session_id=none"):
+        assert (await asked(Intake(echo), message(query))).told == "{}"
 
 
 async def test_other_scopes_and_requests_without_a_body_are_left_alone() -> None:
