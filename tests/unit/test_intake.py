@@ -277,7 +277,7 @@ async def test_messages_are_bounded_however_their_session_is_spelt(query: str) -
 
 async def test_a_message_for_what_is_no_session_is_left_to_the_application() -> None:
     for query in ("", "session_id=", "session_id=none"):
-        assert (await asked(Intake(echo), message(query))).told == "{}"
+        assert (await asked(Intake(echo), message(query))).told == "2"
 
 
 async def test_other_scopes_and_requests_without_a_body_are_left_alone() -> None:
