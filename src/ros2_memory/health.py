@@ -13,16 +13,14 @@ import anyio.to_thread
 from ros2_memory.logs import get_logger
 from ros2_memory.overview import clock_faults, left_open
 from ros2_memory.reading import short_name
-from ros2_memory.recorder.heartbeat import RecorderState
+from ros2_memory.status import problems_of
 from ros2_memory.timebase import Ns, unix_from_ns, unix_rounded_up
-from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
     from ros2_memory.filling import Filler
     from ros2_memory.fitting import JsonObject
     from ros2_memory.memory import Memory
     from ros2_memory.recorder.heartbeat import Heartbeat
-    from ros2_memory.recorder.index_manager import Snapshot
 
 PATIENCE_S: Final = 2.0
 """How long the index may take to answer; the first scan of a large directory takes longer."""
@@ -82,7 +80,7 @@ def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
         **{what: len(files) for what, files in amiss.items()},
         "index_age_s": _seconds(now - snapshot.scanned_at),
     }
-    problems = _problems(snapshot, heartbeat, now)
+    problems = [_short(each) for each in problems_of(snapshot, heartbeat, now)]
     for what, files in amiss.items():
         if files:
             shown[f"{what.removesuffix('s')}_files"] = [
@@ -143,23 +141,6 @@ def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
     if problems:
         return {"status": "degraded", "problems": [*problems], "version": version, **shown}
     return {"status": "ok", "version": version, **shown}
-
-
-def _problems(snapshot: Snapshot, heartbeat: Heartbeat | None, now: Ns) -> list[str]:
-    problems = [_short(snapshot.problem)] if snapshot.problem else []
-    if snapshot.damaged:
-        damaged = counted(len(snapshot.damaged), "damaged bag file")
-        problems.append(f"{damaged}; data_time_range lists what does not answer")
-    if snapshot.dating.note:
-        problems.append(snapshot.dating.note)
-    if heartbeat is None or heartbeat.state is RecorderState.STOPPED:
-        return problems
-    if not heartbeat.is_live(now):
-        problems.append("the recorder has stopped without saying so")
-    elif heartbeat.state is RecorderState.PAUSED:
-        reason = heartbeat.last_error or "it does not say why"
-        problems.append(_short(f"the recorder is paused: {reason}"))
-    return problems
 
 
 def _short(text: str) -> str:

@@ -9,6 +9,7 @@ from ros2_memory.history import View
 from ros2_memory.model import BagState
 from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.timebase import NS_PER_S, Ns
+from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,24 +46,23 @@ def memory_status(memory: Memory, call: Call) -> Status:
         incomplete=sum(bag.state is BagState.INCOMPLETE for bag in snapshot.bags),
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot),
-        problems=tuple(_problems(snapshot, heartbeat, wall)),
+        problems=tuple(problems_of(snapshot, heartbeat, wall)),
         notes=view.notes,
     )
 
 
-def _problems(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
-    """Why answers may be missing something, in sentences."""
+def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
+    """Why answers may be missing something, in sentences.
+
+    A recorder that should be recording is a problem where it does not; a stopped one was stopped.
+    """
     if snapshot.problem:
         yield snapshot.problem
+    if snapshot.damaged:
+        damaged = counted(len(snapshot.damaged), "damaged bag file")
+        yield f"{damaged}; data_time_range lists what does not answer"
     if snapshot.dating.note:
         yield snapshot.dating.note
-    yield from recorder_problems(heartbeat, wall)
-    if snapshot.damaged:
-        yield f"{len(snapshot.damaged)} damaged bag files; data_time_range lists them"
-
-
-def recorder_problems(heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
-    """What is wrong with a recorder that should be recording; a stopped one was stopped."""
     if heartbeat is None or heartbeat.state is RecorderState.STOPPED:
         return
     if not heartbeat.is_live(wall):
