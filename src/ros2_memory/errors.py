@@ -89,14 +89,18 @@ class BusyError(EpisodicError):
 
 
 class BagError(EpisodicError):
-    """A bag file that cannot be read; `path` is which, `reason` is why."""
+    """A bag file that cannot be read; `path` is which, `reason` is why.
+
+    `lost` are the first and last log time of what cannot be, where only some messages cannot.
+    """
 
     code = "bag_unreadable"
 
-    def __init__(self, path: str, reason: str) -> None:
+    def __init__(self, path: str, reason: str, lost: tuple[int, int] | None = None) -> None:
         super().__init__(f"{path}: {reason}")
         self.path = path
         self.reason = reason
+        self.lost = lost
 
 
 class BagVanishedError(BagError):

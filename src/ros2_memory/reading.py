@@ -10,7 +10,7 @@ from ros2_memory.errors import BagError, BagVanishedError, QueryTimeoutError
 from ros2_memory.model import BagState, TimeWindow
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.memory import Call, Memory
@@ -33,6 +33,7 @@ class Reading:
             self.snapshot = memory.index.snapshot(reach)
         self._as_of: int | None = None
         self._notes: dict[str, None] = {}
+        self._lacking: dict[str, Ns] = {}
         self.complete = True
 
     @property
@@ -107,9 +108,24 @@ class Reading:
         self.complete = False
         name = short_name(bag.path)
         if isinstance(error, BagVanishedError):
-            self.note(f"{name} was deleted before it could be read")
+            sentence = f"{name} was deleted before it could be read"
+        elif error.lost is not None:
+            sentence = f"{name} could not be read whole: {error.reason}"
         else:
-            self.note(f"{name} could not be read to its end: {error.reason}")
+            sentence = f"{name} could not be read to its end: {error.reason}"
+        last = bag.end if error.lost is None else error.lost[1]
+        self._lacking[sentence] = max(last, self._lacking.get(sentence, last))
+        self.note(sentence)
+
+    def unsay_before(self, moment: Ns, said: Collection[str] = ()) -> None:
+        """Takes back the notes on what could not be read where all of it lies before a moment.
+
+        For a question that did not need it: how far back is read besides what is asked for depends
+        on what the catalogue knows. What was `said` before stands.
+        """
+        for sentence, last in self._lacking.items():
+            if last < moment and sentence not in said:
+                self._notes.pop(sentence, None)
 
     def read(
         self,
@@ -119,30 +135,41 @@ class Reading:
         *,
         newest_first: bool = False,
     ) -> Iterator[Found]:
-        """One bag's messages; a bag that fails ends early with a note, and disturbs no other."""
+        """One bag's messages; what of it cannot be read is noted, and disturbs no other."""
         self.check_deadline()
         kept = self._kept(bag, topics)
-        if kept is not None:
-            for record in reversed(kept) if newest_first else kept:
-                if window.contains(record.log_time):
-                    yield Found(bag, record)
-            return
+        if kept is None:
+            return self._read(bag, topics, window, newest_first=newest_first)
+        ordered = reversed(kept) if newest_first else iter(kept)
+        return (Found(bag, each) for each in ordered if window.contains(each.log_time))
+
+    def _read(
+        self, bag: BagFile, topics: Sequence[str], window: TimeWindow, *, newest_first: bool
+    ) -> Iterator[Found]:
+        records: Iterator[Record] | None = None
         clock, spent, count = time.perf_counter_ns, 0, 0
-        begin = clock()
-        try:
-            for record in self.memory.reader.records(
-                bag.path, topics, window, newest_first=newest_first
-            ):
-                spent += clock() - begin
-                count += 1
-                if count % _CHECK_EVERY == 0:
-                    self.check_deadline()
-                yield Found(bag, record)
-                begin = clock()
-        except BagError as error:
-            self.skip(bag, error)
-        finally:
-            self.call.stages.add("read", spent)
+        while True:
+            begin = clock()
+            try:
+                if records is None:
+                    reader = self.memory.reader
+                    records = reader.records(bag.path, topics, window, newest_first=newest_first)
+                for record in records:
+                    spent += clock() - begin
+                    count += 1
+                    if count % _CHECK_EVERY == 0:
+                        self.check_deadline()
+                    yield Found(bag, record)
+                    begin = clock()
+            except BagError as error:
+                self.skip(bag, error)
+                if error.lost is None:
+                    return
+            else:
+                return
+            finally:
+                self.call.stages.add("read", spent)
+                spent = 0
 
     def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> Found | None:
         """What `read` gives first when it reads newest first; for less."""
@@ -152,9 +179,12 @@ class Reading:
         begin = time.perf_counter_ns()
         try:
             record = self.memory.reader.newest(bag.path, topic, window)
-        except BagError as error:
+        except BagVanishedError as error:
             self.skip(bag, error)
             return None
+        except BagError:
+            # Others of its messages may be whole.
+            return next(self.read(bag, [topic], window, newest_first=True), None)
         finally:
             self.call.stages.add("read", time.perf_counter_ns() - begin)
         return None if record is None else Found(bag, record)

@@ -59,10 +59,13 @@ class Search:
     def newest(self, until: Ns) -> Found | None:
         """The newest match before a moment, as `last_match` gives it."""
         candidates = self.candidates(until)
+        said = self._view.notes
         try:
             for stretch in candidates.stretches():
                 for found in self._messages(stretch):
                     if self.matches(found):
+                        self._view.unsay_before(found.time, said)
+                        self._view.seek_first(found)
                         self._note_undecodable()
                         return found
                     self._back_to = found.time

@@ -158,9 +158,16 @@ class Streams(Reading):
             for topic in topics
         )
 
+    def seek_first(self, found: Found) -> None:
+        """Notes what cannot be read where a message may have been received before."""
+        if _is_late(found) and self.received_twice([found.record.channel.topic]):
+            record = found.record
+            window = TimeWindow(record.publish_time, found.time)
+            self._seek(record.channel.topic, copy_key(record), window)
+
     def _received_again(self, found: Found) -> bool:
         record = found.record
-        if not record.channel.latched or found.time - record.publish_time <= RECEIVED_AGAIN_NS:
+        if not _is_late(found):
             return False
         topic, key = record.channel.topic, copy_key(record)
         if key not in self._first_copies:
@@ -229,6 +236,11 @@ class Streams(Reading):
                 _, rank, found, source = heapq.heappop(heap)
                 yield found
                 push(rank, source)
+
+
+def _is_late(found: Found) -> bool:
+    record = found.record
+    return record.channel.latched and found.time - record.publish_time > RECEIVED_AGAIN_NS
 
 
 def _with_horizon(window: TimeWindow) -> TimeWindow:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import stat
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import BagError, BagVanishedError
@@ -58,8 +59,13 @@ class ConfinedReader(BagReader):
         newest_first: bool = False,
     ) -> Iterator[Record]:
         """As the reader beneath."""
-        self._require_inside(path)
-        yield from self._reader.records(path, topics, window, newest_first=newest_first)
+
+        def found() -> Iterator[Iterator[Record]]:
+            self._require_inside(path)
+            yield self._reader.records(path, topics, window, newest_first=newest_first)
+
+        # Not a generator, which would end where some messages are lost.
+        return chain.from_iterable(found())
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """As the reader beneath."""

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from functools import partial
+from itertools import chain
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
@@ -104,14 +106,18 @@ class CountingReader(BagReader):
         Raises:
             BagError: as the reader beneath.
         """
-        handover = self._handover(path).handover
-        if handover.hides_all:
-            return
-        records = self._reader.records(path, topics, window, newest_first=newest_first)
-        exclusions = _touching(handover.exclusions(path.name), window)
-        if exclusions:
-            records = (record for record in records if _counts(record, exclusions))
-        yield from records
+
+        def found() -> Iterator[Iterator[Record]]:
+            handover = self._handover(path).handover
+            if handover.hides_all:
+                return
+            records = self._reader.records(path, topics, window, newest_first=newest_first)
+            exclusions = _touching(handover.exclusions(path.name), window)
+            # Not a generator, which would end where some messages are lost.
+            counts = partial(_counts, exclusions=exclusions)
+            yield filter(counts, records) if exclusions else records
+
+        return chain.from_iterable(found())
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """The latest message that counts.

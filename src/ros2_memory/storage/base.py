@@ -141,8 +141,9 @@ class BagReader(ABC):
 
         Raises:
             BagVanishedError: the file is not there.
-            BagError: the bytes from here on cannot be read. Where `summarize` gave
-                `complete=False` the early end is known, and simply ends the iteration.
+            BagError: what comes next cannot be read. With `lost` that is some messages only, and
+                the iterator goes on behind them when it is asked again; else it has ended. Where
+                `summarize` gave `complete=False` the early end is known, and simply ends it.
         """
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import sqlite3
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from ros2_memory.errors import (
     BagError,
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
     from types import TracebackType
+
+    from ros2_memory.timebase import Ns
+
+T = TypeVar("T")
 
 # Not ESTALE and ENODEV: a server or a disk that went may come back with all its files.
 _GONE = {errno.ENOENT, errno.ENOTDIR}
@@ -42,6 +46,29 @@ class UnreadableError(Exception):
 
 class UnreachableError(UnreadableError):
     """As `UnreadableError`, where the fault is not the file's and may pass."""
+
+
+class LostError(UnreadableError):
+    """Messages that cannot be read, while those around them may be.
+
+    `first` and `last` are log times: none of the lost ones lies outside of them.
+    """
+
+    def __init__(self, reason: str, first: Ns, last: Ns) -> None:
+        super().__init__(reason)
+        self.first = first
+        self.last = last
+
+
+def whole(path: Path, item: T | LostError) -> T:
+    """The item itself.
+
+    Raises:
+        BagError: it stands for messages of `path` that are lost.
+    """
+    if isinstance(item, LostError):
+        raise BagError(str(path), str(item), (item.first, item.last))
+    return item
 
 
 def reading(path: Path) -> _Reading:

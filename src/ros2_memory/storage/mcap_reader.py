@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.faults import reading
+from ros2_memory.storage.faults import reading, whole
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap_bags import McapBags
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.model import BagSummary, TimeWindow
     from ros2_memory.storage.base import Channel, Closing, Layout, Record
+    from ros2_memory.storage.faults import LostError
     from ros2_memory.timebase import Ns
 
 
@@ -64,8 +66,12 @@ class McapReader(BagReader):
         newest_first: bool = False,
     ) -> Iterator[Record]:
         """The undecoded messages of `topics` inside the window, by log time."""
-        with reading(path):
-            yield from self._bags.records(path, topics, window, newest_first=newest_first)
+
+        def found() -> Iterator[Record | LostError]:
+            with reading(path):
+                yield from self._bags.records(path, topics, window, newest_first=newest_first)
+
+        return map(partial(whole, path), found())
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """The latest message of the topic inside the window."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.faults import UnreadableError, reading
+from ros2_memory.storage.faults import LostError, UnreadableError, reading, whole
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap_bags import McapBags
 from ros2_memory.storage.open_file import OpenFile
@@ -40,7 +40,7 @@ class _Room(Protocol):
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]: ...
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
-    ) -> Iterator[Record]: ...
+    ) -> Iterator[Record | LostError]: ...
 
 
 class _Opened(NamedTuple):
@@ -105,8 +105,13 @@ class Rosbag2Reader(BagReader):
         newest_first: bool = False,
     ) -> Iterator[Record]:
         """The undecoded messages of `topics` inside the window, by log time."""
-        with reading(path), self._opened(path) as opened:
-            yield from opened.room.records(opened.path, topics, window, newest_first=newest_first)
+
+        def found() -> Iterator[Record | LostError]:
+            with reading(path), self._opened(path) as opened:
+                records = opened.room.records
+                yield from records(opened.path, topics, window, newest_first=newest_first)
+
+        return map(partial(whole, path), found())
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """The log times of the topic inside the window, without payloads."""

@@ -1,0 +1,140 @@
+"""A damaged chunk costs its own messages, and is told where these were looked for."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import queries
+from ros2_memory.errors import BagError
+from ros2_memory.history import View
+from ros2_memory.memory import Call
+from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.confined import ConfinedReader
+from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from ros2_memory.answers import Match
+    from ros2_memory.memory import Memory
+    from ros2_memory.storage.base import BagReader
+
+S = 10**9
+LATCHED = McapLayout(chunk_size=1, latched=frozenset({"/dock"}))
+EVERYTHING = TimeWindow.everything()
+
+
+def damaged_bag(path: Path) -> tuple[Path, range]:
+    """A bag of 40 messages at 0, 1, 2 ... ns, and which of them stand in a damaged chunk."""
+    write_mcap(path, chatter(40), SMALL)
+    lost = chunks_of(path)[3]
+    spoil_chunk(path, 3)
+    return path, range(lost.message_start_time, lost.message_end_time + 1)
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda _: McapReader(),
+        lambda _: Rosbag2Reader(),
+        lambda _: CountingReader(McapReader()),
+        lambda root: ConfinedReader(McapReader(), root),
+    ],
+)
+def test_reading_goes_on_behind_a_damaged_chunk(
+    tmp_path: Path, made: Callable[[Path], BagReader], newest_first: bool
+) -> None:
+    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    records = made(tmp_path).records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
+    before: list[int] = []
+    with pytest.raises(BagError) as told:
+        before.extend(each.log_time for each in iter(partial(next, records), None))
+    assert told.value.lost == (lost[0], lost[-1])
+    whole = [time for time in range(40) if time not in lost]
+    if newest_first:
+        whole.reverse()
+    assert [*before, *(each.log_time for each in records)] == whole
+    assert before == whole[: len(before)]
+    assert all((time > lost[-1]) == newest_first for time in before)
+
+
+def test_what_of_a_damaged_chunk_is_outside_of_the_window_is_not_lost(tmp_path: Path) -> None:
+    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    reader = McapReader()
+    assert [
+        each.log_time for each in reader.records(path, ["/chatter"], TimeWindow(0, lost[0]))
+    ] == [*range(lost[0])]
+    with pytest.raises(BagError) as told:
+        list(reader.records(path, ["/chatter"], TimeWindow(lost[0], lost[0] + 1)))
+    assert told.value.lost == (lost[0], lost[0])
+
+
+def test_the_newest_message_stands_before_the_damaged_chunk_where_that_is_the_last(
+    tmp_path: Path,
+) -> None:
+    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    view = View(memory_of(tmp_path), Call())
+    found = view.newest("/chatter", TimeWindow.until(lost[-1]))
+    assert found is not None
+    assert found.time == lost[0] - 1
+    [told] = view.notes
+    assert told.startswith(f"rec/{path.name} could not be read whole: ")
+
+
+def asked(memory: Memory, pattern: str, wanted: str) -> Match:
+    return queries.find_last_match(memory, Call(), pattern, "contains", wanted)
+
+
+def test_a_match_behind_a_damaged_chunk_is_found_and_the_chunk_is_told(tmp_path: Path) -> None:
+    damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    found = asked(memory_of(tmp_path), "/chatter", f"{3:0100d}")
+    assert found.found is not None
+    assert found.found.sample.time == 3
+    assert any("rec_0.mcap could not be read whole" in note for note in found.notes)
+
+
+def test_a_chunk_damaged_before_the_match_is_told_neither_with_a_catalogue_nor_without(
+    tmp_path: Path,
+) -> None:
+    """What overlaps has the search look further back for copies than it was asked to."""
+    first = write_mcap(tmp_path / "a" / "a_0.mcap", [text(S, "hello"), boolean(S + 1, True)])
+    spoil_chunk(first, 0)
+    wanted = text(2 * S, "person")
+    write_mcap(tmp_path / "a" / "a_1.mcap", [wanted])
+    late: list[Msg] = [boolean(2 * S + 5, False), boolean(3 * S, True)]
+    write_mcap(tmp_path / "b" / "b_0.mcap", late)
+    plain = memory_of(tmp_path)
+    found = asked(plain, "/*", "person")
+    assert found.found is not None
+    assert found.notes == ()
+    assert repr(asked(recalling(plain, tmp_path), "/*", "person")) == repr(found)
+    # Asked for what may stand in it, it is told.
+    assert "a_0.mcap could not be read whole" in asked(plain, "/*", "hello").notes[0]
+
+
+def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_told(
+    tmp_path: Path,
+) -> None:
+    dock = text(10 * S, "docked", "/dock")
+    other = text(9 * S, "undocked", "/dock")
+    first = write_mcap(tmp_path / "a" / "a_0.mcap", [other, dock], LATCHED)
+    spoil_chunk(first, 1)
+    again = Msg("/dock", dock.type, 100 * S, dock.body, 10 * S)
+    write_mcap(tmp_path / "b" / "b_0.mcap", [again], LATCHED)
+    plain = memory_of(tmp_path)
+    for memory in (plain, recalling(plain, tmp_path)):
+        found = asked(memory, "/dock", "docked")
+        assert found.found is not None
+        assert found.found.sample.time == 100 * S
+        assert "a_0.mcap could not be read whole" in found.notes[0]
