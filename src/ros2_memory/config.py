@@ -39,7 +39,8 @@ _LAST_ROS_DOMAIN: Final = 232  # the highest whose DDS ports stay below 65536
 _FOREIGN: Final = (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError)
 
 
-def _quoted(value: str) -> str:
+def quoted(value: str) -> str:
+    """The text as a value in Hydra's grammar, whatever is in it."""
     return str(QuotedString(text=value, quote=Quote.single).with_quotes())
 
 
@@ -48,13 +49,13 @@ def _whole(value: str) -> str:
     try:
         return str(int(value))
     except ValueError:
-        return _quoted(value)
+        return quoted(value)
 
 
 _VARIABLES: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
-    "MEMORY_BAG_DIR": ("recording.bag_dir", _quoted),
-    "MCP_TRANSPORT": ("server.transport", _quoted),
-    "MCP_HOST": ("server.host", _quoted),
+    "MEMORY_BAG_DIR": ("recording.bag_dir", quoted),
+    "MCP_TRANSPORT": ("server.transport", quoted),
+    "MCP_HOST": ("server.host", quoted),
     "MCP_PORT": ("server.port", _whole),
 }
 
@@ -87,6 +88,17 @@ def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None =
     Raises:
         ConfigError: the files, the environment or the overrides hold something that is refused.
     """
+    return load_explained(overrides, env)[0]
+
+
+def load_explained(
+    overrides: Sequence[str] = (), env: Mapping[str, str] | None = None
+) -> tuple[Settings, Callable[[str], str]]:
+    """As `load_settings`, and what tells of a key, such as `server.port`, who set it.
+
+    Raises:
+        ConfigError: as `load_settings`.
+    """
     given = _given(os.environ if env is None else env)
     folder = config_dir(given)
     assignments = [
@@ -113,7 +125,7 @@ def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None =
         _add_interface_folder(composed, given)
         data = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         raw = OmegaConf.to_container(composed, resolve=False)
-    return validated(Settings, data, config_dir=folder, source=source, raw=raw)
+    return validated(Settings, data, config_dir=folder, source=source, raw=raw), source
 
 
 def config_dir(env: Mapping[str, str]) -> Path:
@@ -195,7 +207,7 @@ def _expanded(text: str) -> Path:
 def _named_variables(given: Mapping[str, str]) -> list[_Assignment]:
     preset = given.get("MEMORY_DEPLOYMENT")
     presets = (
-        [_Assignment(f"deployment={_quoted(preset)}", "by MEMORY_DEPLOYMENT")] if preset else []
+        [_Assignment(f"deployment={quoted(preset)}", "by MEMORY_DEPLOYMENT")] if preset else []
     )
     return presets + [
         _Assignment(f"{key}={written(given[name])}", f"by {name}")

@@ -1,0 +1,187 @@
+"""`ros2-memory topics`, `info` and `config show`: what there is, how much of it, and why so."""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+import yaml
+
+from ros2_memory.bootstrap import build_server
+from ros2_memory.cli.asking import asked, is_without_answer
+from ros2_memory.cli.running import (
+    NOT_SO,
+    AsJson,
+    BagDir,
+    Overrides,
+    explained_for,
+    opened,
+    output,
+    reporting,
+    say,
+    settings_for,
+)
+from ros2_memory.cli.showing import cell, plain, show
+from ros2_memory.model import JsonValue, TimeWindow
+from ros2_memory.recorder.snapshot import Snapshot
+from ros2_memory.settings import AdapterNode
+from ros2_memory.timebase import NS_PER_S, unix_from_ns
+
+MASK: Final = "********"
+_WHOLE: Final = "server.max_reply_chars=1000000000"
+"""A planner's context is short; a person's screen scrolls."""
+_SECRET: Final = ("token", "password", "secret", "credential")
+_USUAL_NS: Final = 3600 * NS_PER_S
+
+config_app = typer.Typer(
+    help="The configuration, as the programs see it.", no_args_is_help=True, rich_markup_mode=None
+)
+
+
+def topics(overrides: Overrides = None, as_json: AsJson = False, bag_dir: BagDir = None) -> None:
+    """Every recorded topic: type, messages, usual rate, when it was first and last heard.
+
+    The rate is that of the topic's newest hour, without the gaps between bags.
+    """
+    with reporting("topics"):
+        settings = settings_for(bag_dir, [*(overrides or ()), _WHOLE])
+        memory = opened(settings)
+        text = asked(build_server(settings, memory), "list_recorded_topics", {}).text
+        reply: JsonValue = json.loads(text)
+        snapshot = memory.index.snapshot()
+    rows = [each for each in reply if isinstance(each, dict)] if isinstance(reply, list) else []
+    shown = [{**row, "rate_hz": usual_rate(snapshot, str(row["topic"]))} for row in rows]
+    if as_json:
+        say(json.dumps(shown) if rows else text)
+    elif rows:
+        show(output(), [*shown])
+    elif is_without_answer(reply):
+        show(output(), reply)
+    else:
+        say(f"nothing is recorded in {settings.recording.bag_dir}")
+    if not rows:
+        raise typer.Exit(NOT_SO)
+
+
+def usual_rate(snapshot: Snapshot, topic: str) -> float | None:
+    """How often a topic was heard in its newest hour (Hz); None where that says nothing."""
+    if snapshot.is_latched(topic):
+        return None
+    stated = [*snapshot.stated(topic).values()]
+    if not stated:
+        return None
+    last = max(each.last for each in stated)
+    messages, spent = 0, 0
+    for _, held in snapshot.holding(topic, TimeWindow(last - _USUAL_NS, last + 1)):
+        messages += held.count - 1
+        spent += held.last - held.first
+    return round(messages / unix_from_ns(spent), 2) if messages > 0 and spent > 0 else None
+
+
+def info(overrides: Overrides = None, as_json: AsJson = False, bag_dir: BagDir = None) -> None:
+    """What the memory covers: range, gaps, damaged files, the budget, and how long it lasts."""
+    with reporting("info"):
+        settings = settings_for(bag_dir, [*(overrides or ()), _WHOLE, "server.tools=all"])
+        memory = opened(settings)
+        replies: dict[str, JsonValue] = {
+            tool: json.loads(asked(build_server(settings, memory), tool, {}).text)
+            for tool in ("memory_status", "data_time_range")
+        }
+    if as_json:
+        say(json.dumps(replies))
+    else:
+        console = output()
+        for reply in replies.values():
+            show(console, _in_words(reply))
+            console.print()
+    if all(is_without_answer(reply) for reply in replies.values()):
+        raise typer.Exit(NOT_SO)
+
+
+def _in_words(reply: JsonValue) -> JsonValue:
+    """A status whose budget is a sentence."""
+    budget = reply.get("budget") if isinstance(reply, dict) else None
+    if not isinstance(reply, dict) or not isinstance(budget, dict):
+        return reply
+    return {**reply, "budget": budget_in_words(budget)}
+
+
+def budget_in_words(budget: dict[str, JsonValue]) -> str:
+    """What the bags take of the budget, and for how long it lasts."""
+    used, most, growth = (budget.get(key) for key in ("used_gb", "max_gb", "growth_gb_per_day"))
+    text = f"{cell(used)} GB"
+    if most is None:
+        text += "; no budget: nothing is recorded here, and nothing deleted"
+    else:
+        text += f" of {cell(most)} GB"
+    if growth is not None:
+        text += f"; grows by {cell(growth)} GB a day"
+    if "full_in_days" in budget:
+        text += f"; full in {cell(budget['full_in_days'])} days"
+        text += f", and keeps {cell(budget['keeps_days'])} days"
+    return text
+
+
+@config_app.command("show")
+def config_show(
+    overrides: Overrides = None,
+    bag_dir: BagDir = None,
+    sources: Annotated[bool, typer.Option("--sources", help="Say of each key who set it.")] = False,
+) -> None:
+    """The configuration as YAML, composed of files, environment and arguments; no secrets.
+
+    Whether there is a token for the server is told in a comment, never what it is.
+    """
+    with reporting("config show"):
+        settings, source = explained_for(bag_dir, overrides)
+    if sources:
+        rows: list[JsonValue] = [
+            {"key": key, "value": _shown(key, value), "set": source(key)}
+            for key, value in leaves(settings)
+        ]
+        show(output(), rows)
+        return
+    say(yaml.safe_dump(nested(settings), sort_keys=False, allow_unicode=True).rstrip())
+    for name in ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
+        if os.environ.get(name):
+            say(f"# {name} is set: {MASK}")
+
+
+def leaves(settings: object, prefix: str = "") -> Iterator[tuple[str, object]]:
+    """Every key with its value."""
+    if not is_dataclass(settings):
+        return
+    for each in fields(settings):
+        value: object = getattr(settings, each.name)
+        name = "_target_" if isinstance(settings, AdapterNode) and each.name == "target" else ""
+        key = f"{prefix}{name or each.name}"
+        if is_dataclass(value):
+            yield from leaves(value, f"{key}.")
+        else:
+            yield key, value
+
+
+def nested(settings: object) -> dict[str, object]:
+    """The settings as plain values, as the files have them."""
+    whole: dict[str, object] = {}
+    for key, value in leaves(settings):
+        section, _, name = key.partition(".")
+        part = whole.setdefault(section, {})
+        if isinstance(part, dict):
+            part[name] = _shown(key, value)
+    return whole
+
+
+def _shown(key: str, value: object) -> JsonValue:
+    if value and any(word in key.rpartition(".")[2].lower() for word in _SECRET):
+        return MASK
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, tuple | list):
+        return [_shown("", each) for each in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return plain(str(value))

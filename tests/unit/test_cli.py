@@ -1,0 +1,202 @@
+"""`ros2-memory`: what its commands that only look print, and how they end."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+import yaml
+
+from ros2_memory import cli
+from ros2_memory.cli.asking import complete, parsed
+from ros2_memory.cli.showing import cell, plain
+from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.timebase import NS_PER_S
+from tests.bags import odom, text, write_mcap
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0 = 1_700_000_000 * NS_PER_S
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two bags, ten seconds of odometry at 10 Hz in each, an hour apart; and two words."""
+    for number in range(2):
+        start = T0 + number * 3600 * NS_PER_S
+        messages = [odom(start + n * NS_PER_S // 10, float(number), n / 10) for n in range(100)]
+        messages.append(text(start + NS_PER_S, "scissors \x1b[31mred"))
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "replay")
+    monkeypatch.setenv("COLUMNS", "160")
+    return tmp_path
+
+
+class TestAsk:
+    def test_with_json_the_reply_is_what_a_client_receives(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_position_seconds_ago", "seconds_ago=0", "--json"]) == 0
+        reply = json.loads(capsys.readouterr().out)
+        assert (reply["x"], reply["topic"]) == (1.0, "/odom")
+
+    def test_an_object_is_taken_as_it_is(self, capsys: Capture) -> None:
+        asked = '{"topic": "/chatter", "seconds": 4000}'
+        assert cli.main(["ask", "get_topic_in_last", asked, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["total"] == 2
+
+    def test_people_read_lines_and_tables_with_local_times(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_topic_in_last", "topic=/chatter", "seconds=4000"]) == 0
+        shown = capsys.readouterr().out
+        assert "std_msgs/msg/String" in shown
+        assert "2023-11-1" in shown
+        assert "1700000001" not in shown
+
+    def test_what_was_recorded_cannot_command_the_terminal(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_topic_in_last", "topic=/chatter", "seconds=4000"]) == 0
+        shown = capsys.readouterr().out
+        assert "\x1b" not in shown
+        assert "\\x1b[31mred" in shown
+
+    def test_an_error_is_shown_and_the_exit_code_is_1(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_topic_in_last", "topic=/nowhere", "seconds=1"]) == 1
+        assert "topic_not_recorded" in capsys.readouterr().out
+
+    def test_a_name_that_no_tool_has_lists_those_that_are(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "where_am_i"]) == 1
+        assert "get_position_seconds_ago" in capsys.readouterr().err
+
+    def test_without_a_name_the_tools_are_listed_with_their_arguments(
+        self, capsys: Capture
+    ) -> None:
+        assert cli.main(["ask"]) == 0
+        assert "seconds_ago, topic?, tolerance_s?" in capsys.readouterr().out
+
+    def test_what_is_no_argument_is_refused_with_the_form_it_has(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_position_seconds_ago", "10"]) == 2
+        assert "seconds_ago=10" in capsys.readouterr().err
+
+    def test_settings_reach_the_tool(self, capsys: Capture) -> None:
+        words = ["ask", "get_position_seconds_ago", "seconds_ago=0", "--json"]
+        assert cli.main([*words, "--set", "data.pose_topic=/amcl_pose"]) == 1
+        assert "/amcl_pose" in capsys.readouterr().out
+
+    def test_shells_complete_its_tools(self) -> None:
+        assert complete("get_pos") == ["get_position_at", "get_position_seconds_ago"]
+
+
+class TestArguments:
+    def test_values_are_json_where_they_read_so_and_text_elsewhere(self) -> None:
+        given = ["a=1", "b=true", "c=scissors", 'd={"x": 1}', "e=null", "f=1=2", "g="]
+        assert parsed(given, {}) == {
+            "a": 1,
+            "b": True,
+            "c": "scissors",
+            "d": {"x": 1},
+            "e": None,
+            "f": "1=2",
+            "g": "",
+        }
+
+    def test_what_a_tool_takes_as_text_stays_text(self) -> None:
+        schema = {"properties": {"topic": {"type": "string"}}}
+        assert parsed(["topic=7"], schema) == {"topic": "7"}
+
+    @pytest.mark.parametrize("given", [["{]"], ["=1"], ["seconds"]])
+    def test_anything_else_is_refused(self, given: list[str]) -> None:
+        with pytest.raises(InvalidArgumentsError):
+            parsed(given, {})
+
+
+class TestTopics:
+    def test_rates_do_not_count_the_time_between_bags(self, capsys: Capture) -> None:
+        assert cli.main(["topics", "--json"]) == 0
+        rows = {row["topic"]: row for row in json.loads(capsys.readouterr().out)}
+        assert rows["/odom"]["rate_hz"] == pytest.approx(10.0)
+        assert rows["/odom"]["count"] == 200
+        assert rows["/chatter"]["rate_hz"] is None
+
+    def test_they_are_a_table(self, capsys: Capture) -> None:
+        assert cli.main(["topics"]) == 0
+        assert "nav_msgs/msg/Odometry" in capsys.readouterr().out
+
+    def test_of_an_empty_memory_the_exit_code_is_1(self, tmp_path: Path, capsys: Capture) -> None:
+        (tmp_path / "none").mkdir()
+        assert cli.main(["topics", "--bag-dir", str(tmp_path / "none")]) == 1
+        assert "nothing is recorded in" in capsys.readouterr().out
+
+
+class TestInfo:
+    def test_it_tells_the_range_the_gaps_and_the_bags(self, capsys: Capture) -> None:
+        assert cli.main(["info", "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["data_time_range"]["earliest"] == 1_700_000_000.0
+        assert told["data_time_range"]["bags"] == 2
+        assert len(told["data_time_range"]["gaps"]) == 1
+        assert told["memory_status"]["budget"]["max_gb"] is None
+
+    def test_where_nothing_is_recorded_there_is_no_budget(self, capsys: Capture) -> None:
+        assert cli.main(["info"]) == 0
+        assert "no budget" in capsys.readouterr().out
+
+    def test_where_something_is_it_says_for_how_long_the_budget_lasts(
+        self, capsys: Capture
+    ) -> None:
+        assert cli.main(["info", "deployment=robot", "retention.max_total_gb=2.0"]) == 0
+        shown = capsys.readouterr().out
+        assert "of 2 GB" in shown
+        assert "full in" in shown
+
+
+class TestConfig:
+    def test_it_is_shown_as_yaml_that_a_program_would_take(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        assert cli.main(["config", "show", "server.port=9300"]) == 0
+        shown = yaml.safe_load(capsys.readouterr().out)
+        assert shown["server"]["port"] == 9300
+        assert shown["recording"]["bag_dir"] == str(bag_dir)
+        assert shown["storage"]["_target_"].startswith("ros2_memory.")
+
+    def test_a_token_is_not(self, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+        monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
+        assert cli.main(["config", "show"]) == 0
+        shown = capsys.readouterr().out
+        assert "MEMORY_API_TOKEN is set" in shown
+        assert "a-secret" not in shown
+
+    def test_sources_say_who_set_a_key(self, capsys: Capture) -> None:
+        assert cli.main(["config", "show", "--sources", "server.port=9300"]) == 0
+        rows = capsys.readouterr().out.splitlines()
+        assert "on the command line" in next(row for row in rows if "server.port" in row)
+        assert "MEMORY_BAG_DIR" in next(row for row in rows if "recording.bag_dir" in row)
+
+    def test_a_wrong_key_is_named_and_the_exit_code_is_2(self, capsys: Capture) -> None:
+        assert cli.main(["config", "show", "server.prot=1"]) == 2
+        assert "server.prot" in capsys.readouterr().err
+
+
+class TestTheProgram:
+    def test_a_command_that_there_is_not_ends_with_2(self, capsys: Capture) -> None:
+        assert cli.main(["fly"]) == 2
+        assert "fly" in capsys.readouterr().err
+
+    def test_it_tells_its_version(self, capsys: Capture) -> None:
+        assert cli.main(["--version"]) == 0
+        assert capsys.readouterr().out.startswith("ros2-memory ")
+
+    def test_it_runs_as_a_module_and_a_pipe_gets_whole_lines(self, bag_dir: Path) -> None:
+        program = [sys.executable, "-m", "ros2_memory.cli", "topics", "--bag-dir", str(bag_dir)]
+        done = subprocess.run(program, capture_output=True, text=True, check=True, timeout=60)
+        assert "/chatter" in done.stdout
+        assert done.stderr == ""
+        assert "\x1b" not in done.stdout
+
+    def test_control_characters_are_spelled(self) -> None:
+        assert plain("a\x07\u202eb ß") == "a\\x07\\u202eb ß"
+        assert cell([1.5, "x"]) == "1.5, x"
+        assert cell([]) == cell(None) == "-"
