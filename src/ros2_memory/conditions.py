@@ -1,4 +1,4 @@
-"""Conditions on one extracted value: `contains`, `equals` and `near_position`.
+"""Conditions on one extracted value: `contains`, `equals`, `above`, `below`, `near_position`.
 
 They are tested on the whole value, before anything in it is downsampled or rounded. NaN and null
 match nothing.
@@ -34,8 +34,12 @@ _INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 _EXAMPLES: Final = {
     "contains": 'condition_type "contains", value "scissors"',
     "equals": 'condition_type "equals", value true',
+    "above": 'condition_type "above", value 0.5, field "linear_velocity.x"',
+    "below": 'condition_type "below", value 0.2, field "percentage"',
     "near_position": 'condition_type "near_position", value {"x": 1.5, "y": -0.2}',
 }
+_SIDES: Final = {"above": True, "below": False}
+"""Conditions on a number, and whether it is to be above the limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +115,29 @@ class Equals:
 
 
 @dataclass(frozen=True, slots=True)
+class Beyond:
+    """A number on one side of a limit, which is not part of it; a boolean is no number."""
+
+    limit: int | float
+    above: bool
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether any number at any depth is on that side."""
+        return any(
+            self._is_beyond(leaf)
+            for leaf in leaves(value)
+            if isinstance(leaf, int | float) and not isinstance(leaf, bool)
+        )
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may hold such a number."""
+        return evidence.open or self._is_beyond(evidence.high if self.above else evidence.low)
+
+    def _is_beyond(self, number: float) -> bool:
+        return number > self.limit if self.above else number < self.limit
+
+
+@dataclass(frozen=True, slots=True)
 class NearPosition:
     """A place (m) within `tolerance_m`, inclusive; in the plane where `z` is None.
 
@@ -142,7 +169,7 @@ class NearPosition:
         return distance(here, (self.x, self.y, self.z or 0.0)) <= self.tolerance_m
 
 
-Test: TypeAlias = Contains | Equals | NearPosition
+Test: TypeAlias = Contains | Equals | Beyond | NearPosition
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,15 +206,24 @@ def parse_condition(
     """The condition that a planner's arguments mean.
 
     Args:
-        condition_type: `contains`, `equals` or `near_position`.
-        value: a text, number or boolean; for `near_position` an object with x, y and perhaps z.
+        condition_type: `contains`, `equals`, `above`, `below` or `near_position`.
+        value: a text, number or boolean; for `above` and `below` a number; for `near_position` an
+            object with x, y and perhaps z.
         tolerance_m: how near `near_position` is.
-        field: dot-path in the value that narrows the test; None or blank for all of it.
+        field: dot-path in the value that narrows the test; None or blank for all of it. `above`
+            and `below` need one: most messages hold numbers of many kinds.
 
     Raises:
         InvalidArgumentsError: the sentence says what is wrong and gives an example.
     """
-    return Condition(_parse_test(condition_type, value, tolerance_m), (field or "").strip() or None)
+    path = (field or "").strip() or None
+    test = _parse_test(condition_type, value, tolerance_m)
+    if isinstance(test, Beyond) and path is None:
+        raise InvalidArgumentsError(
+            f"'{condition_type}' needs field, the dot-path of the number that is meant;"
+            f" for example {_EXAMPLES[condition_type]}"
+        )
+    return Condition(test, path)
 
 
 def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
@@ -233,6 +269,13 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
             f" for example {_EXAMPLES['contains']}"
         )
     example = f"for example {_EXAMPLES[condition_type]}"
+    if condition_type in _SIDES:
+        limit = _spelled(value) if isinstance(value, str) else value
+        if isinstance(limit, int | float) and not isinstance(limit, bool) and _is_limit(limit):
+            return Beyond(limit, _SIDES[condition_type])
+        raise InvalidArgumentsError(
+            f"'{condition_type}' takes a number as value, not {_kind(value)}; {example}"
+        )
     if not isinstance(value, bool | int | float | str):
         raise InvalidArgumentsError(
             f"'{condition_type}' takes a text, a number or a boolean as value,"
@@ -245,6 +288,10 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
     if isinstance(value, str) and not value.strip():
         raise InvalidArgumentsError(f"'contains' takes a text that is not blank; {example}")
     return Contains(value)
+
+
+def _is_limit(number: float) -> bool:
+    return isinstance(number, int) or not math.isnan(number)
 
 
 def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.conditions import (
+    Beyond,
     Condition,
     Contains,
     Equals,
@@ -168,6 +169,23 @@ def test_conditions_on_true_and_on_one_are_different_conditions() -> None:
     assert Contains(True) != Contains(1)
 
 
+# above and below
+
+
+@given(st.floats(allow_nan=False), st.floats(allow_nan=False))
+def test_a_limit_is_not_part_of_either_side(limit: float, number: float) -> None:
+    assert Beyond(limit, above=True).matches([number]) == (number > limit)
+    assert Beyond(limit, above=False).matches([number]) == (number < limit)
+    assert not Beyond(limit, above=True).matches({"a": limit})
+    assert not Beyond(limit, above=False).matches({"a": limit})
+
+
+@pytest.mark.parametrize("value", [True, None, "9", [], {}])
+def test_what_is_no_number_is_on_no_side(value: JsonValue) -> None:
+    assert not Beyond(0, above=True).matches(value)
+    assert not Beyond(2, above=False).matches(value)
+
+
 # near_position
 
 
@@ -309,6 +327,12 @@ def test_arguments_become_conditions(kind: str, value: JsonValue, condition: Con
     assert parse_condition(kind, value, 0.5) == condition
 
 
+@pytest.mark.parametrize("asked", [0.5, "0.5"])
+def test_a_limit_may_stand_in_quotes(asked: JsonValue) -> None:
+    condition = parse_condition("above", asked, 0.5, "detections.score")
+    assert condition == Condition(Beyond(0.5, above=True), "detections.score")
+
+
 def test_a_blank_field_is_no_field() -> None:
     assert parse_condition("contains", "mug", 0.5, " ").field is None
     assert parse_condition("contains", "mug", 0.5, "label").field == "label"
@@ -317,12 +341,21 @@ def test_a_blank_field_is_no_field() -> None:
 @pytest.mark.parametrize(
     ("kind", "value", "complaint"),
     [
-        ("near", {"x": 1, "y": 2}, "'near' is not one of contains, equals, near_position"),
+        (
+            "near",
+            {"x": 1, "y": 2},
+            "'near' is not one of contains, equals, above, below, near_position",
+        ),
         ("contains", None, "not null"),
         ("contains", ["a", "b"], "not a list"),
         ("contains", "  ", "not blank"),
         ("equals", {"x": 1}, "not an object"),
         ("equals", math.nan, "NaN"),
+        ("above", "high", "takes a number as value"),
+        ("above", True, "not true"),
+        ("below", math.nan, "takes a number as value"),
+        ("below", {"x": 1}, "not an object"),
+        ("above", 3, "needs field"),
         ("near_position", "1,2", 'not "1,2"'),
         ("near_position", [1, 2], "not a list"),
         ("near_position", {"x": 1}, "'y' of 'near_position' must be a finite number"),

@@ -11,7 +11,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ros2_memory.conditions import Condition, Contains, Equals, NearPosition, parse_condition
+from ros2_memory.conditions import (
+    Beyond,
+    Condition,
+    Contains,
+    Equals,
+    NearPosition,
+    parse_condition,
+)
 from ros2_memory.digest import MOST_KEPT, Digester, EvidenceCollector
 from ros2_memory.evidence import MOST_WORDS, united
 from ros2_memory.model import Pose
@@ -68,6 +75,7 @@ conditions = st.builds(
     st.one_of(
         st.builds(Contains, needles.filter(lambda needle: needle != "")),
         st.builds(Equals, needles),
+        st.builds(Beyond, st.one_of(st.floats(allow_nan=False), st.integers()), st.booleans()),
         st.builds(
             NearPosition,
             st.floats(-6, 6),
@@ -110,6 +118,13 @@ def test_evidence_never_rules_out_what_matches(
 def test_evidence_rules_out_what_was_never_there(condition_type: str, value: JsonValue) -> None:
     seen = topic_of([detections(T0, ["cup", "Person 2"]), detections(T0 + S, ["chair"])])
     assert not parse_condition(condition_type, value, 0.5).may_match(seen.evidence)
+
+
+def test_evidence_rules_out_a_number_beyond_all_that_were_there() -> None:
+    seen = topic_of([detections(T0, ["cup"])])
+    for limit, above in ((1e6, True), (-1e6, False)):
+        assert not Beyond(limit, above=above).may_match(seen.evidence)
+        assert Beyond(-limit, above=above).may_match(seen.evidence)
 
 
 @pytest.mark.parametrize(
