@@ -30,6 +30,7 @@ _MOST_TOPICS: Final = 10
 def _sightings(answer: accounts.Sightings, _bag_dir: Path) -> JsonObject:
     reply: JsonObject = {
         "sightings": [_sighting(each, answer.now) for each in answer.sightings],
+        "total": answer.total,
         "searched_from": moment(answer.start),
         "searched_to": moment(answer.end),
     }
@@ -70,6 +71,7 @@ def _recap(answer: accounts.Recap, _bag_dir: Path) -> JsonObject:
     }
     if answer.throughout:
         reply["seen_throughout"] = [*answer.throughout]
+    reply["counts"] = dict(answer.counts)
     return with_notes(reply, answer.notes)
 
 
@@ -93,6 +95,7 @@ def _visits(answer: accounts.Visits, _bag_dir: Path) -> JsonObject:
         "radius_m": answer.radius_m,
         "there_now": any(each.departed is None for each in answer.visits),
         "visits": [_visit(each, answer.now) for each in answer.visits],
+        "total": answer.total,
     }
     if answer.more:
         reply["more"] = True

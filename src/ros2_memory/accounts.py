@@ -47,10 +47,14 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """Sightings, newest first; `more`: there are older ones. `start` and `end` were searched."""
+    """Sightings in the order asked for; `more`: there are others. `start` and `end` were searched.
+
+    `total` is how many there are; None where the search did not go through all.
+    """
 
     sightings: tuple[Sighting, ...]
     more: bool
+    total: int | None
     start: Ns | None
     end: Ns | None
     now: Ns
@@ -81,6 +85,7 @@ class Recap:
         frame_id: of the places in texts.
         events: what happened, in order of time.
         throughout: things that were in view all the time.
+        counts: how many events of which kind there were, those that are left out too.
     """
 
     start: Ns
@@ -92,6 +97,7 @@ class Recap:
     frame_id: str | None
     events: tuple[Event, ...]
     throughout: tuple[str, ...]
+    counts: tuple[tuple[str, int], ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -171,7 +177,10 @@ class Visit:
 
 @dataclass(frozen=True, slots=True)
 class Visits:
-    """Visits to a place (m) of a frame, newest first; `more`: there are older ones."""
+    """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
+
+    `total` is how many there are; None where the search did not go through all.
+    """
 
     frame_id: str
     x: float
@@ -179,6 +188,7 @@ class Visits:
     radius_m: float
     visits: tuple[Visit, ...]
     more: bool
+    total: int | None
     now: Ns
     notes: tuple[str, ...] = ()
 

@@ -123,21 +123,17 @@ Timestamp: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.", examp
 SecondsAgo: TypeAlias = Annotated[
     _Duration, Field(description="Seconds before now.", examples=[10])
 ]
-Start: TypeAlias = Annotated[
-    _Unix, Field(description="Unix seconds, inclusive.", examples=[1784023200])
-]
-End: TypeAlias = Annotated[
-    _Unix, Field(description="Unix seconds, inclusive.", examples=[1784023260])
-]
+Start: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023200])]
+End: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023260])]
 Seconds: TypeAlias = Annotated[
     float,
     Field(strict=True, gt=0, allow_inf_nan=False),
-    Field(description="Length of the window that ends now, in s.", examples=[60]),
+    Field(description="Before now.", examples=[60]),
 ]
 Tolerance: TypeAlias = Annotated[
     _Duration, Field(description="How old the message may be then, in s.")
 ]
-Topic: TypeAlias = Annotated[_Text, Field(description="Topic name.", examples=["/odom"])]
+Topic: TypeAlias = Annotated[_Text, Field(examples=["/odom"])]
 PoseTopic: TypeAlias = Annotated[_Text, Field(description="Instead of the default topic.")]
 ValueTopic: TypeAlias = Annotated[
     _Text, Field(description="Topic to read at the match.", examples=["/odom"])
@@ -158,8 +154,19 @@ Fields: TypeAlias = Annotated[
     BeforeValidator(_as_list),
     Field(description='Parts of value, e.g. ["position.x"].'),
 ]
-Since: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing before.")]
-Until: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing after.")]
+Since: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.")]
+Until: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.")]
+Within: TypeAlias = Annotated[
+    float,
+    Field(strict=True, gt=0, allow_inf_nan=False),
+    Field(description="Only the last so many s."),
+]
+OldestFirst: TypeAlias = Annotated[
+    bool, Field(strict=True, description="Counts all; the first are told.")
+]
+FrameOfPlace: TypeAlias = Annotated[
+    _Text, Field(description="Of x and y, as replies name it; default: the map.")
+]
 Coordinate: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")
 ]
@@ -173,7 +180,7 @@ MaxSamples: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=10_000)], BeforeValidator(_whole)
 ]
 ConditionType: TypeAlias = Annotated[
-    Literal["contains", "equals", "near_position"], Field(examples=["contains"])
+    Literal["contains", "equals", "above", "below", "near_position"], Field(examples=["contains"])
 ]
 ConditionValue: TypeAlias = Annotated[
     JsonValue,
@@ -188,9 +195,7 @@ ConditionValue: TypeAlias = Annotated[
 SearchField: TypeAlias = Annotated[
     _Text, Field(description="Dot-path in value that alone is tested.")
 ]
-Before: TypeAlias = Annotated[
-    _Unix, Field(description="Unix seconds; nothing after: goes on after a timeout.")
-]
+Before: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing after.")]
 Label: TypeAlias = Annotated[
     str, Field(strict=True, examples=["charger found"]), AfterValidator(_label)
 ]
@@ -358,6 +363,7 @@ class Place(Arguments):
 
     x: Coordinate
     y: Coordinate
+    frame_id: FrameOfPlace | None = None
     radius_m: Radius | None = None
     limit: Limit = 10
 
@@ -369,8 +375,10 @@ class Matches(Arguments):
     condition_type: ConditionType
     value: ConditionValue
     field: SearchField | None = None
+    seconds: Within | None = None
     start: Since | None = None
     end: Until | None = None
+    oldest_first: OldestFirst = False
     limit: Limit = 5
 
 

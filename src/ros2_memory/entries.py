@@ -44,7 +44,8 @@ class Tool:
 class Variant:
     """One name of a question.
 
-    `said` takes the place of {when} in the description, `more` of {more}: what the reply has more.
+    `said` takes the place of {when} in the description; `more` is what the reply has besides that
+    of the question's first name.
     """
 
     name: str
@@ -69,10 +70,10 @@ class Entry(Generic[A]):
         """The tools; `facts` fill the description's placeholders."""
         for variant in self.variants:
             signature = Signature(self.arguments, variant.when)
-            what = self.description.format(when=variant.said, more=variant.more, **facts)
+            what = self._told(variant, facts)
             text = f"{what} Example: {compact(signature.example)}"
             if self.blocking:
-                text = f"Blocking: may take up to {facts['timeout']} s. {text}"
+                text = f"Blocking, up to {facts['timeout']} s. {text}"
             yield Tool(
                 variant.name,
                 variant.title,
@@ -82,6 +83,14 @@ class Entry(Generic[A]):
                 partial(self._question, signature),
                 self.writes,
             )
+
+    def _told(self, variant: Variant, facts: Mapping[str, object]) -> str:
+        """What it answers: in full under the first name, and under the others by that."""
+        first = self.variants[0]
+        if variant is first:
+            return self.description.format(when=variant.said, **facts)
+        also = f" Reply: the same, {variant.more}." if variant.more else ""
+        return f"As {first.name}, {variant.said}.{also}"
 
     def _question(self, signature: Signature[A], given: Mapping[str, object]) -> Question:
         arguments = signature.read(given)

@@ -46,10 +46,10 @@ def readable(facts: Mapping[str, object]) -> Iterator[Tool]:
 
 
 _SIGHTINGS = Entry(
-    (Variant("find_matches", "Sightings (blocking)"),),
-    "When and where a condition (as in find_last_match) held, newest first, matches in a row as "
-    "one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, duration_s, ago_s, count, "
-    "robot: where it was at last_seen, place: of the thing}}], more}}.",
+    (Variant("find_matches", "Sightings"),),
+    "When, where, how often and how long a condition (as in find_last_match) held, newest first; "
+    "matches in a row are one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, "
+    "duration_s, ago_s, count, robot: where it was at last_seen, place: of the thing}}], total}}.",
     Matches,
     lambda memory, call, given: find_matches(
         memory,
@@ -60,17 +60,19 @@ _SIGHTINGS = Entry(
         field=given.field,
         start_s=given.start,
         end_s=given.end,
+        last_s=given.seconds,
+        oldest_first=given.oldest_first,
         limit=given.limit,
     ),
     blocking=True,
 )
 _RECAP = Entry(
     (
-        Variant("recap", "What happened (blocking)", Between, "between two Unix times"),
-        Variant("recap_last", "What happened lately (blocking)", Last, "in the last seconds"),
+        Variant("recap", "What happened", Between, "between two Unix times"),
+        Variant("recap_last", "What happened lately", Last, "in the last seconds"),
     ),
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps. Reply: "
-    "{{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], ...}}.",
+    "{{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], counts}}.",
     Window,
     lambda memory, call, given: recap(memory, call, given.span),
     blocking=True,
@@ -83,13 +85,19 @@ _STATUS = Entry(
     lambda memory, call, _: memory_status(memory, call),
 )
 _VISITS = Entry(
-    (Variant("visits", "Visits to a place (blocking)"),),
-    "When the robot was near a place, newest first, in {map_frame} where transforms lead there, "
-    "else in the frame of {pose_topic}. Reply: {{frame_id, there_now, visits: [{{arrived, "
-    "departed, duration_s, closest_m, ago_s}}]}}.",
+    (Variant("visits", "Visits to a place"),),
+    "When, how long and how often the robot was near a place, newest first, in {map_frame} where "
+    "transforms lead there, else in the frame of {pose_topic}. Reply: {{frame_id, there_now, "
+    "visits: [{{arrived, departed, duration_s, closest_m, ago_s}}], total}}.",
     Place,
     lambda memory, call, given: visits(
-        memory, call, given.x, given.y, radius_m=given.radius_m, limit=given.limit
+        memory,
+        call,
+        given.x,
+        given.y,
+        frame_id=given.frame_id,
+        radius_m=given.radius_m,
+        limit=given.limit,
     ),
     blocking=True,
 )
@@ -106,7 +114,7 @@ _MOMENTS = Entry(
     lambda memory, call, _: list_moments(memory, call),
 )
 _REMEMBER = Entry(
-    (Variant("remember_moment", "Keep a moment (blocking)"),),
+    (Variant("remember_moment", "Keep a moment"),),
     "Keeps what is recorded around now from deletion. Reply: {{moment, bags, pending: the rest is "
     "being written}}.",
     Remember,

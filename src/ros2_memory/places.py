@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ros2_memory.errors import NoDataError
+from ros2_memory.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.frames import connected, graph_over, statics
 from ros2_memory.geometry import compose, distance, invert, rotate
+from ros2_memory.glimpse import glimpse
 from ros2_memory.model import TimeWindow, Transform
 from ros2_memory.tf_tree import FrameGraph
 
@@ -79,11 +80,28 @@ class Placing:
 _NOWHERE = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def placing(view: View, pose_frame: str) -> Placing:
-    """How places are told of poses in this frame."""
-    target = view.memory.limits.map_frame
+def placing(view: View, pose_frame: str, frame_id: str | None = None) -> Placing:
+    """How places are told of poses in this frame; in `frame_id` where one is asked for.
+
+    Raises:
+        InvalidArgumentsError: places are not told in that frame.
+    """
+    own = Placing(view, pose_frame, pose_frame, _NOWHERE)
+    place = own if frame_id == pose_frame else _best(view, own)
+    if frame_id not in (None, place.frame_id):
+        known = " or ".join(dict.fromkeys((place.frame_id, pose_frame)))
+        raise InvalidArgumentsError(
+            f"frame_id was {glimpse(frame_id)}; places are told in {known}, and "
+            "get_transform_at leads from any other frame"
+        )
+    return place
+
+
+def _best(view: View, own: Placing) -> Placing:
+    """In the map, where recorded transforms lead there from the poses' own frame."""
+    target, pose_frame = view.memory.limits.map_frame, own.pose_frame
     if not target or target == pose_frame or not connected(view, (target, pose_frame)):
-        return Placing(view, pose_frame, pose_frame, _NOWHERE)
+        return own
     return Placing(view, target, pose_frame, _fixed(view, target, pose_frame))
 
 

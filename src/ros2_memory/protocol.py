@@ -156,17 +156,12 @@ def _client(context: object) -> Hashable:
 
 
 def _listed(tool: Tool) -> ListedTool:
+    # What only destroys or repeats itself where something is written is not said of what reads.
+    writing: dict[str, bool] = {"destructive_hint": False} if tool.writes else {}
     return ListedTool(
         name=tool.name,
         title=tool.title,
         description=tool.description,
         input_schema=dict(tool.schema),
-        annotations=ToolAnnotations(
-            title=tool.title,
-            read_only_hint=not tool.writes,
-            destructive_hint=False,
-            idempotent_hint=not tool.writes,
-            open_world_hint=False,
-        ),
-        _meta={"blocking": True} if tool.blocking else None,
+        annotations=ToolAnnotations(read_only_hint=not tool.writes, **writing),
     )

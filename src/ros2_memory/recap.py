@@ -101,6 +101,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         frame_id=None if drive is None else drive.way.frames[0],
         events=tuple(told),
         throughout=tuple(sorted(throughout)),
+        counts=tuple(_counts(events)),
         notes=view.notes,
     )
 
@@ -188,6 +189,14 @@ def _gaps(view: View, window: TimeWindow) -> Iterator[Event]:
     end = min(window.stop, latest)
     if end - reach > longest:
         yield Event("gap", reach, end, "nothing was recorded")
+
+
+def _counts(events: Sequence[Event]) -> Iterator[tuple[str, int]]:
+    """How many events there are of each kind that happened."""
+    counts = Counter(each.kind for each in events)
+    for kind in _KINDS:
+        if counts[kind]:
+            yield _PLURALS[kind], counts[kind]
 
 
 def _most_important(view: View, events: Sequence[Event]) -> list[Event]:

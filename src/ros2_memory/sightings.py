@@ -8,7 +8,9 @@ may speak only of what it sees.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.absence import moment, require_bags
@@ -24,7 +26,7 @@ from ros2_memory.frames import transform_at
 from ros2_memory.geometry import rotate
 from ros2_memory.history import View
 from ros2_memory.model import TimeWindow
-from ros2_memory.moments import ns_argument
+from ros2_memory.moments import Span, ns_argument
 from ros2_memory.search import Search
 from ros2_memory.stories import SILENCE_NS
 from ros2_memory.things import things_of
@@ -71,43 +73,58 @@ def find_matches(
     field: str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
+    last_s: float | None = None,
     limit: int = 5,
+    oldest_first: bool = False,
 ) -> Sightings:
     """The newest `limit` sightings on a topic, or on all topics of a glob, newest first.
 
-    `start_s` and `end_s` (Unix seconds, inclusive) bound what is searched.
+    `start_s` and `end_s` (Unix seconds, inclusive), or `last_s` (before now), bound what is
+    searched. With `oldest_first` all of it is gone through, and the oldest sightings are told.
+
+    Raises:
+        InvalidArgumentsError: nothing can meet the condition, or the bounds make no window.
+        NoDataError: the memory holds nothing, or no such topic.
+        QueryTimeoutError: the call's time is over before anything was found.
     """
     condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
-    now = memory.clock.now()
-    window = _window(start_s, end_s)
-    view = View(memory, call, min(window.stop, now))
+    span = Span(start_s, end_s, last_s)
+    wall = memory.clock.now()
+    view = View(memory, call, min(_window(span, wall).stop, wall))
     require_bags(view)
     latest = view.snapshot.latest
-    runs, more = _newest_runs(view, topic, condition, window, limit)
+    now = wall if memory.limits.now == "wall" or latest is None else latest
+    window = _window(span, now)
+    runs = _Runs(limit, oldest_first=oldest_first)
+    _gather(view, topic, condition, window, runs)
     pose_topic = memory.limits.pose_topic
-    found = tuple(_told(view, condition, run, pose_topic) for run in runs)
-    note_unseen(view, _searched(window, found, more=more), nothing=not found)
+    found = tuple(_told(view, condition, run, pose_topic) for run in runs.told)
+    searched = TimeWindow(found[-1].first, window.stop) if runs.cut and found else window
+    note_unseen(view, searched, nothing=not found)
     return Sightings(
         found,
-        more,
+        more=runs.cut or runs.count > len(found),
+        total=None if runs.cut else runs.count,
         start=max(window.start, view.snapshot.earliest or window.start),
         end=min(window.stop, latest or window.stop),
-        now=now if memory.limits.now == "wall" or latest is None else latest,
+        now=now,
         notes=view.notes,
     )
 
 
-def _searched(window: TimeWindow, found: Sequence[Sighting], *, more: bool) -> TimeWindow:
-    """The part of the window that had to be looked at."""
-    return TimeWindow(found[-1].first, window.stop) if more and found else window
-
-
-def _window(start_s: float | None, end_s: float | None) -> TimeWindow:
+def _window(span: Span, now: Ns) -> TimeWindow:
     """The window searched, with the slack of floats of seconds.
 
     Raises:
-        InvalidArgumentsError: the end lies before the start, or a bound is not finite.
+        InvalidArgumentsError: the end lies before the start, or a bound is not finite, or both
+            kinds of bounds are given.
     """
+    start_s, end_s = span.start_s, span.end_s
+    if span.last_s is not None:
+        if start_s is not None or end_s is not None:
+            raise InvalidArgumentsError("seconds counts from now: give it, or start and end")
+        stop = min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
+        return TimeWindow(max(now - ns_argument("seconds", span.last_s), MIN_NS), stop)
     start = MIN_NS if start_s is None else ns_argument("start", start_s) - START_SLACK_NS
     end = MAX_NS - 1 if end_s is None else ns_argument("end", end_s) + AT_OR_BEFORE_SLACK_NS
     if end < start:
@@ -115,10 +132,10 @@ def _window(start_s: float | None, end_s: float | None) -> TimeWindow:
     return TimeWindow(max(start, MIN_NS), min(end + 1, MAX_NS))
 
 
-def _newest_runs(
-    view: View, pattern: str, condition: Condition, window: TimeWindow, limit: int
-) -> tuple[list[_Run], bool]:
-    """The newest rows of matches in a window, newest first, and whether there are more.
+def _gather(
+    view: View, pattern: str, condition: Condition, window: TimeWindow, runs: _Runs
+) -> None:
+    """Adds the matches in a window, newest first, until there are enough.
 
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
@@ -126,7 +143,6 @@ def _newest_runs(
         QueryTimeoutError: the call's time is over before the first match was found.
     """
     search = Search(view, pattern, condition)
-    runs = _Runs(limit)
     candidates = search.candidates(window.stop)
     before = window.stop
     try:
@@ -141,27 +157,36 @@ def _newest_runs(
                 else:
                     runs.end(found.record.channel.topic)
                 if runs.enough:
-                    return runs.newest, True
+                    runs.cut = True
+                    return
             before = part.start
     except QueryTimeoutError:
-        if not runs.newest:
+        if not runs.count:
             raise
+        runs.cut = True
         view.complete = False
         view.note(f"the search ran out of time at {moment(before)}: to go on, ask with end there")
-        return runs.newest, True
-    search.close(candidates, found=bool(runs.newest))
+        return
+    search.close(candidates, found=bool(runs.count))
     for topic in runs.under_way():
         runs.end(topic)
-    return runs.newest, runs.more
 
 
 class _Runs:
-    """Matches that come newest first, in rows by topic."""
+    """Matches that come newest first, in rows by topic; told are the newest or the oldest ones.
 
-    def __init__(self, limit: int) -> None:
+    Attributes:
+        count: how many rows there are so far.
+        cut: the search was left before all was gone through.
+    """
+
+    def __init__(self, limit: int, *, oldest_first: bool) -> None:
         self._limit = limit
-        self._all: list[_Run] = []
+        self._oldest_first = oldest_first
+        self._kept: deque[_Run] = deque(maxlen=limit if oldest_first else None)
         self._open: dict[str, _Run] = {}
+        self.count = 0
+        self.cut = False
 
     def add(self, found: Found) -> None:
         """Takes the next older match."""
@@ -172,7 +197,8 @@ class _Runs:
             run = None
         if run is None:
             self._open[topic] = run = _Run(found, found.time)
-            self._all.append(run)
+            self._kept.append(run)
+            self.count += 1
         else:
             run.first = found.time
             run.messages += 1
@@ -188,19 +214,20 @@ class _Runs:
         return tuple(self._open)
 
     @property
-    def newest(self) -> list[_Run]:
-        """As many as are asked for."""
-        return self._all[: self._limit]
-
-    @property
-    def more(self) -> bool:
-        """Whether there are more than that."""
-        return len(self._all) > self._limit
+    def told(self) -> list[_Run]:
+        """As many as are asked for, in their order."""
+        if self._oldest_first:
+            return [*reversed(self._kept)]
+        return [*islice(self._kept, self._limit)]
 
     @property
     def enough(self) -> bool:
-        """Whether nothing that comes can change the newest ones."""
-        return self.more and all(run.begun for run in self.newest)
+        """Whether nothing that comes can change the newest ones, and those are told."""
+        return (
+            not self._oldest_first
+            and self.count > self._limit
+            and all(run.begun for run in self.told)
+        )
 
 
 def _parts(

@@ -92,7 +92,7 @@ def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[Variant, ...]:
             f"{title} some seconds ago",
             Ago,
             "some seconds ago",
-            ", age_s (before now)",
+            "age_s (before now)",
         ),
     )
 
@@ -108,16 +108,15 @@ _RANGE = Entry(
     (Variant("data_time_range", "Span of the memory"),),
     "What time span the memory covers, with its holes, and what time it is now. "
     "Reply: {{earliest, latest, now, bags, gaps, damaged, clock_faults, ...}}, times in Unix s and "
-    "local ISO; "
-    "earliest and latest are null while the memory is empty.",
+    "local ISO, null while the memory is empty.",
     Nothing,
     lambda memory, call, _: queries.data_time_range(memory, call),
 )
 _TOPIC_AT = Entry(
     _at_and_ago("topic", "A topic's value", at="at_time"),
     "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
-    "(default {tolerance}; latched topics: any age). Reply: {{topic, type, timestamp, "
-    "value{more}}}.",
+    "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
+    "Reply: {{topic, type, timestamp, value}}.",
     TopicAt,
     lambda memory, call, given: queries.topic_value(
         memory,
@@ -148,7 +147,7 @@ _TOPIC_OVER = Entry(
 _POSITION = Entry(
     _at_and_ago("position", "Robot position"),
     "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
-    "(counter-clockwise from x), timestamp, topic, frame_id{more}}}.",
+    "(counter-clockwise from x), timestamp, topic, frame_id}}.",
     MotionAt,
     lambda memory, call, given: queries.position(
         memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
@@ -157,7 +156,7 @@ _POSITION = Entry(
 _VELOCITY = Entry(
     _at_and_ago("velocity", "Robot velocity"),
     "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
-    "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id{more}}}; in the robot's own frame "
+    "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
     "x is ahead and angular z turns left.",
     MotionAt,
     lambda memory, call, given: queries.velocity(
@@ -168,14 +167,14 @@ _TRANSFORM = Entry(
     _at_and_ago("transform", "Transform"),
     "The pose of frame child in frame parent {when}, through any chain of frames, interpolated. "
     "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock"
-    "{more}}}.",
+    "}}.",
     TransformAt,
     lambda memory, call, given: queries.transform(
         memory, call, given.parent, given.child, given.moment
     ),
 )
 _FRAMES = Entry(
-    (Variant("list_frames", "Frames (blocking)"),),
+    (Variant("list_frames", "Frames"),),
     "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, static}}]}}.",
     Nothing,
     lambda memory, call, _: queries.frames(memory, call),
@@ -183,13 +182,14 @@ _FRAMES = Entry(
 )
 _CONDITIONS = (
     "contains (text anywhere in the message, or list element), equals (boolean, number or text), "
-    'near_position ({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
+    "above and below (number; field says which), near_position "
+    '({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
 )
 _LAST_MATCH = Entry(
-    (Variant("find_last_match", "Last time something held (blocking)"),),
-    "When a condition last held, e.g. when scissors were last seen: searches all history, newest "
-    f"first. Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
-    "age_s}}, or null if it never held ({{match: null, notes}} where not all could be read).",
+    (Variant("find_last_match", "Last time something held"),),
+    "When a condition last held, in all history. "
+    f"Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
+    "age_s}}, or null if never ({{match: null, notes}} where not all could be read).",
     Search,
     lambda memory, call, given: queries.find_last_match(
         memory,
@@ -204,7 +204,7 @@ _LAST_MATCH = Entry(
     blocking=True,
 )
 _VALUE_WHEN = Entry(
-    (Variant("get_value_when", "A topic when another matched (blocking)"),),
+    (Variant("get_value_when", "A topic when another matched"),),
     "What value_topic held when condition_topic last met a condition (as in find_last_match), "
     "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
     "value_timestamp, condition_topic, value_topic}}, or null as there.",
@@ -224,10 +224,10 @@ _VALUE_WHEN = Entry(
 )
 _TRAJECTORY = Entry(
     (
-        Variant("trajectory_summary", "Way driven (blocking)", Between, "between two Unix times"),
+        Variant("trajectory_summary", "Way driven", Between, "between two Unix times"),
         Variant(
             "recent_trajectory_summary",
-            "Way driven lately (blocking)",
+            "Way driven lately",
             Last,
             "in the last seconds",
         ),

@@ -43,13 +43,17 @@ def visits(
     x: float,
     y: float,
     *,
+    frame_id: str | None = None,
     radius_m: float | None = None,
     limit: int = 10,
 ) -> Visits:
     """When the robot was within a radius (m) of a place of the plane, the newest visits first.
 
+    The place is meant in `frame_id`: the map, as where none is given, or the frame of the poses.
+
     Raises:
-        InvalidArgumentsError: the pose topic carries no position, or the radius is not positive.
+        InvalidArgumentsError: the pose topic carries no position, the radius is not positive, or
+            the frame is another one.
         NoDataError: the memory holds nothing, or no poses.
         QueryTimeoutError: the call's time is over before anything is known.
     """
@@ -60,7 +64,7 @@ def visits(
     view = View(memory, call, wall)
     require_bags(view)
     topic = resolve_topic(view, memory.limits.pose_topic)
-    place = placing(view, _pose_frame(view, topic))
+    place = placing(view, _pose_frame(view, topic), frame_id)
     looking = _Looking(view, topic, place, (x, y, radius))
     found, more = looking.newest(limit)
     latest, newest = view.snapshot.latest, looking.newest_time
@@ -89,6 +93,7 @@ def visits(
         radius_m=radius,
         visits=told,
         more=more,
+        total=None if more else len(told),
         now=wall if memory.limits.now == "wall" or latest is None else latest,
         notes=view.notes,
     )

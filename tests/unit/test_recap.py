@@ -193,6 +193,7 @@ def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
     told = over(memory_of(tmp_path), 0, 100)
     assert len(told.events) == MOST_EVENTS
     assert len(times(told.events, "flip")) == 19
+    assert dict(told.counts) == {"flips": 19, "sights of things": 20}
     assert any("left out, since they are too many: 14 sights of things" in n for n in told.notes)
     assert [each.start for each in told.events] == sorted(each.start for each in told.events)
     reply = Replies(tmp_path, 24_000).answer(told).text

@@ -23,7 +23,7 @@ from ros2_memory.search import Search
 from ros2_memory.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.stories import SILENCE_NS
-from ros2_memory.timebase import Deadline, unix_from_ns
+from ros2_memory.timebase import Deadline, FixedClock, unix_from_ns
 from tests.bags import boolean, detections, odom, tf, transform, write_mcap
 from tests.closed_form import SESSIONS, position
 from tests.histories import write_history
@@ -124,7 +124,44 @@ def test_the_window_and_the_limit_bound_what_is_told(tmp_path: Path) -> None:
     answer = find_matches(memory, Call(), topic, "contains", "cup", limit=3)
     assert [(each.last - BEGIN) // S for each in answer.sightings] == [19, 17, 15]
     assert answer.more
-    assert not find_matches(memory, Call(), topic, "contains", "cup", limit=10).more
+    assert answer.total is None
+    whole = find_matches(memory, Call(), topic, "contains", "cup", limit=10)
+    assert (whole.more, whole.total) == (False, 10)
+
+
+def test_the_oldest_sightings_come_with_the_number_of_all(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    said = [(float(t), "cup" if t % 2 else "") for t in range(20)]
+    memory = spoken(tmp_path, *said)
+    answer = find_matches(memory, Call(), topic, "contains", "cup", limit=3, oldest_first=True)
+    assert [(each.last - BEGIN) // S for each in answer.sightings] == [1, 3, 5]
+    assert (answer.more, answer.total) == (True, 10)
+    since = BEGIN / S + 14.5
+    later = find_matches(
+        memory, Call(), topic, "contains", "cup", start_s=since, limit=1, oldest_first=True
+    )
+    assert [(each.last - BEGIN) // S for each in later.sightings] == [15]
+    assert later.total == 3
+
+
+def test_the_last_seconds_count_from_now(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    spoken(tmp_path, *((float(t), "cup" if t % 2 else "") for t in range(20)))
+    memory = memory_of(tmp_path, clock=FixedClock(BEGIN + 25 * S))
+    assert seconds(memory, "cup", topic, last_s=10.0) == [(19, 19), (17, 17), (15, 15)]
+    newest = memory_of(tmp_path, limits=Limits(now="latest"))
+    assert seconds(newest, "cup", topic, last_s=3.0) == [(19, 19), (17, 17)]
+    with pytest.raises(InvalidArgumentsError, match="seconds counts from now"):
+        find_matches(memory, Call(), topic, "contains", "cup", last_s=5.0, end_s=4.0)
+
+
+def test_a_number_beyond_a_limit_is_a_sighting_too(tmp_path: Path) -> None:
+    driven = [odom(BEGIN + t * S, 0.0, 0.0, 0.0, vx=0.1 * t) for t in range(10)]
+    write_mcap(tmp_path / "bag.mcap", driven)
+    [fast] = find_matches(
+        memory_of(tmp_path), Call(), "/odom", "above", 0.45, field="linear_velocity.x"
+    ).sightings
+    assert ((fast.first - BEGIN) // S, (fast.last - BEGIN) // S) == (5, 9)
 
 
 def test_a_thing_is_told_in_the_map_where_transforms_lead_there(tmp_path: Path) -> None:
@@ -266,3 +303,6 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
             told = [(each.topic, each.first, each.last, each.messages) for each in answer.sightings]
             assert sorted(told, key=lambda each: (-each[2], each[0])) == expected, (topic, value)
             assert [each[2] for each in told] == sorted((each[2] for each in told), reverse=True)
+            oldest = find_matches(memory, Call(), topic, kind, value, limit=2, oldest_first=True)
+            assert oldest.sightings == tuple(reversed(answer.sightings))[:2]
+            assert oldest.total == len(answer.sightings)

@@ -55,8 +55,8 @@ BLOCKING = {
 }
 OPTIONAL = {
     "remember_moment": {"seconds_before", "seconds_after"},
-    "visits": {"radius_m", "limit"},
-    "find_matches": {"field", "start", "end", "limit"},
+    "visits": {"frame_id", "radius_m", "limit"},
+    "find_matches": {"field", "seconds", "start", "end", "oldest_first", "limit"},
     "list_recorded_topics": {"pattern"},
     "get_topic_at_time": {"tolerance_s", "fields"},
     "get_topic_seconds_ago": {"tolerance_s", "fields"},
@@ -163,8 +163,7 @@ def test_every_tool_names_its_arguments_and_refuses_others(tool: Tool) -> None:
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
 def test_tools_that_may_take_long_say_so(tool: Tool) -> None:
     assert tool.blocking == (tool.name in BLOCKING)
-    assert tool.description.startswith("Blocking: may take up to 25 s.") == tool.blocking
-    assert tool.title.endswith("(blocking)") == tool.blocking
+    assert tool.description.startswith("Blocking, up to 25 s.") == tool.blocking
 
 
 @pytest.mark.parametrize(("absolute", "relative"), PAIRS)
@@ -240,9 +239,9 @@ def test_a_topic_must_have_a_name(topic: str) -> None:
     assert "which is empty" in refusal("get_topic_seconds_ago", topic=topic, seconds_ago=1)
 
 
-def test_the_condition_type_must_be_one_of_three() -> None:
+def test_the_condition_type_must_be_a_known_one() -> None:
     told = refusal("find_last_match", topic="/a", condition_type="like", value="x")
-    assert 'expected one of "contains", "equals", "near_position"' in told
+    assert 'expected one of "contains", "equals", "above", "below", "near_position"' in told
 
 
 @pytest.mark.parametrize("value", [None, math.nan, {"x": math.inf, "y": 0.0}])

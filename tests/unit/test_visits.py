@@ -178,6 +178,19 @@ def test_in_a_map_a_restart_of_odometry_changes_nothing(tmp_path: Path) -> None:
     answer = visits(memory, Call(), 5.0, 1.0, radius_m=1.0)
     assert answer.frame_id == "map"
     assert [each.restarts for each in answer.visits] == [0, 0]
+    assert answer.total == 2
+
+
+def test_a_place_may_be_named_in_the_frame_of_the_poses(tmp_path: Path) -> None:
+    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 1.0, 0.0)), topic="/tf_static")
+    memory = remembering(tmp_path, [fixed, *line((10, 0.0), (20, 0.5))])
+    in_map = visits(memory, Call(), 5.0, 1.0, frame_id="map", radius_m=1.0)
+    in_odom = visits(memory, Call(), 0.0, 0.0, frame_id="odom", radius_m=1.0)
+    assert (in_map.frame_id, in_odom.frame_id) == ("map", "odom")
+    assert in_map.visits == in_odom.visits
+    assert visits(memory, Call(), 5.0, 1.0, radius_m=1.0) == in_map
+    with pytest.raises(InvalidArgumentsError, match=r'frame_id was "laser"; .* in map or odom'):
+        visits(memory, Call(), 0.0, 0.0, frame_id="laser")
 
 
 @each_way
