@@ -13,6 +13,7 @@ import yaml
 
 from ros2_memory.api_token import CREDENTIAL
 from ros2_memory.config import load_settings
+from ros2_memory.recorder.layout import REQUESTS_FOLDER
 from ros2_memory.settings import Ros2BagNode
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -120,6 +121,14 @@ def test_the_server_listens_on_the_loopback_address_unless_it_is_given_a_token()
     # The lines that are commented out are to be right when they are not.
     (credential,) = re.findall(r"^#LoadCredential=(\w+):", SERVER.read_text(), re.MULTILINE)
     assert credential == CREDENTIAL
+
+
+def test_the_server_writes_where_it_asks_the_recorder_and_nowhere_else_in_the_bags() -> None:
+    said = settings_of(SERVER)
+    asks = f"/var/lib/ros2-memory/bags/{REQUESTS_FOLDER}"
+    assert said["ReadWritePaths"] == [f"-{asks}"]
+    assert said["ReadOnlyPaths"] == ["-/var/lib/ros2-memory"]
+    assert f"d {asks} " in (DEPLOY / "ros2-memory.tmpfiles.conf").read_text()
 
 
 def test_the_container_is_published_on_the_loopback_address_and_needs_a_token() -> None:

@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import structlog
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.memory import Call
 from ros2_memory.moments import Moment, Span
+from ros2_memory.recorder import keeper
 from ros2_memory.recorder.keeper import Keeper
 from ros2_memory.recorder.keepsake import Keepsake, Wish, held_in, make_folder, write_keepsake
 from ros2_memory.recorder.layout import MOMENT_FILE, REQUESTS_FOLDER
@@ -255,6 +258,34 @@ class TestCrashes:
         assert (outcome.moment, outcome.bags, outcome.pending) == (folder.name, 2, False)
         assert len(in_moments(tmp_path)) == 2
 
+    @pytest.mark.parametrize("step", ["link", "write_keepsake"])
+    def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_completes(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+    ) -> None:
+        """It dies as it makes its second link, or writes what it made for the second time."""
+        recording(tmp_path, A, 0)
+        slot = asked(tmp_path, 15, 25)
+        owner: Any = os if step == "link" else keeper
+        done, real = [], getattr(owner, step)
+
+        def killed(*given: Any, **options: Any) -> None:
+            done.append(step)
+            if len(done) == 2:
+                raise KeyboardInterrupt
+            real(*given, **options)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(owner, step, killed)
+            with pytest.raises(KeyboardInterrupt):
+                house_of(tmp_path).keep_moments(tmp_path)
+        house_of(tmp_path).keep_moments(tmp_path)
+        outcome = slot.outcome()
+        assert outcome is not None
+        told = told_of(tmp_path)
+        assert (told["pending"], told["missing"]) == (False, [])
+        assert outcome.bags == len(in_moments(tmp_path)) >= 2
+        assert len(list(held_in(tmp_path))) == 1
+
     def test_a_folder_that_is_no_moment_yet_is_removed_and_nothing_else(
         self, tmp_path: Path
     ) -> None:
@@ -396,6 +427,55 @@ class TestRetention:
         assert told["total_bytes"] == size_of(tmp_path)
 
 
+STEPS = st.lists(
+    st.one_of(
+        st.just(("split", 0, 0)),
+        st.just(("apply", 0, 0)),
+        st.tuples(st.just("keep"), st.integers(0, 80), st.integers(0, 30)),
+        st.tuples(st.just("forget"), st.integers(0, 3), st.just(0)),
+    ),
+    max_size=14,
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(steps=STEPS, budget=st.integers(3, 9), share=st.integers(0, 5))
+def test_no_moments_in_any_order_break_a_budget_or_lose_what_is_kept(
+    tmp_path_factory: pytest.TempPathFactory,
+    steps: list[tuple[str, int, int]],
+    budget: int,
+    share: int,
+) -> None:
+    """Splits are recorded, moments kept and deleted, limits applied. A size is one of a split."""
+    root = tmp_path_factory.mktemp("bags")
+    size = bag(root / A / f"{A}_0.mcap", 0).stat().st_size
+    splits, rooms = 1, size * budget + 40_000
+    house = house_of(root, max_bytes=rooms, moments_bytes=size * share + 10)
+    promised: dict[Path, int] = {}
+    for what, first, second in steps:
+        if what == "split":
+            bag(root / A / f"{A}_{splits}.mcap", splits * 10)
+            splits += 1
+        elif what == "keep":
+            kept(house, root, first, first + second)
+            links = [path for path in root.glob("moments/**/*.mcap") if path not in promised]
+            promised.update((path, path.stat().st_ino) for path in links)
+        elif what == "forget":
+            for folder in sorted((root / "moments").glob("*"))[first : first + 1]:
+                shutil.rmtree(folder)
+            promised = {path: inode for path, inode in promised.items() if path.exists()}
+        else:
+            with structlog.testing.capture_logs() as captured:
+                house.apply(root)
+            [told] = [each for each in captured if each["event"] == "retention_applied"]
+            assert told["total_bytes"] == size_of(root) <= rooms
+        assert {path: path.stat().st_ino for path in promised} == promised
+        held = {path.stat().st_ino: path.stat().st_size for path in promised}
+        assert sum(held.values()) <= size * share + 10
+        files = {path.stat().st_ino for path in root.rglob("*.mcap")}
+        assert len(memory_of(root).index.snapshot().bags) == len(files)
+
+
 class TestOthers:
     def test_a_wipe_takes_moments_too_and_leaves_what_is_not_of_them(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
@@ -423,9 +503,9 @@ class TestOthers:
 
     def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
-        keeper = Keeper(tmp_path, PLENTY, SettableClock(NOW))
-        assert keeper.has_work()
-        keeper.keep(memory_of(tmp_path).index.snapshot())
-        assert not keeper.has_work()
+        looking = Keeper(tmp_path, PLENTY, SettableClock(NOW))
+        assert looking.has_work()
+        looking.keep(memory_of(tmp_path).index.snapshot())
+        assert not looking.has_work()
         asked(tmp_path, 0, 5)
-        assert keeper.has_work()
+        assert looking.has_work()

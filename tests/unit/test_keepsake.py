@@ -18,7 +18,6 @@ from ros2_memory.recorder.keepsake import (
     read_keepsake,
     write_keepsake,
 )
-from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.layout import MOMENT_FILE
 from ros2_memory.recorder.scan import bag_kind
 
@@ -117,31 +116,3 @@ class TestMomentFiles:
         (folder / MOMENT_FILE).write_text(text)
         assert read_keepsake(folder) is None
         assert list(held_in(tmp_path)) == []
-
-
-class TestNames:
-    def test_a_kept_bag_answers_after_where_it_was_recorded_and_after_earlier_moments(
-        self, tmp_path: Path
-    ) -> None:
-        names = KeptNames(tmp_path)
-        recorded, first, second = (
-            f"{tmp_path}/{name}"
-            for name in ("r/r_0.mcap", "moments/a/r/r_0.mcap", "moments/b/r/r_0.mcap")
-        )
-        for path in (second, recorded, first):
-            names.enter(path)
-        assert names.before(recorded) == []
-        assert names.before(first) == [recorded]
-        assert names.before(second) == [recorded, first]
-        assert names.of(recorded) == names.of(first) == {first, second}
-        names.leave(first)
-        names.leave(first)
-        assert names.before(second) == [recorded]
-        assert names.known == {second}
-        names.leave(second)
-        assert list(names.of(recorded)) == []
-
-    def test_what_lies_in_no_moment_is_its_own_name(self, tmp_path: Path) -> None:
-        names = KeptNames(tmp_path)
-        for path in (f"{tmp_path}/moments/x.mcap", f"{tmp_path}/a/moments/b/x.mcap"):
-            assert names.recorded_as(path) == path

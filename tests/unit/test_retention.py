@@ -340,3 +340,63 @@ class TestAlways:
         dated = [each for each in held.bags if each.span is not None]
         if dated and any(NOW - 400 * HOUR <= (each.span or (0, 0))[1] <= NOW for each in dated):
             assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
+
+
+class TestMoments:
+    """`kept` are files of moments, which other names of may be deleted."""
+
+    def test_what_a_moment_keeps_counts_once_and_is_not_freed(self) -> None:
+        bags = hourly(4)
+        kept = tuple(each.files[0] for each in bags[2:])
+        limits = replace(LIMITS, max_total_bytes=39)
+        found = weighed(replace(stock(*bags), kept=kept), limits)
+        # The two oldest would free nothing.
+        assert (names(found.doomed), found.total_bytes, found.fits) == (["h1"], 40, True)
+
+    def test_what_lies_in_moments_alone_counts_too(self) -> None:
+        kept = (StoredFile((1, 5), 15, 15),)
+        limits = replace(LIMITS, max_total_bytes=30)
+        found = weighed(replace(stock(*hourly(2)), kept=kept), limits)
+        assert (names(found.doomed), found.total_bytes, found.fits) == (["h1"], 35, True)
+
+    def test_what_is_too_old_goes_from_where_it_was_recorded(self) -> None:
+        bags = hourly(170)
+        found = weighed(replace(stock(*bags), kept=bags[-1].files), LIMITS)
+        assert names(found.doomed) == ["h169"]
+        assert found.total_bytes == 1700
+
+    def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
+        bags = hourly(3)
+        limits = replace(LIMITS, min_free_bytes=10)
+        found = weighed(replace(stock(*bags, free_bytes=0), kept=bags[-1].files), limits)
+        assert (names(found.doomed), found.fits) == (["h1"], True)
+
+    @given(
+        st.lists(st.tuples(st.integers(0, 200), st.integers(0, 6)), min_size=1, max_size=10),
+        st.sets(st.integers(0, 8)),
+        st.integers(0, 120),
+    )
+    def test_what_is_said_of_the_budget_is_what_the_disk_would_show(
+        self, drawn: list[tuple[int, int]], kept: set[int], most: int
+    ) -> None:
+        def file(inode: int) -> StoredFile:
+            return StoredFile((1, inode), 10 + inode, 10 + inode)
+
+        bags = [
+            bag(f"b{n}", NOW - hours * HOUR)._replace(files=(file(inode),))
+            for n, (hours, inode) in enumerate(drawn)
+        ]
+        limits = replace(LIMITS, max_total_bytes=most)
+        files = tuple(file(inode) for inode in kept)
+        found = weighed(replace(stock(*bags), kept=files), limits)
+
+        def shown(left: list[StoredBag]) -> int:
+            return sum({each.inode: each.size for each in (*files, *_files(left))}.values())
+
+        left = [each for each in bags if each not in found.doomed]
+        assert found.total_bytes == shown(bags)
+        assert found.fits == (shown(left) <= most)
+
+
+def _files(bags: list[StoredBag]) -> list[StoredFile]:
+    return [each for bag in bags for each in bag.files]

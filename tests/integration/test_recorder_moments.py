@@ -1,0 +1,111 @@
+"""Moments, through both programs: a planner asks the server, and the recorder's daemon keeps."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory.recorder.keepsake import Held, held_in
+from ros2_memory.recorder.layout import REQUESTS_FOLDER
+from tests.integration.test_recorder_daemon import Site
+from tests.integration.test_server_process import serving
+from tests.live_recorder import answer
+from tests.waiting import until
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from tests.integration.test_server_process import Served
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path)
+    yield site
+    for daemon in site.daemons:
+        if daemon.process.poll() is None:
+            daemon.stop()
+
+
+@pytest.fixture
+def served(site: Site) -> Iterator[Served]:
+    """A server over the same directory, that may ask for moments to be kept."""
+    site.bag_dir.mkdir()
+    overrides = ("data.now=wall", "server.write_tools=true", "reader.index_refresh_s=0.2")
+    with serving(site.bag_dir, site.folder / "server.log", *overrides) as served:
+        yield served
+
+
+def complete(bag_dir: Path) -> Held:
+    """The one moment that is kept, when nothing of it is waited for any more."""
+
+    def is_complete() -> Held | None:
+        [held] = held_in(bag_dir)
+        return None if held.keepsake.pending else held
+
+    return until(is_complete, timeout_s=60)
+
+
+def originals(held: Held, bag_dir: Path) -> list[Path]:
+    """Where the bags of a moment were recorded."""
+    return [bag_dir / path.relative_to(held.folder) for path in held.folder.rglob("*.mcap")]
+
+
+def about(served: Served, told: dict[str, Any]) -> list[Any]:
+    """Answers about the time of a moment; without the notes, which say what is open just now."""
+    given = {"topic": "/odom", "start": told["start"], "end": told["end"], "max_samples": 7}
+    middle = (told["start"] + told["end"]) / 2
+    answers = [
+        answer(served, "get_topic_in_range", **given),
+        answer(served, "get_topic_at_time", topic="/tf", timestamp=middle),
+    ]
+    return [{key: each[key] for key in each if key != "notes"} for each in answers]
+
+
+def test_a_moment_is_answered_from_when_its_bags_have_long_been_deleted(
+    site: Site, served: Served
+) -> None:
+    daemon = site.run("retention.max_age_h=0.003")
+    daemon.wait_for("split_closed", 4)
+    told = answer(served, "remember_moment", label="Küche", seconds_before=2.5)
+    assert (told["label"], told["bags"] >= 2) == ("Küche", True), told
+    held = complete(site.bag_dir)
+    assert (held.folder.name, held.keepsake.missing) == (told["moment"], ())
+    recorded = originals(held, site.bag_dir)
+    assert len(recorded) >= 3
+    before = until(lambda: _whole(about(served, told)))
+    assert all(path.exists() for path in recorded)
+    until(lambda: not any(path.exists() for path in recorded), timeout_s=90)
+    assert about(served, told) == before
+    [listed] = answer(served, "list_moments")["moments"]
+    assert (listed["label"], listed["bags"], listed["complete"]) == ("Küche", len(recorded), True)
+    assert list((site.bag_dir / REQUESTS_FOLDER).iterdir()) == []
+    assert daemon.stop() == 0
+
+
+def test_a_recorder_that_is_killed_while_a_moment_waits_goes_on_with_it_when_it_is_back(
+    site: Site, served: Served
+) -> None:
+    daemon = site.run()
+    daemon.wait_for("split_closed", 2)
+    told = answer(served, "remember_moment", label="fall", seconds_before=1, seconds_after=1)
+    assert told["pending"], told
+    child = daemon.child
+    daemon.stop(signal.SIGKILL)
+    until(lambda: not Path(f"/proc/{child}").exists())
+    refused = answer(served, "remember_moment", label="later")
+    assert refused["error"] == "refused", refused
+    following = site.run()
+    held = complete(site.bag_dir)
+    assert held.keepsake.missing == ()
+    kept = {path.name for path in held.folder.rglob("*.mcap")}
+    assert len(kept) == len(held.files) > told["bags"]
+    assert following.stop() == 0
+
+
+def _whole(answers: list[Any]) -> list[Any] | None:
+    """Answers in which the newest split has its part, too."""
+    return answers if "total" in answers[0] and answers[0]["total"] >= 240 else None

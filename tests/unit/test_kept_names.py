@@ -1,0 +1,98 @@
+"""A bag that moments keep is one bag, whichever of its names the index meets first."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.recorder.kept_names import KeptNames
+from tests.unit.test_dormant import Start
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class TestNames:
+    def test_a_kept_bag_answers_after_where_it_was_recorded_and_after_earlier_moments(
+        self, tmp_path: Path
+    ) -> None:
+        names = KeptNames(tmp_path)
+        recorded, first, second = (
+            f"{tmp_path}/{name}"
+            for name in ("r/r_0.mcap", "moments/a/r/r_0.mcap", "moments/b/r/r_0.mcap")
+        )
+        for path in (second, recorded, first):
+            names.enter(path)
+        assert names.before(recorded) == []
+        assert names.before(first) == [recorded]
+        assert names.before(second) == [recorded, first]
+        assert names.of(recorded) == names.of(first) == {first, second}
+        names.leave(first)
+        names.leave(first)
+        assert names.before(second) == [recorded]
+        assert names.known == {second}
+        names.leave(second)
+        assert list(names.of(recorded)) == []
+
+    def test_what_lies_in_no_moment_is_its_own_name(self, tmp_path: Path) -> None:
+        names = KeptNames(tmp_path)
+        for path in (f"{tmp_path}/moments/x.mcap", f"{tmp_path}/a/moments/b/x.mcap"):
+            assert names.recorded_as(path) == path
+
+
+def keep(start: Start, moment: str, *splits: int) -> None:
+    """Links some of the known bags into a moment."""
+    folder = start.bag_dir / "moments" / moment / "rec"
+    folder.mkdir(parents=True)
+    for split in splits:
+        os.link(start.bag_dir / "rec" / f"rec_{split}.mcap", folder / f"rec_{split}.mcap")
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Start:
+    begun = Start(tmp_path)
+    begun.remember()
+    return begun
+
+
+class TestTheIndex:
+    """Bags that the catalogue knows are taken over unread; what is kept is weighed beside them."""
+
+    def test_a_kept_bag_that_is_known_by_its_own_name_is_no_second_one(self, start: Start) -> None:
+        before = [bag.file for bag in start.index()[0].refresh().bags]
+        keep(start, "one", 1, 2)
+        keep(start, "two", 2, 3)
+        start.age()
+        assert [bag.file for bag in start.index()[0].refresh().bags] == before
+        assert start.index()[0].refresh() == start.read()
+
+    def test_it_answers_when_the_other_has_gone_under_a_running_index(self, start: Start) -> None:
+        index, _ = start.index()
+        before = index.refresh()
+        keep(start, "one", 1, 2)
+        keep(start, "two", 2, 3)
+        index.refresh()
+        for split in (1, 2):
+            (start.bag_dir / "rec" / f"rec_{split}.mcap").unlink()
+        after = index.refresh()
+        assert [bag[5:7] for bag in after.bags] == [bag[5:7] for bag in before.bags]
+        assert [bag.file for bag in after.bags][1:3] == [
+            f"{start.bag_dir}/moments/one/rec/rec_{split}.mcap" for split in (1, 2)
+        ]
+        start.remember()
+        assert [bag.file for bag in start.index()[0].refresh().bags] == [
+            bag.file for bag in after.bags
+        ]
+        shutil.rmtree(start.bag_dir / "moments/one")
+        assert len(index.refresh().bags) == 5
+        assert index.refresh().bags == start.read().bags
+
+    def test_one_that_is_recorded_anew_under_its_name_is_another(self, start: Start) -> None:
+        keep(start, "one", 1)
+        recorded = start.bag_dir / "rec/rec_1.mcap"
+        shutil.copy(recorded, start.bag_dir / "copy")
+        (start.bag_dir / "copy").replace(recorded)
+        assert len(start.read().bags) == 7
