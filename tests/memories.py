@@ -49,6 +49,7 @@ def memory_of(
     clock: Clock | None = None,
     reader: BagReader | None = None,
     limits: Limits | None = None,
+    include_active: bool = False,
 ) -> Memory:
     """The memory over `bag_dir`, rescanned at every question.
 
@@ -58,5 +59,12 @@ def memory_of(
     if reader is None:
         reader = McapReader() if storage == "mcap" else Rosbag2Reader()
     timed = clock or SettableClock(max(time.time_ns(), LAST_WRITTEN) + 3600 * NS_PER_S)
-    index = IndexManager(bag_dir, reader, timed, refresh_s=0.0, split_duration_s=10.0)
+    index = IndexManager(
+        bag_dir,
+        reader,
+        timed,
+        refresh_s=0.0,
+        split_duration_s=10.0,
+        include_active=include_active,
+    )
     return Memory(index, reader, extractor(), timed, limits or Limits())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.globs import matching
@@ -23,6 +23,10 @@ from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
     from ros2_memory.history import View
+
+
+ON_DISK_S: Final = 3
+"""A message that the recorder received longer ago is on disk, as small as its chunks are."""
 
 
 def seconds(duration: Ns) -> str:
@@ -75,7 +79,9 @@ def require_bags(view: View) -> None:
     if snapshot.active:
         raise NoDataError(
             NoDataReason.NOT_CLOSED_YET,
-            "the first split is still being written; ask again when it closes, in "
+            f"nothing of the first split is on disk yet; ask again in {ON_DISK_S} s"
+            if _answering(view)
+            else "the first split is still being written; ask again when it closes, in "
             f"{view.memory.limits.split_duration_s:g} s or less",
         )
     why = [snapshot.problem or "no bag with messages lies in the bag directory"]
@@ -174,6 +180,11 @@ def undecodable(topic: str, type_name: str, error: UndecodableError) -> NoDataEr
     )
 
 
+def _answering(view: View) -> bool:
+    """Whether what is being written answers, as far as it is on disk."""
+    return all(aside.answers for aside in view.snapshot.active)
+
+
 def _advice(view: View, reason: NoDataReason, at: Ns, older: Ns | None) -> str:
     snapshot = view.snapshot
     earliest, latest = snapshot.earliest, snapshot.latest
@@ -182,8 +193,10 @@ def _advice(view: View, reason: NoDataReason, at: Ns, older: Ns | None) -> str:
         advice.append(f"the memory reaches from {moment(earliest)} to {moment(latest)}")
     if reason is NoDataReason.NOT_CLOSED_YET:
         advice.append(
-            "the split being written does not answer until it closes: ask about an earlier moment,"
-            f" or again in {view.memory.limits.split_duration_s:g} s"
+            f"ask about an earlier moment, or again in {ON_DISK_S} s"
+            if _answering(view)
+            else "the split being written does not answer until it closes: ask about an earlier "
+            f"moment, or again in {view.memory.limits.split_duration_s:g} s"
         )
     if older is not None:
         enough = math.ceil(unix_from_ns(at - older) * 1000) / 1000

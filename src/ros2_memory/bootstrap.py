@@ -53,6 +53,7 @@ def build_memory(settings: Settings) -> Memory:
         refresh_s=settings.reader.index_refresh_s,
         split_duration_s=settings.recording.split_duration_s,
         known=partial(catalogue.summaries, bag_dir),
+        include_active=settings.reader.include_active,
     )
     recall = Recall(catalogue, bag_dir)
     return Memory(index, reader, extractor, clock, limits_of(settings), recall)
@@ -122,6 +123,7 @@ def limits_of(settings: Settings) -> Limits:
         tf_clock=data.tf_clock,
         max_plausible_speed_mps=data.max_plausible_speed_mps,
         split_duration_s=settings.recording.split_duration_s,
+        include_active=settings.reader.include_active,
         kept=retention_limits(settings) if records else None,
     )
 

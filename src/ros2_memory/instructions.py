@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 _RULES: Final = """\
 What a robot saw and did in the past, from its recordings. For what it sees right now, ask \
-elsewhere: the newest {split} s or so are still being written and answer not_closed_yet.
+elsewhere: {newest} answer not_closed_yet.
 Three rules prevent most wrong calls:
 1. Times are Unix seconds. For "10 s ago" or "in the last minute" take the tools named \
 _seconds_ago, _last or recent_: they need no clock. A timestamp from a reply can be passed to any \
@@ -44,7 +44,9 @@ def instructions(limits: Limits, *, additions: bool = True) -> str:
     tools beyond the specification's are offered.
     """
     return (_RULES + (_HAPPENED if additions else _SEEN) + _REST).format(
-        split=f"{limits.split_duration_s:g}",
+        newest="the newest 3 s or so are not on disk yet and"
+        if limits.include_active
+        else f"the newest {limits.split_duration_s:g} s or so are still being written and",
         pose_topic=limits.pose_topic,
         tolerance=f"{limits.time_tolerance_s:g}",
     )

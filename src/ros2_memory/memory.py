@@ -40,12 +40,13 @@ class Limits:
     tf_clock: ClockOfTransforms = "auto"
     max_plausible_speed_mps: float = 10.0
     split_duration_s: float = 10.0
+    include_active: bool = False
     kept: RetentionLimits | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """The robot's past, as far as it lies in closed bags.
+    """The robot's past, as far as it lies in bags: closed ones, unless the index includes others.
 
     Every answer is the same with `recall` and without.
     """
@@ -84,9 +85,23 @@ class Stages:
         return {stage: round(ms_from_ns(spent), 3) for stage, spent in self._spent.items()}
 
 
+class Sources:
+    """What kind of bags one call drew on.
+
+    Attributes:
+        active: whether one that is still being written is among them.
+    """
+
+    __slots__ = ("active",)
+
+    def __init__(self) -> None:
+        self.active = False
+
+
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One call: when it must be over, and where its time went."""
+    """One call: when it must be over, where its time went, and what it drew on."""
 
     deadline: Deadline = field(default_factory=Deadline.never)
     stages: Stages = field(default_factory=Stages)
+    sources: Sources = field(default_factory=Sources)

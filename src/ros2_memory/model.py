@@ -117,13 +117,13 @@ class BagState(StrEnum):
     """How a bag file stands."""
 
     CLOSED = "closed"
-    ACTIVE = "active"  # still being written: marked, and excluded from queries
+    ACTIVE = "active"  # still being written: marked, and excluded unless reader.include_active
     INCOMPLETE = "incomplete"  # left open by a crash: its readable messages are served
     DAMAGED = "damaged"  # cannot be read at all: set aside with its reason
 
 
 class BagFile(NamedTuple):
-    """One bag file that answers questions (closed or incomplete, and not empty).
+    """One bag file that answers questions (of any state but damaged, and not empty).
 
     `file` is its path as a text: of 60,000 files the index keeps no more. `start` and `end` are
     the log times of its first and last message, both inclusive. `sidecar_ns` is the mtime of the
@@ -166,12 +166,16 @@ def _folder(text: str) -> Path:
 class SetAside:
     """A file that does not answer: active, damaged, or of a kind that the reader does not read.
 
-    `written` is when it was last written to; None where that is not known, or goes on.
+    `written` is when it was last written to; None where that is not known, or goes on. `answers`:
+    it is active, and what of it is whole answers all the same, up to `until` (the log time of its
+    last message, inclusive; None where nothing of it is on disk yet).
     """
 
     path: Path
     reason: str
     written: Ns | None = None
+    answers: bool = False
+    until: Ns | None = None
 
 
 @dataclass(frozen=True, slots=True)

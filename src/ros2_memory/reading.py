@@ -78,10 +78,15 @@ class Reading:
         return None if notes is None or number is None else (notes, number)
 
     def used(self, found: Iterator[Found]) -> Iterator[Found]:
-        """The messages; where one stands in a bag that a crash left open, they are not all."""
+        """The messages; where one stands in a bag that a crash left open, they are not all.
+
+        Remembers whether one stands in a bag that is still being written.
+        """
         for each in found:
             if each.bag.state is BagState.INCOMPLETE:
                 self.complete = False
+            elif each.bag.state is BagState.ACTIVE:
+                self.call.sources.active = True
             yield each
 
     def log_times(self, bag: BagFile, topic: str, window: TimeWindow) -> Sequence[Ns]:
@@ -89,7 +94,7 @@ class Reading:
         self.check_deadline()
         with self.call.stages.timed("read"):
             try:
-                return self.memory.reader.log_times(bag.path, topic, window)
+                return self.memory.reader.log_times(bag.path, topic, _known(bag, window))
             except BagError as error:
                 self.skip(bag, error)
                 return ()
@@ -139,7 +144,7 @@ class Reading:
         self.check_deadline()
         kept = self._kept(bag, topics)
         if kept is None:
-            return self._read(bag, topics, window, newest_first=newest_first)
+            return self._read(bag, topics, _known(bag, window), newest_first=newest_first)
         ordered = reversed(kept) if newest_first else iter(kept)
         return (Found(bag, each) for each in ordered if window.contains(each.log_time))
 
@@ -178,7 +183,7 @@ class Reading:
         self.check_deadline()
         begin = time.perf_counter_ns()
         try:
-            record = self.memory.reader.newest(bag.path, topic, window)
+            record = self.memory.reader.newest(bag.path, topic, _known(bag, window))
         except BagVanishedError as error:
             self.skip(bag, error)
             return None
@@ -202,6 +207,13 @@ class Reading:
             return None
         notes, number = entry
         return notes.kept(topic).get(number)
+
+
+def _known(bag: BagFile, window: TimeWindow) -> TimeWindow:
+    """The part of a window in which the index knows the bag: one being written grows meanwhile."""
+    if bag.state is not BagState.ACTIVE:
+        return window
+    return window.intersect(TimeWindow.until(bag.end))
 
 
 def short_name(path: Path) -> str:

@@ -45,10 +45,15 @@ class Replies:
     bag_dir: Path
     max_chars: int
 
-    def answer(self, answer: Answer | Account) -> Reply:
-        """An answer in the shape that the tool's description promises."""
+    def answer(self, answer: Answer | Account, *, from_active: bool = False) -> Reply:
+        """An answer in the shape that the tool's description promises.
+
+        Where that is an object, `from_active` is said in it if it is so.
+        """
         value = shown(answer, self.bag_dir)
         if isinstance(value, dict):
+            if from_active:
+                value = {**value, "from_active": True}
             return Reply(fit(value, self.max_chars))
         text = compact(value)
         if isinstance(value, list) and len(text) > self.max_chars:

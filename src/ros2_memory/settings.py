@@ -103,9 +103,13 @@ class DataSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class ReaderSettings:
-    """How bags are found and decoded."""
+    """How bags are found and decoded.
+
+    `include_active`: what is whole of the split being written answers, too.
+    """
 
     index_refresh_s: Positive
+    include_active: Switch
     custom_msg_paths: tuple[Folder, ...]
     chunk_cache_mb: Count
     max_chunk_mb: Megabytes

@@ -6,7 +6,8 @@ Named are, the first few of each and the others counted:
   nothing of its times, so it counts where its recording and its own date have it lie (see
   `recorder.whereabouts`): an old one that nobody removes is not part of every answer for ever. One
   whose time is unknown counts where the answer is that there is nothing, since it may hold it.
-- the file that is still being written, from the end of the split before it on;
+- the file that is still being written, from the end of the split before it on, or, where what is
+  whole of it answers, from there on;
 - bags that a crash left open, on to the last time that their files were written to;
 - closed bags of which parts could not be read, or that contradict themselves;
 - bags that a wrong clock dated, where the answer is not that there is nothing.
@@ -51,11 +52,16 @@ def note_edges(view: Reading, window: TimeWindow) -> None:
     if snapshot.latest is None or asked_to <= snapshot.latest:
         return
     if snapshot.active:
-        view.note(
-            f"the split being written is not included: nothing after {_moment(snapshot.latest)}"
-        )
+        view.note(nothing_after(snapshot.active, snapshot.latest))
     else:
         view.note(f"the memory ends at {_moment(snapshot.latest)}")
+
+
+def nothing_after(active: Sequence[SetAside], latest: Ns) -> str:
+    """The sentence on a window that reaches past the newest message, while files are written."""
+    if all(aside.answers for aside in active):
+        return f"nothing after {_moment(latest)} is on disk yet"
+    return f"the split being written is not included: nothing after {_moment(latest)}"
 
 
 def _moment(at: Ns) -> str:
@@ -102,11 +108,12 @@ def _touches(place: TimeWindow | None, window: TimeWindow, *, unknown: bool) -> 
 def _still_written(snapshot: Snapshot, active: Sequence[SetAside], window: TimeWindow) -> str:
     latest = snapshot.latest
     if latest is not None and window.stop - 1 - AT_OR_BEFORE_SLACK_NS > latest:
-        return (
-            f"the split being written is not included: nothing after {unix_rounded_up(latest):.6f}"
-        )
+        return nothing_after(snapshot.active, latest)
+    lacking = [short_name(each.path) for each in active if not each.answers]
+    if lacking:
+        return f"still being written and not included: {listed(lacking)}"
     names = [short_name(each.path) for each in active]
-    return f"still being written and not included: {listed(names)}"
+    return f"still being written and not all on disk yet: {listed(names)}"
 
 
 def _left_open(bags: Sequence[BagFile]) -> Iterator[str]:

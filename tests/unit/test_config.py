@@ -76,6 +76,7 @@ class TestDefaults:
             },
             "reader": {
                 "index_refresh_s": 5.0,
+                "include_active": False,
                 "custom_msg_paths": (),
                 "chunk_cache_mb": 64,
                 "max_chunk_mb": 64,
@@ -271,6 +272,7 @@ class TestPresets:
         ("preset", "storage", "recorder", "transport", "now"),
         [
             ("robot", MCAP, ROS2BAG, "sse", "wall"),
+            ("robot_live", MCAP, ROS2BAG, "sse", "wall"),
             ("query_only", MCAP, NONE, "stdio", "wall"),
             ("replay", ROSBAG2, NONE, "stdio", "latest"),
             ("local", MCAP, NONE, "stdio", "wall"),
@@ -285,7 +287,14 @@ class TestPresets:
 
     def test_each_shipped_one_is_tested_here(self) -> None:
         shipped = {path.stem for path in (ROOT / "config/deployment").iterdir()}
-        assert shipped == {"robot", "query_only", "replay", "local"}
+        assert shipped == {"robot", "robot_live", "query_only", "replay", "local"}
+
+    def test_robot_live_is_robot_that_answers_from_the_split_being_written(self) -> None:
+        robot, live = (
+            load_settings((), {"MEMORY_DEPLOYMENT": preset}) for preset in ("robot", "robot_live")
+        )
+        assert (robot.reader.include_active, live.reader.include_active) == (False, True)
+        assert dataclasses.replace(live, reader=robot.reader) == robot
 
 
 class TestAdapters:

@@ -35,7 +35,9 @@ def dating(timeline: Timeline, now: Ns, *, with_steps: bool) -> Dating:
 
 
 def place(timeline: Timeline, aside: SetAside, now: Ns, *, growing: bool) -> TimeWindow | None:
-    """When the messages of a file that was set aside may have been recorded; None: unknown."""
+    """When the messages of a file that do not answer may have been recorded; None: unknown."""
+    if aside.until is not None:
+        return TimeWindow(min(aside.until + 1, MAX_NS), MAX_NS)
     folder = str(aside.path.parent)
     runs = [run for run in timeline.runs if folder in run.folders]
     courses = [run.courses for run in runs]

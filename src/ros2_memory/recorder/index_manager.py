@@ -65,7 +65,8 @@ class IndexManager:
     `split_duration_s` is how long the recorder writes one file. `disposal` deletes bags by its
     limits when it is told to; without it nothing here deletes anything. `known` tells, by path, of
     closed files that were read earlier: a scan that begins anew does not read them again while they
-    look as they did.
+    look as they did. `include_active`: what is whole of a file that is being written answers, too;
+    not where bags are disposed of, repaired or kept, which is for those that are finished.
 
     Attributes:
         bag_dir: the bag directory.
@@ -81,9 +82,11 @@ class IndexManager:
         split_duration_s: float,
         disposal: Disposal | None = None,
         known: Callable[[], Mapping[str, FormerFile]] | None = None,
+        include_active: bool = False,
     ) -> None:
         self.bag_dir = bag_dir
         self._known = known
+        self._include_active = include_active
         self._disposal = disposal
         self._reader = reader
         self._clock = clock
@@ -167,7 +170,7 @@ class IndexManager:
         self._files: dict[str, FileNotes] = {}
         self._verdicts: dict[str, Verdict] = {}
         self._counted: dict[str, Verdict] = {}  # of x.mcap and x.mcap.zstd only one
-        self._set_aside: dict[str, Verdict] = {}  # those of `_counted` that are no bags
+        self._set_aside: dict[str, Verdict] = {}  # those of `_counted` that are not only bags
         self._hidden: set[str] = set()  # the other form answers for these, for the time being
         self._names = KeptNames(self.bag_dir)
         self._watched: set[str] = set()
@@ -212,9 +215,9 @@ class IndexManager:
     def _scene(self) -> Scene:
         now = self._clock.now()
         heartbeat = self.heartbeat()
-        if heartbeat is None or not heartbeat.is_live(now):
-            return Scene(self.bag_dir, now, self._three_splits)
-        return Scene(self.bag_dir, now, self._three_splits, frozenset(heartbeat.recordings))
+        live = heartbeat is not None and heartbeat.is_live(now)
+        named = frozenset(heartbeat.recordings) if heartbeat is not None and live else None
+        return Scene(self.bag_dir, now, self._three_splits, named, self._include_active)
 
     def _next_on_patrol(self) -> list[str]:
         if not self._patrol:
@@ -316,7 +319,7 @@ class IndexManager:
             self._set_aside.pop(path, None)
             if after is not None:
                 self._counted[path] = after
-                if after.bag is None:
+                if after.bag is None or after.aside is not None:
                     self._set_aside[path] = after
             if before == after:
                 continue

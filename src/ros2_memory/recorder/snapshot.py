@@ -30,11 +30,11 @@ class Snapshot:
     `bags` answer questions: closed, or left incomplete by a crash, and never empty; sorted by
     (start, end, path). The one of latched messages that outlive their own bags is not among them,
     but found wherever a topic is asked for. Set aside, each with its reason and sorted by path:
-    `active` files are still being written; `damaged` ones cannot be read at all (among them
-    directories that cannot be listed); `unread` ones are of a kind that another storage reads, or
-    symbolic links, which are not followed. `empty` counts closed bags without a message.
-    `silent_topics` are declared in some bag and heard in none. `problem` says why the bag directory
-    itself could not be read.
+    `active` files are still being written (those that answer as far as they are whole are among
+    `bags` too); `damaged` ones cannot be read at all (among them directories that cannot be
+    listed); `unread` ones are of a kind that another storage reads, or symbolic links, which are
+    not followed. `empty` counts closed bags without a message. `silent_topics` are declared in some
+    bag and heard in none. `problem` says why the bag directory itself could not be read.
     """
 
     bags: tuple[BagFile, ...] = ()
@@ -77,9 +77,9 @@ class Snapshot:
 
     @cached_property
     def places(self) -> Mapping[SetAside, TimeWindow | None]:
-        """Of the files set aside, when their messages may have been recorded; None: unknown.
+        """Of the files set aside, when messages may have been recorded that do not answer.
 
-        Of very many files that cannot be read only the last ones are placed.
+        None: unknown. Of very many files that cannot be read only the last ones are placed.
         """
         timeline, now = self._timeline, self.scanned_at
         asides = [(aside, True) for aside in self.active]

@@ -15,11 +15,15 @@ A `.db3` has no closing mark: between two transactions of its recorder it looks 
 grew within the last three splits is active unless the `metadata.yaml` beside it, which a recorder
 writes last, mentions it, or a live heartbeat names other recordings only. A `.zstd` is written
 after the bag in it was closed; it is open until its last frame is whole.
+
+Where a scan includes active files an active `.mcap` is a bag as well as set aside: what of it is
+whole answers. Bytes of such a file never change once they are there. Of a `.db3` they do: it is
+read as a file that nobody writes, and read meanwhile its pages would contradict each other.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -41,6 +45,7 @@ RETRY_SOON_NS: Final[Ns] = 5 * NS_PER_S
 """The same where it certainly was: a disk that failed, or too many open files."""
 
 _ACTIVE = "still being written"
+_ANSWERS = "still being written: its complete chunks answer"
 _NO_MESSAGE = (
     "it ends before its first message: its recorder was killed before any reached the disk"
 )
@@ -62,7 +67,8 @@ class Standing(IntEnum):
 class Verdict:
     """How one file stands: as a bag, set aside with a reason, or without a message.
 
-    `silent` are the topics that a bag without a message declares.
+    Both a bag and set aside is only an active file that answers. `silent` are the topics that a bag
+    without a message declares.
     """
 
     standing: Standing
@@ -76,12 +82,14 @@ class Scene:
     """What one scan knows besides the files themselves.
 
     `open_recordings` are those that a live heartbeat names; None without a live heartbeat.
+    `include_active`: what is whole of a file that is still being written answers.
     """
 
     root: Path
     now: Ns
     three_splits: Ns
     open_recordings: frozenset[str] | None = None
+    include_active: bool = False
     _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
 
     def may_be_recorded(self, path: Path) -> bool:
@@ -211,7 +219,7 @@ def judge(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
             empty = notes.stamp.size == 0
             notes.closing = Closing.OPEN if empty else reader.closing(notes.path)
         if _is_active(notes, scene):
-            return _aside(Standing.ACTIVE, notes, _ACTIVE)
+            return _active(notes, reader, scene)
         if notes.summary is None and notes.fault is None:
             notes.summary = reader.summarize(notes.path)
     except BagVanishedError:
@@ -255,6 +263,38 @@ def _is_active(notes: FileNotes, scene: Scene) -> bool:
     )
 
 
+def _active(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
+    """An active file; as a bag, too, as far as it can be one.
+
+    Raises:
+        BagVanishedError: the file is not there any more.
+    """
+    aside = SetAside(notes.path, _ACTIVE)
+    if not scene.include_active or notes.kind != ".mcap":
+        return Verdict(Standing.ACTIVE, aside=aside)
+    nothing_yet = Verdict(Standing.ACTIVE, aside=replace(aside, answers=True))
+    if notes.stamp.size == 0:
+        return nothing_yet
+    if notes.summary is None:
+        try:
+            notes.summary = reader.summarize(notes.path)
+        except BagVanishedError:
+            raise
+        except BagError:
+            # The file may be about to be one. If it is none, that is found when it stays so.
+            return Verdict(Standing.ACTIVE, aside=aside)
+    summary = notes.summary
+    if not summary.complete:
+        # The first note tells how the file ends; it goes on.
+        summary = summary.replaced(notes=summary.notes[1:])
+    if summary.empty:
+        return nothing_yet
+    bag = _bag(notes, BagState.ACTIVE, summary)
+    return Verdict(
+        Standing.ACTIVE, bag, SetAside(notes.path, _ANSWERS, answers=True, until=bag.end)
+    )
+
+
 def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
     closed = notes.closing is Closing.CLOSED and summary.complete
     if summary.empty:
@@ -263,9 +303,13 @@ def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
         if closed:
             return _aside(Standing.DAMAGED, notes, "; ".join(summary.notes))
         return _aside(Standing.DAMAGED, notes, _NO_MESSAGE)
-    state = BagState.CLOSED if closed else BagState.INCOMPLETE
+    bag = _bag(notes, BagState.CLOSED if closed else BagState.INCOMPLETE, summary)
+    return Verdict(Standing.CLOSED if closed else Standing.INCOMPLETE, bag=bag)
+
+
+def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
     stamp = notes.stamp
-    bag = BagFile(
+    return BagFile(
         str(notes.path),
         stamp.size,
         stamp.mtime_ns,
@@ -275,12 +319,10 @@ def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
         summary.end,
         stamp.sidecar_ns,
     )
-    return Verdict(Standing.CLOSED if closed else Standing.INCOMPLETE, bag=bag)
 
 
 def _aside(standing: Standing, notes: FileNotes, reason: str) -> Verdict:
-    written = None if standing is Standing.ACTIVE else notes.stamp.mtime_ns
-    return Verdict(standing, aside=SetAside(notes.path, reason, written))
+    return Verdict(standing, aside=SetAside(notes.path, reason, notes.stamp.mtime_ns))
 
 
 def _not_read(notes: FileNotes) -> str:

@@ -1,0 +1,143 @@
+"""A robot drives, and is asked where it was a moment ago: what is being written answers.
+
+Two recorders record the same drive in splits of 4 s: one in a single recording, and one that
+rotates.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from ros2_memory.timebase import unix_rounded_up
+from tests.closed_form import position
+from tests.live_recorder import (
+    NS_PER_S,
+    Answer,
+    LiveRecorder,
+    Tick,
+    answering,
+    answers,
+    await_moment,
+    bag_files,
+    machine,
+    ticks,
+)
+from tests.ros_live import needs_ros, publishing_robot, ros_environment
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+pytestmark = needs_ros
+
+HZ: Final = 50.0
+SPLIT_S: Final = 4
+FRESH_S: Final = 3
+DRIVE_S: Final = 14
+NEWEST: Final = ("get_position_seconds_ago", {"seconds_ago": 0, "tolerance_s": 60})
+A_MOMENT_AGO: Final = ("get_position_seconds_ago", {"seconds_ago": FRESH_S, "tolerance_s": 1})
+TRAVELLED: Final = 0.05  # m: how far from the closed form an answer may be
+ROUNDED_S: Final = 0.002  # ages are whole milliseconds
+APART_S: Final = 0.005  # two recordings log one message up to some milliseconds apart
+NAMES: Final = ("steady", "rotating")
+
+
+@dataclass
+class Drive:
+    """What was answered while the robot drove, and what it turned out to have recorded."""
+
+    recorders: dict[str, LiveRecorder]
+    t0: int = 0
+    published: int = 0
+    newest: dict[str, list[Answer]] = field(default_factory=dict)
+    ago: dict[str, list[Answer]] = field(default_factory=dict)
+    recorded: dict[str, list[Tick]] = field(default_factory=dict)
+    files: dict[str, int] = field(default_factory=dict)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
+    folder = tmp_path_factory.mktemp("tail")
+    options = ("--hz", f"{HZ:g}", "--subscribers", "2")
+    with (
+        ros_environment(folder) as env,
+        machine(folder, env) as site,
+        publishing_robot(env, folder / "truth.json", *options) as robot,
+        ExitStack() as stack,
+    ):
+        live = "reader.include_active=true"
+        served = {
+            name: stack.enter_context(answering(site.bag_dir(name), folder / f"{name}.log", live))
+            for name in NAMES
+        }
+        splits = f"recording.split_duration_s={SPLIT_S}"
+        drive = Drive(
+            {
+                "steady": site.record("steady", splits),
+                "rotating": site.record("rotating", splits, "recording.session_duration_s=6"),
+            }
+        )
+        drive.t0 = robot.t0
+        await_moment(drive.t0 + (FRESH_S + 1) * NS_PER_S)
+        while time.time_ns() < drive.t0 + DRIVE_S * NS_PER_S:
+            for name in NAMES:
+                newest, ago = answers(served[name], NEWEST, A_MOMENT_AGO)
+                drive.newest.setdefault(name, []).append(newest)
+                drive.ago.setdefault(name, []).append(ago)
+        drive.published = robot.stop()["/odom"]
+        for name, recorder in drive.recorders.items():
+            recorder.stop()
+            files = bag_files(recorder.bag_dir)
+            drive.files[name] = len(files)
+            drive.recorded[name] = ticks(files, drive.t0, HZ)
+        yield drive
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_questions_went_over_the_end_of_a_split(drive: Drive, name: str) -> None:
+    assert drive.files[name] >= DRIVE_S // SPLIT_S
+    assert len(drive.newest[name]) >= 5
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_was_recorded_3_s_before_a_question_is_found_by_it(drive: Drive, name: str) -> None:
+    for told, asked, _ in drive.newest[name]:
+        assert "timestamp" in told, told
+        recorded = _newest_recorded(drive, name, asked - FRESH_S)
+        assert told["timestamp"] >= unix_rounded_up(recorded)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_where_the_robot_was_a_moment_ago_is_right(drive: Drive, name: str) -> None:
+    for told, asked, answered in drive.ago[name]:
+        assert "x" in told, told
+        now = told["timestamp"] + told["age_s"]
+        assert asked - ROUNDED_S <= now <= answered + ROUNDED_S
+        x, y = position(told["timestamp"] - drive.t0 / NS_PER_S)
+        assert math.hypot(told["x"] - x, told["y"] - y) <= TRAVELLED
+        found = told["timestamp"]
+        assert any(
+            abs(found - _newest_recorded(drive, name, now - FRESH_S + off) / NS_PER_S) <= APART_S
+            for off in (-APART_S, APART_S)
+        )
+
+
+def _newest_recorded(drive: Drive, name: str, at: float) -> int:
+    """The log time of the newest message at or before a moment (Unix s)."""
+    return max(t.log_time for t in drive.recorded[name] if t.log_time <= at * NS_PER_S)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_answer_from_what_is_being_written_says_so(drive: Drive, name: str) -> None:
+    assert any(told.get("from_active") is True for told, *_ in drive.newest[name])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_recording_goes_on_as_if_nobody_had_asked(drive: Drive, name: str) -> None:
+    numbers = [tick.number for tick in drive.recorded[name]]
+    assert numbers == list(range(drive.published))
