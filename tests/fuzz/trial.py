@@ -184,8 +184,8 @@ async def _timed(server: EpisodicServer, name: str, given: dict[str, Any], verdi
     verdict.cpu_s = max(verdict.cpu_s, spent)
     if spent > MOST_S:
         verdict.faults.append(f"slow: {name} {given} took {spent:.1f} s")
-    if isinstance(answer, dict) and answer.get("error") in {"internal", "timeout"}:
-        verdict.faults.append(f"{answer['error']}: {name} {given}")
+    if isinstance(answer, dict) and answer.get("error") == "internal":
+        verdict.faults.append(f"internal: {name} {given}")
     if isinstance(answer, dict) and "error" in answer and not answer.get("detail"):
         verdict.faults.append(f"no reason: {name} {answer}")
     return answer

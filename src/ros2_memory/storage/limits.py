@@ -16,11 +16,11 @@ MAX_CHUNK_MESSAGES: Final = 1_000_000
 """More messages than these take more memory than their chunk, and seconds to look through."""
 MAX_CHANNELS: Final = 5_000
 """The largest robots have some hundred topics; every list and search goes through all there are."""
-MAX_CHUNKS: Final = 300_000
+MAX_CHUNKS: Final = 150_000
 """Each is kept in mind for as long as its file is asked about."""
 MAX_TIMES_PACKED: Final = 100
 """Nothing that a robot records shrinks to less than this part of itself, but for what is small."""
-_ALWAYS_ALLOWED: Final = 64 << 20
+_ALWAYS_ALLOWED: Final = 32 << 20
 
 
 def most_unpacked(packed: int) -> int:

@@ -8,13 +8,13 @@ file's own indexes are missing or wrong (see `mcap_index`).
 from __future__ import annotations
 
 from operator import attrgetter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.storage.base import Channel, Closing, Record
-from ros2_memory.storage.faults import LostError, UnreachableError, UnreadableError, damage
+from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_chunk import Column, joined, walk
@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from ros2_memory.model import BagSummary, TimeWindow
     from ros2_memory.storage.open_file import FileKey
     from ros2_memory.timebase import Ns
+
+
+_LARGE_BYTES: Final = 8 << 20
 
 
 class McapBags:
@@ -88,11 +91,8 @@ class McapBags:
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
-    ) -> Iterator[Record | LostError]:
-        """The messages of `topics` inside the window, in order.
-
-        An error stands for the messages of a damaged chunk, where the first of them would.
-        """
+    ) -> Iterator[Record]:
+        """The messages of `topics` inside the window, in order."""
         if window.empty:
             return
         with OpenFile(path) as file:
@@ -111,10 +111,7 @@ class McapBags:
             wanted = _wanted(index, {topic})
             if index.loose:
                 runs = self._runs(file, {topic}, window, newest_first=True)
-                first = next(merged(runs, newest_first=True), None)
-                if isinstance(first, LostError):
-                    raise first
-                return first
+                return next(merged(runs, newest_first=True), None)
             overlapping = list(_overlapping(index, wanted, window))
             overlapping.sort(key=attrgetter("end"), reverse=True)
             best: tuple[Ns, int, int, bytes] | None = None
@@ -148,27 +145,20 @@ class McapBags:
 
     def _runs(
         self, file: OpenFile, topics: Collection[str], window: TimeWindow, *, newest_first: bool
-    ) -> Iterator[Run[Record | LostError]]:
+    ) -> Iterator[Run[Record]]:
         index = self._index(file)
         wanted = _wanted(index, topics)
 
-        def chunk_run(chunk: Chunk) -> Run[Record | LostError]:
-            def rows() -> Rows[Record | LostError]:
-                # Of a chunk whose index cannot be read it is not known what of it was wanted.
-                first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
-                try:
-                    with damage():
-                        columns = self._chunk_columns(file, chunk, wanted)
-                        column = joined([p.between(window.start, window.stop) for p in columns])
-                        if not column.times.size:
-                            return Rows([], [], _nothing)
-                        first, last = int(column.times[0]), int(column.times[-1])
-                        data = self._chunk_data(file, chunk)
-                except UnreachableError:
-                    raise
-                except UnreadableError as error:
-                    return _lost(LostError(str(error), first, last), newest_first=newest_first)
-                fetch = _from_bytes(data, wanted, self._max_chunk_bytes)
+        large: dict[int, bytes] = {}
+
+        def chunk_run(chunk: Chunk) -> Run[Record]:
+            def rows() -> Rows[Record]:
+                columns = self._chunk_columns(file, chunk, wanted)
+                column = joined([part.between(window.start, window.stop) for part in columns])
+                if not column.times.size:
+                    return Rows([], [], _nothing)
+                data = self._chunk_data(file, chunk)
+                fetch = self._fetching(file, chunk, data, wanted, large)
                 return _rows(column, fetch, newest_first=newest_first)
 
             return Run(chunk.start, chunk.end, chunk.offset, rows)
@@ -181,6 +171,30 @@ class McapBags:
             fetch = _from_file(file, wanted, self._max_chunk_bytes)
             rows = _rows(column, fetch, newest_first=newest_first)
             yield Run(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
+
+    def _fetching(
+        self,
+        file: OpenFile,
+        chunk: Chunk,
+        data: bytes,
+        wanted: dict[int, Channel],
+        last: dict[int, bytes],
+    ) -> Callable[[int, Ns], Record]:
+        """Fetches messages of a chunk; of the large ones only the `last` used stays unpacked.
+
+        Those that overlap in time would otherwise all be held at once.
+        """
+        if len(data) <= _LARGE_BYTES:
+            return _from_bytes(data, wanted, self._max_chunk_bytes)
+
+        def fetch(place: int, time: Ns) -> Record:
+            held = last.get(chunk.offset)
+            if held is None:
+                last.clear()
+                held = last[chunk.offset] = self._chunk_data(file, chunk)
+            return _from_bytes(held, wanted, self._max_chunk_bytes)(place, time)
+
+        return fetch
 
     def _index(self, file: OpenFile) -> McapIndex:
         index = self._found.get(file.key)
@@ -252,13 +266,9 @@ def _overlapping(index: McapIndex, wanted: Collection[int], window: TimeWindow) 
             yield chunk
 
 
-def _lost(lost: LostError, *, newest_first: bool) -> Rows[Record | LostError]:
-    return Rows([lost.last if newest_first else lost.first], [0], lambda _place, _time: lost)
-
-
 def _rows(
-    column: Column, fetch: Callable[[int, Ns], Record | LostError], *, newest_first: bool
-) -> Rows[Record | LostError]:
+    column: Column, fetch: Callable[[int, Ns], Record], *, newest_first: bool
+) -> Rows[Record]:
     times, places = column
     if newest_first:
         times, places = times[::-1], places[::-1]
