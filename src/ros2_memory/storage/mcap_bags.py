@@ -14,7 +14,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.storage.base import Channel, Closing, Record
-from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.faults import LostError, UnreachableError, UnreadableError, damage
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_chunk import Column, joined, walk
@@ -91,8 +91,11 @@ class McapBags:
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
-    ) -> Iterator[Record]:
-        """The messages of `topics` inside the window, in order."""
+    ) -> Iterator[Record | LostError]:
+        """The messages of `topics` inside the window, in order.
+
+        An error stands for the messages of a damaged chunk, where the first of them would.
+        """
         if window.empty:
             return
         with OpenFile(path) as file:
@@ -111,7 +114,10 @@ class McapBags:
             wanted = _wanted(index, {topic})
             if index.loose:
                 runs = self._runs(file, {topic}, window, newest_first=True)
-                return next(merged(runs, newest_first=True), None)
+                first = next(merged(runs, newest_first=True), None)
+                if isinstance(first, LostError):
+                    raise first
+                return first
             overlapping = list(_overlapping(index, wanted, window))
             overlapping.sort(key=attrgetter("end"), reverse=True)
             best: tuple[Ns, int, int, bytes] | None = None
@@ -145,19 +151,28 @@ class McapBags:
 
     def _runs(
         self, file: OpenFile, topics: Collection[str], window: TimeWindow, *, newest_first: bool
-    ) -> Iterator[Run[Record]]:
+    ) -> Iterator[Run[Record | LostError]]:
         index = self._index(file)
         wanted = _wanted(index, topics)
 
         large: dict[int, bytes] = {}
 
-        def chunk_run(chunk: Chunk) -> Run[Record]:
-            def rows() -> Rows[Record]:
-                columns = self._chunk_columns(file, chunk, wanted)
-                column = joined([part.between(window.start, window.stop) for part in columns])
-                if not column.times.size:
-                    return Rows([], [], _nothing)
-                data = self._chunk_data(file, chunk)
+        def chunk_run(chunk: Chunk) -> Run[Record | LostError]:
+            def rows() -> Rows[Record | LostError]:
+                # Of a chunk whose index cannot be read it is not known what of it was wanted.
+                first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
+                try:
+                    with damage():
+                        columns = self._chunk_columns(file, chunk, wanted)
+                        column = joined([p.between(window.start, window.stop) for p in columns])
+                        if not column.times.size:
+                            return Rows([], [], _nothing)
+                        first, last = int(column.times[0]), int(column.times[-1])
+                        data = self._chunk_data(file, chunk)
+                except UnreachableError:
+                    raise
+                except UnreadableError as error:
+                    return _lost(LostError(str(error), first, last), newest_first=newest_first)
                 fetch = self._fetching(file, chunk, data, wanted, large)
                 return _rows(column, fetch, newest_first=newest_first)
 
@@ -266,9 +281,13 @@ def _overlapping(index: McapIndex, wanted: Collection[int], window: TimeWindow) 
             yield chunk
 
 
+def _lost(lost: LostError, *, newest_first: bool) -> Rows[Record | LostError]:
+    return Rows([lost.last if newest_first else lost.first], [0], lambda _place, _time: lost)
+
+
 def _rows(
-    column: Column, fetch: Callable[[int, Ns], Record], *, newest_first: bool
-) -> Rows[Record]:
+    column: Column, fetch: Callable[[int, Ns], Record | LostError], *, newest_first: bool
+) -> Rows[Record | LostError]:
     times, places = column
     if newest_first:
         times, places = times[::-1], places[::-1]
