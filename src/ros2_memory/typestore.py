@@ -30,11 +30,16 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
 MAX_TEXT_BYTES: Final = 1 << 20
-MAX_STATEMENTS: Final = {"ros2msg": 10_000, "ros2idl": 2_000}
+MAX_STATEMENTS: Final = 2_000
+"""In the definition of one type. The parser takes half a millisecond for each."""
+MAX_MEMBERS: Final = 4_000
+"""Fields and constants of a type and all that it is made of; the largest standard type has 112."""
 MAX_NESTING: Final = 40
 MAX_UNROLLED: Final = 5_000
 """Elements of fixed arrays of strings or messages: rosbags writes a line of code for each."""
-_CACHED_TYPES: Final = 4_096
+MAX_CACHED_TYPES: Final = 4_096
+MAX_CACHED_BYTES: Final = 8 << 20
+"""Of their texts: what is made of a text takes some ten times as much."""
 _REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
@@ -89,6 +94,7 @@ class Typestores:
                 self._folders.setdefault(name, _Section("ros2msg", text))
         self._standard = get_typestore(Stores.LATEST).fielddefs
         self._types: dict[tuple[str, str, bytes], MessageType] = {}
+        self._bytes = 0
         self._lock = threading.Lock()
 
     def lookup(self, name: str, encoding: str, text: bytes) -> MessageType:
@@ -104,9 +110,21 @@ class Typestores:
         if known is not None:
             return known
         with self._lock:
-            if len(self._types) >= _CACHED_TYPES:
-                self._types.clear()
-            return self._types.setdefault(key, self._build(name, encoding, text))
+            known = self._types.get(key)
+            if known is None:
+                known = self._build(name, encoding, text)
+                self._keep(key, known)
+            return known
+
+    def _keep(self, key: tuple[str, str, bytes], made: MessageType) -> None:
+        size = len(key[0]) + len(key[2])
+        if size > MAX_CACHED_BYTES:
+            return
+        if len(self._types) >= MAX_CACHED_TYPES or self._bytes + size > MAX_CACHED_BYTES:
+            self._types.clear()
+            self._bytes = 0
+        self._types[key] = made
+        self._bytes += size
 
     def _build(self, name: str, encoding: str, text: bytes) -> MessageType:
         root = full_name(name)
@@ -125,16 +143,20 @@ class Typestores:
         """The definitions of `root` and of all that it is made of, checked to be bounded."""
         found: Typesdict = {}
         finished: set[str] = set()
-        unrolled = 0
+        members = unrolled = 0
 
         def add(name: str, trail: tuple[str, ...]) -> None:
-            nonlocal unrolled
+            nonlocal members, unrolled
             if name in trail:
                 raise _UnusableError(f"its definition contains itself: {' > '.join(trail)}")
             if len(trail) > MAX_NESTING:
                 raise _UnusableError(f"its definition nests more than {MAX_NESTING} levels deep")
             if name not in found:
-                found.update(self._definition(name, in_bag, trail))
+                definition = self._definition(name, in_bag, trail)
+                members += sum(len(named) + len(kept) for named, kept in definition.values())
+                if members > MAX_MEMBERS:
+                    raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
+                found.update(definition)
             for _, field in found[name][1]:
                 unrolled += _unrolled(field)
                 if unrolled > MAX_UNROLLED:
@@ -205,7 +227,7 @@ def _parse(name: str, section: _Section) -> Typesdict:
     if section.encoding == "ros2msg":
         text = _MSG_NOISE.sub("", text)
     statements = text.count(";" if section.encoding == "ros2idl" else "\n")
-    if statements > MAX_STATEMENTS[section.encoding]:
+    if statements > MAX_STATEMENTS:
         raise _UnusableError(f"its definition of {name} has {statements} statements, too many")
     parse = get_types_from_idl if section.encoding == "ros2idl" else _types_from_msg(name)
     try:

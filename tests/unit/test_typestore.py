@@ -9,7 +9,15 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from ros2_memory.errors import ConfigError
-from ros2_memory.typestore import MAX_NESTING, MAX_TEXT_BYTES, MessageType, Typestores
+from ros2_memory.typestore import (
+    MAX_CACHED_BYTES,
+    MAX_MEMBERS,
+    MAX_NESTING,
+    MAX_STATEMENTS,
+    MAX_TEXT_BYTES,
+    MessageType,
+    Typestores,
+)
 from tests.bags import VISION_DEFINITIONS, definition, detections, odom, text, typestore
 
 if TYPE_CHECKING:
@@ -226,6 +234,13 @@ class TestHostileDefinitions:
         whole = "\n".join(f"uint8 f{n}" for n in range(20_000))
         assert "too many" in reason(lookup("a_msgs/msg/A", whole))
 
+    def test_a_definition_of_many_parts_with_more_fields_in_all_than_any(self) -> None:
+        fields = "\n".join(f"uint8 f{n}" for n in range(MAX_STATEMENTS // 2))
+        count = 2 * MAX_MEMBERS // MAX_STATEMENTS + 1
+        parts = [f"{RULE}\nMSG: a_msgs/B{n}\n{fields}\n" for n in range(count)]
+        whole = "".join(f"B{n} b{n}\n" for n in range(count)) + "".join(parts)
+        assert f"more than {MAX_MEMBERS} fields" in reason(lookup("a_msgs/msg/A", whole))
+
     def test_comments_do_not_count_as_lines(self) -> None:
         assert lookup("a_msgs/msg/A", "# comment\n\n" * 20_000 + "uint8 x\n").reason is None
 
@@ -326,3 +341,20 @@ def test_threads_that_look_up_at_once_get_one_type() -> None:
     for thread in threads:
         thread.join()
     assert sorted(answers) == sorted((m.type, oracle(m)) for m in messages * 8)
+
+
+def test_what_is_kept_of_definitions_is_bounded_by_their_length() -> None:
+    stores = Typestores()
+    long = (f"# {n} {'x' * (MAX_TEXT_BYTES - 100)}\nuint8 x\n" for n in range(20))
+    for each in long:
+        assert stores.lookup("a_msgs/msg/A", "ros2msg", each.encode()).reason is None
+        assert sum(len(text) for _, _, text in stores._types) <= MAX_CACHED_BYTES
+    assert stores._types
+
+
+def test_a_definition_longer_than_all_that_is_kept_is_refused_and_not_kept() -> None:
+    stores = Typestores()
+    stores.lookup("a_msgs/msg/A", "ros2msg", b"uint8 x\n")
+    found = stores.lookup("a_msgs/msg/A", "ros2msg", b"#" * (MAX_CACHED_BYTES + 1))
+    assert "larger than" in reason(found)
+    assert [text for _, _, text in stores._types] == [b"uint8 x\n"]
