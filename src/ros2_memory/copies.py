@@ -12,7 +12,7 @@ from bisect import bisect_right
 from collections import deque
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Record
 
 COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
+_LONGEST_ROW_NS: Final[Ns] = 3 * COPY_HORIZON_NS
+"""Bounds what is held of a topic whose messages are all alike, their publish times too."""
 
 
 class Found(NamedTuple):
@@ -122,31 +124,56 @@ def once_forward(found: Iterable[Found], spans: Sequence[tuple[Ns, Ns]]) -> Iter
 
 
 def once_backward(found: Iterable[Found], spans: Sequence[tuple[Ns, Ns]]) -> Iterator[Found]:
-    """A descending stream without the later copies: held back until no earlier one can come."""
-    held: deque[list[Found]] = deque()  # a list of one; emptied where an earlier copy replaced it
-    by_key: dict[Copy, list[list[Found]]] = {}
+    """A descending stream without the copies that `once_forward` leaves out.
+
+    Held back until no earlier copy can come. Where copies follow each other for longer than
+    `_LONGEST_ROW_NS`, with never a pause of `COPY_HORIZON_NS`, other ones of them may be left out.
+    """
+    held: deque[tuple[Found, _Row | None]] = deque()
+    rows: dict[Copy, _Row] = {}
     for each in found:
-        while held and (not held[0] or held[0][0].time > each.time + COPY_HORIZON_NS):
-            yield from _released(held.popleft(), by_key)
-        slot = [each]
-        if _inside(spans, each.time):
-            slots = by_key.setdefault(copy_key(each.record), [])
-            later = next((s for s in slots if s and s[0].bag.recording != each.bag.recording), None)
-            if later is not None:
-                slots.remove(later)
-                later.clear()
-            slots.append(slot)
-        held.append(slot)
-    for slot in held:
-        yield from slot
+        while held and (held[0][1] is None or held[0][1].is_over(each.time)):
+            yield from _released(*held.popleft(), rows)
+        if not _inside(spans, each.time):
+            held.append((each, None))
+            continue
+        key = copy_key(each.record)
+        row = rows.get(key)
+        if row is None or row.is_over(each.time):
+            row = rows[key] = _Row(key)
+        row.messages.append(each)
+        held.append((each, row))
+    for each, row in held:
+        yield from _released(each, row, rows)
 
 
-def _released(slot: list[Found], by_key: dict[Copy, list[list[Found]]]) -> list[Found]:
-    if slot:
-        key = copy_key(slot[0].record)
-        remaining = [each for each in by_key.get(key, []) if each is not slot]
-        if remaining:
-            by_key[key] = remaining
-        else:
-            by_key.pop(key, None)
-    return slot
+class _Row:
+    """Copies that follow each other without a long pause, newest first."""
+
+    def __init__(self, key: Copy) -> None:
+        self.key = key
+        self.messages: list[Found] = []
+        self._kept: set[int] | None = None
+
+    def is_over(self, now: Ns) -> bool:
+        """Whether what comes at a moment, or before it, is no part of it."""
+        if self._kept is not None:
+            return True
+        first, last = self.messages[-1].time, self.messages[0].time
+        return now < max(first - COPY_HORIZON_NS, last - _LONGEST_ROW_NS)
+
+    def keeps(self, found: Found) -> bool:
+        """Whether one of its messages counts; it is over then."""
+        if len(self.messages) == 1:
+            return True
+        if self._kept is None:
+            everywhere = [(MIN_NS, MAX_NS)]
+            self._kept = {id(each) for each in once_forward(reversed(self.messages), everywhere)}
+        return id(found) in self._kept
+
+
+def _released(each: Found, row: _Row | None, rows: dict[Copy, _Row]) -> Iterator[Found]:
+    if row is None or row.keeps(each):
+        yield each
+    if row is not None and rows.get(row.key) is row:
+        del rows[row.key]
