@@ -1,0 +1,78 @@
+"""`ros2-memory doctor`: looks at everything that has to be right, and says what to do."""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from ros2_memory.cli import findings
+from ros2_memory.cli.findings import Finding, Level
+from ros2_memory.cli.running import (
+    AsJson,
+    BagDir,
+    Overrides,
+    busy,
+    opened,
+    output,
+    reporting,
+    say,
+    settings_for,
+)
+from ros2_memory.cli.showing import plain
+from ros2_memory.config import config_dir
+from ros2_memory.errors import ConfigError
+
+_STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
+
+
+def doctor(overrides: Overrides = None, as_json: AsJson = False, bag_dir: BagDir = None) -> None:
+    """Check configuration, disk, clock, bags, recorder, ROS environment, topics and server.
+
+    Each finding says what to do. The exit code is 0 where all is in order, 1 where something wants
+    attention, 2 where something does not work.
+    """
+    with reporting("doctor"):
+        found = [*examined(bag_dir, overrides)]
+    worst = max(each.level for each in found)
+    if as_json:
+        told = {"status": worst.name.lower(), "findings": [each.as_json() for each in found]}
+        say(json.dumps(told))
+    else:
+        _show(output(), found)
+    raise typer.Exit(int(worst))
+
+
+def examined(bag_dir: Path | None, overrides: Sequence[str] | None) -> Iterator[Finding]:
+    """All findings; of a configuration that is refused no other."""
+    try:
+        settings = settings_for(bag_dir, overrides)
+        memory = opened(settings)
+    except ConfigError as error:
+        yield Finding(Level.ERROR, "config", str(error), "correct the key that it names")
+        return
+    yield Finding(Level.OK, "config", f"composed from {config_dir(os.environ)}")
+    now, snapshot = memory.clock.now(), memory.index.snapshot()
+    with busy("asking the disk, ros2, the recorder and the server"):
+        yield from findings.of_bag_dir(settings)
+        yield from findings.of_clock(snapshot, now)
+        yield from findings.of_bags(settings, memory)
+        yield from findings.of_ros(settings, memory.reader)
+        yield from findings.of_recorder(settings, now)
+        yield from findings.of_topics(settings, snapshot)
+        yield from findings.of_server(settings)
+
+
+def _show(console: Console, found: Sequence[Finding]) -> None:
+    for each in found:
+        line = Text.assemble(
+            (f"{each.level.name.lower():<8}", _STYLES[each.level]),
+            (f"{each.about:<9}", "bold"),
+            plain(each.seen),
+        )
+        console.print(line)
+        if each.do and each.level is not Level.OK:
+            console.print(Text(f"{'':17}-> {plain(each.do)}"))

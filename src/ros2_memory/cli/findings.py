@@ -1,0 +1,363 @@
+"""What `ros2-memory doctor` looks at, and what it says of it: one function for each concern.
+
+A finding that is not in order says what to do. Nothing here changes anything.
+"""
+
+from __future__ import annotations
+
+import getpass
+import http.client
+import json
+import os
+import shutil
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from difflib import get_close_matches
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.adapters import GB, build_recorder
+from ros2_memory.api_token import api_token
+from ros2_memory.errors import EpisodicError
+from ros2_memory.memory import Call
+from ros2_memory.overview import data_time_range
+from ros2_memory.recorder.clock_faults import FIRST_BAGS_NS, FUTURE_NS
+from ros2_memory.recorder.daemon import Ticking
+from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.recorder.topics import TopicSelection, load_topics
+from ros2_memory.settings import NullRecorderNode
+from ros2_memory.timebase import NS_PER_S, iso_local, unix_from_ns
+from ros2_memory.wording import counted, listed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from ros2_memory.memory import Memory
+    from ros2_memory.model import JsonValue
+    from ros2_memory.recorder.heartbeat import Heartbeat
+    from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.settings import Settings
+    from ros2_memory.storage.base import BagReader
+    from ros2_memory.timebase import Ns
+
+LATELY_NS: Final = 3600 * NS_PER_S
+"""A topic that is not in the newest data of this length is not recorded just now."""
+
+_SERVER_PATIENCE_S: Final = 5.0
+_MOST_REPLY: Final = 1 << 20
+_HERE: Final[Mapping[str, str]] = {"0.0.0.0": "127.0.0.1", "::": "::1", "": "127.0.0.1"}  # noqa: S104
+"""Where a server that listens everywhere is reached from its own machine."""
+
+
+class Level(IntEnum):
+    """How bad it is, and the exit code that follows."""
+
+    OK = 0
+    WARNING = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What was seen of one concern; `do` says what to do about it."""
+
+    level: Level
+    about: str
+    seen: str
+    do: str = ""
+
+    def as_json(self) -> dict[str, JsonValue]:
+        """For programs."""
+        return {
+            "level": self.level.name.lower(),
+            "about": self.about,
+            "seen": self.seen,
+            "do": self.do or None,
+        }
+
+
+def of_bag_dir(settings: Settings) -> Iterator[Finding]:
+    """Whether the bag directory is there, may be used by this user, and has room."""
+    bag_dir, about = settings.recording.bag_dir.absolute(), "bag_dir"
+    records = not isinstance(settings.recorder, NullRecorderNode)
+    if not bag_dir.is_dir():
+        if not records:
+            do = "name the directory of the bags: MEMORY_BAG_DIR, or recording.bag_dir=DIR"
+            yield Finding(Level.ERROR, about, f"{bag_dir} is no directory", do)
+            return
+        yield Finding(
+            Level.WARNING,
+            about,
+            f"{bag_dir} is not there",
+            "the recorder makes it when it starts; is its disk mounted?",
+        )
+    else:
+        yield from _permissions(bag_dir, records=records)
+    if records:
+        yield from _room(settings, bag_dir)
+
+
+def _permissions(bag_dir: Path, *, records: bool) -> Iterator[Finding]:
+    user = _user()
+    wanted = os.R_OK | os.X_OK
+    if not os.access(bag_dir, wanted):
+        do = "give this user the right to read it, or run as the user of the services"
+        yield Finding(Level.ERROR, "bag_dir", f"{user} may not read {bag_dir}", do)
+    elif records and not os.access(bag_dir, wanted | os.W_OK):
+        yield Finding(
+            Level.WARNING,
+            "bag_dir",
+            f"{user} may read {bag_dir}, and not write there",
+            "fine if the recorder runs as another user, who may: "
+            "sudo -u USER ros2-memory doctor looks as that one",
+        )
+    else:
+        may = "read and write" if records else "read"
+        yield Finding(Level.OK, "bag_dir", f"{bag_dir}, where {user} may {may}")
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container's user without an entry
+        return f"user {os.getuid()}"
+
+
+def _room(settings: Settings, bag_dir: Path) -> Iterator[Finding]:
+    there = next(each for each in (bag_dir, *bag_dir.parents) if each.is_dir())
+    try:
+        disk = shutil.disk_usage(there)
+    except OSError as error:
+        yield Finding(
+            Level.ERROR, "disk", f"{there} cannot be measured: {error}", "look after the disk"
+        )
+        return
+    mount = next(each for each in (there, *there.parents) if os.path.ismount(each))
+    kept = settings.retention
+    free, used = disk.free / GB, _size(there) / GB
+    seen = f"{free:.1f} GB free on {mount}; {used:.1f} of {kept.max_total_gb:g} GB used"
+    if free < kept.min_free_gb:
+        do = (
+            f"recording pauses below retention.min_free_gb={kept.min_free_gb:g}; delete what else "
+            "lies on this disk"
+        )
+        yield Finding(Level.ERROR, "disk", seen, do)
+    elif free - kept.min_free_gb < kept.max_total_gb - used:
+        do = (
+            "the disk is full before the budget is: lower retention.max_total_gb to "
+            f"{max(free - kept.min_free_gb + used, 0):.1f}, or make room"
+        )
+        yield Finding(Level.WARNING, "disk", seen, do)
+    else:
+        yield Finding(Level.OK, "disk", seen)
+
+
+def _size(folder: Path) -> int:
+    """The bytes of all files below a folder, as far as they can be seen; two names count once."""
+    sizes: dict[tuple[int, int], int] = {}
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with suppress(OSError):
+                status = os.lstat(os.path.join(parent, name))  # noqa: PTH118 - many files
+                sizes[status.st_dev, status.st_ino] = status.st_size
+    return sum(sizes.values())
+
+
+def of_clock(snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
+    """Whether this machine's clock can be right, and those that dated the bags."""
+    do = "set the clock (timedatectl, chrony); bags keep the dates they were given"
+    latest = snapshot.dating.latest
+    if now < FIRST_BAGS_NS:
+        yield Finding(Level.ERROR, "clock", f"it says {iso_local(now)}: it was never set", do)
+    elif latest is not None and latest > now + FUTURE_NS:
+        seen = f"the newest data is dated {unix_from_ns(latest - now):.0f} s after the present"
+        yield Finding(Level.ERROR, "clock", seen, do)
+    elif snapshot.dating.faults:
+        faults = counted(len(snapshot.dating.faults), "bag was", "bags were")
+        seen = f"{faults} dated by a wrong clock: `ros2-memory info` lists them"
+        yield Finding(Level.WARNING, "clock", seen, do)
+    else:
+        yield Finding(Level.OK, "clock", f"it says {iso_local(now)}")
+
+
+def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
+    """Whether all bags can be read, and all messages in them understood."""
+    told = data_time_range(memory, Call())
+    snapshot = memory.index.snapshot()
+    if snapshot.problem:
+        do = "see bag_dir above; is the disk mounted?"
+        yield Finding(Level.ERROR, "bags", snapshot.problem, do)
+        return
+    newest = "" if told.latest is None else f", the newest from {iso_local(told.latest)}"
+    yield Finding(Level.OK, "bags", f"{counted(told.bags, 'bag')} answer{newest}")
+    left = (*told.damaged, *told.incomplete)
+    if left:
+        yield Finding(
+            Level.WARNING,
+            "bags",
+            f"{len(told.damaged)} damaged and {len(told.incomplete)} unfinished: "
+            f"{listed([each.path.name for each in left])}",
+            f"ros2-memory recover {settings.recording.bag_dir}",
+        )
+    if told.unread:
+        names = listed([each.path.name for each in told.unread])
+        do = "storage=rosbag2 reads sqlite and compressed bags, too"
+        yield Finding(Level.WARNING, "bags", f"{len(told.unread)} are not read: {names}", do)
+    if told.undecodable:
+        topics = listed([f"{each.topic} ({each.reason})" for each in told.undecodable])
+        do = "name the folder with the .msg files in reader.custom_msg_paths"
+        yield Finding(Level.WARNING, "bags", f"these topics cannot be decoded: {topics}", do)
+
+
+def of_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
+    """What the recorder last said of itself."""
+    about = "recorder"
+    if isinstance(settings.recorder, NullRecorderNode):
+        yield Finding(Level.OK, about, "recorder=none: nothing is recorded here")
+        return
+    start = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
+    heartbeat, reason = read_heartbeat(settings.recording.bag_dir)
+    if heartbeat is None:
+        yield Finding(Level.ERROR, about, str(reason), start)
+        return
+    age = f"{unix_from_ns(abs(now - heartbeat.updated)):.0f} s ago"
+    if heartbeat.state is RecorderState.STOPPED:
+        yield Finding(Level.WARNING, about, f"it was stopped {age}", start)
+    elif not heartbeat.is_live(now):
+        do = "journalctl -u ros2-memory-recorder says why it ended; " + start
+        yield Finding(Level.ERROR, about, f"it was last heard of {age}, and never said why", do)
+    elif heartbeat.state is RecorderState.PAUSED:
+        why = heartbeat.last_error or "it does not say why"
+        yield Finding(Level.ERROR, about, f"it is paused: {why}", "see disk above")
+    else:
+        yield Finding(
+            Level.OK,
+            about,
+            f"{heartbeat.state}, {counted(len(heartbeat.subscribed), 'topic')} subscribed",
+        )
+        yield from _troubles(heartbeat)
+
+
+def _troubles(heartbeat: Heartbeat) -> Iterator[Finding]:
+    if heartbeat.silent:
+        do = (
+            "is their publisher running? Under another user it is heard over the network alone: "
+            "FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder"
+        )
+        seen = f"subscribed and never heard: {listed(heartbeat.silent)}"
+        yield Finding(Level.WARNING, "recorder", seen, do)
+    if heartbeat.last_error:
+        seen = f"its last error: {heartbeat.last_error}"
+        yield Finding(Level.WARNING, "recorder", seen, "its log has more of it")
+
+
+def of_ros(settings: Settings, reader: BagReader) -> Iterator[Finding]:
+    """Whether `ros2 bag record` can be run, in the environment that the recorder gives it."""
+    if isinstance(settings.recorder, NullRecorderNode):
+        return
+    try:
+        recorder = build_recorder(settings, reader=reader)
+        if isinstance(recorder, Ticking):
+            recorder.check()
+    except EpisodicError as error:
+        reason, _, do = str(error).partition("; ")
+        yield Finding(Level.ERROR, "ros", reason, do or "correct recorder.setup_files")
+    else:
+        named = ", ".join(str(each) for each in settings.recorder.setup_files)
+        seen = f"ros2 bag record can be run{f' after {named}' if named else ''}"
+        yield Finding(Level.OK, "ros", seen)
+
+
+def of_topics(settings: Settings, snapshot: Snapshot) -> Iterator[Finding]:
+    """Whether what `topics.yaml` names has been recorded lately."""
+    if isinstance(settings.recorder, NullRecorderNode):
+        return
+    try:
+        selection = load_topics(settings.recording.topics_file)
+    except EpisodicError as error:
+        yield Finding(Level.ERROR, "topics", str(error), "correct recording.topics_file")
+        return
+    missing = never_heard(selection, snapshot)
+    file = settings.recording.topics_file
+    if not snapshot.bags:
+        seen = f"{file} lists {len(selection.entries)}; nothing is recorded yet"
+        yield Finding(Level.OK, "topics", seen)
+    elif not missing:
+        yield Finding(Level.OK, "topics", f"all {len(selection.entries)} of {file} are recorded")
+    for entry, near in missing.items():
+        hint = f"is it {' or '.join(near)}? " if near else ""
+        yield Finding(
+            Level.WARNING,
+            "topics",
+            f"{entry} is in {file}, and not in the newest hour of data",
+            f"{hint}compare with `ros2 topic list`; a name that nobody publishes is recorded by "
+            "nobody",
+        )
+
+
+def never_heard(selection: TopicSelection, snapshot: Snapshot) -> Mapping[str, list[str]]:
+    """The entries of which nothing was recorded lately, with recorded names that are like them."""
+    latest = snapshot.dating.latest
+    heard = []
+    for topic in snapshot.topics():
+        last = max(each.last for each in snapshot.stated(topic).values())
+        if latest is None or snapshot.is_latched(topic) or last > latest - LATELY_NS:
+            heard.append(topic)
+    if not snapshot.bags:
+        return {}
+    return {
+        entry: get_close_matches(entry, snapshot.topics(), n=2)
+        for entry in selection.entries
+        if not any(TopicSelection((entry,)).matches(topic) for topic in heard)
+    }
+
+
+def of_server(settings: Settings) -> Iterator[Finding]:
+    """What the server's `/health` says."""
+    at, about = settings.server, "server"
+    if at.transport == "stdio":
+        seen = "server.transport=stdio: each client starts its own, there is none to ask"
+        yield Finding(Level.OK, about, seen)
+        return
+    begun = time.monotonic()
+    try:
+        status, reply = _health(_HERE.get(at.host, at.host), at.port)
+    except (OSError, http.client.HTTPException) as error:
+        seen = f"nothing answers on {at.host} port {at.port}: {error}"
+        do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
+        yield Finding(Level.ERROR, about, seen, do)
+        return
+    except (ValueError, EpisodicError) as error:
+        seen = f"what answers on {at.host} port {at.port} is another program: {error}"
+        yield Finding(Level.ERROR, about, seen, "give the server another port: server.port")
+        return
+    took = f"in {(time.monotonic() - begun) * 1000:.0f} ms"
+    if reply.get("status") == "ok":
+        yield Finding(Level.OK, about, f"ok on {at.host} port {at.port}, {took}")
+        return
+    problems = reply.get("problems")
+    named = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
+    seen = f"{reply.get('status', f'HTTP {status}')}: {named or 'it does not say why'}"
+    yield Finding(Level.WARNING, about, seen, "the findings above and its log have the cause")
+
+
+def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
+    """Status and reply of `/health`.
+
+    Raises:
+        ValueError: the reply is no JSON object.
+    """
+    token = api_token(os.environ)
+    headers = {"Authorization": f"Bearer {token.get_secret_value()}"} if token else {}
+    connection = http.client.HTTPConnection(host, port, timeout=_SERVER_PATIENCE_S)
+    try:
+        connection.request("GET", "/health", headers=headers)
+        response = connection.getresponse()
+        reply: JsonValue = json.loads(response.read(_MOST_REPLY))
+    finally:
+        connection.close()
+    if not isinstance(reply, dict) or "status" not in reply:
+        raise ValueError("it gives no status")
+    return response.status, reply

@@ -1,0 +1,222 @@
+"""`ros2-memory doctor`: every fault has a finding that says what to do, and an exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory import cli
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.timebase import NS_PER_S
+from tests import stub_ros2
+from tests.bags import odom, write_mcap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Capture = pytest.CaptureFixture[str]
+
+
+class Answering(BaseHTTPRequestHandler):
+    """What stands for the server's `/health`."""
+
+    reply = b'{"status": "ok"}'
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(self.reply)
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
+        pass
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    Answering.reply = b'{"status": "ok"}'
+    with HTTPServer(("127.0.0.1", 0), Answering) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        yield server.server_port
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> Path:
+    """A bag directory of a robot with which all is well, and the settings that lead there."""
+    bag_dir = tmp_path / "bags"
+    now = time.time_ns()
+    messages = [odom(now - (60 - n) * NS_PER_S, n / 10, 0.0) for n in range(50)]
+    write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
+    (tmp_path / "bin").mkdir()
+    stub_ros2.install(tmp_path / "bin" / "ros2")
+    (tmp_path / "topics.yaml").write_text("topics: [/odom]\n")
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    monkeypatch.setenv("MCP_PORT", str(port))
+    overrides = [f"recording.topics_file={tmp_path / 'topics.yaml'}", "retention.max_total_gb=0.01"]
+    monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", " ".join([*overrides, "retention.min_free_gb=0"]))
+    beat(bag_dir)
+    return bag_dir
+
+
+def beat(bag_dir: Path, state: RecorderState = RecorderState.RECORDING, **more: Any) -> None:
+    now = time.time_ns()
+    fields: dict[str, Any] = {
+        "pid": os.getpid(),
+        "updated": now,
+        "recordings": ("rec",),
+        "since": now,
+        "bytes_written": 0,
+        "subscribed": ("/odom",),
+        "silent": (),
+        "last_error": None,
+        "interval_s": 2.0,
+    }
+    write_heartbeat(bag_dir, Heartbeat(state=state, **(fields | more)))
+
+
+def examined(capsys: Capture, *overrides: str) -> tuple[int, dict[str, list[dict[str, str]]]]:
+    """The exit code, and by concern the findings that are not in order."""
+    code = cli.main(["doctor", "--json", *overrides])
+    wrong: dict[str, list[dict[str, str]]] = {}
+    for each in json.loads(capsys.readouterr().out)["findings"]:
+        if each["level"] != "ok":
+            assert each["do"], each
+            wrong.setdefault(each["about"], []).append(each)
+    return code, wrong
+
+
+def test_where_all_is_well_the_exit_code_is_0(robot: Path, capsys: Capture) -> None:
+    assert examined(capsys) == (0, {})
+
+
+def test_people_read_a_line_for_each_concern(robot: Path, capsys: Capture) -> None:
+    assert cli.main(["doctor"]) == 0
+    told = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    about = ["config", "bag_dir", "disk", "clock", "bags", "ros", "recorder", "topics", "server"]
+    assert told == [["ok", each] for each in about]
+
+
+def test_a_refused_configuration_is_an_error(capsys: Capture) -> None:
+    code, wrong = examined(capsys, "server.prot=1")
+    assert code == 2
+    assert "server.prot" in wrong["config"][0]["seen"]
+
+
+def test_a_missing_directory_of_bags_is_an_error_where_nothing_is_recorded(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    gone = f"recording.bag_dir={tmp_path / 'gone'}"
+    code, wrong = examined(capsys, gone, "deployment=query_only", "server.transport=stdio")
+    assert code == 2
+    assert "MEMORY_BAG_DIR" in wrong["bag_dir"][0]["do"]
+
+
+@pytest.mark.parametrize(
+    ("override", "code", "words"),
+    [
+        ("retention.min_free_gb=1000000.0", 2, "recording pauses"),
+        ("retention.max_total_gb=1000000.0", 1, "lower retention.max_total_gb"),
+    ],
+)
+def test_a_disk_without_the_room_that_is_asked_of_it_is_told(
+    robot: Path, capsys: Capture, override: str, code: int, words: str
+) -> None:
+    ended, wrong = examined(capsys, override)
+    assert ended == code
+    assert words in wrong["disk"][0]["do"]
+
+
+def test_data_from_the_future_means_that_the_clock_is_wrong(robot: Path, capsys: Capture) -> None:
+    ahead = time.time_ns() + 7200 * NS_PER_S
+    for path in robot.glob("rec/*.mcap"):
+        path.unlink()
+    write_mcap(robot / "rec" / "rec_1.mcap", [odom(ahead, 0.0, 0.0)])
+    code, wrong = examined(capsys)
+    assert code > 0
+    assert "chrony" in wrong["clock"][0]["do"]
+
+
+def test_damaged_bags_lead_to_recover(robot: Path, capsys: Capture) -> None:
+    (robot / "old").mkdir()
+    (robot / "old" / "old_0.mcap").write_bytes(b"a letter")
+    hour_ago = time.time() - 3600
+    os.utime(robot / "old" / "old_0.mcap", (hour_ago, hour_ago))
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert wrong["bags"][0]["do"] == f"ros2-memory recover {robot}"
+
+
+@pytest.mark.parametrize(
+    ("state", "more", "code"),
+    [
+        (RecorderState.STOPPED, {}, 1),
+        (RecorderState.PAUSED, {"last_error": "the disk is full"}, 2),
+        (RecorderState.RECORDING, {"updated": time.time_ns() - 3600 * NS_PER_S}, 2),
+        (RecorderState.RECORDING, {"silent": ("/scan",)}, 1),
+        (RecorderState.RECORDING, {"last_error": "ros2 bag record died"}, 1),
+    ],
+)
+def test_a_recorder_that_does_not_record_is_told(
+    robot: Path, capsys: Capture, state: RecorderState, more: dict[str, Any], code: int
+) -> None:
+    beat(robot, state, **more)
+    ended, wrong = examined(capsys)
+    assert (ended, [*wrong]) == (code, ["recorder"])
+
+
+def test_where_no_recorder_ever_wrote_it_says_how_to_start_one(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot / "recorder.json").unlink()
+    code, wrong = examined(capsys)
+    assert code == 2
+    assert "systemctl start" in wrong["recorder"][0]["do"]
+
+
+def test_a_missing_setup_file_is_named(robot: Path, capsys: Capture) -> None:
+    code, wrong = examined(capsys, "recorder.setup_files=[/opt/ros/none/setup.bash]")
+    assert code == 2
+    assert "/opt/ros/none/setup.bash" in wrong["ros"][0]["seen"]
+    assert "recorder.setup_files" in wrong["ros"][0]["do"]
+
+
+def test_a_topic_that_is_listed_and_not_recorded_is_told_with_what_is_like_it(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot.parent / "topics.yaml").write_text("topics: [/odom, /odom_, /vision/*/objects]\n")
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert [each["seen"].split()[0] for each in wrong["topics"]] == ["/odom_", "/vision/*/objects"]
+    assert "is it /odom?" in wrong["topics"][0]["do"]
+
+
+class TestTheServer:
+    def test_where_nothing_answers_it_says_how_to_start_it(
+        self, robot: Path, capsys: Capture
+    ) -> None:
+        code, wrong = examined(capsys, "server.port=1")
+        assert code == 2
+        assert "ros2-memory-server" in wrong["server"][0]["do"]
+
+    def test_another_program_is_recognised(self, robot: Path, capsys: Capture) -> None:
+        Answering.reply = b"<html>a printer</html>"
+        code, wrong = examined(capsys)
+        assert code == 2
+        assert "another program" in wrong["server"][0]["seen"]
+
+    def test_its_problems_are_told(self, robot: Path, capsys: Capture) -> None:
+        Answering.reply = b'{"status": "degraded", "problems": ["the bag directory is gone"]}'
+        code, wrong = examined(capsys)
+        assert code == 1
+        assert "the bag directory is gone" in wrong["server"][0]["seen"]
