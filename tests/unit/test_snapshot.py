@@ -178,3 +178,20 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
 def test_a_timeline_to_which_nothing_happens_stays_itself() -> None:
     timeline = Timeline.of([_bag("a", ("/odom", 0, 9))])
     assert timeline.changed([], iter(())) is timeline
+
+
+def test_which_recordings_hold_a_topic_is_known_anew_whatever_changes() -> None:
+    def split(number: int, until: int = 9) -> BagFile:
+        folder = f"rec_{number // 100}"
+        return _bag(f"{folder}/{number}.mcap", ("/odom", number * 10, number * 10 + until))
+
+    first = 2 * RUN_LIMIT - 3
+    timeline = Timeline.of(split(number) for number in range(first))
+    for number in range(first, first + 6):  # past the end of a run
+        timeline = timeline.changed([], [split(number, 0)])
+        for before, until in ((0, 4), (4, 9)):
+            timeline = timeline.changed([split(number, before)], [split(number, until)])
+            assert timeline.recordings("/odom") == Timeline.of(timeline.bags).recordings("/odom")
+    for number in (0, RUN_LIMIT, first + 5):
+        timeline = timeline.changed([split(number)], [])
+        assert timeline.recordings("/odom") == Timeline.of(timeline.bags).recordings("/odom")

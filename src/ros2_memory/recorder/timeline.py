@@ -12,19 +12,17 @@ from functools import cached_property, lru_cache
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-import numpy as np
-
 from ros2_memory.model import BagState
+from ros2_memory.recorder.columns import all_alike, column_of, rows_in
 from ros2_memory.recorder.courses import courses_of
 from ros2_memory.recorder.layout import CARRY_FILE, is_carried
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from ros2_memory.model import BagFile, TimeWindow, TopicSummary
+    from ros2_memory.recorder.columns import Alike, Column
     from ros2_memory.recorder.courses import Course, Series
     from ros2_memory.summaries import Shape
     from ros2_memory.timebase import Ns
@@ -70,23 +68,6 @@ class Stated(NamedTuple):
         return Stated(
             min(self.first, other.first), max(self.last, other.last), self.messages + other.messages
         )
-
-
-class _Alike(NamedTuple):
-    """Bags of one shape: where they lie in their run, and their numbers by bag and topic."""
-
-    shape: Shape
-    at: NDArray[np.intp]
-    numbers: NDArray[np.int64]
-
-
-class _Column(NamedTuple):
-    """What the bags of a run hold of one topic, in bag order, one row for each of its types."""
-
-    at: NDArray[np.intp]
-    firsts: NDArray[np.int64]
-    lasts: NDArray[np.int64]
-    places: NDArray[np.intp]
 
 
 class Run:
@@ -171,7 +152,7 @@ class Run:
         column = self._column(topic)
         if column is None:
             return
-        rows = _rows(column, window)
+        rows = rows_in(column, window)
         for at, place in zip(column.at[rows].tolist(), column.places[rows].tolist(), strict=True):
             bag = self.bags[at]
             yield bag, bag.summary.at(place)
@@ -181,7 +162,7 @@ class Run:
         column = self._column(topic)
         if column is None:
             return
-        rows = _rows(column, window)
+        rows = rows_in(column, window)
         columns = (column.at, column.firsts, column.lasts)
         for at, first, last in zip(*(each[rows].tolist() for each in columns), strict=True):
             yield Extent(self.bags[at], first, last)
@@ -194,11 +175,11 @@ class Run:
         places = [] if column is None else column.at.tolist()
         return tuple(self.bags[at] for at in dict.fromkeys(places))
 
-    def _column(self, topic: str) -> _Column | None:
+    def _column(self, topic: str) -> Column | None:
         """What is held of a topic; None where nothing is."""
         numbers = _at_hand(self)
         if topic not in numbers.columns:
-            numbers.columns[topic] = _column_of(numbers.alike, topic)
+            numbers.columns[topic] = column_of(numbers.alike, topic)
         return numbers.columns[topic]
 
     @cached_property
@@ -236,6 +217,7 @@ class Timeline:
     def __init__(self, runs: Sequence[Run] = ()) -> None:
         self._runs = tuple(runs)
         self._recordings: dict[str, dict[Path, Span]] = {}
+        self._before_last: dict[str, dict[Path, Span]] = {}  # of all runs but the last
 
     @property
     def runs(self) -> tuple[Run, ...]:
@@ -275,7 +257,11 @@ class Timeline:
                 runs.extend(_runs_of(sorted(touched[at], key=in_time)))
             else:
                 runs.append(run)
-        return Timeline(runs)
+        changed = Timeline(runs)
+        if touched.keys() == {len(runs) - 1}:
+            # Mostly it is the end that changes, often while a file there grows.
+            changed._before_last = self._before_last
+        return changed
 
     @cached_property
     def _firsts(self) -> list[tuple[Ns, Ns, str]]:
@@ -308,11 +294,10 @@ class Timeline:
     def recordings(self, topic: str) -> dict[Path, Span]:
         """The recordings that hold the topic, each with the times of its first and last message."""
         if topic not in self._recordings:
-            spans: dict[Path, Span] = {}
-            for run in self._runs:
-                for folder, span in run.recordings(topic).items():
-                    spans[folder] = _wider(spans.get(folder), span)
-            self._recordings[topic] = spans
+            if topic not in self._before_last:
+                self._before_last[topic] = _recordings(self._runs[:-1], topic, {})
+            known = self._before_last[topic]
+            self._recordings[topic] = _recordings(self._runs[-1:], topic, known)
         return self._recordings[topic]
 
     @cached_property
@@ -387,6 +372,15 @@ def _runs_of(bags: Sequence[BagFile]) -> list[Run]:
     return [Run(bags[at : at + RUN_LIMIT]) for at in range(0, len(bags), RUN_LIMIT)]
 
 
+def _recordings(runs: Iterable[Run], topic: str, known: Mapping[Path, Span]) -> dict[Path, Span]:
+    """The recordings that hold the topic in some runs, besides those that are known."""
+    spans = dict(known)
+    for run in runs:
+        for folder, span in run.recordings(topic).items():
+            spans[folder] = _wider(spans.get(folder), span)
+    return spans
+
+
 def _wider(known: Span | None, span: Span) -> Span:
     return span if known is None else (min(known[0], span[0]), max(known[1], span[1]))
 
@@ -394,52 +388,12 @@ def _wider(known: Span | None, span: Span) -> Span:
 class _Numbers:
     """The numbers of a run's bags, and what of them was asked for."""
 
-    def __init__(self, alike: tuple[_Alike, ...]) -> None:
+    def __init__(self, alike: tuple[Alike, ...]) -> None:
         self.alike = alike
-        self.columns: dict[str, _Column | None] = {}
+        self.columns: dict[str, Column | None] = {}
 
 
 @lru_cache(maxsize=_RUNS_AT_HAND)
 def _at_hand(run: Run) -> _Numbers:
     """The numbers of a run: a copy of what its summaries say, so of a week few are held."""
-    places: dict[int, list[int]] = {}
-    for place, bag in enumerate(run.bags):
-        places.setdefault(id(bag.summary.shape), []).append(place)
-    return _Numbers(tuple(_alike([run.bags[place] for place in at], at) for at in places.values()))
-
-
-def _alike(bags: Sequence[BagFile], at: Sequence[int]) -> _Alike:
-    shape = bags[0].summary.shape
-    packed = b"".join([bag.summary.numbers for bag in bags])
-    numbers = np.frombuffer(packed, "<i8").reshape(len(bags), len(shape.topics), 3)
-    return _Alike(shape, np.array(at, np.intp), numbers)
-
-
-def _column_of(alike: Iterable[_Alike], topic: str) -> _Column | None:
-    columns = [
-        _Column(
-            at,
-            numbers[:, place, 1],
-            numbers[:, place, 2],
-            np.broadcast_to(np.intp(place), at.shape),
-        )
-        for shape, at, numbers in alike
-        for place in shape.places.get(topic, ())
-    ]
-    if len(columns) < 2:
-        return columns[0] if columns else None
-    at = np.concatenate([each.at for each in columns])
-    places = np.concatenate([each.places for each in columns])
-    order = np.lexsort((places, at))
-    return _Column(
-        at[order],
-        np.concatenate([each.firsts for each in columns])[order],
-        np.concatenate([each.lasts for each in columns])[order],
-        places[order],
-    )
-
-
-def _rows(column: _Column, window: TimeWindow | None) -> NDArray[np.intp]:
-    if window is None:
-        return np.arange(len(column.at))
-    return np.flatnonzero((column.firsts < window.stop) & (column.lasts >= window.start))
+    return _Numbers(all_alike(run.bags))
