@@ -93,12 +93,9 @@ class View(Streams):
         if recall is None or len(numbers) < len(involved):
             return self._count_contest(topic, window, involved)
         question = json.dumps(["contest", topic, window.start, window.stop])
-        remembered = recall.remembered(question, numbers)
+        remembered = recall.remembered(question, numbers, _contest)
         if remembered is not None:
-            return {
-                type_name: (Census(*standing), Census(*once))
-                for type_name, (standing, once) in json.loads(remembered).items()
-            }
+            return remembered
         counted = self._count_contest(topic, window, involved)
         if self.complete:
             answer = {
@@ -115,6 +112,13 @@ class View(Streams):
         merged = self.merged(involved, [topic], window, newest_first=False)
         once = _counted(once_forward(merged, [(window.start, window.stop)]))
         return {type_name: (standing[type_name], once[type_name]) for type_name in once}
+
+
+def _contest(answer: str) -> dict[str, tuple[Census, Census]]:
+    return {
+        type_name: (Census(*standing), Census(*once))
+        for type_name, (standing, once) in json.loads(answer).items()
+    }
 
 
 def _counted(found: Iterable[Found]) -> dict[str, Census]:

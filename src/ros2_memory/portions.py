@@ -88,11 +88,11 @@ class Kept(Generic[T]):
         recall, numbers = self._view.memory.recall, self._numbers(group)
         if recall is None or numbers is None:
             return None
-        answer = recall.remembered(self._question, numbers)
-        if answer is None:
-            return None
+        return recall.remembered(self._question, numbers, self._parsed)
+
+    def _parsed(self, answer: str) -> tuple[T, tuple[Ns, Ns]]:
         packed, first, last = json.loads(answer)
-        return self._kind.unpacked(packed), (first, last)
+        return self._kind.unpacked(packed), (int(first), int(last))
 
     def _numbers(self, group: Group) -> list[int] | None:
         """The entries of the group's bags; None where one has none."""

@@ -199,9 +199,16 @@ class Recall:
             return None
         return known
 
-    def remembered(self, question: str, numbers: Sequence[int]) -> str | None:
-        """What was once worked out from these entries."""
-        return self.catalogue.remembered(question, numbers)
+    def remembered(
+        self, question: str, numbers: Sequence[int], parsed: Callable[[str], T]
+    ) -> T | None:
+        """What was once worked out from these entries; None where nothing that can be parsed."""
+        answer = self.catalogue.remembered(question, numbers)
+        try:
+            return None if answer is None else parsed(answer)
+        # A damaged file holds anything.
+        except (ValueError, TypeError, LookupError, AttributeError):
+            return None
 
     def remember(self, question: str, numbers: Sequence[int], answer: str) -> None:
         """Keeps what was worked out from these entries, for as long as they stand."""

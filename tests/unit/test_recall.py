@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from typing import TYPE_CHECKING
 
+import pytest
+
 from ros2_memory.catalogue import FILE, FOLDER
+from ros2_memory.memory import Call
+from ros2_memory.moments import Span
+from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from tests.bags import odom, write_mcap
 from tests.memories import memory_of
 from tests.recalled import recalling
@@ -55,3 +62,24 @@ def test_what_a_catalogue_said_that_is_no_more_does_not_settle_anything(tmp_path
     recall.as_of()
     assert recall.settled(run) is None
     assert not recall.notes(run, recall.as_of()).numbers
+
+
+@pytest.mark.parametrize("answer", ["", "x", "7", "[]", '["zz", 1, 2]', '{"a": [[1], 2]}'])
+def test_what_cannot_be_read_of_what_was_worked_out_is_worked_out_again(
+    tmp_path: Path, answer: str
+) -> None:
+    for recording in ("a", "b"):
+        messages = [odom(T0 + n, 0.1 * n, 0.0) for n in range(5)]
+        write_mcap(tmp_path / recording / f"{recording}_0.mcap", messages)
+    memory = recalling(memory_of(tmp_path), tmp_path)
+
+    def told() -> object:
+        way = trajectory_summary(memory, Call(), Span(start_s=0.0, end_s=9e9))
+        return list_recorded_topics(memory, Call()), way
+
+    before = told()
+    with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
+        changed = base.execute("UPDATE remembered SET answer = ?", (answer,)).rowcount
+        base.commit()
+    assert changed == 2
+    assert told() == before
