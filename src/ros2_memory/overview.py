@@ -59,6 +59,7 @@ def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
     """
     now = memory.clock.now()
     view = View(memory, call, now if memory.limits.now == "wall" else None)
+    view.count_all()
     snapshot = view.snapshot
     if memory.limits.now == "latest" and snapshot.latest is not None:
         now = snapshot.latest
@@ -152,9 +153,9 @@ def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
 
 
 def _note_odd_bags(view: View) -> None:
-    """Says of the newest closed bags that are odd what is odd about them."""
+    """Says of the newest bags that are odd, and not left open, what is odd about them."""
     bags = view.snapshot.odd(TimeWindow.everything())
-    odd = [bag for bag in bags if bag.state is BagState.CLOSED]
+    odd = [bag for bag in bags if bag.state is not BagState.INCOMPLETE]
     for bag in odd[-_ODD_BAGS:]:
         view.note(f"{short_name(bag.path)}: {'; '.join(bag.summary.notes)}")
     more = len(odd) - _ODD_BAGS

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.copies import Found
 from ros2_memory.errors import BagError, BagVanishedError, QueryTimeoutError
 from ros2_memory.model import BagState, TimeWindow
+from ros2_memory.timebase import MIN_NS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -89,6 +90,11 @@ class Reading:
                 self.call.sources.active = True
             yield each
 
+    def count_all(self) -> None:
+        """As `used` for an answer that is about all bags as the index knows them."""
+        if any(aside.until is not None for aside in self.snapshot.active):
+            self.call.sources.active = True
+
     def log_times(self, bag: BagFile, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """The log times of one bag's messages; empty, with a note, where they cannot be read."""
         self.check_deadline()
@@ -108,8 +114,8 @@ class Reading:
             self.skip(bag, error)
             return ()
 
-    def skip(self, bag: BagFile, error: BagError) -> None:
-        """Notes that a bag, or the rest of it, is not part of the answer."""
+    def skip(self, bag: BagFile, error: BagError, since: Ns = MIN_NS) -> None:
+        """Notes that a bag, or some of it, is not part of the answer, be it since a moment."""
         self.complete = False
         name = short_name(bag.path)
         if isinstance(error, BagVanishedError):
@@ -119,6 +125,8 @@ class Reading:
         else:
             sentence = f"{name} could not be read to its end: {error.reason}"
         last = bag.end if error.lost is None else error.lost[1]
+        if last < since:
+            return
         self._lacking[sentence] = max(last, self._lacking.get(sentence, last))
         self.note(sentence)
 
@@ -139,17 +147,28 @@ class Reading:
         window: TimeWindow,
         *,
         newest_first: bool = False,
+        since: Ns = MIN_NS,
     ) -> Iterator[Found]:
-        """One bag's messages; what of it cannot be read is noted, and disturbs no other."""
+        """One bag's messages; what of it cannot be read is noted, and disturbs no other.
+
+        Not noted is what is lost before `since` alone: what is read there is read for copies only.
+        """
         self.check_deadline()
         kept = self._kept(bag, topics)
         if kept is None:
-            return self._read(bag, topics, _known(bag, window), newest_first=newest_first)
+            known = _known(bag, window)
+            return self._read(bag, topics, known, newest_first=newest_first, since=since)
         ordered = reversed(kept) if newest_first else iter(kept)
         return (Found(bag, each) for each in ordered if window.contains(each.log_time))
 
     def _read(
-        self, bag: BagFile, topics: Sequence[str], window: TimeWindow, *, newest_first: bool
+        self,
+        bag: BagFile,
+        topics: Sequence[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool,
+        since: Ns,
     ) -> Iterator[Found]:
         records: Iterator[Record] | None = None
         clock, spent, count = time.perf_counter_ns, 0, 0
@@ -167,7 +186,7 @@ class Reading:
                     yield Found(bag, record)
                     begin = clock()
             except BagError as error:
-                self.skip(bag, error)
+                self.skip(bag, error, since)
                 if error.lost is None:
                     return
             else:

@@ -31,6 +31,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     """What the recorder does, how old the newest data is, what fell silent, what is amiss."""
     wall = memory.clock.now()
     view = View(memory, call, wall)
+    view.count_all()
     snapshot, heartbeat = view.snapshot, memory.index.heartbeat()
     latest = snapshot.dating.latest
     now = wall if memory.limits.now == "wall" or latest is None else latest

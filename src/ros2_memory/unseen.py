@@ -137,7 +137,7 @@ def amiss(bags: Sequence[BagFile]) -> Iterator[str]:
     """The sentences on bags that are not whole or contradict themselves."""
     if bags:
         yield from _left_open([bag for bag in bags if bag.state is BagState.INCOMPLETE])
-        yield from _odd([bag for bag in bags if bag.state is BagState.CLOSED])
+        yield from _odd([bag for bag in bags if bag.state is not BagState.INCOMPLETE])
 
 
 def misdated(faults: Sequence[ClockFault]) -> str:

@@ -29,7 +29,9 @@ from ros2_memory.replies import Replies
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools import build_tools
 from tests.bags import McapLayout, Msg, odom, write_db3, write_mcap
+from tests.mcap_surgery import spoil_chunk
 from tests.memories import SettableClock, memory_of
+from tests.recalled import recalling
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -186,12 +188,42 @@ def test_an_active_file_answers_and_is_named_as_active_all_the_same(tail: Tail) 
     tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
     assert tail.states() == [BagState.ACTIVE]
     told = tail.asked("data_time_range")
-    assert told["bags"] == 1
+    assert (told["bags"], told["from_active"]) == (1, True)
+    assert tail.asked("memory_status")["from_active"] is True
     assert told["active"] == [
         {"file": "rec_0.mcap", "reason": "still being written: its complete chunks answer"}
     ]
     assert (told["incomplete"], told["damaged"]) == ([], [])
     assert not any("ends early" in note for note in told.get("notes", ()))
+
+
+@pytest.mark.parametrize("recall", [False, True], ids=["plain", "catalogue"])
+def test_what_is_amiss_inside_is_told_before_the_split_closes(tail: Tail, recall: bool) -> None:
+    content, ends = split(LAYOUTS[0])
+    path = tail.write("rec/rec_0.mcap", content, at=10 * S)
+    spoil_chunk(path, 1)
+    tail.write("rec/rec_0.mcap", path.read_bytes()[: ends[3][0]], at=10 * S)
+    if recall:
+        tail.memory = recalling(tail.memory, tail.bag_dir)
+    notes = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 9)["notes"]
+    assert any(note.startswith("rec/rec_0.mcap: 1 damaged") for note in notes), notes
+    assert not any("crash" in note for note in notes)
+
+
+def test_with_the_catalogue_the_same_is_answered(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0], at=10 * S)
+    tail.clock.at = T0 + 60 * S
+    catalogued = recalling(tail.memory, tail.bag_dir)
+    later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
+    near = {"condition_type": "near_position", "value": {"x": 14.2, "y": 0}}
+    for cut in range(4096, len(later), 4096):
+        tail.write("rec/rec_1.mcap", later[:cut], at=60 * S + cut)
+        for name, arguments in (
+            ("find_last_match", {"topic": "/odom", **near}),
+            ("trajectory_summary", {"start": T0 / S, "end": T0 / S + 30}),
+            ("get_topic_in_range", {"topic": "/odom", "start": T0 / S, "end": T0 / S + 30}),
+        ):
+            assert told(catalogued, name, **arguments) == tail.asked(name, **arguments)
 
 
 def test_a_file_that_is_no_bag_yet_stays_aside(tail: Tail) -> None:

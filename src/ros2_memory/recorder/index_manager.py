@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.errors import BagVanishedError
+from ros2_memory.model import BagState
 from ros2_memory.recorder.disposal import Disposed
 from ros2_memory.recorder.dormant import Dormant
 from ros2_memory.recorder.heartbeat import read_heartbeat
@@ -30,7 +31,7 @@ from ros2_memory.recorder.standing import FileNotes, Scene, Standing, judge
 from ros2_memory.timebase import ms_from_ns, ns_from_unix
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from structlog.typing import FilteringBoundLogger
 
@@ -209,7 +210,7 @@ class IndexManager:
             return self._published
         self._odd = odd
         self._published = self._compose(scene.now)
-        self._report(before, self._published, len(removed), len(added), begun)
+        self._report(before, self._published, removed, added, begun)
         return self._published
 
     def _scene(self) -> Scene:
@@ -391,18 +392,25 @@ class IndexManager:
         )
 
     def _report(
-        self, before: Snapshot | None, after: Snapshot, removed: int, added: int, begun: Ns
+        self,
+        before: Snapshot | None,
+        after: Snapshot,
+        removed: Sequence[BagFile],
+        added: Sequence[BagFile],
+        begun: Ns,
     ) -> None:
         known = set() if before is None else set(before.damaged)
         for each in after.damaged:
             if each not in known:
                 self._log.warning("bag_damaged", path=str(each.path), reason=each.reason)
-        self._log.info(
+        # One that grows and answers does so with every question.
+        grew = removed and all(bag.state is BagState.ACTIVE for bag in (*removed, *added))
+        (self._log.debug if grew else self._log.info)(
             "index_scanned",
             bag_dir=str(self.bag_dir),
             bags=len(after.bags),
-            added=added,
-            removed=removed,
+            added=len(added),
+            removed=len(removed),
             active=len(after.active),
             damaged=len(after.damaged),
             unread=len(after.unread),
