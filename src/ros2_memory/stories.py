@@ -7,7 +7,7 @@ long as nothing is left out for being too much.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.things import things_of
 from ros2_memory.timebase import NS_PER_S, Ns
@@ -17,11 +17,15 @@ if TYPE_CHECKING:
 
     from ros2_memory.model import JsonValue
 
+T = TypeVar("T")
+
 SILENCE_NS: Final[Ns] = 10 * NS_PER_S
 """After so long without a message a thing counts as gone: many detectors speak only of what is."""
 
 MOST_TOLD: Final = 64
 """Presences, flips and faults of one topic in one bag that are kept, each; the rest is counted."""
+MOST_HELD: Final = 20_000
+"""The same of a topic in all bags together: what a question about a week may hold in memory."""
 MOST_FLAGS: Final = 16
 
 _ERROR: Final = 2
@@ -100,7 +104,7 @@ class Story:
         known: each boolean's value at either end.
         flips: in order.
         faults: by the time of their first report.
-        left_out: presences, flips and faults beyond what is kept.
+        left_out: presences, flips and faults beyond what is kept; the earliest ones are.
         undecodable: messages that cannot be decoded, of which nothing is told; where there are no
             others, `first` lies after `last`.
     """
@@ -195,7 +199,8 @@ class StoryBuilder:
         flips = [
             Flip(known.path, known.at, known.first) for known in story.known if self._turns(known)
         ]
-        self._flips += sorted([*flips, *story.flips], key=lambda flip: flip.time)
+        for flip in sorted([*flips, *story.flips], key=lambda flip: flip.time):
+            self._add(self._flips, flip)
         for known in story.known:
             self._learn(known)
         for fault in story.faults:
@@ -237,7 +242,8 @@ class StoryBuilder:
                 if before is None
                 else before._replace(last=each.last, messages=before.messages + each.messages)
             )
-        self._over += self._open.values()
+        for each in self._open.values():
+            self._add(self._over, each)
         self._open = goes_on
 
     def _turns(self, known: Known) -> bool:
@@ -246,20 +252,33 @@ class StoryBuilder:
 
     def _flag(self, known: Known) -> None:
         if self._turns(known):
-            self._flips.append(Flip(known.path, known.at, known.first))
+            self._add(self._flips, Flip(known.path, known.at, known.first))
         self._learn(known)
 
     def _learn(self, known: Known) -> None:
         before = self._known.get(known.path)
+        if before is None and len(self._known) >= MOST_HELD:
+            self._left_out += 1
+            return
         self._known[known.path] = known if before is None else before._replace(last=known.last)
 
     def _end(self, label: str) -> None:
         """A thing is gone, if it was there."""
         if label in self._open:
-            self._over.append(self._open.pop(label))
+            self._add(self._over, self._open.pop(label))
+
+    def _add(self, to: list[T], each: T) -> None:
+        """Adds one to what is over, or counts it where that is too much."""
+        if len(to) < MOST_HELD:
+            to.append(each)
+        else:
+            self._left_out += 1
 
     def _fault(self, fault: Fault) -> None:
         before = self._faults.get(fault.text)
+        if before is None and len(self._faults) >= MOST_HELD:
+            self._left_out += 1
+            return
         self._faults[fault.text] = (
             fault
             if before is None

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory import stories
 from ros2_memory.model import JsonValue
 from ros2_memory.stories import (
     NOTHING,
     Fault,
     Flip,
+    Known,
     Presence,
     State,
     Story,
@@ -132,6 +135,32 @@ def test_what_is_beyond_the_limit_is_counted() -> None:
     assert story is not None
     assert len(story.seen) == 3
     assert story.left_out == 7
+
+
+def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(stories, "MOST_HELD", 10)
+    builder = StoryBuilder()
+    for nth in range(15):
+        at = nth * 100 * NS_PER_S
+        known = [Known(path, at, first=False, last=True) for path in ("x", "y")]
+        builder.join(
+            Story(
+                at,
+                at + NS_PER_S,
+                seen=(Presence(f"cup {nth}", at, at, 1),),
+                known=tuple(known),
+                flips=tuple(Flip(each.path, at + 1, True) for each in known),
+                faults=(Fault(f"error {nth}", at, at, 1),),
+            )
+        )
+    story = builder.story()
+    assert story is not None
+    assert len(story.seen) == len(story.flips) == len(story.faults) == 10
+    assert story.seen[0].label == "cup 0"
+    flips = 2 * 15 + 2 * 14
+    assert story.left_out == (15 - 10) + (flips - 10) + (15 - 10)
 
 
 def test_messages_that_say_nothing_make_a_story_that_says_nothing() -> None:
