@@ -1,0 +1,165 @@
+"""`ros2-memory export`: a time window as an MCAP file, or as rows of Parquet."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from ros2_memory.cli.running import (
+    NOT_SO,
+    BagDir,
+    Overrides,
+    opened,
+    reporting,
+    say,
+    settings_for,
+)
+from ros2_memory.cli.windows import End, Last, Start, window_of
+from ros2_memory.copies import Found
+from ros2_memory.errors import ConfigError, InvalidArgumentsError, NoDataError, NoDataReason
+from ros2_memory.globs import matching
+from ros2_memory.history import View
+from ros2_memory.memory import Call, Memory
+from ros2_memory.model import TimeWindow
+from ros2_memory.storage.base import Record
+from ros2_memory.storage.mcap_writer import McapWriter
+from ros2_memory.timebase import Ns
+from ros2_memory.unseen import note_unseen
+from ros2_memory.wording import counted
+
+_TELL_EVERY: Final = 512
+
+
+def export(
+    overrides: Overrides = None,
+    *,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="An MCAP file to make, for Foxglove, ros2 bag and rosbags."
+        ),
+    ] = None,
+    parquet: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="A folder of Parquet, by recording and date, for DuckDB or Spark."
+        ),
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(metavar="GLOB", help="Only these topics, such as /vision/*; repeatable."),
+    ] = None,
+    start: Start = None,
+    end: End = None,
+    last: Last = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Parquet by robot, too: one dataset for a fleet."),
+    ] = None,
+    bag_dir: BagDir = None,
+) -> None:
+    """Copy a time window out of the memory, each message once.
+
+    MCAP has the original messages, definitions, log and publish times. Parquet has one row for a
+    message: what it says as JSON, and its pose in columns. Needs ros2-memory[parquet]. The exit
+    code is 1 where something of the window could not be read; stderr says what.
+    """
+    with reporting("export"):
+        if (mcap is None) == (parquet is None):
+            raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
+        settings = settings_for(bag_dir, overrides)
+        memory = opened(settings)
+        view = View(memory, Call())
+        window = window_of(memory, view.snapshot, start, end, last)
+        topics = _topics(view, topic or ())
+        note_unseen(view, window)
+        with _progress(view, window) as tell:
+            found = _told(view.stream(topics, window), tell)
+            if mcap is not None:
+                done = _as_mcap(mcap, found)
+            elif parquet is not None:
+                done = _as_parquet(parquet, found, memory, robot)
+    say(done)
+    for note in view.notes:
+        typer.echo(f"note: {note}", err=True)
+    if not view.complete:
+        raise typer.Exit(NOT_SO)
+
+
+def _topics(view: View, globs: Sequence[str]) -> list[str]:
+    """The recorded topics that are asked for.
+
+    Raises:
+        NoDataError: there is none.
+    """
+    names = view.snapshot.topics()
+    chosen = [name for glob in globs or ("*",) for name in matching(names, glob)]
+    if not chosen:
+        asked = f"no recorded topic matches {', '.join(globs)}" if globs else "nothing is recorded"
+        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{asked}; see ros2-memory topics")
+    return sorted(set(chosen))
+
+
+def _as_mcap(path: Path, found: Iterator[Found]) -> str:
+    """Writes the file; what was done, in a sentence.
+
+    Raises:
+        BagError: it cannot be written.
+        NoDataError: there is no message.
+    """
+    first = next(found, None)
+    if first is None:
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, "no message lies in the window")
+    written = 0
+
+    def records() -> Iterator[Record]:
+        nonlocal written
+        for each in chain((first,), found):
+            written += 1
+            yield each.record
+
+    McapWriter().write(path, records())
+    return f"{counted(written, 'message')} in {path}"
+
+
+def _as_parquet(path: Path, found: Iterator[Found], memory: Memory, robot: str | None) -> str:
+    """Writes the rows; what was done, in a sentence.
+
+    Raises:
+        ConfigError: the optional dependency is missing.
+    """
+    try:
+        from ros2_memory.cli.parquet import Dataset  # noqa: PLC0415 - an extra that few install
+    except ImportError as error:
+        raise ConfigError(
+            f"Parquet needs the optional part of this package (no {error.name}): "
+            "pip install 'ros2-memory[parquet]'"
+        ) from error
+    with Dataset(path, memory.reader, memory.extractor, robot) as dataset:
+        for each in found:
+            dataset.add(each)
+    return f"{counted(dataset.rows, 'message')} in {counted(dataset.files, 'file')} below {path}"
+
+
+def _told(found: Iterator[Found], tell: Callable[[Ns], None]) -> Iterator[Found]:
+    for number, each in enumerate(found):
+        if number % _TELL_EVERY == 0:
+            tell(each.time)
+        yield each
+
+
+@contextmanager
+def _progress(view: View, window: TimeWindow) -> Iterator[Callable[[Ns], None]]:
+    """A bar along the window on a terminal, and nothing elsewhere."""
+    bags = view.snapshot.overlapping(window)
+    first = max(window.start, min((bag.start for bag in bags), default=0))
+    last = min(window.stop, max((bag.end for bag in bags), default=0) + 1)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("exporting", total=max(last - first, 1))
+        yield lambda at: bar.update(task, completed=max(at - first, 0))

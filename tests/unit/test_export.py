@@ -1,0 +1,249 @@
+"""`ros2-memory export`: what comes out is what was recorded, and other programs read it."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import duckdb
+import pytest
+from rosbags.rosbag2 import Reader
+
+from ros2_memory import cli
+from ros2_memory.cli.windows import unix_of
+from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.model import TimeWindow
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.timebase import NS_PER_S
+from tests.bags import McapLayout, Msg, odom, text, write_db3, write_mcap
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0 = 1_700_000_000 * NS_PER_S
+Capture = pytest.CaptureFixture[str]
+Row = tuple[str, int, bytes]
+
+
+def driven(start: int, number: int) -> list[Msg]:
+    """Ten seconds of odometry at 10 Hz around a corner, and a word a second."""
+    messages: list[Msg] = []
+    for n in range(100):
+        at = start + n * NS_PER_S // 10
+        x, y = (n / 20, 0.1) if n < 50 else (2.5, 0.1 + (n - 50) / 20)
+        messages.append(odom(at, x + number / 7, y))
+        if n % 10 == 0:
+            messages.append(text(at, f"word {number} {n} ü"))
+    return messages
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two recordings, the second on another day (UTC)."""
+    folder = tmp_path / "bags"
+    for number, start in enumerate((T0, T0 + 86_400 * NS_PER_S)):
+        write_mcap(folder / f"rec_{number}" / f"rec_{number}_0.mcap", driven(start, number))
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "replay")
+    return folder
+
+
+def left(path: Path) -> None:
+    """Nobody has written to the file for an hour."""
+    hour_ago = time.time() - 3600
+    os.utime(path, (hour_ago, hour_ago))
+
+
+def read(path: Path) -> list[Row]:
+    """Topic, log time and payload of all messages of a file, by plain rosbags."""
+    with Reader(path) as reader:
+        return [(connection.topic, at, bytes(raw)) for connection, at, raw in reader.messages()]
+
+
+class TestMcap:
+    def test_plain_rosbags_reads_the_very_messages_of_the_window(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        out = tmp_path / "out.mcap"
+        start, end = str(T0 / NS_PER_S + 2), str(T0 / NS_PER_S + 5)
+        assert cli.main(["export", "--mcap", str(out), "--start", start, "--end", end]) == 0
+        source = read(bag_dir / "rec_0" / "rec_0_0.mcap")
+        wanted = [row for row in source if T0 + 2 * NS_PER_S <= row[1] <= T0 + 5 * NS_PER_S]
+        assert read(out) == wanted
+        assert len(wanted) == 35
+        assert "35 messages" in capsys.readouterr().out
+
+    def test_publish_times_definitions_and_what_publishers_offer_stay(self, tmp_path: Path) -> None:
+        published = T0 - 5 * NS_PER_S
+        message = Msg("/word", "std_msgs/msg/String", T0, text(T0, "x").body, published)
+        folder = tmp_path / "bags"
+        write_mcap(
+            folder / "rec" / "rec_0.mcap", [message], McapLayout(latched=frozenset({"/word"}))
+        )
+        out = tmp_path / "out.mcap"
+        words = ["export", "--mcap", str(out), "--bag-dir", str(folder), "deployment=replay"]
+        assert cli.main(words) == 0
+        with Reader(out) as reader:
+            connection = reader.connections[0]
+            assert connection.msgtype == "std_msgs/msg/String"
+            assert "string data" in connection.msgdef.data
+            assert "transient_local" in str(connection.ext).lower()
+        (record,) = McapReader().records(out, ["/word"], TimeWindow.everything())
+        assert (record.log_time, record.publish_time) == (T0, published)
+
+    def test_what_two_recordings_hold_is_there_once(self, bag_dir: Path, tmp_path: Path) -> None:
+        copies = [
+            Msg(each.topic, each.type, each.log_time + 1000, each.body, each.published)
+            for each in driven(T0, 0)
+        ]
+        write_mcap(bag_dir / "rec_2" / "rec_2_0.mcap", copies)
+        out = tmp_path / "out.mcap"
+        assert cli.main(["export", "--mcap", str(out), "--end", str(T0 / NS_PER_S + 60)]) == 0
+        assert read(out) == read(bag_dir / "rec_0" / "rec_0_0.mcap")
+
+    def test_only_the_topics_that_were_asked_for(self, bag_dir: Path, tmp_path: Path) -> None:
+        out = tmp_path / "out.mcap"
+        assert cli.main(["export", "--mcap", str(out), "--topic", "/chat*", "--last", "20"]) == 0
+        assert {row[0] for row in read(out)} == {"/chatter"}
+
+    def test_sqlite_bags_become_mcap(self, tmp_path: Path) -> None:
+        left(write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", driven(T0, 0)))
+        out = tmp_path / "out.mcap"
+        words = ["export", "--mcap", str(out), "--bag-dir", str(tmp_path / "bags")]
+        assert cli.main([*words, "deployment=replay"]) == 0
+        assert len(read(out)) == 110
+
+    def test_a_file_is_never_overwritten(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        out = tmp_path / "out.mcap"
+        out.write_text("a letter")
+        assert cli.main(["export", "--mcap", str(out)]) == 2
+        assert out.read_text() == "a letter"
+        assert str(out) in capsys.readouterr().err
+
+    def test_of_a_window_without_messages_no_file_is_made(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        out = tmp_path / "out.mcap"
+        assert cli.main(["export", "--mcap", str(out), "--end", "1000"]) == 2
+        assert "no message" in capsys.readouterr().err
+        assert not out.exists()
+
+    def test_what_could_not_be_read_is_told_and_the_exit_code_is_1(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        source = bag_dir / "rec_0" / "rec_0_0.mcap"
+        left(write_mcap(source, driven(T0, 0), McapLayout(finish=False, chunk_size=500)))
+        assert cli.main(["export", "--mcap", str(tmp_path / "out.mcap")]) == 1
+        assert "rec_0_0.mcap" in capsys.readouterr().err
+
+
+class TestParquet:
+    def test_duckdb_computes_the_way_that_trajectory_summary_tells(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        start, end = T0 / NS_PER_S, T0 / NS_PER_S + 60
+        asked = json.dumps({"start": start, "end": end})
+        assert cli.main(["ask", "trajectory_summary", asked, "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)["distance_m"]
+        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 0
+        ((length,),) = queried(
+            tmp_path / "rows",
+            """
+            SELECT sum(sqrt((x - px)^2 + (y - py)^2 + (z - pz)^2)) FROM (
+              SELECT x, y, z, lag(x) OVER way AS px, lag(y) OVER way AS py, lag(z) OVER way AS pz
+              FROM memory
+              WHERE topic = '/odom' AND recording = 'rec_0'
+              WINDOW way AS (PARTITION BY recording ORDER BY log_time)
+            )
+            """,
+        )
+        assert length == pytest.approx(told, abs=1e-3)
+        assert told > 4
+
+    def test_there_is_a_row_for_each_message_by_recording_and_date(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 0
+        assert "220 messages in 2 files" in capsys.readouterr().out
+        rows = queried(
+            tmp_path / "rows",
+            "SELECT recording, CAST(date AS VARCHAR), count(*) FROM memory GROUP BY ALL ORDER BY 1",
+        )
+        assert rows == [("rec_0", "2023-11-14", 110), ("rec_1", "2023-11-15", 110)]
+
+    def test_times_are_exact_and_values_are_json(self, bag_dir: Path, tmp_path: Path) -> None:
+        words = ["export", "--parquet", str(tmp_path / "rows"), "--robot", "r2"]
+        assert cli.main([*words, "--topic", "/chatter", "--end", str(T0 / NS_PER_S)]) == 0
+        rows = queried(
+            tmp_path / "rows",
+            "SELECT robot, type, epoch_ns(log_time), epoch_ns(publish_time), value->>'value', x "
+            "FROM memory",
+        )
+        assert rows == [("r2", "std_msgs/msg/String", T0, T0, "word 0 0 ü", None)]
+
+    def test_nothing_can_stand_there_twice(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        words = ["export", "--parquet", str(tmp_path / "rows")]
+        assert cli.main(words) == 0
+        assert cli.main(words) == 2
+        assert "twice" in capsys.readouterr().err
+        assert len([*tmp_path.glob("rows/*/*/*")]) == 2
+
+    def test_what_cannot_be_decoded_has_a_row_that_says_why(
+        self, tmp_path: Path, capsys: Capture
+    ) -> None:
+        odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\x00\x01\x00\x00\x00")
+        layout = McapLayout(definitions=False)
+        write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [odd], layout)
+        words = ["export", "--parquet", str(tmp_path / "rows"), "--bag-dir", str(tmp_path / "bags")]
+        assert cli.main([*words, "deployment=replay"]) == 0
+        ((reason, value),) = queried(tmp_path / "rows", "SELECT undecodable, value FROM memory")
+        assert reason
+        assert value is None
+
+    def test_without_the_optional_part_it_says_how_to_get_it(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
+        monkeypatch.setitem(sys.modules, "pyarrow", None)
+        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 2
+        assert "ros2-memory[parquet]" in capsys.readouterr().err
+
+
+def queried(folder: Path, query: str) -> list[tuple[object, ...]]:
+    """What DuckDB gives for a query over `memory`, the dataset of a folder."""
+    dataset = f"read_parquet('{folder}/**/*.parquet', hive_partitioning = true)"
+    rows: list[tuple[object, ...]] = duckdb.execute(query.replace("memory", dataset)).fetchall()
+    return rows
+
+
+class TestWindows:
+    @pytest.mark.parametrize(
+        "words",
+        [
+            [],
+            ["--mcap", "a", "--parquet", "b"],
+            ["--mcap", "a", "--last", "5", "--start", "1"],
+            ["--mcap", "a", "--last", "0"],
+            ["--mcap", "a", "--start", "yesterday"],
+            ["--mcap", "a", "--start", "2", "--end", "1"],
+            ["--mcap", "a", "--topic", "/nothing"],
+        ],
+    )
+    def test_what_makes_no_sense_is_refused(
+        self, bag_dir: Path, capsys: Capture, words: list[str]
+    ) -> None:
+        assert cli.main(["export", *words]) == 2
+        assert capsys.readouterr().err
+
+    def test_times_are_unix_seconds_or_iso(self) -> None:
+        assert unix_of("1700000000.5") == 1_700_000_000.5
+        assert unix_of("2023-11-14T22:13:20+00:00") == 1_700_000_000
+        with pytest.raises(InvalidArgumentsError):
+            unix_of("noon")
