@@ -5,11 +5,15 @@ It stays small whatever is amiss: of many things the newest few are named, and a
 
 from __future__ import annotations
 
+from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import anyio
 import anyio.to_thread
 
+from ros2_memory.errors import BusyError
+from ros2_memory.lanes import Lane
 from ros2_memory.logs import get_logger
 from ros2_memory.overview import clock_faults, left_open
 from ros2_memory.reading import short_name
@@ -43,22 +47,38 @@ async def keep_fresh(memory: Memory, every_s: float) -> None:
         await anyio.sleep(every_s)
 
 
-async def health(
-    memory: Memory,
-    version: str,
-    filler: Filler | None = None,
-    patience_s: float = PATIENCE_S,
-) -> JsonObject:
-    """How the server is: `ok`, or `degraded` with the reasons in `problems`.
+class Health:
+    """Says how a server is, to whoever asks; for one event loop.
 
-    An empty memory is no problem, and neither are a topic that cannot be decoded, a bag that a
-    crash left open, or one that a wrong clock dated; they are counted. Times are Unix seconds.
+    One look is under way at a time, also where nobody waits for it any more: a disk that hangs
+    must not cost a thread with every question.
     """
-    with anyio.move_on_after(patience_s):
-        return await anyio.to_thread.run_sync(
-            _health, memory, version, filler, abandon_on_cancel=True
-        )
-    return _status(version, ["the bag directory is being looked through"], {})
+
+    def __init__(
+        self,
+        memory: Memory,
+        version: str,
+        filler: Filler | None = None,
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        self._look = partial(_health, memory, version, filler)
+        self._version = version
+        self._patience_s = patience_s
+        self._lane = Lane("health", 1)
+
+    def stop(self) -> None:
+        """Lets its thread go."""
+        self._lane.stop()
+
+    async def __call__(self) -> JsonObject:
+        """How it is: `ok`, or `degraded` with the reasons in `problems`.
+
+        An empty memory is no problem, and neither are a topic that cannot be decoded, a bag that a
+        crash left open, or one that a wrong clock dated; they are counted. Times are Unix seconds.
+        """
+        with anyio.move_on_after(self._patience_s), suppress(BusyError):
+            return await self._lane.run(None, self._look)
+        return _status(self._version, ["the bag directory is being looked through"], {})
 
 
 def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:

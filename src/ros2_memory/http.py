@@ -36,7 +36,7 @@ GRACE_S: Final = 0.4
 """How long requests under way may still take when the server stops; event streams end at once."""
 
 THREADS: Final = 4
-"""For what is not a question, such as `/health`. One that was needed once stays for a while."""
+"""For what nobody asked, such as a look at the bags. One that was needed once stays a while."""
 
 _LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 _ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104

@@ -22,7 +22,7 @@ from ros2_memory.bootstrap import build_filler, build_memory, build_server, pack
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.connections import BoundedConnection
 from ros2_memory.filling import keep_filled
-from ros2_memory.health import health, keep_fresh
+from ros2_memory.health import Health, keep_fresh
 from ros2_memory.http import STREAM_PATH, web_app
 from ros2_memory.listening import CannotListenError, bound, resolved
 from ros2_memory.logs import configure_logging, get_logger
@@ -81,6 +81,7 @@ def _run(overrides: Sequence[str]) -> None:
         memory = build_memory(settings)
         server = build_server(settings, memory)
     filler = build_filler(settings, memory)
+    health = Health(memory, package_version(), filler)
     background = partial(_in_background, memory, filler, settings.reader.index_refresh_s, overrides)
     log.info(
         "starting",
@@ -95,7 +96,7 @@ def _run(overrides: Sequence[str]) -> None:
             app = web_app(
                 server,
                 host=settings.server.host,
-                health=partial(health, memory, package_version(), filler),
+                health=health,
                 background=background,
                 api_token=front.token.get_secret_value() if front.token else None,
             )
@@ -104,6 +105,7 @@ def _run(overrides: Sequence[str]) -> None:
         log.info("stopped")
     finally:
         server.dispatcher.stop()
+        health.stop()
 
 
 class _Front(NamedTuple):

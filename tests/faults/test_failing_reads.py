@@ -20,7 +20,7 @@ import pytest
 import zstandard
 
 from ros2_memory.errors import BagError, BagUnreachableError, BagVanishedError
-from ros2_memory.health import health
+from ros2_memory.health import Health
 from ros2_memory.recorder.standing import RETRY_SOON_NS
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.faults import reading
@@ -113,14 +113,14 @@ async def test_a_disk_that_fails_under_a_running_memory_loses_nothing(
     with failing(monkeypatch, functions) as disk:
         disk.fail(number)
         answers = ask_honest(memory, right)
-        told_health = await health(memory, "1")
+        told_health = await Health(memory, "1")()
         disk.heal()
     if functions is LOOK:
         assert told_health["status"] == "degraded"
         assert not [each for each in answers if "was deleted" in each]
     clock.at += RETRY_SOON_NS
     assert told(memory, count=COUNT) == right
-    assert (await health(memory, "1"))["status"] == "ok"
+    assert (await Health(memory, "1")())["status"] == "ok"
 
 
 def test_a_disk_that_fails_while_bags_are_digested_has_them_digested_later(

@@ -22,7 +22,7 @@ from ros2_memory.cli import main
 from ros2_memory.digest import Digester
 from ros2_memory.errors import BagError
 from ros2_memory.filling import BACKLOG, Filler, Progress, keep_filled
-from ros2_memory.health import health
+from ros2_memory.health import Health
 from ros2_memory.indexing import Bar, fill, line
 from ros2_memory.memory import Call
 from ros2_memory.recall import Recall
@@ -191,7 +191,7 @@ async def test_health_tells_how_far_the_catalogue_is(tmp_path: Path) -> None:
     memory = recalling(tmp_path)
     filler = filler_of(memory, tmp_path)
     filler.digest(filler.waiting()[0])
-    told = await health(memory, "1.2.3", filler)
+    told = await Health(memory, "1.2.3", filler)()
     assert told["catalogue"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
 
 

@@ -12,7 +12,7 @@ import anyio.lowlevel
 import pytest
 from structlog.testing import capture_logs
 
-from ros2_memory.health import NAMED, health, keep_fresh
+from ros2_memory.health import NAMED, Health, keep_fresh
 from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.timebase import NS_PER_S
@@ -46,7 +46,7 @@ def memory_at(bag_dir: Path, *, seconds: int = 0) -> Memory:
 
 
 async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
-    assert await health(memory_at(tmp_path), "1.2.3") == {
+    assert await Health(memory_at(tmp_path), "1.2.3")() == {
         "status": "ok",
         "version": "1.2.3",
         "bags": 0,
@@ -63,13 +63,13 @@ async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
 
 async def test_the_span_of_the_memory_is_told(tmp_path: Path) -> None:
     write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a"), text(T0 + NS_PER_S, "b")])
-    told = await health(memory_at(tmp_path), "1")
+    told = await Health(memory_at(tmp_path), "1")()
     assert (told["bags"], told["earliest"], told["latest"]) == (1, 1784023200.0, 1784023201.0)
 
 
 async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
     (tmp_path / "torn.mcap").write_bytes(b"no bag at all, but not empty")
-    told = await health(memory_at(tmp_path, seconds=3600), "1")
+    told = await Health(memory_at(tmp_path, seconds=3600), "1")()
     assert told["status"] == "degraded"
     assert told["damaged"] == 1
     assert told["problems"] == ["1 damaged bag file; data_time_range lists what does not answer"]
@@ -89,7 +89,7 @@ async def test_everything_that_does_not_answer_is_counted_and_the_last_of_it_nam
     (tmp_path / "r" / "r_1.db3").write_bytes(b"of another storage")
     for number in range(5):
         write_mcap(tmp_path / "boot" / f"boot_{number}.mcap", [text(number, "a")])
-    told = await health(memory_of(tmp_path), "1")
+    told = await Health(memory_of(tmp_path), "1")()
     assert told["status"] == "ok"
     counts = {what: told[what] for what in ("damaged", "incomplete", "unread", "clock_faults")}
     assert counts == {"damaged": 0, "incomplete": 1, "unread": 1, "clock_faults": 5}
@@ -100,21 +100,21 @@ async def test_everything_that_does_not_answer_is_counted_and_the_last_of_it_nam
 
 async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) -> None:
     write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
-    told = await health(memory_at(tmp_path, seconds=-3600), "1")
+    told = await Health(memory_at(tmp_path, seconds=-3600), "1")()
     assert told["problems"] == [
         "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
     ]
 
 
 async def test_a_missing_bag_directory_is_told(tmp_path: Path) -> None:
-    told = await health(memory_at(tmp_path / "later"), "1")
+    told = await Health(memory_at(tmp_path / "later"), "1")()
     assert told["bags"] == 0
     assert told["status"] == "degraded"
 
 
 async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
     write_heartbeat(tmp_path, beat(RecorderState.RECORDING))
-    told = await health(memory_at(tmp_path, seconds=3), "1")
+    told = await Health(memory_at(tmp_path, seconds=3), "1")()
     assert told["status"] == "ok"
     assert told["recorder"] == {
         "state": "recording",
@@ -140,14 +140,14 @@ async def test_a_recorder_that_does_not_record_degrades_it(
     tmp_path: Path, heartbeat: Heartbeat, seconds: int, problem: str
 ) -> None:
     write_heartbeat(tmp_path, heartbeat)
-    told = await health(memory_at(tmp_path, seconds=seconds), "1")
+    told = await Health(memory_at(tmp_path, seconds=seconds), "1")()
     assert told["status"] == "degraded"
     assert told["problems"] == [problem]
 
 
 async def test_a_recorder_that_was_stopped_is_no_problem(tmp_path: Path) -> None:
     write_heartbeat(tmp_path, beat(RecorderState.STOPPED))
-    assert (await health(memory_at(tmp_path, seconds=600), "1"))["status"] == "ok"
+    assert (await Health(memory_at(tmp_path, seconds=600), "1")())["status"] == "ok"
 
 
 async def test_health_answers_while_the_first_scan_runs(tmp_path: Path) -> None:
@@ -164,12 +164,37 @@ async def test_health_answers_while_the_first_scan_runs(tmp_path: Path) -> None:
 
     memory = memory_at(tmp_path)
     slow = Slow(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
-    told = await health(replace(memory, index=slow), "1", patience_s=0.01)
+    told = await Health(replace(memory, index=slow), "1", patience_s=0.01)()
     released.set()
     # On a busy machine patience may end before it is even begun.
     assert not begun.is_set() or ended.wait(10)
     assert told["status"] == "degraded"
     assert told["problems"] == ["the bag directory is being looked through"]
+
+
+async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
+    tmp_path: Path,
+) -> None:
+    released = threading.Event()
+    looks: list[int] = []
+
+    class Hanging(IndexManager):
+        def snapshot(self, reach: int | None = None) -> Snapshot:
+            looks.append(threading.get_ident())
+            released.wait(10)
+            return super().snapshot(reach)
+
+    memory = memory_at(tmp_path)
+    index = Hanging(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
+    health = Health(replace(memory, index=index), "1", patience_s=0.001)
+    before = threading.active_count()
+    told = [await health() for _ in range(10)]
+    during = threading.active_count()
+    released.set()
+    health.stop()
+    assert {str(each["status"]) for each in told} == {"degraded"}
+    assert during <= before + 1
+    assert len(looks) <= 1
 
 
 async def test_a_bag_that_closes_is_found_without_a_question(tmp_path: Path) -> None:
@@ -215,7 +240,7 @@ async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> 
     names = tuple(f"/topic_{n}/{'y' * 300}" for n in range(1000))
     told = beat(RecorderState.PAUSED, updated=T0 + 3600 * NS_PER_S, last_error="z" * 100_000)
     write_heartbeat(tmp_path, replace(told, silent=names, subscribed=names))
-    said = await health(memory_at(tmp_path, seconds=3600), "1")
+    said = await Health(memory_at(tmp_path, seconds=3600), "1")()
     assert len(json.dumps(said)) < 10_000
     assert said["damaged"] == 50
     assert isinstance(said["recorder"], dict)
