@@ -121,7 +121,9 @@ def calls(tools: Mapping[str, Mapping[str, Any]]) -> SearchStrategy[tuple[str, d
 
     `tools` maps each name to the JSON schema of its arguments.
     """
-    good = {name: given for name, given, _ in ANSWERED}
+    # What writes is refused where nothing is recorded, and so is no good question there.
+    good: dict[str, dict[str, Any]] = {name: {} for name in tools}
+    good |= {name: given for name, given, _ in ANSWERED}
     return st.sampled_from(sorted(tools)).flatmap(
         lambda name: st.tuples(st.just(name), _arguments(tools[name], good[name]))
     )

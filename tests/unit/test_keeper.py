@@ -371,6 +371,22 @@ class TestRetention:
         told = [event for event in captured if event["event"] == "retention_applied"]
         assert [event["total_bytes"] for event in told] == [total, size_of(tmp_path)]
 
+    def test_a_bag_that_lies_in_moments_alone_counts_once_in_the_budget(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, A, 0)
+        recording(tmp_path, B, 3 * 3600)
+        house = house_of(tmp_path, max_age_h=1)
+        kept(house, tmp_path, 15, 25, "one")
+        kept(house, tmp_path, 15, 35, "two")
+        house.apply(tmp_path)
+        assert not (tmp_path / A).exists()
+        with structlog.testing.capture_logs() as captured:
+            house.apply(tmp_path)
+        [told] = [event for event in captured if event["event"] == "retention_applied"]
+        sidecars = [path.stat() for path in (tmp_path / "moments").rglob("handover.json")]
+        assert told["total_bytes"] - size_of(tmp_path) in {0, sidecars[0].st_size}
+
     def test_moments_stay_where_the_budget_cannot_be_held(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
         house = house_of(tmp_path, max_bytes=1)
@@ -494,6 +510,15 @@ class TestOthers:
         (tmp_path / "mine/moments/metadata.yaml").write_text("of another program")
         clear_bags(tmp_path)
         assert (tmp_path / "mine/moments/metadata.yaml").exists()
+
+    def test_what_is_in_a_moment_is_not_repaired(self, tmp_path: Path) -> None:
+        """It would be written anew, and be another file than the one that it was linked to."""
+        recording(tmp_path, A, 0, splits=1)
+        layout = McapLayout(chunk_size=400, finish=False)
+        left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, layout)
+        before = left.read_bytes()
+        house_of(tmp_path).apply(tmp_path)
+        assert left.read_bytes() == before
 
     def test_recover_leaves_moments_alone(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0, splits=1)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory import keepsakes
+from ros2_memory.bootstrap import build_server
+from ros2_memory.config import load_settings
 from ros2_memory.errors import RefusedError
 from ros2_memory.keepsakes import MOST_LISTED, list_moments, remember_moment
 from ros2_memory.memory import Call, Limits, Memory
@@ -34,6 +36,12 @@ S = 10**9
 T0 = 1_790_000_000 * S
 NOW = T0 + 60 * S
 RECORDS = Limits(kept=RetentionLimits(10**12, 10**18))
+
+
+@pytest.fixture(autouse=True)
+def _much_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine does not fail a test."""
+    monkeypatch.setattr(keepsakes, "PATIENCE_S", 60.0)
 
 
 def remembering(bag_dir: Path, limits: Limits = RECORDS) -> Memory:
@@ -226,6 +234,22 @@ class TestTheList:
 
 
 class TestTheTool:
+    async def test_clients_are_told_that_it_writes_and_destroys_nothing(
+        self, tmp_path: Path
+    ) -> None:
+        chosen = load_settings([f"recording.bag_dir={tmp_path}", "server.write_tools=true"], {})
+        server = build_server(chosen, memory_of(tmp_path))
+        hints = {each.name: each.annotations for each in await server.list_tools()}
+        writing = hints.pop("remember_moment")
+        assert writing is not None
+        assert (writing.read_only_hint, writing.destructive_hint) == (False, False)
+        assert not writing.idempotent_hint
+        assert all(each is not None and each.read_only_hint for each in hints.values())
+
+    @pytest.mark.parametrize(("preset", "offered"), [("robot", True), ("query_only", False)])
+    def test_it_is_on_where_the_robot_records(self, preset: str, offered: bool) -> None:
+        assert load_settings((), {"MEMORY_DEPLOYMENT": preset}).server.write_tools is offered
+
     def test_it_is_offered_only_where_writing_is_allowed(self) -> None:
         reading = {tool.name for tool in build_tools(Limits(), 25.0)}
         writing = {tool.name: tool for tool in build_tools(Limits(), 25.0, writing=True)}

@@ -106,14 +106,16 @@ class Keeper:
 
         What of a bag counts is decided when its recording is over, which may be later.
         """
-        for held in held_in(self._bag_dir):
-            folders = {Path(root) for root, _, _ in os.walk(held.folder)} - {held.folder}
-            for folder in folders:
-                recording = self._bag_dir / folder.relative_to(held.folder)
-                try:
-                    _link_sidecar(recording, folder)
-                except OSError as error:
-                    _log.error("moment_not_followed", path=str(folder), reason=str(error))
+        moments = moments_of(self._bag_dir)
+        if moments.is_symlink():
+            return
+        for root, _, _ in os.walk(moments):
+            recording = self._names.recorded_as(root)
+            try:
+                if recording != root:
+                    _link_sidecar(Path(recording), Path(root))
+            except OSError as error:
+                _log.error("moment_not_followed", path=root, reason=str(error))
 
     def _grant(self, wish: Wish, book: dict[str, Held], snapshot: Snapshot) -> Outcome:
         """Begins a moment, which is then in the book, or says why not."""

@@ -13,6 +13,7 @@ nothing here: whoever can write here can only ask.
 from __future__ import annotations
 
 import json
+import os
 import re
 import uuid
 from contextlib import suppress
@@ -22,11 +23,11 @@ import structlog
 
 from ros2_memory.recorder.keepsake import FORMAT, Wish, json_object, wish_from
 from ros2_memory.recorder.layout import REQUESTS_FOLDER
-from ros2_memory.recorder.sync import read_small_file, write_durably
+from ros2_memory.recorder.sync import read_small_file
 from ros2_memory.timebase import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from ros2_memory.timebase import Ns
@@ -37,6 +38,7 @@ LARGEST: Final = 4096
 STALE_NS: Final[Ns] = 60 * NS_PER_S
 """A wish this old was not withdrawn because its server died."""
 _LEFT_NS: Final[Ns] = 600 * NS_PER_S
+_ANEW: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
 _WISH: Final = re.compile(r"[0-9a-f]{32}\.(json|taken)")
 _OURS: Final = re.compile(r"\.?[0-9a-f]{32}\.(json|taken|answer)(\.tmp)?")
 
@@ -69,17 +71,7 @@ class Slot:
             OSError: it cannot be written.
         """
         _make(self._folder)
-        target = self._named("json")
-        beside = target.with_name(f".{target.name}.tmp")
-        try:
-            beside.write_text(json.dumps(_written(self.wish)), encoding="utf-8")
-            # The recorder may be another user.
-            beside.chmod(0o644)
-            beside.rename(target)
-        except OSError:
-            with suppress(OSError):
-                beside.unlink(missing_ok=True)
-            raise
+        _put(self._named("json"), _written(self.wish))
 
     def outcome(self) -> Outcome | None:
         """What came of it; None as long as nothing has."""
@@ -148,11 +140,8 @@ class Mailbox:
         Raises:
             OSError: it cannot be written.
         """
-        content = {"format": FORMAT, **outcome._asdict()}
         target = self._folder / f"{wish.number}.answer"
-        write_durably(target, json.dumps(content))
-        # The server may be another user.
-        target.chmod(0o644)
+        _put(target, {"format": FORMAT, **outcome._asdict()})
         self._drop(wish.number)
 
     def _taken(self, name: str, now: Ns) -> Wish | None:
@@ -207,6 +196,24 @@ def _make(folder: Path) -> None:
     """Makes the folder, and none above the bag directory: that may be on a disk that is away."""
     folder.parent.mkdir(exist_ok=True)
     folder.mkdir(exist_ok=True)
+
+
+def _put(target: Path, content: Mapping[str, object]) -> None:
+    """Writes a file that is there whole or not at all, and that another user may read.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    beside = target.with_name(f".{target.name}.tmp")
+    try:
+        with os.fdopen(os.open(beside, _ANEW, 0o644), "w", encoding="utf-8") as stream:
+            os.fchmod(stream.fileno(), 0o644)
+            json.dump(content, stream)
+        beside.rename(target)
+    except OSError:
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)
+        raise
 
 
 def _read_wish(path: Path) -> Wish:
