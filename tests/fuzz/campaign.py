@@ -22,7 +22,7 @@ HANG_S: Final = 60.0
 """After so long without a word a child hangs: it asks seven questions, of 10 s each at most."""
 _ROOT: Final = Path(__file__).resolve().parents[2]
 _MOST_FAULTS: Final = 200
-_MOST_LEFT_MB: Final = 200
+_MOST_LEFT_MB: Final = 260
 
 
 @dataclass

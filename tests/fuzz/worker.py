@@ -22,7 +22,7 @@ from tests.fuzz.trial import Verdict, World, resident_mb, tried
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-_MUCH_MB: Final = 160
+_MUCH_MB: Final = 220
 _MOST_ADDRESSES: Final = 8 << 30
 """So that what would take all memory of the machine fails here."""
 _COMBINATIONS: Final = (("mcap", False), ("rosbag2", True), ("rosbag2", False), ("mcap", True))
