@@ -7,6 +7,7 @@ It does when the robot is switched on: after a silence its poses go on elsewhere
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.model import TimeWindow
@@ -33,13 +34,24 @@ def restarts(view: View, topic: str, since: Ns) -> list[Ns]:
     for group in view.groups(topic, window):
         known = kept.of(group) if is_whole(group, window) else None
         digest = None if known is None else known[0]
-        whole = digest is not None and not digest.jumps and not digest.invalid
-        ends = (digest.first, digest.last) if digest is not None and whole else ()
+        ends = (digest.first, digest.last) if digest is not None and _is_steady(digest) else ()
         for stop in filter(None, ends or stops(view, group.once())):
             if before is not None and _is_anew(before, stop, fastest):
                 found.append(stop.time)
             before = stop
     return found
+
+
+def _is_steady(digest: PoseDigest) -> bool:
+    """Whether odometry certainly did not begin anew between the poses of a digest."""
+    if digest.jumps or digest.invalid:
+        return False
+    # Two poses next to each other lie between two vertices, and by the path or next to it.
+    nearer = MOVED_M - 2 * digest.error_m
+    return all(
+        after - before <= SILENCE_NS or math.dist(here, there) < nearer
+        for (before, here, _), (after, there, _) in pairwise(digest.vertices)
+    )
 
 
 def _is_anew(before: Stop, after: Stop, fastest_mps: float) -> bool:

@@ -48,7 +48,7 @@ class Search:
         self._view = view
         self._condition = condition
         self.topics = matching_topics(view, pattern)
-        self._failures: dict[tuple[str, str], UndecodableError] = {}
+        self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._tested = False
         self._back_to: Ns | None = None
 
@@ -66,7 +66,7 @@ class Search:
                     if self.matches(found):
                         self._view.unsay_before(found.time, said)
                         self._view.seek_first(found)
-                        self._note_undecodable()
+                        self.note_undecodable()
                         return found
                     self._back_to = found.time
                 self._back_to = stretch.window.start
@@ -85,9 +85,9 @@ class Search:
             NoDataError: nothing was found, since no message could be decoded.
         """
         if not found and self._failures and not self._tested and not candidates.ruled_out:
-            (topic, type_name), failure = next(iter(self._failures.items()))
+            (topic, type_name), (failure, _) = next(iter(self._failures.items()))
             raise undecodable(topic, type_name, failure)
-        self._note_undecodable()
+        self.note_undecodable()
         if not found:
             self._require_testable()
 
@@ -145,13 +145,16 @@ class Search:
         except UndecodableError as error:
             # One that was raised keeps all that was on the way, the message with it.
             alone = UndecodableError(error.topic, error.type_name, error.reason)
-            self._failures.setdefault((channel.topic, channel.type), alone)
+            self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
             return False
         finally:
             self._view.call.stages.add("extract", time.perf_counter_ns() - begin)
 
-    def _note_undecodable(self) -> None:
-        for (topic, type_name), error in self._failures.items():
+    def note_undecodable(self, since: Ns = MIN_NS) -> None:
+        """Notes what could not be tested since a moment, of a search newest first."""
+        for (topic, type_name), (error, newest) in self._failures.items():
+            if newest < since:
+                continue
             self._view.complete = False
             self._view.note(
                 f"messages of {topic} ({type_name}) could not be decoded: {error.reason}"

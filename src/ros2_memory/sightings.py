@@ -97,9 +97,10 @@ def find_matches(
     window = _window(span, now)
     runs = _Runs(limit, oldest_first=oldest_first)
     _gather(view, topic, condition, window, runs)
+    searched = TimeWindow(runs.told[-1].first, window.stop) if runs.cut and runs.told else window
+    view.unsay_before(searched.start)
     pose_topic = memory.limits.pose_topic
     found = tuple(_told(view, condition, run, pose_topic) for run in runs.told)
-    searched = TimeWindow(found[-1].first, window.stop) if runs.cut and found else window
     note_unseen(view, searched, nothing=not found)
     return Sightings(
         found,
@@ -147,9 +148,7 @@ def _gather(
     before = window.stop
     try:
         for part in _parts(view, search.topics, candidates.stretches(), window):
-            for topic in runs.under_way():
-                if _any_between(view, topic, TimeWindow(part.stop, max(before, part.stop))):
-                    runs.end(topic)
+            _pass_over(view, runs, TimeWindow(part.stop, max(before, part.stop)))
             for found in view.stream(search.topics, part, newest_first=True):
                 before = found.time
                 if search.matches(found):
@@ -157,7 +156,7 @@ def _gather(
                 else:
                     runs.end(found.record.channel.topic)
                 if runs.enough:
-                    runs.cut = True
+                    _leave(search, runs)
                     return
             before = part.start
     except QueryTimeoutError:
@@ -167,9 +166,26 @@ def _gather(
         view.complete = False
         view.note(f"the search ran out of time at {moment(before)}: to go on, ask with end there")
         return
-    search.close(candidates, found=bool(runs.count))
     for topic in runs.under_way():
         runs.end(topic)
+    if runs.enough:
+        # As where one message more is read, which the catalogue rules out.
+        _leave(search, runs)
+    else:
+        search.close(candidates, found=bool(runs.count))
+
+
+def _pass_over(view: View, runs: _Runs, gap: TimeWindow) -> None:
+    """Ends the rows of the topics that have a message in a time without a match."""
+    for topic in runs.under_way():
+        if _any_between(view, topic, gap):
+            runs.end(topic)
+
+
+def _leave(search: Search, runs: _Runs) -> None:
+    """Ends a search that need not have looked further."""
+    runs.cut = True
+    search.note_undecodable(runs.told[-1].first)
 
 
 class _Runs:
@@ -177,7 +193,7 @@ class _Runs:
 
     Attributes:
         count: how many rows there are so far.
-        cut: the search was left before all was gone through.
+        cut: the search was left before all was gone through, or might have been.
     """
 
     def __init__(self, limit: int, *, oldest_first: bool) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import heapq
 from bisect import bisect_left, bisect_right
 from collections import Counter, deque
+from functools import partial
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final
 
@@ -142,7 +143,9 @@ class Streams(Reading):
         spans = contested(holdings)
         found: Iterator[Found]
         if spans:
-            merged = self.merged(holdings, topics, wider, newest_first=newest_first)
+            merged = self.merged(
+                holdings, topics, wider, newest_first=newest_first, since=window.start
+            )
             once = (once_backward if newest_first else once_forward)(merged, spans)
             found = (each for each in once if window.contains(each.time))
         else:
@@ -205,10 +208,17 @@ class Streams(Reading):
         window: TimeWindow,
         *,
         newest_first: bool,
+        since: Ns = MIN_NS,
     ) -> Iterator[Found]:
-        """All messages in order, copies too, opening a bag only when the stream reaches it."""
+        """All messages in order, copies too, opening a bag only when the stream reaches it.
+
+        What cannot be read is noted where it was asked for: not all of it lies before `since`.
+        """
+        read = partial(
+            self.read, topics=topics, window=window, newest_first=newest_first, since=since
+        )
         if len(holdings) == 1:
-            yield from self.read(holdings[0].bag, topics, window, newest_first=newest_first)
+            yield from read(holdings[0].bag)
             return
         sign = -1 if newest_first else 1
         waiting = deque(
@@ -231,7 +241,7 @@ class Streams(Reading):
                 not heap or _edge(waiting[0][1], newest_first=newest_first) <= heap[0][0]
             ):
                 index, held = waiting.popleft()
-                push(sign * index, self.read(held.bag, topics, window, newest_first=newest_first))
+                push(sign * index, read(held.bag))
             if heap:
                 _, rank, found, source = heapq.heappop(heap)
                 yield found

@@ -14,9 +14,10 @@ from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.bags import McapLayout, Msg, text, write_mcap
 from tests.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
 from tests.memories import memory_of
 from tests.recalled import recalling
@@ -92,6 +93,15 @@ def test_the_newest_message_stands_before_the_damaged_chunk_where_that_is_the_la
     assert told.startswith(f"rec/{path.name} could not be read whole: ")
 
 
+def overlapping(folder: Path) -> Memory:
+    """A damaged bag up to 1 s, one of its recording from 2 s on, and one that overlaps this."""
+    first = write_mcap(folder / "a" / "a_0.mcap", [text(S, "hello")])
+    spoil_chunk(first, 0)
+    write_mcap(folder / "a" / "a_1.mcap", [text(2 * S, "person"), text(20 * S, "person")])
+    write_mcap(folder / "b" / "b_0.mcap", [text(S // 2, "nobody"), text(3 * S, "nobody")])
+    return memory_of(folder)
+
+
 def asked(memory: Memory, pattern: str, wanted: str) -> Match:
     return queries.find_last_match(memory, Call(), pattern, "contains", wanted)
 
@@ -108,17 +118,13 @@ def test_a_chunk_damaged_before_the_match_is_told_neither_with_a_catalogue_nor_w
     tmp_path: Path,
 ) -> None:
     """What overlaps has the search look further back for copies than it was asked to."""
-    first = write_mcap(tmp_path / "a" / "a_0.mcap", [text(S, "hello"), boolean(S + 1, True)])
-    spoil_chunk(first, 0)
-    wanted = text(2 * S, "person")
-    write_mcap(tmp_path / "a" / "a_1.mcap", [wanted])
-    late: list[Msg] = [boolean(2 * S + 5, False), boolean(3 * S, True)]
-    write_mcap(tmp_path / "b" / "b_0.mcap", late)
-    plain = memory_of(tmp_path)
-    found = asked(plain, "/*", "person")
+    plain = overlapping(tmp_path)
+    found = queries.find_last_match(plain, Call(), "/*", "contains", "person", before_s=10.0)
     assert found.found is not None
     assert found.notes == ()
-    assert repr(asked(recalling(plain, tmp_path), "/*", "person")) == repr(found)
+    recalled = recalling(plain, tmp_path)
+    again = queries.find_last_match(recalled, Call(), "/*", "contains", "person", before_s=10.0)
+    assert repr(again) == repr(found)
     # Asked for what may stand in it, it is told.
     assert "a_0.mcap could not be read whole" in asked(plain, "/*", "hello").notes[0]
 
@@ -138,3 +144,27 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_told(
         assert found.found is not None
         assert found.found.sample.time == 100 * S
         assert "a_0.mcap could not be read whole" in found.notes[0]
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_what_is_read_for_copies_alone_is_not_told_when_it_is_damaged(
+    tmp_path: Path, newest_first: bool
+) -> None:
+    memory = overlapping(tmp_path)
+    view = View(memory, Call())
+    found = view.stream(["/chatter"], TimeWindow(2 * S, 4 * S), newest_first=newest_first)
+    assert len(list(found)) == 2
+    assert view.notes == ()
+    list(view.stream(["/chatter"], TimeWindow(S, 4 * S), newest_first=newest_first))
+    assert len(view.notes) == 1
+
+
+def test_sightings_tell_what_is_damaged_in_the_time_that_they_span(tmp_path: Path) -> None:
+    memory = overlapping(tmp_path)
+    for each in (memory, recalling(memory, tmp_path)):
+        ask = partial(find_matches, each, Call(), "/*", "contains", "person")
+        assert ask(start_s=2.0).notes == ()
+        assert "a_0.mcap could not be read whole" in ask(start_s=0.5).notes[0]
+        assert "a_0.mcap could not be read whole" in ask(limit=5).notes[0]
+        assert ask(end_s=10.0, limit=5).notes != ()
+        assert ask(limit=1).notes == ()

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory import queries
@@ -173,6 +173,7 @@ def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 1.0, 0.5]))
 @example(seed=572545084, part=1.0)
 @example(seed=246, part=1.0)
+@example(seed=11445, part=1.0)
 def test_every_question_is_answered_as_without_a_catalogue(
     clock: str, seed: int, part: float
 ) -> None:
@@ -201,6 +202,7 @@ def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed
             start = draw.choice([MIN_NS, stop - draw.choice([1, 10**8, 3 * 10**9, 10**11])])
             for memory in (plain, recalled):
                 asked = View(memory, Call())
+                assume(asked.snapshot.topics())  # not where each bag was spoilt
                 topic = draw.choice(asked.snapshot.topics())
                 window = TimeWindow(start, stop)
                 first = next(View(memory, Call()).stream([topic], window, newest_first=True), None)

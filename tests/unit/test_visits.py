@@ -170,6 +170,16 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_pat
     assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
 
 
+def test_a_restart_of_odometry_inside_one_bag_is_seen_with_a_catalogue_too(tmp_path: Path) -> None:
+    first = line((10, 0.0), (20, 0.5))
+    second = line((10, 0.0), (20, 0.5), begin=1000.0)
+    memory = remembering(tmp_path, [*first, *second], split_s=5000.0)
+    answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
+    assert [each.restarts for each in answer.visits] == [0, 1]
+    recalled = recalling(replace(memory), tmp_path)
+    assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
+
+
 def test_in_a_map_a_restart_of_odometry_changes_nothing(tmp_path: Path) -> None:
     first = line((10, 0.0), (20, 0.5))
     second = line((10, 0.0), (20, 0.5), begin=1000.0)
