@@ -83,6 +83,8 @@ def _event(event: accounts.Event, now: Ns) -> JsonObject:
     }
     if event.end is not None:
         shown_event["duration_s"] = round(seconds(event.end - event.start), 1)
+    if event.goes_on:
+        shown_event["goes_on"] = True
     return shown_event
 
 

@@ -63,12 +63,16 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened at `start`, and went on until `end` where it took time."""
+    """Something that happened at `start`, and went on until `end` where it took time.
+
+    `goes_on`: `end` is only that of what is known.
+    """
 
     kind: str
     start: Ns
     end: Ns | None
     text: str
+    goes_on: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from ros2_memory.absence import resolve_topic
 from ros2_memory.accounts import Event, Recap
 from ros2_memory.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.moments import open_span
-from ros2_memory.stories import tells
+from ros2_memory.stories import SILENCE_NS, tells
 from ros2_memory.tales import rests_in, story_in
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, ns_from_unix
 from ros2_memory.unseen import note_edges, note_unseen
@@ -72,6 +72,8 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     events = [] if drive is None else [*_stops(drive)]
     seen: list[Presence] = []
     throughout: set[str] = set()
+    there_still: dict[str, Ns] = {}
+    known_to = min(window.stop, view.snapshot.latest or window.stop)
     for topic, story in _stories(view, window):
         events += [*_flips(topic, story), *map(_error, story.faults)]
         here = [*_steady(story.seen)]
@@ -79,12 +81,18 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         throughout.update(
             each.label for each in here if (each.first, each.last) == (story.first, story.last)
         )
+        if known_to - story.last <= SILENCE_NS:
+            there_still.update((each.label, each.last) for each in here if each.last == story.last)
         if story.undecodable:
             messages = counted(story.undecodable, "message")
             view.note(f"{messages} of {topic} could not be decoded: what they say is not told")
         if story.left_out:
             view.note(f"{topic} changes too often to tell each: {story.left_out} more")
-    events += [_thing(each) for each in _steady(seen) if each.label not in throughout]
+    events += [
+        _thing(each, goes_on=each.last == there_still.get(each.label))
+        for each in _steady(seen)
+        if each.label not in throughout
+    ]
     events += _gaps(view, window)
     note_unseen(view, window)
     note_edges(view, window)
@@ -132,7 +140,8 @@ def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, Story]]:
 def _stops(drive: _Drive) -> Iterator[Event]:
     for rest in drive.rests:
         x, y, _ = rest.box.centre
-        yield Event("stop", rest.start, rest.end, f"stood at x {x:.2f}, y {y:.2f}")
+        text = f"stood at x {x:.2f}, y {y:.2f}"
+        yield Event("stop", rest.start, rest.end, text, goes_on=rest.end >= drive.way.last)
 
 
 def _flips(topic: str, story: Story) -> Iterator[Event]:
@@ -141,7 +150,8 @@ def _flips(topic: str, story: Story) -> Iterator[Event]:
     for flip in reversed(story.flips):
         name = topic if flip.path == "value" else f"{topic} {flip.path}"
         text = f"{name} became {'true' if flip.value else 'false'}"
-        yield Event("flip", flip.time, until.get(flip.path), text)
+        held = until.get(flip.path)
+        yield Event("flip", flip.time, held, text, goes_on=held is None)
         until[flip.path] = flip.time
 
 
@@ -151,8 +161,9 @@ def _error(fault: Fault) -> Event:
     return Event("error", fault.first, end, f"error: {fault.text}{again}")
 
 
-def _thing(presence: Presence) -> Event:
-    return Event("thing", presence.first, presence.last, f"{presence.label} in view")
+def _thing(presence: Presence, *, goes_on: bool) -> Event:
+    text = f"{presence.label} in view"
+    return Event("thing", presence.first, presence.last, text, goes_on)
 
 
 def _steady(seen: Iterable[Presence]) -> Iterator[Presence]:

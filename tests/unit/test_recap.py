@@ -221,3 +221,25 @@ def _answer(memory: Memory, span: Span) -> str:
         return repr(recap(memory, Call(), span))
     except EpisodicError as error:
         return repr(error)
+
+
+def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> None:
+    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
+    seen = [
+        detections(BEGIN + at * S, ["cup"] if at < 9 else ["fork"] if at > 11 else [])
+        for at in range(20)
+    ]
+    flips = [boolean(BEGIN + at * S, 3 <= at < 7) for at in range(20)]
+    messages = sorted([*stood, *seen, *flips], key=lambda each: each.log_time)
+    write_mcap(tmp_path / "bag.mcap", messages)
+    told = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 30).events}
+    assert told == {
+        "stood at x 1.00, y 2.00": True,
+        "cup in view": False,
+        "fork in view": True,
+        "/bumper became true": False,
+        "/bumper became false": True,
+    }
+    before = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 8).events}
+    assert before["stood at x 1.00, y 2.00"]
+    assert "cup in view" not in before  # all the time
