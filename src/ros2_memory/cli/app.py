@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from ros2_memory.bootstrap import build_filler, build_memory, package_version
-from ros2_memory.cli import asking, doctor, exporting, forgetting, telling
+from ros2_memory.cli import asking, doctor, exporting, forgetting, telling, watching
 from ros2_memory.cli.running import (
     CANNOT_RUN,
     INTERRUPTED,
@@ -37,6 +37,7 @@ app = typer.Typer(
 app.command(short_help="ask any tool of the server, in process")(asking.ask)
 app.command(short_help="every recorded topic, with its rate")(telling.topics)
 app.command(short_help="range, gaps, budget and how long it lasts")(telling.info)
+app.command(short_help="what is being recorded just now")(watching.watch)
 app.command(short_help="look for what is wrong, and say what to do")(doctor.doctor)
 app.command(short_help="a time window as MCAP or Parquet")(exporting.export)
 app.command(short_help="delete a time window, after asking")(forgetting.forget)

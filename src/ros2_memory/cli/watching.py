@@ -1,0 +1,197 @@
+"""`ros2-memory watch`: what is being recorded just now, against what is usual."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from ros2_memory.accounts import Status
+from ros2_memory.cli.running import BagDir, Overrides, opened, output, reporting, say, settings_for
+from ros2_memory.cli.showing import moment, plain
+from ros2_memory.cli.telling import usual_rate
+from ros2_memory.errors import BagError, InvalidArgumentsError
+from ros2_memory.memory import Call, Memory
+from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.snapshot import Snapshot
+from ros2_memory.status import memory_status
+from ros2_memory.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.wording import counted
+
+WINDOW_NS: Final[Ns] = 10 * NS_PER_S
+"""The newest data of this length is what goes on just now."""
+AS_USUAL: Final = "as usual"
+_FEW: Final = 5
+"""So few messages make no rate."""
+_SILENT_PERIODS: Final = 10
+_STYLES: Final = {AS_USUAL: "green", "slow": "yellow", "fast": "yellow", "silent": "red"}
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """How one topic goes: rates in Hz, `age_s` of its newest message before the newest of all."""
+
+    topic: str
+    rate: float
+    usual: float | None
+    age_s: float
+
+    @property
+    def judged(self) -> str:
+        """What there is to say of it: `as usual`, `slow`, `fast`, `silent`."""
+        usual, span = self.usual, unix_from_ns(WINDOW_NS)
+        if usual is None:
+            return AS_USUAL
+        if self.age_s > max(span, _SILENT_PERIODS / usual):
+            return "silent"
+        if usual * span >= _FEW and self.rate < usual / 2:
+            return "slow"
+        if self.rate * span >= _FEW and self.rate > usual * 2:
+            return "fast"
+        return AS_USUAL
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What was seen at one moment."""
+
+    now: Ns
+    status: Status
+    courses: tuple[Course, ...]
+
+    @property
+    def recorder(self) -> str:
+        """The recorder's state, in some words."""
+        state = self.status.recorder or "none"
+        return state if self.status.live or self.status.recorder is None else f"{state}, not alive"
+
+    @property
+    def newest(self) -> str:
+        """How old the newest data is."""
+        latest = self.status.latest
+        return "no data" if latest is None else f"{unix_from_ns(self.now - latest):.1f} s old"
+
+
+def watch(
+    overrides: Overrides = None,
+    *,
+    every: Annotated[float, typer.Option(metavar="S", help="Seconds between two looks.")] = 2.0,
+    count: Annotated[
+        int | None, typer.Option(metavar="N", help="Leave after so many looks.")
+    ] = None,
+    bag_dir: BagDir = None,
+) -> None:
+    """Watch what is being recorded: the recorder, the newest data, rates against the usual ones.
+
+    On a terminal a table that is kept up to date, elsewhere a line for each look. Ends with Ctrl-C.
+    """
+    with reporting("watch"):
+        if not every > 0 or (count is not None and count < 1):
+            raise InvalidArgumentsError("--every and --count must be more than 0")
+        settings = settings_for(bag_dir, ["reader.include_active=true", *(overrides or ())])
+        memory = opened(settings)
+        console = output()
+        try:
+            if console.is_terminal:
+                _live(console, _looks(memory, every, count))
+            else:
+                for look in _looks(memory, every, count):
+                    say(line(look))
+        except KeyboardInterrupt:
+            raise typer.Exit from None
+
+
+def _live(console: Console, looks: Iterator[Look]) -> None:
+    with Live(console=console, auto_refresh=False) as live:
+        for look in looks:
+            live.update(Group(*shown(look)), refresh=True)
+
+
+def _looks(memory: Memory, every_s: float, count: int | None) -> Iterator[Look]:
+    number = 0
+    while True:
+        yield looked(memory)
+        number += 1
+        if number == count:
+            return
+        time.sleep(every_s)
+        memory.index.refresh()
+
+
+def looked(memory: Memory) -> Look:
+    """What there is to see now."""
+    snapshot = memory.index.snapshot()
+    return Look(memory.clock.now(), memory_status(memory, Call()), (*_courses(memory, snapshot),))
+
+
+def _courses(memory: Memory, snapshot: Snapshot) -> Iterator[Course]:
+    latest = snapshot.dating.latest
+    if latest is None:
+        return
+    window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
+    for topic in snapshot.topics():
+        if snapshot.is_latched(topic):
+            continue
+        last = max(each.last for each in snapshot.stated(topic).values())
+        heard = _heard(memory, snapshot, topic, window)
+        age_s = max(unix_from_ns(latest - last), 0.0)
+        yield Course(topic, heard / unix_from_ns(WINDOW_NS), usual_rate(snapshot, topic), age_s)
+
+
+def _heard(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -> int:
+    """How many messages of a topic lie in a window, as far as they can be read."""
+    heard = 0
+    for bag in dict.fromkeys(bag for bag, *_ in snapshot.extents(topic, window)):
+        try:
+            heard += len(memory.reader.log_times(bag.path, topic, window))
+        except BagError:
+            continue  # it was deleted, or is not whole yet; the next look sees what became of it
+    return heard
+
+
+def line(look: Look) -> str:
+    """One look in one line, for logs: what is not as usual is named."""
+    odd = [each for each in look.courses if each.judged != AS_USUAL]
+    usual = counted(len(look.courses) - len(odd), "topic")
+    said = [f"{usual} as usual", *(f"{plain(each.topic)} {_rates(each)}" for each in odd)]
+    return (
+        f"{moment(unix_from_ns(look.now))} recorder: {look.recorder}; newest: {look.newest}; "
+        f"{'; '.join([*said, *map(plain, look.status.problems)])}"
+    )
+
+
+def _rates(course: Course) -> str:
+    usual = "" if course.usual is None else f", usually {course.usual:.3g}"
+    return f"{course.judged} ({course.rate:.3g} Hz{usual})"
+
+
+def shown(look: Look) -> Sequence[Text | Table]:
+    """One look on a screen."""
+    budget, gigabyte = look.status.budget, 1e9
+    most = "" if budget.most is None else f" of {budget.most / gigabyte:.3g}"
+    head = Text.assemble(
+        (moment(unix_from_ns(look.now)), "bold"),
+        f"  recorder: {look.recorder}  newest: {look.newest}  "
+        f"used: {budget.used / gigabyte:.3g}{most} GB",
+    )
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("topic")
+    for name in ("Hz", "usually", "last"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("")
+    for each in look.courses:
+        table.add_row(
+            Text(plain(each.topic)),
+            f"{each.rate:.1f}",
+            "-" if each.usual is None else f"{each.usual:.1f}",
+            f"{each.age_s:.1f} s",
+            Text(each.judged, style=_STYLES[each.judged]),
+        )
+    problems = [Text(plain(each), style="red") for each in look.status.problems]
+    return (head, table, *problems)

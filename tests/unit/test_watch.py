@@ -1,0 +1,99 @@
+"""`ros2-memory watch`: what is not as usual is seen, on a terminal and in a log."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import cli
+from ros2_memory.cli.watching import AS_USUAL, Course
+from ros2_memory.timebase import NS_PER_S
+from tests.bags import boolean, odom, text, write_mcap
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A minute at 10 Hz, in which one topic falls silent and another becomes slow."""
+    now = time.time_ns()
+    for number in range(6):
+        start = now - (60 - number * 10) * NS_PER_S
+        messages = [odom(start + n * NS_PER_S // 10, 0.0, 0.0) for n in range(100)]
+        words = range(0, 100, 10) if number < 3 else ()
+        messages += [text(start + n * NS_PER_S // 10, "x") for n in words]
+        bumps = range(0, 100, 10 if number < 5 else 50)
+        messages += [boolean(start + n * NS_PER_S // 10, data=True) for n in bumps]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "query_only")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("rate", "usual", "age_s", "judged"),
+    [
+        (20.0, 20.0, 0.0, AS_USUAL),
+        (9.9, 20.0, 0.0, "slow"),
+        (41.0, 20.0, 0.0, "fast"),
+        (0.0, 20.0, 11.0, "silent"),
+        (0.0, 0.1, 60.0, AS_USUAL),
+        (0.0, 0.1, 101.0, "silent"),
+        (0.1, 0.4, 5.0, AS_USUAL),
+        (0.0, None, 1000.0, AS_USUAL),
+    ],
+)
+def test_a_course_is_judged_by_what_is_usual(
+    rate: float, usual: float | None, age_s: float, judged: str
+) -> None:
+    assert Course("/x", rate, usual, age_s).judged == judged
+
+
+def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(capsys: Capture) -> None:
+    assert cli.main(["watch", "--count", "2", "--every", "0.01"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2
+    assert "1 topic as usual" in lines[0]
+    assert "/chatter silent (0 Hz, usually 1" in lines[0]
+    assert "/bumper slow (0.2 Hz" in lines[0]
+    assert "/odom" not in lines[0]
+
+
+def test_an_empty_memory_can_be_watched(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "none").mkdir()
+    assert cli.main(["watch", "--count", "1", "--bag-dir", str(tmp_path / "none")]) == 0
+    assert "no data" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["--every", "0"], ["--count", "0"]])
+def test_what_makes_no_sense_is_refused(capsys: Capture, words: list[str]) -> None:
+    assert cli.main(["watch", *words]) == 2
+    assert "more than 0" in capsys.readouterr().err
+
+
+def test_a_terminal_gets_a_table() -> None:
+    ours, theirs = pty.openpty()
+    program = [sys.executable, "-m", "ros2_memory.cli", "watch", "--count", "1"]
+    env = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
+    with subprocess.Popen(program, stdout=theirs, stderr=subprocess.PIPE, env=env) as process:
+        os.close(theirs)
+        shown = b""
+        try:
+            while some := os.read(ours, 4096):
+                shown += some
+        except OSError:  # the other end is closed
+            pass
+        os.close(ours)
+        assert process.wait(60) == 0
+    assert b"/odom" in shown
+    assert b"usually" in shown
+    assert b"silent" in shown
