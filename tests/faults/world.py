@@ -16,7 +16,10 @@ from ros2_memory.errors import EpisodicError
 from ros2_memory.indexing import fill
 from ros2_memory.memory import Call
 from ros2_memory.moments import Moment, Span
+from ros2_memory.recap import recap
+from ros2_memory.sightings import find_matches
 from ros2_memory.timebase import NS_PER_S, FixedClock
+from ros2_memory.visits import visits
 from tests.bags import McapLayout, detections, odom, tf, transform, write_mcap
 from tests.memories import memory_of
 
@@ -51,7 +54,7 @@ def write_bag(bag_dir: Path, number: int) -> Path:
 def told(
     memory: Memory, *, count: int = 12, after_each: Callable[[], None] = lambda: None
 ) -> list[str]:
-    """What is answered: topics, frames, searches that find and that find nothing, the way driven.
+    """What is answered: topics, frames, searches that find and find nothing, ways and happenings.
 
     An error of the tree is an answer too.
     """
@@ -68,12 +71,15 @@ def told(
         lambda: queries.find_last_match(memory, Call(), "/odom", "near_position", place),
         lambda: queries.trajectory_summary(memory, Call(), span),
         lambda: queries.topic_value(memory, Call(), "/odom", Moment(at_s=T0_S + 42.0)),
+        lambda: recap(memory, Call(), span),
+        lambda: visits(memory, Call(), 4.0, 0.0),
+        lambda: find_matches(memory, Call(), "/vision/*", "contains", "cup"),
     ]
     answers = []
     for ask in asked:
         try:
-            # How long ago that was grows while a test waits.
-            answers.append(re.sub(r"age=\d+", "age", repr(ask())))
+            # What is now, and how long ago that was, moves on while a test waits.
+            answers.append(re.sub(r"(age|now)=\d+", r"\1", repr(ask())))
         except EpisodicError as error:
             answers.append(repr(error))
         after_each()
