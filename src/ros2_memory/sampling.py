@@ -5,13 +5,6 @@ A reply that leaves something out says how much of how much; these are the only 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-T = TypeVar("T")
-
 
 def evenly(count: int, at_most: int) -> list[int]:
     """Strictly increasing indices into `count` values, at most `at_most`, evenly spaced.
@@ -29,16 +22,6 @@ def evenly(count: int, at_most: int) -> list[int]:
     if at_most == 1:
         return [count - 1]
     return [place * (count - 1) // (at_most - 1) for place in range(at_most)]
-
-
-def thin(values: Sequence[T], at_most: int) -> tuple[list[T], str | None]:
-    """The samples that `evenly` keeps, and the note where any was left out.
-
-    Raises:
-        ValueError: `at_most` is below 1.
-    """
-    kept = [values[index] for index in evenly(len(values), at_most)]
-    return kept, samples_note(len(kept), len(values)) if len(kept) < len(values) else None
 
 
 def array_note(name: str, kept: int, total: int) -> str:

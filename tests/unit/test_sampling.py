@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.sampling import array_note, evenly, samples_note, thin
+from ros2_memory.sampling import array_note, evenly, samples_note
 
 counts = st.integers(0, 5000)
 limits = st.integers(1, 600)
@@ -41,17 +41,6 @@ def test_a_single_place_goes_to_the_newest(count: int) -> None:
 def test_keeping_nothing_is_refused(at_most: int) -> None:
     with pytest.raises(ValueError, match=f"at most {at_most} values"):
         evenly(10, at_most)
-
-
-def test_thinned_samples_come_with_a_note_of_how_many_there_were() -> None:
-    kept, note = thin(list(range(1300)), 100)
-    assert (len(kept), kept[0], kept[-1]) == (100, 0, 1299)
-    assert note == "100 of 1300 samples, evenly spaced over the window"
-
-
-def test_samples_that_fit_are_all_kept_without_a_note() -> None:
-    assert thin("abc", 3) == (["a", "b", "c"], None)
-    assert thin([], 1) == ([], None)
 
 
 def test_the_notes_name_what_was_thinned() -> None:
