@@ -18,7 +18,7 @@ from ros2_memory.errors import InvalidArgumentsError
 from ros2_memory.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import NS_PER_S
-from tests.bags import McapLayout, Msg, odom, text, write_db3, write_mcap
+from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -103,6 +103,26 @@ class TestMcap:
         out = tmp_path / "out.mcap"
         assert cli.main(["export", "--mcap", str(out), "--end", str(T0 / NS_PER_S + 60)]) == 0
         assert read(out) == read(bag_dir / "rec_0" / "rec_0_0.mcap")
+
+    def test_what_latched_messages_held_at_the_start_comes_along_where_it_is_asked_for(
+        self, bag_dir: Path, tmp_path: Path
+    ) -> None:
+        mounts = [
+            tf(at, transform(at, "base_link", child, (x, 0.0, 0.0)), topic="/tf_static")
+            for at, child, x in (
+                (T0, "laser", 0.1),
+                (T0 + 1, "camera", 0.2),
+                (T0 + 2, "laser", 0.3),
+            )
+        ]
+        write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [*mounts, *driven(T0 + 3, 0)])
+        words = ["export", "--start", str(T0 / NS_PER_S + 5), "--end", str(T0 / NS_PER_S + 6)]
+        assert cli.main([*words, "--mcap", str(tmp_path / "without.mcap")]) == 0
+        assert cli.main([*words, "--mcap", str(tmp_path / "with.mcap"), "--latched"]) == 0
+        held = [row for row in read(tmp_path / "with.mcap") if row[0] == "/tf_static"]
+        assert [at for _, at, _ in held] == [T0 + 1, T0 + 2]
+        rest = [row for row in read(tmp_path / "with.mcap") if row[0] != "/tf_static"]
+        assert rest == read(tmp_path / "without.mcap")
 
     def test_only_the_topics_that_were_asked_for(self, bag_dir: Path, tmp_path: Path) -> None:
         out = tmp_path / "out.mcap"

@@ -21,14 +21,20 @@ from ros2_memory.cli.running import (
 )
 from ros2_memory.cli.windows import End, Last, Start, window_of
 from ros2_memory.copies import Found
-from ros2_memory.errors import ConfigError, InvalidArgumentsError, NoDataError, NoDataReason
+from ros2_memory.errors import (
+    ConfigError,
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    UndecodableError,
+)
 from ros2_memory.globs import matching
 from ros2_memory.history import View
 from ros2_memory.memory import Call, Memory
 from ros2_memory.model import TimeWindow
 from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap_writer import McapWriter
-from ros2_memory.timebase import Ns
+from ros2_memory.timebase import MIN_NS, Ns
 from ros2_memory.unseen import note_unseen
 from ros2_memory.wording import counted
 
@@ -57,6 +63,13 @@ def export(
     start: Start = None,
     end: End = None,
     last: Last = None,
+    latched: Annotated[
+        bool,
+        typer.Option(
+            "--latched",
+            help="Also what latched messages held when the window begins: maps, static transforms.",
+        ),
+    ] = False,
     robot: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Parquet by robot, too: one dataset for a fleet."),
@@ -79,7 +92,8 @@ def export(
         topics = _topics(view, topic or ())
         note_unseen(view, window)
         with _progress(view, window) as tell:
-            found = _told(view.stream(topics, window), tell)
+            held = _held(view, topics, window.start) if latched else []
+            found = _told(chain(held, view.stream(topics, window)), tell)
             if mcap is not None:
                 done = _as_mcap(mcap, found)
             elif parquet is not None:
@@ -103,6 +117,36 @@ def _topics(view: View, globs: Sequence[str]) -> list[str]:
         asked = f"no recorded topic matches {', '.join(globs)}" if globs else "nothing is recorded"
         raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{asked}; see ros2-memory topics")
     return sorted(set(chosen))
+
+
+def _held(view: View, topics: Sequence[str], start: Ns) -> list[Found]:
+    """The latched messages of before that hold at a moment, with their own times.
+
+    That is the newest of a topic; and of transforms the newest of each child frame, since every
+    broadcaster publishes only its own.
+    """
+    before = TimeWindow(MIN_NS, start)
+    held: dict[tuple[str, str], Found] = {}
+    for topic in topics:
+        if not (view.snapshot.is_latched(topic) or topic in view.memory.limits.tf_static_topics):
+            continue
+        if any(each.endswith("/TFMessage") for each in view.snapshot.types_of(topic)):
+            for found in view.stream([topic], before):
+                held.update(((topic, frame), found) for frame in _frames(view.memory, found))
+        elif (newest := view.newest(topic, before)) is not None:
+            held[topic, ""] = newest
+    once = {id(found): found for found in held.values()}
+    return sorted(once.values(), key=lambda found: found.time)
+
+
+def _frames(memory: Memory, found: Found) -> set[str]:
+    """The child frames of a message of transforms; none where it cannot be decoded."""
+    try:
+        message = memory.reader.decode(found.record)
+    except UndecodableError:
+        return set()
+    edges = memory.extractor.transforms(message, found.time, static=True)
+    return {edge.child for edge in edges}
 
 
 def _as_mcap(path: Path, found: Iterator[Found]) -> str:
