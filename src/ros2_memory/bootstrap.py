@@ -24,6 +24,7 @@ from ros2_memory.recall import Recall
 from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.recorder.stand_in import StandInReader
 from ros2_memory.replies import Replies
 from ros2_memory.settings import NullRecorderNode
 from ros2_memory.timebase import WallClock
@@ -44,7 +45,8 @@ def build_memory(settings: Settings) -> Memory:
     clock = WallClock()
     extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
     bag_dir = settings.recording.bag_dir
-    reader = ConfinedReader(CountingReader(build_reader(settings)), bag_dir)
+    counting = CountingReader(build_reader(settings))
+    reader = StandInReader(ConfinedReader(counting, bag_dir), bag_dir)
     catalogue = Catalogue(catalogue_places(settings), way_of_reading(settings), waits_for=bag_dir)
     index = IndexManager(
         bag_dir,

@@ -8,11 +8,19 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory.errors import BagVanishedError
+from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.kept_names import KeptNames
+from ros2_memory.recorder.stand_in import StandInReader
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import odom, write_mcap
 from tests.unit.test_dormant import Start
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+S = 10**9
 
 
 class TestNames:
@@ -56,6 +64,42 @@ def start(tmp_path: Path) -> Start:
     begun = Start(tmp_path)
     begun.remember()
     return begun
+
+
+class TestAQuestionMeanwhile:
+    """The index looks every few seconds; a bag may have gone from where it was since."""
+
+    def test_a_kept_bag_is_read_under_its_other_name(self, tmp_path: Path) -> None:
+        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+        linked = tmp_path / "moments/one/rec/rec_0.mcap"
+        linked.parent.mkdir(parents=True)
+        os.link(recorded, linked)
+        reader = StandInReader(ConfinedReader(McapReader(), tmp_path), tmp_path)
+        everything = TimeWindow.everything()
+
+        def read(path: Path) -> tuple[object, ...]:
+            return (
+                [each.log_time for each in reader.records(path, ["/odom"], everything)],
+                reader.newest(path, "/odom", everything) is not None,
+                list(reader.log_times(path, "/odom", everything)),
+                [channel.topic for channel in reader.channels(path)],
+            )
+
+        before = read(recorded)
+        assert before == ([S], True, [S], ["/odom"])
+        begun = reader.records(recorded, ["/odom"], everything)
+        recorded.unlink()
+        assert [each.log_time for each in begun] == [S]
+        assert read(recorded) == before
+        # The index is told how it is.
+        with pytest.raises(BagVanishedError):
+            reader.summarize(recorded)
+        os.link(linked, recorded)
+        linked.unlink()
+        assert read(linked) == before
+        recorded.unlink()
+        with pytest.raises(BagVanishedError):
+            read(recorded)
 
 
 class TestTheIndex:
