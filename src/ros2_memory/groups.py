@@ -43,7 +43,12 @@ def groups_of(view: Streams, topic: str, window: TimeWindow) -> list[Group]:
 
 
 class Group:
-    """Bags of one topic whose messages must be ordered, and told apart, together."""
+    """Bags of one topic whose messages must be ordered, and told apart, together.
+
+    Attributes:
+        holdings: the bags, in order.
+        received_twice: which of the messages count depends on bags outside of the group too.
+    """
 
     def __init__(
         self,
@@ -58,6 +63,7 @@ class Group:
         self._topic = topic
         self._window = window
         self.holdings = holdings
+        self.received_twice = received_twice
         self._mixed = received_twice or (
             len(holdings) > 1 and len({held.bag.recording for held in holdings}) > 1
         )

@@ -62,6 +62,8 @@ class Kept(Generic[T]):
 
     def of(self, group: Group) -> tuple[T, tuple[Ns, Ns]] | None:
         """What is kept of a group, and the times of its first and last message; None: nothing."""
+        if group.received_twice:
+            return None
         if len(group.holdings) > 1:
             return self._remembered(group)
         [held] = group.holdings
@@ -81,6 +83,8 @@ class Kept(Generic[T]):
         """Keeps what bags that hold copies of each other come to, for the next time."""
         recall, numbers = self._view.memory.recall, self._numbers(group)
         if recall is None or numbers is None or len(numbers) < 2 or not self._view.complete:
+            return
+        if group.received_twice:
             return
         recall.remember(self._question, numbers, json.dumps([self._kind.packed(kept), *span]))
 

@@ -34,11 +34,14 @@ def restarts(view: View, topic: str, since: Ns) -> list[Ns]:
     for group in view.groups(topic, window):
         known = kept.of(group) if is_whole(group, window) else None
         digest = None if known is None else known[0]
-        ends = (digest.first, digest.last) if digest is not None and _is_steady(digest) else ()
-        for stop in filter(None, ends or stops(view, group.once())):
+        steady = digest is not None and _is_steady(digest)
+        poses = [digest.first] if digest is not None and steady else stops(view, group.once())
+        for stop in filter(None, poses):
             if before is not None and _is_anew(before, stop, fastest):
                 found.append(stop.time)
             before = stop
+        if digest is not None and steady:
+            before = digest.last or before
     return found
 
 

@@ -24,6 +24,7 @@ from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import MIN_NS
+from tests.bags import McapLayout, boolean, odom, write_mcap
 from tests.histories import S, write_history
 from tests.memories import memory_of
 from tests.recalled import recalling
@@ -207,3 +208,26 @@ def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed
                 window = TimeWindow(start, stop)
                 first = next(View(memory, Call()).stream([topic], window, newest_first=True), None)
                 assert asked.newest(topic, window) == first, (seed, topic, window)
+
+
+def test_a_latched_message_received_again_is_no_event_with_a_catalogue_either(
+    tmp_path: Path,
+) -> None:
+    """What one bag says of such a topic alone is not what counts in it."""
+    layout = McapLayout(latched=frozenset({"/docked"}))
+    first = [boolean(S, False, "/docked"), boolean(5 * S, True, "/docked")]
+    write_mcap(tmp_path / "a" / "a_0.mcap", first, layout)
+    again = [
+        replace(each, log_time=600 * S + n, publish_time=each.log_time)
+        for n, each in enumerate(first)
+    ]
+    write_mcap(
+        tmp_path / "b" / "b_0.mcap", [odom(600 * S, 0, 0), *again, odom(601 * S, 0, 0)], layout
+    )
+    plain = memory_of(tmp_path)
+    recalled = recalling(replace(plain), tmp_path)
+    told = [recap(memory, Call(), Span(start_s=590.0, end_s=610.0)) for memory in (plain, recalled)]
+    assert told[0] == told[1]
+    assert told[0].events == ()
+    flipped = recap(recalled, Call(), Span(start_s=0.0, end_s=610.0)).events
+    assert [each.start for each in flipped if each.kind == "flip"] == [5 * S]

@@ -180,6 +180,14 @@ def test_a_restart_of_odometry_inside_one_bag_is_seen_with_a_catalogue_too(tmp_p
     assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
 
 
+def test_a_robot_that_drives_on_through_a_long_bag_did_not_restart(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((8, 0.5), (7, -0.2)), split_s=20.0)
+    recalled = recalling(replace(memory), tmp_path)
+    for each in (memory, recalled):
+        answer = visits(each, Call(), 0.0, 0.0, radius_m=1.0)
+        assert [visit.restarts for visit in answer.visits] == [0]
+
+
 def test_in_a_map_a_restart_of_odometry_changes_nothing(tmp_path: Path) -> None:
     first = line((10, 0.0), (20, 0.5))
     second = line((10, 0.0), (20, 0.5), begin=1000.0)
