@@ -13,15 +13,22 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import cli
+from ros2_memory.cli.exporting import as_mcap
 from ros2_memory.cli.windows import unix_of
 from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.history import View
+from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.memories import memory_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
+
+    from ros2_memory.copies import Found
 
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
@@ -144,6 +151,18 @@ class TestMcap:
         assert cli.main(["export", "--mcap", str(out)]) == 2
         assert out.read_text() == "a letter"
         assert str(out) in capsys.readouterr().err
+
+    def test_an_interrupted_export_leaves_nothing(self, bag_dir: Path, tmp_path: Path) -> None:
+        def interrupted() -> Iterator[Found]:
+            view = View(memory_of(bag_dir), Call())
+            yield from view.stream(["/odom"], TimeWindow.everything())
+            raise KeyboardInterrupt
+
+        folder = tmp_path / "out"
+        folder.mkdir()
+        with pytest.raises(KeyboardInterrupt):
+            as_mcap(folder / "out.mcap", interrupted())
+        assert [*folder.iterdir()] == []
 
     def test_of_a_window_without_messages_no_file_is_made(
         self, bag_dir: Path, tmp_path: Path, capsys: Capture

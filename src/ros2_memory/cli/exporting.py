@@ -95,7 +95,7 @@ def export(
             held = _held(view, topics, window.start) if latched else []
             found = _told(chain(held, view.stream(topics, window)), tell)
             if mcap is not None:
-                done = _as_mcap(mcap, found)
+                done = as_mcap(mcap, found)
             elif parquet is not None:
                 done = _as_parquet(parquet, found, memory, robot)
     say(done)
@@ -149,13 +149,16 @@ def _frames(memory: Memory, found: Found) -> set[str]:
     return {edge.child for edge in edges}
 
 
-def _as_mcap(path: Path, found: Iterator[Found]) -> str:
-    """Writes the file; what was done, in a sentence.
+def as_mcap(path: Path, found: Iterator[Found]) -> str:
+    """Writes the file, which is there when it is whole; what was done, in a sentence.
 
     Raises:
         BagError: it cannot be written.
+        InvalidArgumentsError: there is such a file.
         NoDataError: there is no message.
     """
+    if path.exists():
+        raise InvalidArgumentsError(f"{path} exists; name another file, or delete it first")
     first = next(found, None)
     if first is None:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, "no message lies in the window")
@@ -167,7 +170,13 @@ def _as_mcap(path: Path, found: Iterator[Found]) -> str:
             written += 1
             yield each.record
 
-    McapWriter().write(path, records())
+    beside = path.with_name(f".{path.name}.tmp")
+    try:
+        beside.unlink(missing_ok=True)
+        McapWriter().write(beside, records())
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
     return f"{counted(written, 'message')} in {path}"
 
 
