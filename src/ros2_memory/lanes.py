@@ -112,8 +112,8 @@ class Lane:
         """
         most = max(self._waiting, key=lambda each: len(self._waiting[each]))
         refusal = BusyError(
-            f"{self._most_waiting} questions wait already, most of them this client's; ask again "
-            "when some are answered, and fewer at once"
+            f"{self._most_waiting} questions wait already; ask again when some are answered, and "
+            "fewer at once"
         )
         own = len(self._waiting.get(client, ()))
         if len(self._waiting[most]) <= own + 1:
