@@ -1,54 +1,60 @@
-"""What a planner asks about the demo's robot: words, the calls that answer them, and who judges.
+"""What a planner asks about the demo's robot: in words, the calls that answer it, and the judge.
 
 Each answer is a value that stands in a reply as it is, or the choice among a few; what a second
-call is given was copied from the reply to the first. Judges compare with the closed form.
+call is given was copied from the reply to the first.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from itertools import groupby, pairwise, takewhile
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.demo import judges, robot, streams
-from ros2_memory.demo.checking import at, items, near, near_angle, number, one_of, same, text
-from ros2_memory.demo.flat import THINGS
-from ros2_memory.demo.messages import description
-from ros2_memory.demo.robot import Planar
-from ros2_memory.demo.streams import STREAMS
-from ros2_memory.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns, unix_rounded_up
+from tests.planner_judges import (
+    ASKED_AT_S,
+    BATTERY,
+    CLEAR,
+    DOCK,
+    OBJECTS,
+    ODOM,
+    SAID,
+    SEEN,
+    STARTED_S,
+    between_stops,
+    came_into_view,
+    charge_when_seen,
+    commanded,
+    counted,
+    driven_between_stops,
+    flips_of_path,
+    how_often,
+    in_map,
+    last_stay,
+    later,
+    lowest_charge,
+    nearest_wall,
+    never,
+    no_error,
+    none_kept,
+    only,
+    pose_at,
+    said_last,
+    seen_there,
+    sees,
+    sighting_of,
+    standing_since,
+    stopped,
+    trusted,
+    visited,
+    way_of_recap,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable
 
-    from ros2_memory.demo.checking import Asked
-    from ros2_memory.demo.streams import Message, Stream
+    from ros2_memory.demo.robot import Planar
     from ros2_memory.model import JsonValue
-
-Replies: TypeAlias = "Sequence[JsonValue]"
-Arguments: TypeAlias = "Mapping[str, JsonValue]"
-Judge: TypeAlias = "Callable[[Replies, Asked], object]"
-
-STARTED_S: Final = 1_784_023_200
-"""When the robot started, in Unix seconds: it was on its dock."""
-HEARD_AFTER_S: Final = 17
-ASKED_AFTER_S: Final = 240.5
-"""Seconds since then after which the recording begins, and the planner asks."""
-ASKED_AT_S: Final = STARTED_S + ASKED_AFTER_S
-
-PLACE_M: Final = 0.05
-SECOND: Final = 1.0
-SAME_S: Final = 2e-3
-
-OBJECTS: Final = "/vision/*/scene_objects"
-DOCK: Final = robot.MAP_TO_ODOM
-_BY_TOPIC: Final = {stream.topic: stream for stream in STREAMS}
-_ODOM: Final = _BY_TOPIC[streams.ODOM]
-_SEEN: Final = _BY_TOPIC[streams.SCENE_OBJECTS]
-_CLEAR: Final = _BY_TOPIC[streams.PATH_CLEAR]
-_SAID: Final = _BY_TOPIC[streams.SCENE_DESCRIPTION]
-_BATTERY: Final = _BY_TOPIC[streams.BATTERY]
+    from tests.planner_judges import Arguments, Judge, Replies
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,365 +76,6 @@ class Planned:
     words: str
     steps: tuple[Step, ...]
     judge: Judge
-
-
-# What is true
-
-
-def _messages(asked: Asked, stream: Stream, since_s: float = 0.0) -> list[Message]:
-    """All messages that the memory knows, from so many Unix seconds on."""
-    since = ns_from_unix(since_s)
-    known = takewhile(
-        lambda message: message.log_time <= asked.known[-1], asked.timeline.messages(stream)
-    )
-    return [message for message in known if message.log_time >= since]
-
-
-def _rows(
-    asked: Asked, stream: Stream, holds: Callable[[float], bool], since_s: float = 0.0
-) -> list[list[Message]]:
-    """Messages in a row at whose time (s) something holds, oldest first."""
-    grouped = groupby(_messages(asked, stream, since_s), key=lambda message: holds(message.t))
-    return [[*row] for held, row in grouped if held]
-
-
-def _sees(label: str) -> Callable[[float], bool]:
-    return lambda t: any(thing.label == label for thing in robot.seen(t))
-
-
-def _near(place: Planar | tuple[float, float], radius: float) -> Callable[[float], bool]:
-    def holds(t: float) -> bool:
-        here = robot.pose_in_map(t)
-        return math.hypot(here.x - place[0], here.y - place[1]) <= radius
-
-    return holds
-
-
-def _stands(t: float) -> bool:
-    return abs(robot.twist(t)[0]) < 0.05
-
-
-def _stops(asked: Asked, since_s: float, least_s: float = 4.0) -> list[list[Message]]:
-    """Where the robot stood for so long and more; whether it stopped for 3 s is told to 1 s."""
-    rows = _rows(asked, _ODOM, _stands, since_s)
-    return [row for row in rows if row[-1].log_time - row[0].log_time >= least_s * NS_PER_S]
-
-
-def _t(moment_s: float) -> float:
-    return moment_s - STARTED_S
-
-
-def _unix(message: Message) -> float:
-    return unix_from_ns(message.log_time)
-
-
-def _ago(moment: Ns) -> float:
-    return ASKED_AT_S - unix_from_ns(moment)
-
-
-# Judges
-
-
-def _one(judge: judges.Judge) -> Judge:
-    """A judge of the only reply."""
-    return lambda replies, asked: judge(replies[-1], asked)
-
-
-def _sighting(told: JsonValue, row: Sequence[Message]) -> None:
-    """A row of messages as a sighting."""
-    first, last = row[0], row[-1]
-    one_of("first seen", number(told, "first_seen"), [first.log_time])
-    one_of("last seen", number(told, "last_seen"), [last.log_time])
-    near("how long", number(told, "duration_s"), (last.log_time - first.log_time) / 1e9, SAME_S)
-    near("how long ago", number(told, "ago_s"), _ago(last.log_time), SAME_S)
-    same("count", number(told, "count"), len(row))
-    here = robot.pose(last.t)
-    near("x", number(told, "robot", "x"), here.x, PLACE_M)
-    near("y", number(told, "robot", "y"), here.y, PLACE_M)
-    same("frame", text(told, "robot", "frame_id"), "odom")
-
-
-def _sightings(
-    stream: Stream,
-    holds: Callable[[float], bool],
-    *,
-    nth: int = -1,
-    place: str | None = None,
-) -> Judge:
-    """The newest sighting, or the nth from the start or (negative) the end."""
-
-    def judge(replies: Replies, asked: Asked) -> None:
-        told = at(replies[-1], "sightings", 0 if nth >= 0 else -1 - nth)
-        same("topic", text(told, "topic"), stream.topic)
-        _sighting(told, _rows(asked, stream, holds)[nth])
-        if place is not None:
-            for axis, expected in zip("xyz", THINGS[place], strict=True):
-                near(f"{axis} of the {place}", number(told, "place", axis), expected, PLACE_M)
-            same("frame", text(told, "place", "frame_id"), "map")
-
-    return judge
-
-
-def _how_often(stream: Stream, holds: Callable[[float], bool], last_s: float = math.inf) -> Judge:
-    def judge(replies: Replies, asked: Asked) -> None:
-        since = 0.0 if math.isinf(last_s) else ASKED_AT_S - last_s
-        same("total", number(replies[-1], "total"), len(_rows(asked, stream, holds, since)))
-
-    return judge
-
-
-def _visited(place: Planar | tuple[float, float], radius: float = 0.5) -> Judge:
-    """The newest visit, how many there were, and whether it is there now."""
-
-    def judge(replies: Replies, asked: Asked) -> None:
-        rows = _rows(asked, _ODOM, _near(place, radius))
-        newest = _messages(asked, _ODOM)[-1]
-        there = rows[-1][-1].log_time == newest.log_time
-        told = at(replies[-1], "visits", 0)
-        same("frame", text(replies[-1], "frame_id"), "map")
-        same("there now", at(replies[-1], "there_now"), there)
-        same("visits", number(replies[-1], "total"), len(rows))
-        one_of("arrival", number(told, "arrived"), [rows[-1][0].log_time])
-        if there:
-            same("departure", at(told, "departed"), None)
-        else:
-            one_of("departure", number(told, "departed"), [rows[-1][-1].log_time])
-            near("how long ago", number(told, "ago_s"), _ago(rows[-1][-1].log_time), SAME_S)
-        stayed = (rows[-1][-1].log_time - rows[-1][0].log_time) / 1e9
-        near("how long", number(told, "duration_s"), stayed, SAME_S)
-        here = [robot.pose_in_map(message.t) for message in rows[-1]]
-        closest = min(math.hypot(each.x - place[0], each.y - place[1]) for each in here)
-        near("how near", number(told, "closest_m"), closest, PLACE_M)
-
-    return judge
-
-
-def _never(replies: Replies, _asked: Asked) -> None:
-    reply = replies[-1]
-    same("found", items(reply, "visits" if "visits" in str(reply) else "sightings"), [])
-    same("total", number(reply, "total"), 0)
-
-
-def _no_error(replies: Replies, _asked: Asked) -> None:
-    told = [text(event, "text") for event in items(replies[-1], "events")]
-    same("errors", [each for each in told if each.startswith("error")], [])
-    same("gaps", [each for each in told if each == "nothing was recorded"], [])
-
-
-def _pose_at(moment_s: float) -> Judge:
-    def judge(replies: Replies, _asked: Asked) -> None:
-        truth = robot.pose(_t(moment_s))
-        near("x", number(replies[-1], "x"), truth.x, PLACE_M)
-        near("y", number(replies[-1], "y"), truth.y, PLACE_M)
-        near_angle("yaw", number(replies[-1], "yaw_deg"), truth.yaw, tolerance_deg=5.0)
-        near("time", number(replies[-1], "timestamp"), moment_s, SECOND)
-
-    return judge
-
-
-def _in_map(seconds_ago: float) -> Judge:
-    def judge(replies: Replies, _asked: Asked) -> None:
-        truth = robot.pose_in_map(_t(ASKED_AT_S - seconds_ago))
-        near("x", number(replies[-1], "translation", "x"), truth.x, PLACE_M)
-        near("y", number(replies[-1], "translation", "y"), truth.y, PLACE_M)
-        near_angle("yaw", number(replies[-1], "yaw_deg"), truth.yaw, tolerance_deg=1.0)
-
-    return judge
-
-
-def _way(last_s: float) -> Judge:
-    """Distance, top speed and time stood of a recap, as far as it is in closed files."""
-
-    def judge(replies: Replies, asked: Asked) -> None:
-        reply, driven = replies[-1], _messages(asked, _ODOM, ASKED_AT_S - last_s)
-        way = robot.driven(driven[-1].t) - robot.driven(driven[0].t)
-        near("distance", number(reply, "distance_m"), way, PLACE_M)
-        fastest = max(abs(robot.twist(message.t)[0]) for message in driven)
-        near("top speed", number(reply, "max_speed"), fastest, 2e-3)
-        certain = _stops(asked, ASKED_AT_S - last_s)
-        stood = sum(row[-1].log_time - row[0].log_time for row in certain) / 1e9
-        doubtful = len(_stops(asked, ASKED_AT_S - last_s, 2.0)) - len(certain)
-        room = SECOND * len(certain) + 4 * SECOND * doubtful
-        near("stood", number(reply, "stood_s"), stood + room / 2, room / 2 + SECOND)
-
-    return judge
-
-
-def _stopped(last_s: float) -> Judge:
-    """Every stop of a recap: when, where, how long, and whether it goes on."""
-
-    def judge(replies: Replies, asked: Asked) -> None:
-        told = _of_kind(replies[-1], "stood at")
-        same("number of stops", number(replies[-1], "counts", "stops"), len(told))
-        since = ASKED_AT_S - last_s
-        certain = _stops(asked, since)
-        possible = _stops(asked, since, 2.0)
-        if not len(certain) <= len(told) <= len(possible):
-            same("stops", len(told), len(certain))
-        for event in told:
-            began = number(event, "timestamp")
-            _stop(event, min(possible, key=lambda row: abs(_unix(row[0]) - began)))
-
-    return judge
-
-
-def _stop(event: JsonValue, row: Sequence[Message]) -> None:
-    x, y = text(event, "text").removeprefix("stood at x ").split(", y ")
-    middle = robot.pose(row[len(row) // 2].t)
-    near("x", float(x), middle.x, PLACE_M)
-    near("y", float(y), middle.y, PLACE_M)
-    near("time", number(event, "timestamp"), unix_from_ns(row[0].log_time), SECOND)
-    near("how long ago", number(event, "ago_s"), _ago(row[0].log_time), SECOND)
-    stood = (row[-1].log_time - row[0].log_time) / 1e9
-    near("how long", number(event, "duration_s"), stood, 2 * SECOND)
-
-
-def _of_kind(reply: JsonValue, begins: str) -> list[JsonValue]:
-    return [each for each in items(reply, "events") if text(each, "text").startswith(begins)]
-
-
-def _standing_since(replies: Replies, asked: Asked) -> None:
-    event = _of_kind(replies[-1], "stood at")[-1]
-    _stop(event, _stops(asked, 0.0)[-1])
-    same("still", at(event, "goes_on"), expected=True)
-
-
-def _came_into_view(last_s: float) -> Judge:
-    """What was seen, by the names of things, and when each came into view."""
-
-    def judge(replies: Replies, asked: Asked) -> None:
-        told = [
-            (text(event, "text").removesuffix(" in view"), number(event, "timestamp"))
-            for event in items(replies[-1], "events")
-            if text(event, "text").endswith(" in view")
-        ]
-        since = ASKED_AT_S - last_s
-        for label in THINGS:
-            rows = _rows(asked, _SEEN, _sees(label), since)
-            moments = [row[0].log_time for row in rows]
-            mine = [moment for name, moment in told if name == label]
-            same(f"whether the {label} was in view", bool(mine), bool(moments))
-            for moment in mine:
-                one_of(f"the {label} in view at", moment, moments)
-
-    return judge
-
-
-def _seen_there(place: Planar) -> Judge:
-    """What was in view while the robot was last at a place."""
-
-    def judge(replies: Replies, asked: Asked) -> None:
-        row = _rows(asked, _ODOM, _near(place, 0.5))[-1]
-        there = [
-            message
-            for message in _messages(asked, _SEEN)
-            if row[0].log_time <= message.log_time <= row[-1].log_time
-        ]
-        expected = {thing.label for message in there for thing in robot.seen(message.t)}
-        told = {
-            text(event, "text").removesuffix(" in view")
-            for event in items(replies[-1], "events")
-            if text(event, "text").endswith(" in view")
-        }
-        same("things", told, expected)
-
-    return judge
-
-
-def _flips_of_path(replies: Replies, asked: Asked) -> None:
-    told = [
-        (number(event, "timestamp"), text(event, "text").rsplit(" ", 1)[1] == "true")
-        for event in _of_kind(replies[-1], streams.PATH_CLEAR)
-    ]
-    some = _messages(asked, _CLEAR, ASKED_AT_S - 60)
-    pairs = pairwise(some)
-    flips = [
-        (unix_rounded_up(after.log_time), robot.path_clear(after.t))
-        for before, after in pairs
-        if robot.path_clear(before.t) != robot.path_clear(after.t)
-    ]
-    same("flips", told, flips)
-
-
-def _later(first: str, second: str) -> Judge:
-    """Which of two things was seen last: a comparison of two moments."""
-
-    def judge(replies: Replies, asked: Asked) -> None:
-        for label, reply in zip((first, second), replies, strict=True):
-            _sighting(at(reply, "sightings", 0), _rows(asked, _SEEN, _sees(label))[-1])
-
-    return judge
-
-
-def _charge_when_seen(label: str) -> Judge:
-    def judge(replies: Replies, asked: Asked) -> None:
-        last = _rows(asked, _SEEN, _sees(label))[-1][-1]
-        one_of("the match at", number(replies[-1], "timestamp"), [last.log_time])
-        then = asked.timeline.newest(_BATTERY, last.log_time)
-        assert then is not None
-        near("charge", number(replies[-1], "value", "percentage"), robot.battery(then.t), 1e-6)
-
-    return judge
-
-
-def _driven_between_stops(replies: Replies, asked: Asked) -> None:
-    *_, before, last = _stops(asked, ASKED_AT_S - 60)
-    way = robot.driven(last[0].t) - robot.driven(before[0].t)
-    near("distance", number(replies[-1], "distance_m"), way, PLACE_M)
-
-
-def _between_stops(replies: Replies) -> Arguments:
-    *_, before, last = _of_kind(replies[0], "stood at")
-    return {"start": at(before, "timestamp"), "end": at(last, "timestamp")}
-
-
-def _last_stay(replies: Replies) -> Arguments:
-    return {
-        "start": at(replies[0], "visits", 0, "arrived"),
-        "end": at(replies[0], "visits", 0, "departed"),
-    }
-
-
-def _said_last(replies: Replies, asked: Asked) -> None:
-    newest = _messages(asked, _SAID)[-1]
-    told = at(replies[-1], "samples", -1)
-    one_of("the words at", number(told, "timestamp"), [newest.log_time])
-    same("words", text(told, "value", "value"), description(newest.t))
-
-
-def _commanded(seconds_ago: float) -> Judge:
-    def judge(replies: Replies, _asked: Asked) -> None:
-        forward, turning = robot.twist(_t(number(replies[-1], "timestamp")))
-        near("time", number(replies[-1], "timestamp"), ASKED_AT_S - seconds_ago, 0.2)
-        told = at(replies[-1], "value")
-        near("forward", number(told, "linear_velocity", "x"), forward, 5e-3)
-        near("turning", number(told, "angular_velocity", "z"), turning, 5e-3)
-
-    return judge
-
-
-def _trusted(replies: Replies, asked: Asked) -> None:
-    reply = replies[-1]
-    same("trust", text(reply, "trust"), "nothing is known to be missing")
-    near("age", number(reply, "newest_age_s"), _ago(asked.known[-1]), SAME_S)
-    same("silent topics", items(reply, "fell_silent"), [])
-    same("damaged", number(reply, "damaged"), 0)
-
-
-def _none_kept(replies: Replies, _asked: Asked) -> None:
-    same("moments", items(replies[-1], "moments"), [])
-
-
-def _counted(topic: str) -> Judge:
-    def judge(replies: Replies, asked: Asked) -> None:
-        [row] = items(replies[-1])
-        same("topic", text(row, "topic"), topic)
-        same("messages", number(row, "count"), len(_messages(asked, _BY_TOPIC[topic])))
-
-    return judge
-
-
-# The questions
 
 
 def _see(label: str, **more: JsonValue) -> Step:
@@ -460,134 +107,134 @@ def _asked(words: str, tool: str, given: Arguments, judge: Judge) -> Planned:
 
 
 QUESTIONS: Final = (
-    _asked("How far back do you remember?", "data_time_range", {}, _one(judges.time_range)),
-    _asked("What do you remember at all?", "list_recorded_topics", {}, _one(judges.topics)),
+    _asked("How far back do you remember?", "data_time_range", {}, only(judges.time_range)),
+    _asked("What do you remember at all?", "list_recorded_topics", {}, only(judges.topics)),
     _asked(
         "How many odometry messages do you have?",
         "list_recorded_topics",
         {"pattern": streams.ODOM},
-        _counted(streams.ODOM),
+        counted(streams.ODOM),
     ),
     _asked(
         "Where was I 10 s ago?",
         "get_position_seconds_ago",
         {"seconds_ago": 10},
-        _one(judges.position(10)),
+        only(judges.position(10)),
     ),
     _asked(
         "Which way were you facing 40 s ago?",
         "get_position_seconds_ago",
         {"seconds_ago": 40},
-        _pose_at(ASKED_AT_S - 40),
+        pose_at(ASKED_AT_S - 40),
     ),
     _asked(
         f"Where were you at {_THEN_S:.0f}?",
         "get_position_at",
         {"timestamp": _THEN_S},
-        _pose_at(_THEN_S),
+        pose_at(_THEN_S),
     ),
     _asked(
         "How fast were you, and were you turning, half a minute ago?",
         "get_velocity_seconds_ago",
         {"seconds_ago": 30},
-        _one(judges.velocity(30)),
+        only(judges.velocity(30)),
     ),
     _asked(
         "Where in the flat were you 25 s ago?",
         "get_transform_seconds_ago",
         {"parent": "map", "child": "base_link", "seconds_ago": 25},
-        _in_map(25),
+        in_map(25),
     ),
     _asked(
         "Where in the flat was the camera 10 s ago?",
         "get_transform_seconds_ago",
         {"parent": "map", "child": "camera", "seconds_ago": 10},
-        _one(judges.camera_in_map(10)),
+        only(judges.camera_in_map(10)),
     ),
-    _asked("Which frames do you know?", "list_frames", {}, _one(judges.frames)),
+    _asked("Which frames do you know?", "list_frames", {}, only(judges.frames)),
     _asked(
         "How far have I driven in the last minute, and along which way?",
         "recent_trajectory_summary",
         {"seconds": 60},
-        _one(judges.driven(60)),
+        only(judges.driven(60)),
     ),
     _asked(
         "How fast were you at most in the last half minute, and how long did you stand?",
         "recap_last",
         {"seconds": 30},
-        _way(30),
+        way_of_recap(30),
     ),
     _asked(
         "How far have you driven since you remember anything?",
         "recap_last",
         {"seconds": 86_400},
-        _way(86_400),
+        way_of_recap(86_400),
     ),
     _asked(
         "Where did you stop in the last minute, when, and for how long?",
         "recap_last",
         {"seconds": 60},
-        _stopped(60),
+        stopped(60),
     ),
-    _asked("How long have you been standing here?", "recap_last", {"seconds": 30}, _standing_since),
+    _asked("How long have you been standing here?", "recap_last", {"seconds": 30}, standing_since),
     _asked(
-        "What came into view in the last 40 s?", "recap_last", {"seconds": 40}, _came_into_view(40)
+        "What came into view in the last 40 s?", "recap_last", {"seconds": 40}, came_into_view(40)
     ),
     _asked(
         "Did anything go wrong between these two times?",
         "recap",
         {"start": _THEN_S, "end": _THEN_S + 20},
-        _no_error,
+        no_error,
     ),
     _asked(
         "When did the path become clear or blocked in the last minute?",
         "recap_last",
         {"seconds": 60},
-        _flips_of_path,
+        flips_of_path,
     ),
     Planned(
         "How far did you drive between your last two stops?",
-        (Step("recap_last", {"seconds": 60}), Step("recap", _between_stops)),
-        _driven_between_stops,
+        (Step("recap_last", {"seconds": 60}), Step("recap", between_stops)),
+        driven_between_stops,
     ),
     _asked(
         "When did you last see scissors?",
         "find_last_match",
         {"topic": OBJECTS, "condition_type": "contains", "value": "scissors"},
-        _one(judges.last_seen("scissors")),
+        only(judges.last_seen("scissors")),
     ),
     Planned(
         "Where were you when you last saw the umbrella?",
         (_see("umbrella"),),
-        _sightings(_SEEN, _sees("umbrella")),
+        sighting_of(SEEN, sees("umbrella")),
     ),
-    Planned("Where is the cup?", (_see("cup"),), _sightings(_SEEN, _sees("cup"), place="cup")),
+    Planned("Where is the cup?", (_see("cup"),), sighting_of(SEEN, sees("cup"), place="cup")),
     Planned(
         "How long was the television in view, the last time?",
         (_see("television"),),
-        _sightings(_SEEN, _sees("television")),
+        sighting_of(SEEN, sees("television")),
     ),
     Planned(
         "And when had you seen the scissors before the last time?",
         (_see("scissors", limit=2),),
-        _sightings(_SEEN, _sees("scissors"), nth=-2),
+        sighting_of(SEEN, sees("scissors"), nth=-2),
     ),
     Planned(
         "When did you see the fridge for the first time?",
         (_see("fridge", oldest_first=True),),
-        _sightings(_SEEN, _sees("fridge"), nth=0),
+        sighting_of(SEEN, sees("fridge"), nth=0),
     ),
     Planned(
         "How often have you seen the sofa?",
         (_see("sofa", oldest_first=True),),
-        _how_often(_SEEN, _sees("sofa")),
+        how_often(SEEN, sees("sofa")),
     ),
     Planned(
         "Did you see the toy car or the plant last?",
         (_see("toy car"), _see("plant")),
-        _later("toy car", "plant"),
+        later("toy car", "plant"),
     ),
-    Planned("Have you ever seen a dog?", (_see("dog"),), _never),
+    Planned("Have you ever seen a dog?", (_see("dog"),), never),
     _asked(
         "What objects did you see at the front door?",
         "get_value_when",
@@ -597,25 +244,25 @@ QUESTIONS: Final = (
             "condition_type": "near_position",
             "value": _spot(_DOOR),
         },
-        _one(judges.seen_near(_DOOR)),
+        only(judges.seen_near(_DOOR)),
     ),
     _asked(
         "When was the path last clear?",
         "find_last_match",
         {"topic": streams.PATH_CLEAR, "condition_type": "equals", "value": True},
-        _one(judges.path_clear),
+        only(judges.path_clear),
     ),
     _asked(
         "When was the path last blocked, where, and for how long?",
         "find_matches",
         _BLOCKED,
-        _sightings(_CLEAR, lambda t: not robot.path_clear(t)),
+        sighting_of(CLEAR, lambda t: not robot.path_clear(t)),
     ),
     _asked(
         "How often was the path blocked in the last two minutes?",
         "find_matches",
         {**_BLOCKED, "seconds": 120, "oldest_first": True},
-        _how_often(_CLEAR, lambda t: not robot.path_clear(t), last_s=120),
+        how_often(CLEAR, lambda t: not robot.path_clear(t), last_s=120),
     ),
     _asked(
         "How full was the battery half a minute ago?",
@@ -626,7 +273,7 @@ QUESTIONS: Final = (
             "tolerance_s": 1.5,
             "fields": ["percentage"],
         },
-        _one(judges.battery(30)),
+        only(judges.battery(30)),
     ),
     _asked(
         "How full was the battery when you last saw the table?",
@@ -638,7 +285,7 @@ QUESTIONS: Final = (
             "value": "table",
             "fields": ["percentage"],
         },
-        _charge_when_seen("table"),
+        charge_when_seen("table"),
     ),
     _asked(
         "When did the battery last fall below 85 %, and where?",
@@ -650,7 +297,7 @@ QUESTIONS: Final = (
             "field": "percentage",
             "limit": 1,
         },
-        _sightings(_BATTERY, lambda t: robot.battery(t) < 0.85),
+        sighting_of(BATTERY, lambda t: robot.battery(t) < 0.85),
     ),
     _asked(
         "When did you last drive faster than 1 m/s?",
@@ -662,20 +309,37 @@ QUESTIONS: Final = (
             "field": "linear_velocity.x",
             "limit": 1,
         },
-        _sightings(_ODOM, lambda t: robot.twist(t)[0] > 1.0),
+        sighting_of(ODOM, lambda t: robot.twist(t)[0] > 1.0),
+    ),
+    _asked(
+        "How low was the battery in the last minute, and when?",
+        "get_topic_in_last",
+        {
+            "topic": streams.BATTERY,
+            "seconds": 60,
+            "max_samples": 1,
+            "fields": ["percentage"],
+        },
+        lowest_charge(60),
+    ),
+    _asked(
+        "How near was the nearest wall in the last 20 s?",
+        "get_topic_in_last",
+        {"topic": streams.SCAN, "seconds": 20, "max_samples": 1, "fields": ["ranges"]},
+        nearest_wall(20),
     ),
     Planned(
         "When were you last at the kitchen counter, how often, and for how long?",
         (_place(_KITCHEN.x, _KITCHEN.y),),
-        _visited(_KITCHEN),
+        visited(_KITCHEN),
     ),
-    Planned("Are you on the dock, and since when?", (_place(DOCK.x, DOCK.y),), _visited(DOCK)),
+    Planned("Are you on the dock, and since when?", (_place(DOCK.x, DOCK.y),), visited(DOCK)),
     Planned(
         "What did you see while you were last at the kitchen counter?",
-        (_place(_KITCHEN.x, _KITCHEN.y), Step("recap", _last_stay)),
-        _seen_there(_KITCHEN),
+        (_place(_KITCHEN.x, _KITCHEN.y), Step("recap", last_stay)),
+        seen_there(_KITCHEN),
     ),
-    Planned("Have you been in that corner, at 0.5, 3.5?", (_place(0.5, 3.5),), _never),
+    Planned("Have you been in that corner, at 0.5, 3.5?", (_place(0.5, 3.5),), never),
     _asked(
         "When were you last in the kitchen, and for how long?",
         "find_matches",
@@ -685,26 +349,26 @@ QUESTIONS: Final = (
             "value": "in the kitchen",
             "limit": 1,
         },
-        _sightings(_SAID, lambda t: robot.place(t) == "kitchen"),
+        sighting_of(SAID, lambda t: robot.place(t) == "kitchen"),
     ),
     _asked(
         "What did you last say you saw?",
         "get_topic_in_last",
         {"topic": streams.SCENE_DESCRIPTION, "seconds": 20, "max_samples": 1},
-        _said_last,
+        said_last,
     ),
     _asked(
         "What were you told to do 20 s ago?",
         "get_topic_seconds_ago",
         {"topic": streams.CMD_VEL, "seconds_ago": 20},
-        _commanded(20),
+        commanded(20),
     ),
-    _asked("Can I trust what you remember just now?", "memory_status", {}, _trusted),
-    _asked("Which moments were you told to keep?", "list_moments", {}, _none_kept),
+    _asked("Can I trust what you remember just now?", "memory_status", {}, trusted),
+    _asked("Which moments were you told to keep?", "list_moments", {}, none_kept),
     _asked(
         "What did the camera's pictures show?",
         "get_topic_seconds_ago",
         {"topic": "/camera/image_raw", "seconds_ago": 10},
-        _one(judges.nothing_on("/camera/image_raw")),
+        only(judges.nothing_on("/camera/image_raw")),
     ),
 )

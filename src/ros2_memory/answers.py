@@ -78,14 +78,29 @@ class TopicValue:
 
 
 @dataclass(frozen=True, slots=True)
+class Extremes:
+    """The least and the greatest number that a field held, and when it first did."""
+
+    field: str
+    least: float
+    least_at: Ns
+    most: float
+    most_at: Ns
+
+
+@dataclass(frozen=True, slots=True)
 class TopicRange:
-    """Samples of a window, evenly spaced over all `total` messages in it, first and last kept."""
+    """Samples of a window, evenly spaced over all `total` messages in it, first and last kept.
+
+    `extremes` are those of all messages, for the fields that were asked for and hold numbers.
+    """
 
     topic: str
     type: str
     total: int
     samples: tuple[Sample, ...]
     notes: tuple[str, ...] = ()
+    extremes: tuple[Extremes, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -134,7 +134,7 @@ Tolerance: TypeAlias = Annotated[
     _Duration, Field(description="How old the message may be then, in s.")
 ]
 Topic: TypeAlias = Annotated[_Text, Field(examples=["/odom"])]
-PoseTopic: TypeAlias = Annotated[_Text, Field(description="Instead of the default topic.")]
+PoseTopic: TypeAlias = Annotated[_Text, Field(description="Not the default.")]
 ValueTopic: TypeAlias = Annotated[
     _Text, Field(description="Topic to read at the match.", examples=["/odom"])
 ]

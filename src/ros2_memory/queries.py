@@ -29,6 +29,7 @@ from ros2_memory.errors import (
     NoDataError,
     NoDataReason,
 )
+from ros2_memory.extremes import MOST_MESSAGES, TOO_MANY, extremes_of
 from ros2_memory.history import View
 from ros2_memory.model import Sample, TimeWindow
 from ros2_memory.moments import Moment, Span, ns_argument, open_moment, open_span
@@ -97,7 +98,10 @@ def topic_range(
     max_samples: int = 100,
     fields: Sequence[str] = (),
 ) -> answers.TopicRange:
-    """Samples of a topic, evenly spaced over all its messages in a window."""
+    """Samples of a topic, evenly spaced over all its messages in a window.
+
+    Of `fields` that hold numbers the extremes are told, unless the messages are too many.
+    """
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, chosen = view.pick(name, window, max_samples)
@@ -110,7 +114,12 @@ def topic_range(
         view.note(samples_note(len(chosen), total))
     note_unseen(view, window)
     note_edges(view, window)
-    return answers.TopicRange(name, types[-1], total, samples, view.notes)
+    extremes: tuple[answers.Extremes, ...] = ()
+    if fields and total > MOST_MESSAGES:
+        view.note(TOO_MANY)
+    elif fields:
+        extremes = extremes_of(view, name, window, fields)
+    return answers.TopicRange(name, types[-1], total, samples, view.notes, extremes)
 
 
 def position(

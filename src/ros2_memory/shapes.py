@@ -168,7 +168,18 @@ def _range_of(
         "total": answer.total,
         "samples": samples,
     }
+    if answer.extremes:
+        reply["extremes"] = {each.field: _extremes(each) for each in answer.extremes}
     return with_notes(reply, notes)
+
+
+def _extremes(extremes: answers.Extremes) -> JsonObject:
+    return {
+        "min": rounded(extremes.least, 6),
+        "min_at": unix_rounded_up(extremes.least_at),
+        "max": rounded(extremes.most, 6),
+        "max_at": unix_rounded_up(extremes.most_at),
+    }
 
 
 @shown.register(answers.Position)

@@ -133,7 +133,8 @@ _TOPIC_OVER = Entry(
         Variant("get_topic_in_last", "A topic over the last seconds", Last, "in the last seconds"),
     ),
     "What a topic said {when}: up to max_samples messages, evenly spaced over the window, first "
-    "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}.",
+    "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; with "
+    "fields of numbers extremes, too: {{field: {{min, min_at, max, max_at}}}} of all messages.",
     TopicOver,
     lambda memory, call, given: queries.topic_range(
         memory,

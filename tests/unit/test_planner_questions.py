@@ -21,13 +21,8 @@ from ros2_memory.demo.streams import Timeline
 from ros2_memory.fitting import compact
 from ros2_memory.timebase import FixedClock, ns_from_unix
 from tests.memories import memory_of
-from tests.planner_questions import (
-    ASKED_AT_S,
-    HEARD_AFTER_S,
-    QUESTIONS,
-    STARTED_S,
-    Planned,
-)
+from tests.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S
+from tests.planner_questions import QUESTIONS, Planned
 from tests.recalled import recalling
 
 if TYPE_CHECKING:
@@ -89,6 +84,11 @@ THAT_COUNT = {
         "visits.0.ago_s",
     },
     "Are you on the dock, and since when?": {"there_now", "total", "visits.0.arrived"},
+    "How low was the battery in the last minute, and when?": {
+        "extremes.percentage.min",
+        "extremes.percentage.min_at",
+    },
+    "How near was the nearest wall in the last 20 s?": {"extremes.ranges.min"},
     "Can I trust what you remember just now?": {"trust", "newest_age_s", "damaged"},
     "What did you last say you saw?": {"samples.0.timestamp", "samples.0.value.value"},
 }

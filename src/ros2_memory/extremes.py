@@ -1,0 +1,80 @@
+"""The least and the greatest number that fields of a topic held in a window, and when.
+
+All messages of the window count, not only those that a reply shows.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.answers import Extremes
+from ros2_memory.conditions import at_field, leaves
+from ros2_memory.errors import UndecodableError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.history import View
+    from ros2_memory.model import JsonValue, TimeWindow
+    from ros2_memory.timebase import Ns
+
+MOST_MESSAGES: Final = 4_000
+MOST_NUMBERS: Final = 400_000
+"""What is gone through for one question: minutes of odometry, an hour of a slow topic."""
+
+TOO_MANY: Final = "there is too much in the window to tell extremes: ask for a shorter one"
+
+_LARGEST: Final = sys.float_info.max
+
+
+def extremes_of(
+    view: View, topic: str, window: TimeWindow, fields: Sequence[str]
+) -> tuple[Extremes, ...]:
+    """The extremes of each of the fields (dot-paths) that holds numbers.
+
+    None of any, with a note, where the window holds more than `MOST_NUMBERS`. Messages that cannot
+    be decoded are passed over; so are NaN and infinities.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    found: dict[str, Extremes] = {}
+    looked_at = 0
+    for each in view.stream([topic], window):
+        channel = each.record.channel
+        try:
+            message = view.memory.reader.decode(each.record)
+        except UndecodableError:
+            continue
+        value = view.memory.extractor.exact(message, channel.type)
+        for field in fields:
+            numbers = [*_numbers(value, field)]
+            looked_at += len(numbers)
+            if numbers:
+                _take(found, field, each.time, numbers)
+        if looked_at > MOST_NUMBERS:
+            view.note(TOO_MANY)
+            return ()
+    return tuple(found[field] for field in dict.fromkeys(fields) if field in found)
+
+
+def _numbers(value: JsonValue, field: str) -> Iterator[float]:
+    for target in at_field(value, field):
+        for leaf in leaves(target):
+            if isinstance(leaf, bool) or not isinstance(leaf, int | float):
+                continue
+            if -_LARGEST <= leaf <= _LARGEST:
+                yield leaf
+
+
+def _take(found: dict[str, Extremes], field: str, time: Ns, numbers: Sequence[float]) -> None:
+    """Takes the numbers of the next message; of equal ones the first counts."""
+    least, most = min(numbers), max(numbers)
+    before = found.get(field)
+    if before is None:
+        found[field] = Extremes(field, least, time, most, time)
+        return
+    low = (least, time) if least < before.least else (before.least, before.least_at)
+    high = (most, time) if most > before.most else (before.most, before.most_at)
+    found[field] = Extremes(field, *low, *high)
