@@ -8,7 +8,9 @@ begins anew gives places another meaning: visits of before are marked.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from contextlib import suppress
+from itertools import islice
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.absence import moment, require_bags, resolve_topic
 from ros2_memory.accounts import Visit, Visits
@@ -31,10 +33,14 @@ from ros2_memory.ways import POSES, carries_no, stops
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from ros2_memory.copies import Found
     from ros2_memory.memory import Call, Memory
     from ros2_memory.motion import PoseDigest, Stop
     from ros2_memory.places import Placing
     from ros2_memory.stays import Stay
+
+_MOST_TRIED: Final = 1000
+"""The newest poses, of which one must be readable."""
 
 
 def visits(
@@ -100,14 +106,28 @@ def visits(
 
 
 def _pose_frame(view: View, topic: str) -> str:
-    """The frame of the newest pose.
+    """The frame of the newest pose that can be decoded.
 
     Raises:
         InvalidArgumentsError: the topic's messages carry no position.
+        UndecodableError: none of the newest ones can be decoded.
     """
     found = view.newest(topic, TimeWindow.everything())
     if found is None:
         return ""
+    try:
+        return _frame_of(view, found)
+    except UndecodableError as error:
+        view.complete = False
+        view.note(f"poses of {topic} left out, since they cannot be decoded: {error.reason}")
+        older = view.stream([topic], TimeWindow.until(found.time), newest_first=True)
+        for each in islice(older, _MOST_TRIED):
+            with suppress(UndecodableError):
+                return _frame_of(view, each)
+        raise
+
+
+def _frame_of(view: View, found: Found) -> str:
     message = view.memory.reader.decode(found.record)
     pose = view.memory.extractor.pose(message, found.record.channel.type)
     if pose is None:

@@ -16,7 +16,12 @@ from hypothesis import strategies as st
 from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.demo.streams import Timeline
-from ros2_memory.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.errors import (
+    EpisodicError,
+    InvalidArgumentsError,
+    QueryTimeoutError,
+    UndecodableError,
+)
 from ros2_memory.memory import Call
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.replies import Replies
@@ -269,3 +274,24 @@ def _answer(memory: Memory, place: tuple[float, float], radius: float) -> str:
         return repr(visits(memory, Call(), *place, radius_m=radius))
     except EpisodicError as error:
         return repr(error)
+
+
+@each_way
+def test_a_newest_pose_that_cannot_be_decoded_hides_no_visit(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    way = line((20.0, 0.1))
+    way[-1] = replace(way[-1], body=way[-1].payload[:40])
+    memory = remembering(tmp_path, way)
+    if recalls:
+        memory = recalling(memory, tmp_path)
+    found = visits(memory, Call(), 0.0, 0.0)
+    assert len(found.visits) == 1
+    assert found.frame_id == "odom"
+    assert [note for note in found.notes if "cannot be decoded" in note]
+
+
+def test_of_poses_of_which_none_can_be_decoded_it_is_told_that(tmp_path: Path) -> None:
+    way = [replace(each, body=each.payload[:40]) for each in line((3.0, 0.1))]
+    with pytest.raises(UndecodableError, match="does not fit"):
+        visits(remembering(tmp_path, way), Call(), 0.0, 0.0)
