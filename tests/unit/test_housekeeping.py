@@ -358,7 +358,15 @@ class TestInTheBackground:
         assert not first.exists()
         assert all(asked)
 
-    def test_a_failure_is_reported(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize(
+        ("error", "told"),
+        [
+            (OSError("the disk is gone"), "the disk is gone"),
+            (KeyError("x"), "a fault in this program (KeyError); see its log"),
+        ],
+        ids=["of the disk", "of this program"],
+    )
+    def test_a_failure_is_reported(self, tmp_path: Path, error: Exception, told: str) -> None:
         class Failing:
             mended = False
 
@@ -369,7 +377,7 @@ class TestInTheBackground:
 
             def apply(self, bag_dir: Path) -> None:
                 if not self.mended:
-                    raise OSError("the disk is gone")
+                    raise error
 
             def keep_moments(self, bag_dir: Path) -> None: ...
 
@@ -380,7 +388,7 @@ class TestInTheBackground:
         keeper = InBackground(failing)
         keeper.apply(tmp_path)
         keeper.wait()
-        assert keeper.faults() == {"apply": "the disk is gone"}
+        assert keeper.faults() == {"apply": told}
         failing.mended = True
         keeper.apply(tmp_path)
         keeper.wait()

@@ -338,6 +338,9 @@ class InBackground:
             do()
         except (EpisodicError, OSError) as error:
             self._faults[task] = str(error)
+        except Exception as error:  # noqa: BLE001 - or it ends unheard, and the disk fills
+            _log.exception("housekeeping_faulty", task=task)
+            self._faults[task] = f"a fault in this program ({type(error).__name__}); see its log"
         else:
             self._faults.pop(task, None)
 
