@@ -6,6 +6,7 @@ Judges compare with the robot's closed form: places to 5 cm, times to the second
 from __future__ import annotations
 
 import math
+from functools import cache
 from itertools import groupby, pairwise, takewhile
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -52,13 +53,24 @@ BATTERY: Final = _BY_TOPIC[streams.BATTERY]
 # What is true
 
 
+@cache
+def _known(asked: Asked, stream: Stream) -> tuple[Message, ...]:
+    """All messages that the memory knows."""
+    end = asked.known[-1]
+    return tuple(
+        takewhile(lambda message: message.log_time <= end, asked.timeline.messages(stream))
+    )
+
+
+@cache
+def _labels(t: float) -> frozenset[str]:
+    return frozenset(thing.label for thing in robot.seen(t))
+
+
 def _messages(asked: Asked, stream: Stream, since_s: float = 0.0) -> list[Message]:
     """All messages that the memory knows, from so many Unix seconds on."""
     since = ns_from_unix(since_s)
-    known = takewhile(
-        lambda message: message.log_time <= asked.known[-1], asked.timeline.messages(stream)
-    )
-    return [message for message in known if message.log_time >= since]
+    return [message for message in _known(asked, stream) if message.log_time >= since]
 
 
 def _rows(
@@ -70,7 +82,7 @@ def _rows(
 
 
 def sees(label: str) -> Callable[[float], bool]:
-    return lambda t: any(thing.label == label for thing in robot.seen(t))
+    return lambda t: label in _labels(t)
 
 
 def _near(place: Planar | tuple[float, float], radius: float) -> Callable[[float], bool]:
