@@ -40,7 +40,9 @@ class Reading:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was skipped so far, each thing once."""
-        return tuple(self._notes)
+        # In which order bags are found damaged depends on what the catalogue knows.
+        lacking = iter(sorted(each for each in self._notes if each in self._lacking))
+        return tuple(next(lacking) if each in self._lacking else each for each in self._notes)
 
     def note(self, sentence: str) -> None:
         """Adds a sentence for the reply."""

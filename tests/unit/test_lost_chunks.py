@@ -168,3 +168,16 @@ def test_sightings_tell_what_is_damaged_in_the_time_that_they_span(tmp_path: Pat
         assert "a_0.mcap could not be read whole" in ask(limit=5).notes[0]
         assert ask(end_s=10.0, limit=5).notes != ()
         assert ask(limit=1).notes == ()
+
+
+def test_damaged_bags_are_told_in_one_order_whichever_was_found_first(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        path = write_mcap(tmp_path / name / f"{name}_0.mcap", [text(ord(name) * S, "hello")])
+        spoil_chunk(path, 0)
+    told = []
+    for newest_first in (False, True):
+        view = View(memory_of(tmp_path), Call())
+        list(view.stream(["/chatter"], EVERYTHING, newest_first=newest_first))
+        told.append(view.notes)
+    assert told[0] == told[1]
+    assert len(told[0]) == 2
