@@ -59,6 +59,12 @@ class Channel:
         """The message type, `package/msg/Name` for ROS 2."""
         return self.schema.name
 
+    @property
+    def bytes_held(self) -> int:
+        """About how much memory its texts take."""
+        offered = sum([len(name) + len(text) for name, text in self.metadata])
+        return len(self.topic) + len(self.schema.name) + len(self.schema.text) + offered
+
 
 class Record(NamedTuple):
     """One message, not yet decoded (a tuple: millions of them pass through a search).

@@ -16,6 +16,10 @@ MAX_CHUNK_MESSAGES: Final = 1_000_000
 """More messages than these take more memory than their chunk, and seconds to look through."""
 MAX_CHANNELS: Final = 5_000
 """The largest robots have some hundred topics; every list and search goes through all there are."""
+MAX_NAMES_CHARS: Final = 1 << 20
+"""Names of all topics and types of one file, which are held for as long as the bag lies there."""
+MAX_DEFINITION_BYTES: Final = 1 << 20
+"""A larger one is not used, so no more of it is held than what shows that it is larger."""
 MAX_CHUNKS: Final = 150_000
 """Each is kept in mind for as long as its file is asked about."""
 MAX_TIMES_PACKED: Final = 100

@@ -7,11 +7,12 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable
+    from collections.abc import Callable, Hashable
 
 T = TypeVar("T")
 
 _MAX_SHARED = 10_000
+_MAX_SHARED_BYTES = 16 << 20
 
 
 class ByteLru(Generic[T]):
@@ -57,13 +58,24 @@ class ByteLru(Generic[T]):
 
 
 class Shared(Generic[T]):
-    """One object for all that are equal: bags of one robot declare the same channels."""
+    """One object for all that are equal: bags of one robot declare the same channels.
 
-    def __init__(self) -> None:
+    Args:
+        size_of: about how many bytes a value takes.
+    """
+
+    def __init__(self, size_of: Callable[[T], int]) -> None:
+        self._size_of = size_of
         self._known: dict[T, T] = {}
+        self._bytes = 0
 
     def of(self, value: T) -> T:
         """The first object met that equals `value`."""
-        if len(self._known) >= _MAX_SHARED:
+        known = self._known.get(value)
+        if known is not None:
+            return known
+        if len(self._known) >= _MAX_SHARED or self._bytes > _MAX_SHARED_BYTES:
             self._known.clear()
+            self._bytes = 0
+        self._bytes += self._size_of(value)
         return self._known.setdefault(value, value)

@@ -60,7 +60,7 @@ class McapBags:
         self._max_chunk_bytes = max_chunk_mb << 20
         self._found: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
-        self._shared: Shared[Channel] = Shared()
+        self._shared: Shared[Channel] = Shared(attrgetter("bytes_held"))
         self._finished: FileKey | None = None
         self._last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel]] = {}, {}
 

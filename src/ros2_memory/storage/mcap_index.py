@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.open_file import OpenFile
     from ros2_memory.timebase import Ns
 
+_USUAL_BYTES: Final = 32 << 10
 _NEVER: Final = 1 << 64
 """Later than any time that a file can state."""
 
@@ -66,7 +67,9 @@ class McapIndex(NamedTuple):
         """About how much memory it takes."""
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
         loose = sum(column.times.nbytes * 2 for column in self.loose.values())
-        return 1000 + 300 * len(self.channels) + 400 * len(self.chunks) + places + loose
+        # Those of usual length are shared with other files.
+        long = sum([size for c in self.channels.values() if (size := c.bytes_held) > _USUAL_BYTES])
+        return 1000 + 300 * len(self.channels) + 400 * len(self.chunks) + places + loose + long
 
 
 def chunk_columns(

@@ -21,7 +21,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from ros2_memory.storage.base import Channel, Schema
 from ros2_memory.storage.faults import UnreadableError
-from ros2_memory.storage.limits import MAX_CHANNELS
+from ros2_memory.storage.limits import MAX_CHANNELS, MAX_DEFINITION_BYTES, MAX_NAMES_CHARS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -145,6 +145,12 @@ class Declarations:
         """
         if len(self._channels) > MAX_CHANNELS:
             raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
+        names = sum(
+            len(each.topic) + len(each.message_encoding) for each in self._channels.values()
+        )
+        types = sum(len(each.name) for each in self._schemas.values())
+        if names + types > MAX_NAMES_CHARS:
+            raise UnreadableError("its topics and types have longer names than any can have")
         return {
             number: Channel(
                 channel.topic,
@@ -161,7 +167,7 @@ class Declarations:
 @lru_cache(_MOST_REMEMBERED)
 def _schema(body: bytes) -> tuple[int, Schema]:
     schema: mcap_records.Schema = mcap_records.Schema.read(_stream(body))
-    return schema.id, Schema(schema.name, schema.encoding, schema.data)
+    return schema.id, Schema(schema.name, schema.encoding, schema.data[: MAX_DEFINITION_BYTES + 1])
 
 
 @lru_cache(_MOST_REMEMBERED)

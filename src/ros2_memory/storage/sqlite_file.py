@@ -13,11 +13,18 @@ import sqlite3
 import stat
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.storage.base import Channel, Closing, Record, Schema
 from ros2_memory.storage.faults import UnreadableError
-from ros2_memory.storage.limits import MAX_CHANNELS, MAX_CHUNK_MB, MAX_SECTION_BYTES
+from ros2_memory.storage.limits import (
+    MAX_CHANNELS,
+    MAX_CHUNK_MB,
+    MAX_DEFINITION_BYTES,
+    MAX_NAMES_CHARS,
+    MAX_SECTION_BYTES,
+)
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_records import offered_as_latched
 from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile, open_regular
@@ -88,7 +95,7 @@ class SqliteBags:
     def __init__(self, max_message_mb: int = MAX_CHUNK_MB) -> None:
         self._max_message_bytes = max_message_mb << 20
         self._known: ByteLru[_Topics] = ByteLru(_KEPT_BYTES)
-        self._shared: Shared[Channel] = Shared()
+        self._shared: Shared[Channel] = Shared(attrgetter("bytes_held"))
 
     def summarize(self, path: Path) -> BagSummary:
         """Topics with exact counts and first and last log times."""
@@ -163,7 +170,7 @@ class SqliteBags:
             if topics is None:
                 require_plain_tables(base)
                 topics = self._topics(base)
-                size = 1000 + sum(300 + len(c.schema.text) for c in topics.channels.values())
+                size = 1000 + sum(300 + c.bytes_held for c in topics.channels.values())
                 self._known.put(key, topics, size)
             yield base, topics
 
@@ -193,6 +200,8 @@ class SqliteBags:
             )
         if len(channels) > MAX_CHANNELS:
             raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
+        if sum(len(c.topic) + len(c.type) for c in channels.values()) > MAX_NAMES_CHARS:
+            raise UnreadableError("its topics and types have longer names than any can have")
         return _Topics(channels)
 
 
@@ -232,7 +241,9 @@ def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
         (MAX_CHANNELS,),
     )
     return {
-        str(name): Schema(_full_type(str(name)), str(encoding), str(text).encode())
+        str(name): Schema(
+            _full_type(str(name)), str(encoding), str(text).encode()[: MAX_DEFINITION_BYTES + 1]
+        )
         for name, encoding, text in rows
         if encoding in {"ros2msg", "ros2idl"}
     }
