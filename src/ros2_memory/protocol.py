@@ -157,11 +157,16 @@ def _client(context: object) -> Hashable:
 
 def _listed(tool: Tool) -> ListedTool:
     # What only destroys or repeats itself where something is written is not said of what reads.
-    writing: dict[str, bool] = {"destructive_hint": False} if tool.writes else {}
+    annotations = ToolAnnotations(
+        # Clients show it where a tool has no title of its own; twice would be once too often.
+        title=f"{tool.title} (blocking)" if tool.blocking else None,
+        read_only_hint=not tool.writes,
+        destructive_hint=False if tool.writes else None,
+    )
     return ListedTool(
         name=tool.name,
-        title=tool.title,
+        title=None if tool.blocking else tool.title,
         description=tool.description,
         input_schema=dict(tool.schema),
-        annotations=ToolAnnotations(read_only_hint=not tool.writes, **writing),
+        annotations=annotations,
     )

@@ -33,6 +33,16 @@ async def read(client: Client, uri: str) -> Any:
     return json.loads(content.text)
 
 
+async def test_tools_that_may_take_long_are_marked_in_their_annotations(tmp_path: Path) -> None:
+    async with Client(server(tmp_path)) as client:
+        for tool in (await client.list_tools()).tools:
+            assert tool.annotations is not None
+            assert tool.annotations.read_only_hint
+            marked = (tool.annotations.title or "").endswith(" (blocking)")
+            assert marked == (tool.description or "").startswith("Blocking")
+            assert (tool.title is None) == marked
+
+
 async def test_topics_and_status_are_resources(tmp_path: Path) -> None:
     write_run(tmp_path)
     async with Client(server(tmp_path)) as client:
