@@ -215,8 +215,9 @@ def _look_for(memory: Memory, bag: Path, told: Any, verdict: Verdict, *, trapped
             verdict.faults.append(f"set aside, and not listed: {str(told)[:300]}")
         return
     verdict.state = "empty" if snapshot.empty else "absent"
-    # A folder may be called as it likes.
-    if trapped or bag.is_dir() or not (bag.exists() or bag.is_symlink()):
+    # A folder may be called as it likes, and what lies in a hidden one is not looked at.
+    hidden = any(name.startswith(".") for name in bag.parts)
+    if trapped or hidden or bag.is_dir() or not (bag.exists() or bag.is_symlink()):
         return
     if not snapshot.empty:
         verdict.faults.append("silently absent")

@@ -15,7 +15,10 @@ import zstandard
 
 from ros2_memory.digest import Digester
 from ros2_memory.errors import BagError, UndecodableError
+from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow
+from ros2_memory.moments import Span
+from ros2_memory.queries import topic_range
 from ros2_memory.rendering import MAX_EXACT_NUMBERS
 from ros2_memory.sights import Sights
 from ros2_memory.storage.base import Channel, Record, Schema
@@ -162,6 +165,19 @@ class TestChunks:
         summary = McapReader().summarize(bag(tmp_path, first, *[each] * (MAX_CHUNKS + 1)))
         assert summary.count == MAX_CHUNKS
         assert "more than 150000 chunks" in summary.notes[0]
+
+
+class TestTies:
+    def test_samples_of_messages_of_one_log_time_are_evenly_spaced_and_read_once(
+        self, tmp_path: Path
+    ) -> None:
+        same = [message(1, 5, text(0, f"{n}").payload) for n in range(1000)]
+        bag(tmp_path, chunk_of(bytes_of([*STRINGS, *same]), span=(5, 5)))
+        memory = memory_of(tmp_path)
+        answer = topic_range(memory, Call(), "/chatter", Span(start_s=0, end_s=1), max_samples=4)
+        assert answer.total == 1000
+        values = [each.value for each in answer.samples]
+        assert values == [{"value": f"{n}"} for n in (0, 333, 666, 999)]
 
 
 class TestMessages:
