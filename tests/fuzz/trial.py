@@ -151,7 +151,11 @@ def tried(world: World, job: Job, mutant: Mutant) -> Verdict:
 async def _asked(
     world: World, job: Job, known: list[Any], bag: Path, verdict: Verdict, *, trapped: bool
 ) -> None:
+    begun, busy = time.monotonic(), time.process_time()
     memory, server = world.serving()
+    verdict.seconds, verdict.cpu_s = time.monotonic() - begun, time.process_time() - busy
+    if verdict.cpu_s > MOST_S:
+        verdict.faults.append(f"slow: looking into the bag took {verdict.cpu_s:.1f} s")
     rng = job.rng
     if world.catalogue and job.number % 2:
         _digested(world, memory, verdict)

@@ -111,6 +111,11 @@ class TestChunks:
         with pytest.raises(UnreadableError, match=f"more than {MAX_CHUNK_MESSAGES} messages"):
             walk(one * (MAX_CHUNK_MESSAGES + 40_000))
 
+    def test_a_chunk_that_declares_more_than_any_writer_does_is_refused(self) -> None:
+        assert len(walk(STRINGS[0].data * 20_000).declarations) == 20_000
+        with pytest.raises(UnreadableError, match="declares more than 20000 things"):
+            walk(STRINGS[0].data * 20_001)
+
     def test_a_message_outside_of_chunks_that_is_larger_than_allowed_is_left_out(
         self, tmp_path: Path
     ) -> None:

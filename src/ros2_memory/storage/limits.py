@@ -20,6 +20,10 @@ MAX_NAMES_CHARS: Final = 1 << 20
 """Names of all topics and types of one file, which are held for as long as the bag lies there."""
 MAX_DEFINITION_BYTES: Final = 1 << 20
 """A larger one is not used, so no more of it is held than what shows that it is larger."""
+MAX_CHUNK_DECLARATIONS: Final = 20_000
+"""Schemas and channels in one chunk; a writer declares each once."""
+MESSAGE_BYTES: Final = 64
+"""What a message takes besides itself while its file is looked through."""
 MAX_CHUNKS: Final = 150_000
 """Each is kept in mind for as long as its file is asked about."""
 MAX_TIMES_PACKED: Final = 100

@@ -14,7 +14,11 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ros2_memory.storage.faults import UnreadableError
-from ros2_memory.storage.limits import MAX_CHUNK_MESSAGES, too_large
+from ros2_memory.storage.limits import (
+    MAX_CHUNK_DECLARATIONS,
+    MAX_CHUNK_MESSAGES,
+    too_large,
+)
 from ros2_memory.storage.mcap_records import (
     CHUNK_TIMES,
     MESSAGE,
@@ -201,6 +205,8 @@ def walk(data: bytes) -> Walked:
             entry[1].append(position)
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             declarations.append((opcode, data[position + RECORD.size : following]))
+            if len(declarations) > MAX_CHUNK_DECLARATIONS:
+                raise UnreadableError(f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things")
         position = following
     columns = {channel: column_of(*lists) for channel, lists in found.items()}
     messages = sum(len(times) for times, _ in found.values())

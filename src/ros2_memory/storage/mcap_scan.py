@@ -18,6 +18,7 @@ from ros2_memory.storage.limits import (
     MAX_CHUNKS,
     MAX_SECTION_BYTES,
     MAX_TIMES_PACKED,
+    MESSAGE_BYTES,
     most_unpacked,
     too_large,
 )
@@ -147,6 +148,7 @@ class _Scan:
             data = unpacked(*self._packed(end), self.max_chunk_bytes)
         self.unpacked += len(data)
         walked = walk(data)
+        self.unpacked += MESSAGE_BYTES * walked.messages
         if walked.usable < len(data):
             self.damaged.append("damaged: a chunk holds something that is no record")
         self._take(walked, end, None)
