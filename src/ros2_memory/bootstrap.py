@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,9 +16,11 @@ from ros2_memory.catalogue import FILE, FOLDER, Catalogue
 from ros2_memory.config import load_message_schemas
 from ros2_memory.digest import DIGEST_VERSION, Digester
 from ros2_memory.dispatch import Dispatcher
+from ros2_memory.errors import ConfigError
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.filling import Filler
 from ros2_memory.instructions import instructions
+from ros2_memory.measures import Measuring
 from ros2_memory.memory import Limits, Memory
 from ros2_memory.protocol import EpisodicServer
 from ros2_memory.recall import Recall
@@ -27,11 +30,15 @@ from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.stand_in import StandInReader
 from ros2_memory.replies import Replies
 from ros2_memory.settings import NullRecorderNode
+from ros2_memory.telemetry import SILENT, Telemetry
 from ros2_memory.timebase import WallClock
 from ros2_memory.tools import build_tools, readable_tools
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from ros2_memory.settings import Settings
+    from ros2_memory.telemetry import Observer
 
 _PACKAGE: Final = "ros2-memory"
 
@@ -130,7 +137,48 @@ def limits_of(settings: Settings) -> Limits:
     )
 
 
-def build_server(settings: Settings, memory: Memory) -> EpisodicServer:
+def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
+    """Who is told of answers, as the configuration wants it; nobody by default.
+
+    Raises:
+        ConfigError: the optional part of the package is missing, there is no HTTP to show metrics
+            on, or the environment describes no exporter.
+    """
+    observers: list[Observer] = []
+    exposition = None
+    if settings.server.metrics:
+        if settings.server.transport == "stdio":
+            raise ConfigError(
+                "server.metrics: true is not allowed with server.transport=stdio, which has no "
+                "/metrics; choose server.transport=sse or leave it out"
+            )
+        with _optional("server.metrics"):
+            from ros2_memory.observability.metrics import Metrics  # noqa: PLC0415 - an extra
+        metrics = Metrics(Measuring(memory), package_version())
+        observers.append(metrics)
+        exposition = metrics.exposition
+    if settings.server.traces:
+        with _optional("server.traces"):
+            from ros2_memory.observability import traces  # noqa: PLC0415 - an extra
+        observers.append(traces.traces_from_environment())
+    return Telemetry(tuple(observers), exposition)
+
+
+@contextmanager
+def _optional(key: str) -> Iterator[None]:
+    """Around the import of what few install."""
+    try:
+        yield
+    except ImportError as error:
+        raise ConfigError(
+            f"{key}: true needs the optional part of this package (no {error.name}): "
+            "pip install 'ros2-memory[observability]'"
+        ) from error
+
+
+def build_server(
+    settings: Settings, memory: Memory, telemetry: Telemetry = SILENT
+) -> EpisodicServer:
     """The MCP server that answers from a memory."""
     served = settings.server
     tools = build_tools(
@@ -144,6 +192,7 @@ def build_server(settings: Settings, memory: Memory) -> EpisodicServer:
         (*tools, *readable_tools(memory.limits)),
         Replies(settings.recording.bag_dir, served.max_reply_chars),
         call_timeout_s=served.call_timeout_s,
+        telemetry=telemetry,
     )
     return EpisodicServer(
         dispatcher,

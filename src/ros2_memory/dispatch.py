@@ -28,7 +28,8 @@ from ros2_memory.glimpse import glimpse
 from ros2_memory.lanes import Lane
 from ros2_memory.logs import get_logger
 from ros2_memory.memory import Call
-from ros2_memory.timebase import Deadline, ms_from_ns
+from ros2_memory.telemetry import SILENT, UNKNOWN_TOOL, Answered
+from ros2_memory.timebase import Deadline, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.entries import Question, Tool
     from ros2_memory.memory import Memory
     from ros2_memory.replies import Replies, Reply
+    from ros2_memory.telemetry import Telemetry
 
 QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2
@@ -58,12 +60,19 @@ class Dispatcher:
     """Answers tool calls from one memory, a bounded number at a time."""
 
     def __init__(
-        self, memory: Memory, tools: Sequence[Tool], replies: Replies, *, call_timeout_s: float
+        self,
+        memory: Memory,
+        tools: Sequence[Tool],
+        replies: Replies,
+        *,
+        call_timeout_s: float,
+        telemetry: Telemetry = SILENT,
     ) -> None:
         self._memory = memory
         self._tools = {tool.name: tool for tool in tools}
         self._replies = replies
         self._call_timeout_s = call_timeout_s
+        self._telemetry = telemetry
         self.quick = Lane("quick", QUICK_AT_ONCE)
         self.blocking = Lane("blocking", BLOCKING_AT_ONCE)
         self._stopping = threading.Event()
@@ -86,7 +95,8 @@ class Dispatcher:
         over = threading.Event()
         call = Call(Deadline.after(patience_s, partial(self._monotonic, over)))
         outcome, chars = "cancelled", 0
-        with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
+        correlation_id = uuid.uuid4().hex[:12]
+        with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
             try:
                 try:
                     outcome, reply = await self._outcome(name, given, call, client)
@@ -96,16 +106,34 @@ class Dispatcher:
                 chars = len(reply.text)
             finally:
                 over.set()
-                log.info(
-                    "tool_call",
-                    tool=name if name in self._tools else glimpse(name),
-                    arguments=glimpse(given, _LOGGED_CHARS),
-                    outcome=outcome,
-                    duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
-                    stages_ms=call.stages.as_ms(),
-                    chars=chars,
+                known = name in self._tools
+                done = Answered(
+                    name if known else UNKNOWN_TOOL,
+                    outcome,
+                    unix_from_ns(time.perf_counter_ns() - begun),
+                    chars,
+                    correlation_id,
+                    call.stages.as_ms(),
                 )
+                self._tell(done, name if known else glimpse(name), given)
         return reply
+
+    def _tell(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
+        """Of a call that is over: the log, and whoever observes."""
+        log.info(
+            "tool_call",
+            tool=name,
+            arguments=glimpse(given, _LOGGED_CHARS),
+            outcome=done.outcome,
+            duration_ms=round(done.duration_s * 1000, 3),
+            stages_ms=done.stages_ms,
+            chars=done.chars,
+        )
+        try:
+            self._telemetry.answered(done)
+        except Exception:
+            # No answer is worth losing for it.
+            log.exception("telemetry_failed")
 
     def _monotonic(self, over: threading.Event) -> float:
         """The clock of one call's deadline: its time is up when nobody waits for it any more."""

@@ -1,4 +1,4 @@
-"""The one web application: `/sse` with `/messages/`, `/mcp`, and `/health`, on one port."""
+"""The one web application: `/sse` with `/messages/`, `/mcp`, `/health` and a page, on one port."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from starlette.routing import Route
 
 from ros2_memory.gate import ADMITTED, HEALTH_PATH, TokenGate
 from ros2_memory.intake import Intake
+from ros2_memory.page import Page
 from ros2_memory.session_names import SessionNames
 
 if TYPE_CHECKING:
@@ -53,7 +54,8 @@ def web_app(
     """The application that listens on `host`.
 
     `background` runs from start to end of the application, and is cancelled then. `api_token` is
-    demanded of every request; without it `/health` shows its status alone.
+    demanded of every request; without it `/health` shows its status alone, and on the loopback
+    address the page is shown, which asks for it.
     """
     # `Guard` stands before all routes, and knows the addresses of a host such as 0.0.0.0.
     guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
@@ -79,8 +81,14 @@ def web_app(
 
     routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
     app: ASGIApp = Intake(SessionNames(Starlette(routes=routes, lifespan=lifespan)))
+    if host.lower() not in _LOOPBACK:
+        app = Page(app)
     if api_token is not None:
         app = TokenGate(app, api_token)
+    if host.lower() in _LOOPBACK:
+        # It holds no data, and a browser cannot show a token before it has a page to ask for it.
+        # Where others can reach the server, the token comes first nevertheless.
+        app = Page(app)
     return WebApp(Guard(app, host))
 
 

@@ -18,7 +18,13 @@ import anyio
 import uvicorn
 
 from ros2_memory.api_token import take_token
-from ros2_memory.bootstrap import build_filler, build_memory, build_server, package_version
+from ros2_memory.bootstrap import (
+    build_filler,
+    build_memory,
+    build_server,
+    build_telemetry,
+    package_version,
+)
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.connections import BoundedConnection
 from ros2_memory.filling import keep_filled
@@ -79,7 +85,8 @@ def _run(overrides: Sequence[str]) -> None:
         configure_logging(settings.logging.level, settings.logging.format)
         front = None if settings.server.transport == "stdio" else _front(settings.server)
         memory = build_memory(settings)
-        server = build_server(settings, memory)
+        telemetry = build_telemetry(settings, memory)
+        server = build_server(settings, memory, telemetry)
     filler = build_filler(settings, memory)
     health = Health(memory, package_version(), filler)
     background = partial(_in_background, memory, filler, settings.reader.index_refresh_s, overrides)
@@ -99,6 +106,7 @@ def _run(overrides: Sequence[str]) -> None:
                 health=health,
                 background=background,
                 api_token=front.token.get_secret_value() if front.token else None,
+                metrics=telemetry.metrics,
             )
             _serve_http(server, app, front.address)
     except SystemExit:
@@ -106,6 +114,7 @@ def _run(overrides: Sequence[str]) -> None:
     finally:
         server.dispatcher.stop()
         health.stop()
+        telemetry.stop()
 
 
 class _Front(NamedTuple):

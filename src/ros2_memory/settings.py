@@ -133,7 +133,8 @@ class RetentionSettings:
 class ServerSettings:
     """How the query server is reached, and what it offers. Port 0 is any that is free.
 
-    `tools`: all, or the specification's alone; `write_tools`: those that write, too.
+    `tools`: all, or the specification's alone; `write_tools`: those that write, too. `metrics` and
+    `traces` need the optional part of the package.
     """
 
     name: Text
@@ -144,6 +145,8 @@ class ServerSettings:
     max_reply_chars: Annotated[int, Field(strict=True, ge=1000)]
     tools: Literal["all", "spec"]
     write_tools: Switch
+    metrics: Switch
+    traces: Switch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

@@ -56,7 +56,7 @@ def ask_honest(memory: Memory, right: list[str]) -> list[str]:
     amiss: list[bool] = []
 
     def look() -> None:
-        seen = memory.index._published
+        seen = memory.index.published
         amiss.append(seen is None or bool(seen.damaged or seen.problem))
 
     answers = told(memory, count=COUNT, after_each=look)

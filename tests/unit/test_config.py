@@ -97,6 +97,8 @@ class TestDefaults:
                 "max_reply_chars": 24000,
                 "tools": "all",
                 "write_tools": False,
+                "metrics": False,
+                "traces": False,
             },
             "logging": {"level": "info", "format": "json"},
             "storage": {

@@ -95,6 +95,10 @@ class TestWheel:
         assert "ros2_memory/py.typed" in names
         assert any(name.endswith("licenses/LICENSE") for name in names)
 
+    def test_ships_the_page(self, wheel: zipfile.ZipFile) -> None:
+        page = ROOT / "src/ros2_memory/page/index.html"
+        assert wheel.read("ros2_memory/page/index.html") == page.read_bytes()
+
     def test_has_nothing_but_the_package(self, wheel: zipfile.ZipFile) -> None:
         tops = {name.split("/")[0] for name in wheel.namelist()}
         assert {re.sub(r"-.*\.", ".", top) for top in tops} == {

@@ -15,6 +15,10 @@ from tests.licences import UnknownLicenceError, closure, permitted, said, stated
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())
 RUNTIME = [Requirement(line) for line in PROJECT["project"]["dependencies"]]
+EXTRAS = {
+    extra: [Requirement(line) for line in lines]
+    for extra, lines in PROJECT["project"]["optional-dependencies"].items()
+}
 PERMISSIVE = frozenset(
     {
         "0BSD",
@@ -32,6 +36,11 @@ PERMISSIVE = frozenset(
 """What may be shipped with a product, closed ones included, for no more than a notice."""
 TOOLS = PERMISSIVE | {"MPL-2.0"}
 """Tools are shipped to nobody, and what MPL-2.0 asks for concerns changed files of theirs alone."""
+UNCHANGED = {
+    # Mozilla's list of certificates, which its licence has nobody open more than.
+    "certifi": "MPL-2.0",
+}
+"""What comes along with an extra: whoever ships it unchanged owes its notice alone."""
 READ_BY_HAND = {
     # Its LICENSE file: any licence that the Open Source Initiative approved, at one's choice.
     "apsw": "any-OSI",
@@ -67,6 +76,13 @@ def saying(**fields: str | list[str]) -> Message:
 class TestLicences:
     def test_whatever_is_installed_with_this_package_is_permissive(self) -> None:
         assert refused(closure(["ros2-memory"]), PERMISSIVE) == {}
+
+    @pytest.mark.parametrize("extra", EXTRAS)
+    def test_whatever_an_extra_installs_is_too_but_for_a_list_of_certificates(
+        self, extra: str
+    ) -> None:
+        found = refused(closure([str(each) for each in EXTRAS[extra]]), PERMISSIVE)
+        assert found.items() <= UNCHANGED.items()
 
     def test_the_tools_of_development_are_too_or_ask_for_nothing_of_the_product(self) -> None:
         tools = closure(PROJECT["dependency-groups"]["dev"])
@@ -151,7 +167,11 @@ class TestLicences:
         assert found == READ_BY_HAND
 
 
-@pytest.mark.parametrize("requirement", RUNTIME, ids=lambda requirement: requirement.name)
+@pytest.mark.parametrize(
+    "requirement",
+    [*RUNTIME, *(each for extra in EXTRAS.values() for each in extra)],
+    ids=lambda requirement: requirement.name,
+)
 def test_no_dependency_may_reach_a_major_release_that_nobody_tried(
     requirement: Requirement,
 ) -> None:

@@ -71,6 +71,7 @@ class IndexManager:
 
     Attributes:
         bag_dir: the bag directory.
+        published: what the last scan gave, however old; None before the first has ended.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class IndexManager:
         self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._log: FilteringBoundLogger = structlog.get_logger()
         self._lock = threading.Lock()
-        self._published: Snapshot | None = None
+        self.published: Snapshot | None = None
         self._start_over()
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
@@ -105,12 +106,12 @@ class IndexManager:
         about, lies past the end of the newest bag. Callers that come while a scan runs wait for it
         and share its result.
         """
-        current = self._published
+        current = self.published
         if current is not None and not self._is_stale(current, reach):
             return current
         with self._lock:
-            if self._published is not None and self._published is not current:
-                return self._published
+            if self.published is not None and self.published is not current:
+                return self.published
             # A question waits for what changes by itself, the newest bags; `refresh` patrols.
             return self._scan(patrolling=False)
 
@@ -180,7 +181,7 @@ class IndexManager:
         self._timeline = Timeline()
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
-        if self._published is not None:
+        if self.published is not None:
             return self._look_through(patrolling=patrolling)
         with _collector_resting():
             return self._look_through(patrolling=patrolling)
@@ -204,14 +205,14 @@ class IndexManager:
             # The walk does not show a second time what it has shown once.
             self._start_over()
             raise
-        before, odd = self._published, _oddities(walked)
+        before, odd = self.published, _oddities(walked)
         if before is not None and not (changed or recalled) and odd == self._odd:
-            self._published = replace(before, scanned_at=scene.now)
-            return self._published
+            self.published = replace(before, scanned_at=scene.now)
+            return self.published
         self._odd = odd
-        self._published = self._compose(scene.now)
-        self._report(before, self._published, removed, added, begun)
-        return self._published
+        self.published = self._compose(scene.now)
+        self._report(before, self.published, removed, added, begun)
+        return self.published
 
     def _scene(self) -> Scene:
         now = self._clock.now()

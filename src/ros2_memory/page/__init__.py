@@ -1,0 +1,76 @@
+"""The page at `/`: the memory at a glance, for a browser on this machine.
+
+It holds no data and asks for none but through `/mcp`, so whoever may not ask sees an empty page.
+What was recorded is hostile text: the page writes it as text alone, and its policy allows no
+script, style, or destination but its own, should that ever fail.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+from importlib import resources
+from typing import TYPE_CHECKING, Final
+
+from starlette.responses import Response
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Receive, Scope, Send
+
+PAGE_PATH: Final = "/"
+
+_INLINE: Final = re.compile(rb"<(script|style)>(.*?)</\1>", re.DOTALL)
+_METHODS: Final = frozenset({"GET", "HEAD"})
+
+
+class Page:
+    """Answers `GET /` with the page, and passes everything else on."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._html = resources.files(__name__).joinpath("index.html").read_bytes()
+        self._headers = {
+            "content-security-policy": policy(self._html),
+            "x-content-type-options": "nosniff",
+            "referrer-policy": "no-referrer",
+            "cross-origin-resource-policy": "same-origin",
+            "cache-control": "no-cache",
+        }
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """ASGI."""
+        is_page = scope["type"] == "http" and scope["path"] == PAGE_PATH
+        if not is_page or scope["method"] not in _METHODS:
+            await self._app(scope, receive, send)
+            return
+        response = Response(self._html, media_type="text/html", headers=self._headers)
+        if scope["method"] == "HEAD":
+            response.body = b""
+        await response(scope, receive, send)
+
+
+def policy(html: bytes) -> str:
+    """The Content-Security-Policy of a page that is whole in itself.
+
+    Its inline scripts and styles are allowed by their hash (CSP level 3, section 2.3.1), and
+    nothing else is loaded, sent, framed, or made of text.
+    """
+    hashes: dict[bytes, list[str]] = {b"script": [], b"style": []}
+    for kind, body in _INLINE.findall(html):
+        digest = base64.b64encode(hashlib.sha256(body).digest()).decode("ascii")
+        hashes[kind].append(f"'sha256-{digest}'")
+    return "; ".join(
+        (
+            "default-src 'none'",
+            f"script-src {' '.join(hashes[b'script'])}",
+            f"style-src {' '.join(hashes[b'style'])}",
+            "connect-src 'self'",
+            "img-src data:",
+            "base-uri 'none'",
+            "form-action 'none'",
+            "frame-ancestors 'none'",
+            "require-trusted-types-for 'script'",
+            "trusted-types 'none'",
+        )
+    )

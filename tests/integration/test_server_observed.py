@@ -1,0 +1,205 @@
+"""The query server as its own process, scraped as Prometheus does, and sending spans."""
+
+from __future__ import annotations
+
+import http.client
+import http.server
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import httpx2
+import pytest
+from mcp import Client
+from mcp.client.streamable_http import streamable_http_client
+
+from tests.integration.test_server_process import (
+    ENDS_WITHIN_S,
+    Served,
+    command,
+    environment,
+    serving,
+)
+from tests.questions import ask, write_run
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+GOOD = "kJ7-x._~+/0123456789=="
+SHOWN = {"Authorization": f"Bearer {GOOD}"}
+SWITCHES = {"server.metrics": "prometheus_client", "server.traces": "opentelemetry.sdk"}
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    write_run(tmp_path / "bags")
+    return tmp_path / "bags"
+
+
+def get(served: Served, path: str, headers: dict[str, str]) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=10)
+    try:
+        connection.request("GET", path, headers=headers)
+        response = connection.getresponse()
+        return response.status, response.read()
+    finally:
+        connection.close()
+
+
+@contextmanager
+def collector() -> Iterator[tuple[str, list[bytes]]]:
+    """Where spans are sent to, and the bodies that came."""
+    bodies: list[bytes] = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            bodies.append(self.rfile.read(int(self.headers["content-length"])))
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - its name
+            """Tests have no log."""
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}", bodies
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+async def asked(served: Served) -> None:
+    async with (
+        httpx2.AsyncClient(headers=SHOWN) as shown,
+        Client(streamable_http_client(served.url("/mcp"), http_client=shown)) as client,
+    ):
+        await ask(client, "data_time_range", {})
+        await ask(client, "data_time_range", {})
+        await ask(client, "get_position_at", {"timestamp": 5})
+        await ask(client, "no_such_tool", {})
+
+
+async def test_what_was_asked_and_what_is_known_is_scraped_by_whoever_shows_the_token(
+    bag_dir: Path, tmp_path: Path
+) -> None:
+    parser = pytest.importorskip("prometheus_client.parser", reason="needs the extra observability")
+    with serving(bag_dir, tmp_path / "log", "server.metrics=true", MEMORY_API_TOKEN=GOOD) as served:
+        await asked(served)
+        assert get(served, "/metrics", {})[0] == 401
+        assert get(served, "/metrics", {"Authorization": "Bearer x"})[0] == 401
+        assert get(served, "/metrics", SHOWN | {"Host": "evil.example"})[0] == 421
+        status, body = get(served, "/metrics", SHOWN)
+    assert status == 200
+    found = {
+        (sample.name, *sorted(sample.labels.items())): sample.value
+        for family in parser.text_string_to_metric_families(body.decode())
+        for sample in family.samples
+    }
+    assert all(name.startswith("ros2_memory_") for name, *_ in found)
+    answered = {
+        (dict(labels)["tool"], dict(labels)["outcome"]): value
+        for (name, *labels), value in found.items()
+        if name == "ros2_memory_answers_total"
+    }
+    assert answered == {
+        ("data_time_range", "ok"): 2,
+        ("get_position_at", "no_data"): 1,
+        ("unknown", "invalid_arguments"): 1,
+    }
+    assert found["ros2_memory_bags",] == 1
+    assert found["ros2_memory_kept_bytes",] == (bag_dir / "run" / "run_0.mcap").stat().st_size
+    assert found["ros2_memory_newest_data_age_seconds",] > 0
+    assert found["ros2_memory_budget_bytes",] == 5e9
+
+
+async def test_each_call_is_one_span_at_the_collector(bag_dir: Path, tmp_path: Path) -> None:
+    pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")
+    from opentelemetry.proto.collector.trace.v1 import trace_service_pb2  # noqa: PLC0415
+
+    with collector() as (endpoint, bodies):
+        more = {"OTEL_EXPORTER_OTLP_ENDPOINT": endpoint, "MEMORY_API_TOKEN": GOOD}
+        with serving(bag_dir, tmp_path / "log", "server.traces=true", **more) as served:
+            await asked(served)
+            assert get(served, "/metrics", SHOWN)[0] == 404
+            # The last spans leave when it ends.
+            served.process.terminate()
+            assert served.process.wait(ENDS_WITHIN_S) == 0
+    outcomes = []
+    for body in bodies:
+        for resource in trace_service_pb2.ExportTraceServiceRequest.FromString(body).resource_spans:
+            named = {each.key: each.value.string_value for each in resource.resource.attributes}
+            assert named["service.name"] == "ros2-memory-server"
+            for scope in resource.scope_spans:
+                for span in scope.spans:
+                    if span.name.startswith("tools/call"):
+                        told = {each.key: each.value.string_value for each in span.attributes}
+                        outcomes.append((span.name, told.get("ros2_memory.outcome")))
+    assert outcomes == [
+        ("tools/call data_time_range", "ok"),
+        ("tools/call data_time_range", "ok"),
+        ("tools/call get_position_at", "no_data: outside_range"),
+        ("tools/call no_such_tool", "invalid_arguments"),
+    ]
+
+
+def refused(bag_dir: Path, program: list[str]) -> str:
+    """What a server says that does not start."""
+    ended = subprocess.run(
+        program,
+        env=environment(bag_dir),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    return ended.stderr
+
+
+@pytest.mark.parametrize("key", SWITCHES)
+def test_without_the_extra_it_does_not_start_and_says_what_to_install(
+    bag_dir: Path, key: str
+) -> None:
+    absent = SWITCHES[key]
+    hidden = (
+        f"import sys; sys.modules[{absent!r}] = None; from ros2_memory.server import main; "
+        f"sys.exit(main(['server.transport=sse', 'server.port=0', '{key}=true']))"
+    )
+    told = refused(bag_dir, [sys.executable, "-c", hidden])
+    assert len(told.splitlines()) == 2
+    assert f"{key}: true needs the optional part of this package" in told
+    assert "pip install 'ros2-memory[observability]'" in told
+
+
+def test_there_are_no_metrics_over_stdio(bag_dir: Path) -> None:
+    told = refused(bag_dir, command("server.metrics=true"))
+    assert len(told.splitlines()) == 2
+    assert "server.transport=sse" in told
+
+
+def test_a_server_that_is_not_observed_loads_nothing_for_it(bag_dir: Path) -> None:
+    """And so runs without the extra."""
+    loaded = (
+        "import sys; from ros2_memory.config import load_settings; "
+        "from ros2_memory.bootstrap import build_memory, build_telemetry; "
+        "import ros2_memory.server; settings = load_settings(); "
+        "build_telemetry(settings, build_memory(settings)); "
+        "print([name for name in sys.modules if name.startswith("
+        "('prometheus_client', 'opentelemetry.sdk', 'ros2_memory.observability'))])"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", loaded],
+        env=environment(bag_dir),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert ended.stdout == "[]\n"
