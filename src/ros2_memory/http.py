@@ -13,7 +13,7 @@ import anyio.to_thread
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.applications import Starlette
 from starlette.datastructures import Headers
-from starlette.responses import JSONResponse, PlainTextResponse
+from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
 from ros2_memory.gate import ADMITTED, HEALTH_PATH, TokenGate
@@ -29,10 +29,12 @@ if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
     from ros2_memory.fitting import JsonObject
+    from ros2_memory.telemetry import Exposition
 
 Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 
 STREAM_PATH: Final = "/sse"
+METRICS_PATH: Final = "/metrics"
 GRACE_S: Final = 0.4
 """How long requests under way may still take when the server stops; event streams end at once."""
 
@@ -50,12 +52,14 @@ def web_app(
     health: Callable[[], Awaitable[JsonObject]],
     background: Background,
     api_token: str | None = None,
+    metrics: Callable[[], Awaitable[Exposition]] | None = None,
 ) -> WebApp:
     """The application that listens on `host`.
 
-    `background` runs from start to end of the application, and is cancelled then. `api_token` is
-    demanded of every request; without it `/health` shows its status alone, and on the loopback
-    address the page is shown, which asks for it.
+    `background` runs from start to end of the application, and is cancelled then. `metrics` gives
+    what `/metrics` shows; without it there is no such path. `api_token` is demanded of every
+    request; without it `/health` shows its status alone, and on the loopback address the page is
+    shown, which asks for it.
     """
     # `Guard` stands before all routes, and knows the addresses of a host such as 0.0.0.0.
     guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
@@ -80,6 +84,8 @@ def web_app(
             tasks.cancel_scope.cancel()
 
     routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
+    if metrics is not None:
+        routes.append(Route(METRICS_PATH, _showing(metrics), methods=["GET"]))
     app: ASGIApp = Intake(SessionNames(Starlette(routes=routes, lifespan=lifespan)))
     if host.lower() not in _LOOPBACK:
         app = Page(app)
@@ -90,6 +96,16 @@ def web_app(
         # Where others can reach the server, the token comes first nevertheless.
         app = Page(app)
     return WebApp(Guard(app, host))
+
+
+def _showing(
+    metrics: Callable[[], Awaitable[Exposition]],
+) -> Callable[[Request], Awaitable[Response]]:
+    async def show(_request: Request) -> Response:
+        shown = await metrics()
+        return Response(shown.body, headers={"content-type": shown.content_type})
+
+    return show
 
 
 class WebApp:
