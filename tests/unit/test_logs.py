@@ -75,6 +75,8 @@ def test_what_libraries_log_has_the_same_shape(capsys: pytest.CaptureFixture[str
 
 
 def test_warnings_have_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
+    # Left on by another test, it would be taken for on here, where warnings go elsewhere.
+    logging.captureWarnings(capture=False)
     configure_logging("info", "json")
     with warnings.catch_warnings():
         warnings.simplefilter("default")

@@ -73,6 +73,6 @@ def _show(console: Console, found: Sequence[Finding]) -> None:
             (f"{each.about:<9}", "bold"),
             plain(each.seen),
         )
-        console.print(line)
+        console.print(line, soft_wrap=True)
         if each.do and each.level is not Level.OK:
-            console.print(Text(f"{'':17}-> {plain(each.do)}"))
+            console.print(Text(f"{'':17}-> {plain(each.do)}"), soft_wrap=True)
