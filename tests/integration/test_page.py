@@ -87,7 +87,7 @@ def test_it_shows_the_memory_at_a_glance(page: Browser) -> None:
     assert "1 gap (60 s), 1 damaged bag" in label
     assert "/odom" in page.text("#topics")
     assert "nav_msgs/msg/Odometry" in page.text("#topics")
-    assert "Recorder" in page.text("#state")
+    assert "Recorder\nnot heard of" in page.text("#state")
     assert "GB" in page.text("#state")
     assert "30.0 m in odom" in page.text("#way")
     drawn = page.run("return document.querySelector('#way polyline').getAttribute('points')")
