@@ -18,7 +18,15 @@ import anyio
 
 from ros2_memory.bootstrap import build_server, limits_of
 from ros2_memory.config import load_settings
-from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.recorder.handover import Handover, Overlap, write_handover
+from ros2_memory.recorder.heartbeat import (
+    HEARTBEAT_FILE,
+    Heartbeat,
+    RecorderState,
+    write_heartbeat,
+)
+from ros2_memory.recorder.keepsake import Keepsake, write_keepsake
+from ros2_memory.recorder.layout import HANDOVER_FILE, MOMENT_FILE
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import McapLayout, Msg, detections, odom, text, tf, transform, write_mcap
 from tests.keeping import keeper_of
@@ -130,19 +138,7 @@ def write_history(bag_dir: Path) -> Path:
 @contextmanager
 def recorder_beside(bag_dir: Path, clock: SettableClock) -> Iterator[None]:
     """A recorder's heartbeat, and what it does when a moment is to be kept."""
-    beat = Heartbeat(
-        pid=4711,
-        updated=clock.at,
-        state=RecorderState.RECORDING,
-        recordings=(RECORDING,),
-        since=START_S * NS_PER_S,
-        bytes_written=1_000_000,
-        subscribed=("/odom", "/tf", "/tf_static"),
-        silent=(),
-        last_error=None,
-        interval_s=2.0,
-    )
-    write_heartbeat(bag_dir, beat)
+    write_heartbeat(bag_dir, heartbeat(clock.at))
     house, over = keeper_of(bag_dir, clock=clock), threading.Event()
 
     def work() -> None:
@@ -172,3 +168,31 @@ def replies(bag_dir: Path) -> dict[str, str]:
             told[name] = anyio.run(server.dispatcher.answer, tool, given).text
     server.dispatcher.stop()
     return told
+
+
+def shown_files(bag_dir: Path) -> dict[str, str]:
+    """The recorder's own files of that history, by name."""
+    write_heartbeat(bag_dir, heartbeat(NOW))
+    cut = (START_S + 60) * NS_PER_S
+    overlap = Overlap(cut - 2 * NS_PER_S, cut + 2 * NS_PER_S, (f"{RECORDING}_5.mcap",))
+    write_handover(bag_dir, Handover(next="rec_20261120T080058Z", counts_until=cut, end=overlap))
+    start = (START_S + 34) * NS_PER_S
+    write_keepsake(bag_dir, Keepsake("5f0c" * 8, "scissors found", start, NOW, NOW, pending=False))
+    names = (HEARTBEAT_FILE, HANDOVER_FILE, MOMENT_FILE)
+    return {name: (bag_dir / name).read_text(encoding="utf-8") for name in names}
+
+
+def heartbeat(now: int) -> Heartbeat:
+    """What the recorder says at some time of that history."""
+    return Heartbeat(
+        pid=4711,
+        updated=now,
+        state=RecorderState.RECORDING,
+        recordings=(RECORDING,),
+        since=START_S * NS_PER_S,
+        bytes_written=1_000_000,
+        subscribed=("/odom", "/tf", "/tf_static"),
+        silent=(),
+        last_error=None,
+        interval_s=2.0,
+    )

@@ -71,7 +71,7 @@ def test_every_key_that_readme_tells_of_exists() -> None:
     assert {key for key in told if key.split(".")[0] in sections} <= known
 
 
-DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 NAMED = sorted(
     {
         (document.name, reference)

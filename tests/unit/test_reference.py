@@ -15,11 +15,12 @@ from ros2_memory.errors import EpisodicError, NoDataReason
 from ros2_memory.memory import Limits
 from ros2_memory.tools import build_tools
 from tests import reference
-from tests.documented import CALLS, MISTAKES, replies, write_history
+from tests.documented import CALLS, MISTAKES, replies, shown_files, write_history
 from tests.memories import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+    from pathlib import Path
 
 FOLDER = ROOT / "docs" / "reference"
 TOOLS = build_tools(Limits(), 25.0, writing=True)
@@ -107,3 +108,8 @@ def test_every_error_that_is_shown_is_what_the_server_says(
     tool, given = MISTAKES[part]
     call = json.dumps({"name": tool, "arguments": given})
     compare("errors", part, f"```json\n{call}\n```\n\n{reference.shown(answers[part])}")
+
+
+def test_every_file_that_is_shown_is_what_the_recorder_writes(tmp_path: Path) -> None:
+    for part, text in shown_files(tmp_path).items():
+        compare("files", part, reference.shown(text))
