@@ -32,7 +32,7 @@ class Recording:
         self._log = directory.with_name(f"{directory.name}.log")
         self._log.parent.mkdir(parents=True, exist_ok=True)
         # Whatever this process inherited.
-        signals = "--ignore-signal=INT" if ignore_sigint else "--default-signal=INT"
+        signals = "--ignore-signal=INT" if ignore_sigint else "--default-signal=INT,HUP"
         argv = ["env", signals, "ros2", "bag", "record", "-s", "mcap", "-o", str(directory)]
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
