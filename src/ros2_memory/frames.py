@@ -141,6 +141,10 @@ def _known_pairs(
 ) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
     """The pairs that the catalogue has of a run of bags, and the time of bags it has none of."""
     notes = view.recalled(run) if topic in run.spans else None
+    if notes is not None and window.covers(*run.spans[topic]):
+        every = notes.pairs(topic)
+        if every is not None:
+            return set(every), []
     numbers = {} if notes is None else notes.numbers
     edges = {} if notes is None else notes.edges(topic)
     known: set[tuple[str, str]] = set()

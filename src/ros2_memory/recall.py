@@ -74,6 +74,7 @@ class RunNotes:
         self._evidence: dict[str, Evidence] = {}
         self._boxes: dict[str, Boxes] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
+        self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._kept: dict[str, dict[int, tuple[Record, ...]]] = {}
 
     def evidence_of_all(self, topic: str) -> Evidence:
@@ -108,6 +109,16 @@ class RunNotes:
         return self._kept_as(
             self._edges, topic, lambda: self._catalogue.edges(topic, self._of(topic))
         )
+
+    def pairs(self, topic: str) -> frozenset[tuple[str, str]] | None:
+        """The frame pairs of all the run's bags; None where those of some are not known."""
+        return self._kept_as(self._pairs, topic, lambda: self._pairs_of(topic))
+
+    def _pairs_of(self, topic: str) -> frozenset[tuple[str, str]] | None:
+        edges = self.edges(topic)
+        if not self.whole or len(edges) < len(self._of(topic)):
+            return None
+        return frozenset(pair for edge in edges.values() for pair in edge.pairs)
 
     def kept(self, topic: str) -> Mapping[int, tuple[Record, ...]]:
         """For each entry that keeps them all messages of the topic.
