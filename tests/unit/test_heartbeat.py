@@ -225,7 +225,8 @@ def test_on_a_full_disk_the_one_that_lies_there_is_overwritten(tmp_path: Path) -
         write_heartbeat(disk, replace(BEAT, last_error="x" * 700))
         with filled(disk):
             for error in ("the disk is full", None):
-                write_heartbeat(disk, replace(BEAT, last_error=error))
+                with pytest.raises(RecorderError, match="No space left"):
+                    write_heartbeat(disk, replace(BEAT, last_error=error))
                 assert read_heartbeat(disk).heartbeat == replace(BEAT, last_error=error)
             with pytest.raises(RecorderError, match="No space left"):
                 write_heartbeat(disk, replace(BEAT, last_error="y" * 10_000))

@@ -103,15 +103,16 @@ def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
     very moment may find no heartbeat, and finds this one when it looks again.
 
     Raises:
-        RecorderError: it cannot be written, e.g. because the disk is full; the old one stands.
+        RecorderError: the disk is full, whether it could be overwritten or not; or it cannot be
+            written, and the old one stands.
     """
     target = bag_dir / HEARTBEAT_FILE
     text = json.dumps(asdict(heartbeat), allow_nan=False, separators=(",", ":"))
     try:
         write_durably(target, text)
     except OSError as error:
-        if error.errno in _NO_ROOM and _overwritten(target, text.encode()):
-            return
+        if error.errno in _NO_ROOM:
+            _overwritten(target, text.encode())
         raise RecorderError(
             f"{target} cannot be written: {error.strerror or error}; "
             "free disk space or correct the permissions of the bag directory"
