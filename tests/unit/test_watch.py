@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import cli
+from ros2_memory.cli.showing import span
 from ros2_memory.cli.watching import AS_USUAL, Course
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import boolean, odom, text, write_mcap
@@ -97,3 +98,41 @@ def test_a_terminal_gets_a_table() -> None:
     assert b"/odom" in shown
     assert b"usually" in shown
     assert b"silent" in shown
+
+
+class TestOldData:
+    @pytest.fixture
+    def old(self, tmp_path: Path) -> Path:
+        folder = tmp_path / "old"
+        messages = [odom((1_700_000_000 * 10 + n) * NS_PER_S // 10, 0.0, 0.0) for n in range(100)]
+        write_mcap(folder / "rec" / "rec_0.mcap", messages)
+        os.utime(folder / "rec" / "rec_0.mcap", (1_700_000_010,) * 2)
+        return folder
+
+    def test_is_not_judged_by_what_is_usual(self, old: Path, capsys: Capture) -> None:
+        assert cli.main(["watch", "--count", "1", "--bag-dir", str(old)]) == 0
+        told = capsys.readouterr().out
+        assert "as usual" not in told
+        assert "days old; nothing comes in: 1 topic not judged" in told
+
+    def test_is_as_old_as_the_tools_say(self, old: Path, capsys: Capture) -> None:
+        words = ["watch", "--count", "1", "--bag-dir", str(old), "data.now=latest"]
+        assert cli.main(words) == 0
+        told = capsys.readouterr().out
+        assert "which is now (data.now=latest); nothing comes in" in told
+        assert "days old" not in told
+
+
+@pytest.mark.parametrize(
+    ("seconds", "told"),
+    [
+        (0.04, "0.0 s"),
+        (119.0, "119.0 s"),
+        (600.0, "10 min"),
+        (18_000.0, "5.0 h"),
+        (864_000.0, "10 days"),
+        (-30.0, "-30.0 s"),
+    ],
+)
+def test_a_duration_has_the_unit_that_suits_it(seconds: float, told: str) -> None:
+    assert span(seconds) == told

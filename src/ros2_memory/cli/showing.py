@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 _FIRST_MOMENT: Final = 1e9
 _LAST_MOMENT: Final = 4.2e9
 """Replies have times as floats of Unix seconds; hardly anything else lies between 2001 and 2103."""
+_MINUTES_FROM_S: Final = 120.0
+_HOURS_FROM_S: Final = 7200.0
+_DAYS_FROM_S: Final = 172_800.0
 _NESTED: Final = 8
 _MOST_COLUMNS: Final = 9
 _NOTHING: Final = "-"
@@ -123,6 +126,16 @@ def moment(unix_s: float) -> str:
     """A time in this machine's zone, to the millisecond."""
     local = datetime.fromtimestamp(unix_s, tz=UTC).astimezone()
     return f"{local:%Y-%m-%d %H:%M:%S}.{local.microsecond // 1000:03d}"
+
+
+def span(seconds: float) -> str:
+    """A duration in the unit that suits it: `4.2 s`, `12 min`, `5.1 h`, `23 days`."""
+    amount = abs(seconds)
+    if amount < _MINUTES_FROM_S:
+        return f"{seconds:.1f} s"
+    if amount < _HOURS_FROM_S:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h" if amount < _DAYS_FROM_S else f"{seconds / 86_400:.0f} days"
 
 
 def plain(text: str) -> str:

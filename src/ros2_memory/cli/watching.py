@@ -14,19 +14,23 @@ from rich.text import Text
 
 from ros2_memory.accounts import Status
 from ros2_memory.cli.running import BagDir, Overrides, opened, output, reporting, say, settings_for
-from ros2_memory.cli.showing import moment, plain
+from ros2_memory.cli.showing import moment, plain, span
 from ros2_memory.cli.telling import usual_rate
 from ros2_memory.errors import BagError, InvalidArgumentsError
 from ros2_memory.memory import Call, Memory
 from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.recorder.snapshot import Snapshot
 from ros2_memory.status import memory_status
-from ros2_memory.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.wording import counted
 
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S
 """The newest data of this length is what goes on just now."""
 AS_USUAL: Final = "as usual"
+FRESH_SPLITS: Final = 3
+"""Data is live while it is no older than so many splits (and than `FRESH_NS`)."""
+FRESH_NS: Final[Ns] = 60 * NS_PER_S
 _FEW: Final = 5
 """So few messages make no rate."""
 _SILENT_PERIODS: Final = 10
@@ -59,11 +63,16 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What was seen at one moment."""
+    """What was seen at one moment.
+
+    `now` is that of the wall clock; ages count from the status's own. Where `live` is False the
+    newest data is old, and rates in it say nothing of what is recorded just now.
+    """
 
     now: Ns
     status: Status
     courses: tuple[Course, ...]
+    live: bool
 
     @property
     def recorder(self) -> str:
@@ -75,7 +84,11 @@ class Look:
     def newest(self) -> str:
         """How old the newest data is."""
         latest = self.status.latest
-        return "no data" if latest is None else f"{unix_from_ns(self.now - latest):.1f} s old"
+        if latest is None:
+            return "no data"
+        if self.status.now == latest != self.now:
+            return f"{moment(unix_from_ns(latest))}, which is now (data.now=latest)"
+        return f"{span(unix_from_ns(self.status.now - latest))} old"
 
 
 def watch(
@@ -89,6 +102,7 @@ def watch(
 ) -> None:
     """Watch what is being recorded: the recorder, the newest data, rates against the usual ones.
 
+    Ages count as in the tools' answers (data.now). Rates are judged only while data comes in.
     On a terminal a table that is kept up to date, elsewhere a line for each look. Ends with Ctrl-C.
     """
     with reporting("watch"):
@@ -126,8 +140,26 @@ def _looks(memory: Memory, every_s: float, count: int | None) -> Iterator[Look]:
 
 def looked(memory: Memory) -> Look:
     """What there is to see now."""
-    snapshot = memory.index.snapshot()
-    return Look(memory.clock.now(), memory_status(memory, Call()), (*_courses(memory, snapshot),))
+    snapshot, wall = memory.index.snapshot(), memory.clock.now()
+    status = memory_status(memory, Call())
+    live = _is_live(memory, snapshot, status, wall)
+    return Look(wall, status, (*_courses(memory, snapshot),), live)
+
+
+def _is_live(memory: Memory, snapshot: Snapshot, status: Status, wall: Ns) -> bool:
+    """Whether the newest data is what is being recorded.
+
+    Where its own time is the present, as in a simulation, only a recorder or a file that grows can
+    tell.
+    """
+    latest = snapshot.dating.latest
+    if latest is None:
+        return False
+    if memory.limits.now == "latest":
+        recording = status.live and status.recorder == RecorderState.RECORDING
+        return recording or bool(snapshot.active)
+    splits = ns_from_unix(FRESH_SPLITS * memory.limits.split_duration_s)
+    return abs(wall - latest) <= max(splits, FRESH_NS)
 
 
 def _courses(memory: Memory, snapshot: Snapshot) -> Iterator[Course]:
@@ -157,13 +189,20 @@ def _heard(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -
 
 def line(look: Look) -> str:
     """One look in one line, for logs: what is not as usual is named."""
-    odd = [each for each in look.courses if each.judged != AS_USUAL]
-    usual = counted(len(look.courses) - len(odd), "topic")
-    said = [f"{usual} as usual", *(f"{plain(each.topic)} {_rates(each)}" for each in odd)]
+    if look.live:
+        odd = [each for each in look.courses if each.judged != AS_USUAL]
+        usual = counted(len(look.courses) - len(odd), "topic")
+        said = [f"{usual} as usual", *(f"{plain(each.topic)} {_rates(each)}" for each in odd)]
+    else:
+        said = [_not_live(look)] if look.courses else []
     return (
-        f"{moment(unix_from_ns(look.now))} recorder: {look.recorder}; newest: {look.newest}; "
-        f"{'; '.join([*said, *map(plain, look.status.problems)])}"
+        f"{moment(unix_from_ns(look.now))} recorder: {look.recorder}; newest: {look.newest}"
+        f"{''.join(f'; {each}' for each in [*said, *map(plain, look.status.problems)])}"
     )
+
+
+def _not_live(look: Look) -> str:
+    return f"nothing comes in: {counted(len(look.courses), 'topic')} not judged"
 
 
 def _rates(course: Course) -> str:
@@ -191,7 +230,10 @@ def shown(look: Look) -> Sequence[Text | Table]:
             f"{each.rate:.1f}",
             "-" if each.usual is None else f"{each.usual:.1f}",
             f"{each.age_s:.1f} s",
-            Text(each.judged, style=_STYLES[each.judged]),
+            Text(each.judged, style=_STYLES[each.judged]) if look.live else Text(""),
         )
     problems = [Text(plain(each), style="red") for each in look.status.problems]
+    if look.courses and not look.live:
+        told = f"{_not_live(look)}; the rates are those of the last 10 s of data"
+        problems.insert(0, Text(told, style="yellow"))
     return (head, table, *problems)
