@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import logging
 import sys
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 from structlog.stdlib import ProcessorFormatter
 
 if TYPE_CHECKING:
     from structlog.typing import FilteringBoundLogger, Processor
+
+_TALKATIVE: Final = "mcp.server.streamable_http"
+"""Says at the end of each request that a session ends, where there are no sessions."""
 
 
 def configure_logging(
@@ -59,6 +62,8 @@ def configure_logging(
         )
     )
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    least = logging.WARNING if level == "info" else logging.NOTSET
+    logging.getLogger(_TALKATIVE).setLevel(least)
     logging.captureWarnings(capture=True)
 
 

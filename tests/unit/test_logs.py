@@ -6,10 +6,11 @@ import json
 import logging
 import warnings
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 import structlog
+from mcp.server import streamable_http as transport
 
 from ros2_memory.logs import configure_logging, get_logger
 
@@ -25,6 +26,7 @@ def restored_logging() -> Iterator[None]:
     root.handlers = []
     yield
     root.level, root.handlers = level, handlers
+    logging.getLogger(transport.__name__).setLevel(logging.NOTSET)
     logging.captureWarnings(capture=False)
     structlog.reset_defaults()
 
@@ -72,6 +74,21 @@ def test_what_libraries_log_has_the_same_shape(capsys: pytest.CaptureFixture[str
     (event,) = events(capsys)
     assert datetime.fromisoformat(event.pop("timestamp")).tzinfo == UTC
     assert event == {"event": "port 9203 is busy", "logger": "uvicorn.error", "level": "warning"}
+
+
+@pytest.mark.parametrize(
+    ("level", "told"),
+    [("debug", ["info", "warning"]), ("info", ["warning"]), ("error", [])],
+)
+def test_the_end_of_a_request_is_no_event_and_a_warning_of_its_library_is(
+    level: Literal["debug", "info", "error"], told: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    theirs = logging.getLogger(transport.__name__)
+    assert transport.logger is theirs
+    configure_logging(level, "json")
+    theirs.info("Terminating session: None")
+    theirs.warning("a stream was closed")
+    assert [event["level"] for event in events(capsys)] == told
 
 
 def test_warnings_have_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
