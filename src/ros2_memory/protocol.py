@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Final
 
 from mcp.server.lowlevel.helper_types import ReadResourceContents
 from mcp.server.mcpserver import Context, MCPServer
-from mcp.server.mcpserver.exceptions import ResourceError
+from mcp.server.mcpserver.exceptions import ResourceNotFoundError
+from mcp.shared.exceptions import MCPError
 from mcp.types import (
+    INVALID_PARAMS,
     CallToolResult,
     GetPromptResult,
     Prompt,
@@ -59,7 +61,8 @@ class EpisodicServer(MCPServer[object]):
         super().__init__(name, version=version, instructions=instructions)
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in tools]
-        self._reads_more = any(tool.name == STATUS.tool for tool in tools)
+        reads_more = any(tool.name == STATUS.tool for tool in tools)
+        self._offered = (TOPICS, STATUS, SCHEMA) if reads_more else (TOPICS,)
         self._prompt = f"{instructions}\n{PROMPT}"
 
     async def list_tools(self) -> list[ListedTool]:
@@ -78,15 +81,15 @@ class EpisodicServer(MCPServer[object]):
 
     async def list_resources(self) -> list[Resource]:
         """What can be read as it is."""
-        fixed = (TOPICS, STATUS) if self._reads_more else (TOPICS,)
         return [
             Resource(uri=each.uri, name=each.name, description=each.description, mime_type=_JSON)
-            for each in fixed
+            for each in self._offered
+            if each is not SCHEMA
         ]
 
     async def list_resource_templates(self) -> list[ResourceTemplate]:
         """What can be read for each message type."""
-        if not self._reads_more:
+        if SCHEMA not in self._offered:
             return []
         return [
             ResourceTemplate(
@@ -103,12 +106,13 @@ class EpisodicServer(MCPServer[object]):
         """A resource's JSON: the reply of the question behind it, errors included.
 
         Raises:
-            ResourceError: there is no such resource.
+            ResourceNotFoundError: there is no such resource; the client is told so by the code
+                that the protocol has for it, -32602 (SEP-2164).
         """
         try:
-            name, given = asked_of(str(uri))
+            name, given = asked_of(str(uri), self._offered)
         except InvalidArgumentsError as error:
-            raise ResourceError(str(error)) from error
+            raise ResourceNotFoundError(str(error)) from error
         reply = await self.dispatcher.answer(name, given, _client(context))
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
@@ -125,11 +129,11 @@ class EpisodicServer(MCPServer[object]):
         """What teaches a planner how to use the memory.
 
         Raises:
-            ValueError: there is no such prompt.
+            MCPError: there is no such prompt.
         """
         del arguments, context
         if name != _PROMPT_NAME:
-            raise ValueError(f"there is one prompt, {_PROMPT_NAME}")
+            raise MCPError(code=INVALID_PARAMS, message=f"there is one prompt, {_PROMPT_NAME}")
         text = TextContent(type="text", text=self._prompt)
         return GetPromptResult(
             description=_PROMPT_SAYS, messages=[PromptMessage(role="user", content=text)]

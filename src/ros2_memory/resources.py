@@ -8,10 +8,13 @@ from urllib.parse import unquote
 from ros2_memory.errors import InvalidArgumentsError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.model import JsonValue
 
 SCHEME: Final = "episodic://"
 _OF_TYPE: Final = f"{SCHEME}schema/"
+_LONGEST: Final = 200
 
 
 class Readable(NamedTuple):
@@ -40,17 +43,18 @@ SCHEMA: Final = Readable(
 )
 
 
-def asked_of(uri: str) -> tuple[str, dict[str, JsonValue]]:
+def asked_of(uri: str, offered: Sequence[Readable]) -> tuple[str, dict[str, JsonValue]]:
     """The question behind a URI: a tool and its arguments.
 
     Raises:
-        InvalidArgumentsError: there is no such resource.
+        InvalidArgumentsError: it is none of the resources that are offered.
     """
-    for fixed in (TOPICS, STATUS):
-        if uri == fixed.uri:
-            return fixed.tool, {}
-    if uri.startswith(_OF_TYPE) and len(uri) > len(_OF_TYPE):
-        return SCHEMA.tool, {"type": unquote(uri.removeprefix(_OF_TYPE))}
-    raise InvalidArgumentsError(
-        f"there is no such resource; there are {TOPICS.uri}, {STATUS.uri} and {SCHEMA.uri}"
-    )
+    for each in offered:
+        if each is SCHEMA:
+            if uri.startswith(_OF_TYPE) and len(uri) > len(_OF_TYPE):
+                return SCHEMA.tool, {"type": unquote(uri.removeprefix(_OF_TYPE))}
+        elif uri == each.uri:
+            return each.tool, {}
+    shown = uri if len(uri) <= _LONGEST else f"{uri[:_LONGEST]}..."
+    there = ", ".join(each.uri for each in offered)
+    raise InvalidArgumentsError(f"there is no resource {shown}; what can be read: {there}")

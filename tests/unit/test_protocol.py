@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from mcp import Client
 from mcp.shared.exceptions import MCPError
-from mcp.types import TextContent, TextResourceContents
+from mcp.types import INVALID_PARAMS, TextContent, TextResourceContents
 
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
@@ -79,8 +79,21 @@ async def test_a_type_that_was_not_recorded_is_no_data(tmp_path: Path) -> None:
 async def test_there_are_no_other_resources(tmp_path: Path, uri: str) -> None:
     write_run(tmp_path)
     async with Client(server(tmp_path)) as client:
-        with pytest.raises(MCPError):
+        with pytest.raises(MCPError) as refused:
             await client.read_resource(uri)
+    assert refused.value.error.code == INVALID_PARAMS
+    for named in (uri, "episodic://topics", "episodic://status", "episodic://schema/{type}"):
+        assert named in refused.value.error.message
+
+
+async def test_a_resource_that_is_not_offered_is_told_with_those_that_are(tmp_path: Path) -> None:
+    async with Client(server(tmp_path, "server.tools=spec")) as client:
+        for uri in ("episodic://status", f"episodic://{'x' * 10_000}"):
+            with pytest.raises(MCPError) as refused:
+                await client.read_resource(uri)
+            assert refused.value.error.code == INVALID_PARAMS
+            assert refused.value.error.message.endswith("what can be read: episodic://topics")
+            assert len(refused.value.error.message) < 300
 
 
 async def test_the_prompt_teaches_with_tools_that_there_are(tmp_path: Path) -> None:
@@ -93,8 +106,9 @@ async def test_the_prompt_teaches_with_tools_that_there_are(tmp_path: Path) -> N
         for name in ("find_matches", "recap_last", "visits", "memory_status", "data_time_range"):
             assert name in tools
             assert name in message.content.text
-        with pytest.raises(MCPError):
+        with pytest.raises(MCPError, match=prompt.name) as refused:
             await client.get_prompt("another")
+    assert refused.value.error.code == INVALID_PARAMS
 
 
 async def test_with_the_specifications_tools_alone_nothing_speaks_of_the_others(
