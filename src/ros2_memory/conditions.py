@@ -44,10 +44,10 @@ _SIDES: Final = {"above": True, "below": False}
 
 @dataclass(frozen=True, slots=True)
 class Contains:
-    """A text anywhere in the value, or an element of any list in it.
+    """A text inside any string at any depth (not the keys), without regard to case.
 
-    A text matches without regard to case, inside any string at any depth (not the keys); a number
-    or a boolean matches an equal element of a list, compared as `Equals` compares.
+    Whatever `Equals` finds is contained as well, be it an element of a list or not: an answer that
+    nothing holds true would be wrong where a boolean is.
     """
 
     needle: Scalar
@@ -58,17 +58,17 @@ class Contains:
 
     def matches(self, value: JsonValue) -> bool:
         """Whether the value contains the needle."""
-        if isinstance(self.needle, str):
-            folded = self.needle.casefold()
-            return any(
-                isinstance(leaf, str) and folded in leaf.casefold() for leaf in leaves(value)
-            )
-        return any(self._equals.is_leaf(element) for element in _elements(value))
+        if not isinstance(self.needle, str):
+            return self._equals.matches(value)
+        folded = self.needle.casefold()
+        return any(
+            folded in leaf.casefold() if isinstance(leaf, str) else self._equals.is_leaf(leaf)
+            for leaf in leaves(value)
+        )
 
     def may_match(self, evidence: Evidence) -> bool:
         """Whether some value of which this is the evidence may contain the needle."""
-        if isinstance(self.needle, str):
-            return evidence.may_hold_text(self.needle.casefold())
+        # What holds a text equal to the needle may hold the needle's, so this asks for both.
         return self._equals.may_match(evidence)
 
 
@@ -356,18 +356,6 @@ def leaves(value: JsonValue) -> Iterator[JsonValue]:
             waiting.extend(held)
         else:
             yield held
-
-
-def _elements(value: JsonValue) -> Iterator[JsonValue]:
-    """Every element of every list at any depth."""
-    waiting = [value]
-    while waiting:
-        held = waiting.pop()
-        if isinstance(held, dict):
-            waiting.extend(held.values())
-        elif isinstance(held, list):
-            yield from held
-            waiting.extend(held)
 
 
 def _own_positions(value: JsonValue) -> Iterator[Vector3]:

@@ -182,7 +182,8 @@ _FRAMES = Entry(
     blocking=True,
 )
 _CONDITIONS = (
-    "contains (text anywhere in the message, or list element), equals (boolean, number or text), "
+    "contains (text anywhere in the message, or what equals finds), equals (boolean, number or "
+    "text), "
     "above and below (number; field says which), near_position "
     '({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
 )

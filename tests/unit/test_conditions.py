@@ -50,8 +50,8 @@ def test_a_text_is_found_inside_any_string_without_regard_to_case(needle: str) -
     assert Contains(needle).matches(SCENE)
 
 
-@pytest.mark.parametrize("needle", ["label", "hammer", "0.5", "mugs"])
-def test_a_text_is_not_found_in_keys_numbers_or_shorter_strings(needle: str) -> None:
+@pytest.mark.parametrize("needle", ["label", "hammer", "0.", "mugs"])
+def test_a_text_is_not_found_in_keys_digits_of_numbers_or_shorter_strings(needle: str) -> None:
     assert not Contains(needle).matches(SCENE)
 
 
@@ -60,9 +60,21 @@ def test_case_is_folded_in_every_script() -> None:
     assert Contains("ΣΟΦΟΣ").matches(["σοφος"])
 
 
-@pytest.mark.parametrize(("needle", "found"), [(3, True), (7.5, True), (True, True), (0.5, False)])
+@pytest.mark.parametrize(("needle", "found"), [(3, True), (7.5, True), (True, True), (8, False)])
 def test_numbers_and_booleans_are_elements_of_a_list(needle: Scalar, found: bool) -> None:
     assert Contains(needle).matches(SCENE) is found
+
+
+@given(asked_scalars, json_values)
+def test_what_is_equal_is_contained(asked: Scalar, value: JsonValue) -> None:
+    if Equals(asked).matches(value):
+        assert Contains(asked).matches(value)
+
+
+@pytest.mark.parametrize("needle", ["true", "True", True])
+def test_a_boolean_alone_is_contained_also_where_it_is_asked_for_in_quotes(needle: Scalar) -> None:
+    assert Contains(needle).matches({"data": True})
+    assert not Contains(needle).matches({"data": False})
 
 
 def test_true_is_not_the_element_one() -> None:
