@@ -189,9 +189,10 @@ def build_server(
     )
     dispatcher = Dispatcher(
         memory,
-        (*tools, *readable_tools(memory.limits)),
+        tools,
         Replies(settings.recording.bag_dir, served.max_reply_chars),
         call_timeout_s=served.call_timeout_s,
+        readable=readable_tools(memory.limits),
         telemetry=telemetry,
     )
     return EpisodicServer(

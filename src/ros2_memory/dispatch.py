@@ -57,7 +57,10 @@ log = get_logger(__name__)
 
 
 class Dispatcher:
-    """Answers tool calls from one memory, a bounded number at a time."""
+    """Answers tool calls from one memory, a bounded number at a time.
+
+    `readable`: what no tool call reaches, but a resource that is read.
+    """
 
     def __init__(
         self,
@@ -66,10 +69,12 @@ class Dispatcher:
         replies: Replies,
         *,
         call_timeout_s: float,
+        readable: Sequence[Tool] = (),
         telemetry: Telemetry = SILENT,
     ) -> None:
         self._memory = memory
         self._tools = {tool.name: tool for tool in tools}
+        self._readable = self._tools | {each.name: each for each in readable}
         self._replies = replies
         self._call_timeout_s = call_timeout_s
         self._telemetry = telemetry
@@ -90,6 +95,19 @@ class Dispatcher:
 
         Where there are more calls than places, they are begun in turn for each `client`.
         """
+        return await self._answer(self._tools, name, given, client)
+
+    async def read(self, name: str, given: Mapping[str, object], client: Hashable = None) -> Reply:
+        """The reply to the question behind a resource; the rest as for a call."""
+        return await self._answer(self._readable, name, given, client)
+
+    async def _answer(
+        self,
+        asked: Mapping[str, Tool],
+        name: str,
+        given: Mapping[str, object],
+        client: Hashable,
+    ) -> Reply:
         begun = time.perf_counter_ns()
         patience_s = max(self._call_timeout_s - _SOONER_S, self._call_timeout_s * 0.9)
         over = threading.Event()
@@ -99,14 +117,14 @@ class Dispatcher:
         with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
             try:
                 try:
-                    outcome, reply = await self._outcome(name, given, call, client)
+                    outcome, reply = await self._outcome(asked, name, given, call, client)
                 except Exception:
                     log.exception("tool_failed")
                     outcome, reply = self._fault()
                 chars = len(reply.text)
             finally:
                 over.set()
-                known = name in self._tools
+                known = name in asked
                 done = Answered(
                     name if known else UNKNOWN_TOOL,
                     outcome,
@@ -140,10 +158,15 @@ class Dispatcher:
         return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
 
     async def _outcome(
-        self, name: str, given: Mapping[str, object], call: Call, client: Hashable
+        self,
+        asked: Mapping[str, Tool],
+        name: str,
+        given: Mapping[str, object],
+        call: Call,
+        client: Hashable,
     ) -> tuple[str, Reply]:
         try:
-            tool = self._tool(name)
+            tool = _named(name, asked)
             question = tool.question(given)
         except InvalidArgumentsError as error:
             return error.code, self._replies.error(error)
@@ -171,15 +194,6 @@ class Dispatcher:
             "ask about a shorter window or a single topic"
         )
 
-    def _tool(self, name: str) -> Tool:
-        if name in self._tools:
-            return self._tools[name]
-        near = get_close_matches(name[:_LONGEST_NAME], self._tools, n=3)
-        hint = (
-            f"do you mean {' or '.join(near)}?" if near else f"there are: {', '.join(self._tools)}"
-        )
-        raise InvalidArgumentsError(f"there is no tool {glimpse(name)}; {hint}")
-
     def _ask(self, question: Question, call: Call, waits: _Waits) -> tuple[str, Reply]:
         """Runs in a worker thread: the query, and the rendering of what it gives."""
         waits.end()
@@ -206,6 +220,14 @@ class Dispatcher:
         """The reply to a call that failed through a fault of this program."""
         context = structlog.contextvars.get_contextvars()
         return "internal", self._replies.internal(str(context.get("correlation_id")))
+
+
+def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
+    if name in tools:
+        return tools[name]
+    near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
+    hint = f"do you mean {' or '.join(near)}?" if near else f"there are: {', '.join(tools)}"
+    raise InvalidArgumentsError(f"there is no tool {glimpse(name)}; {hint}")
 
 
 class _Waits:

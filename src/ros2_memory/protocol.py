@@ -113,7 +113,7 @@ class EpisodicServer(MCPServer[object]):
             name, given = asked_of(str(uri), self._offered)
         except InvalidArgumentsError as error:
             raise ResourceNotFoundError(str(error)) from error
-        reply = await self.dispatcher.answer(name, given, _client(context))
+        reply = await self.dispatcher.read(name, given, _client(context))
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
     async def list_prompts(self) -> list[Prompt]:

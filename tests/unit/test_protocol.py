@@ -111,6 +111,17 @@ async def test_the_prompt_teaches_with_tools_that_there_are(tmp_path: Path) -> N
     assert refused.value.error.code == INVALID_PARAMS
 
 
+@pytest.mark.parametrize("which", ["spec", "all"])
+async def test_what_is_only_read_is_no_tool_and_named_by_none(tmp_path: Path, which: str) -> None:
+    async with Client(server(tmp_path, f"server.tools={which}")) as client:
+        result = await client.call_tool("describe_type", {"type": "nav_msgs/msg/Odometry"})
+    [block] = result.content
+    assert isinstance(block, TextContent)
+    detail = json.loads(block.text)["detail"]
+    assert 'there is no tool "describe_type"' in detail
+    assert "describe_type" not in detail.partition(";")[2]
+
+
 async def test_with_the_specifications_tools_alone_nothing_speaks_of_the_others(
     tmp_path: Path,
 ) -> None:
