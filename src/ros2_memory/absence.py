@@ -18,7 +18,7 @@ from ros2_memory.timebase import (
     unix_from_ns,
     unix_rounded_up,
 )
-from ros2_memory.unseen import note_unseen
+from ros2_memory.unseen import may_be_written, note_unseen
 from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
@@ -138,12 +138,13 @@ def nothing_at(
         told.append(
             f"the nearest newer one is {seconds(newer.time - at)} after it, at {moment(newer.time)}"
         )
-    reason = NoDataReason.GAP if older and newer else beyond(view, at)
-    acceptable = older.time if older and tolerance is not None else None
-    told.append(_advice(view, reason, at, acceptable))
     before = tolerance if around is None else around
     start = TimeWindow.everything().start if before is None else max(at - before, MIN_NS)
-    note_unseen(view, TimeWindow(start, min(at + (around or 0) + 1, MAX_NS)), nothing=True)
+    window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
+    reason = between(view, window) if older and newer else beyond(view, at)
+    acceptable = older.time if older and tolerance is not None else None
+    told.append(_advice(view, reason, at, acceptable))
+    note_unseen(view, window, nothing=True)
     return NoDataError(reason, "; ".join(told), view.notes)
 
 
@@ -158,10 +159,20 @@ def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         told.append(f"the last one before is at {moment(older.time)}")
     if newer:
         told.append(f"the first one after is at {moment(newer.time)}")
-    reason = NoDataReason.GAP if older and newer else beyond(view, end)
+    reason = between(view, window) if older and newer else beyond(view, end)
     told.append(_advice(view, reason, window.start, None))
     note_unseen(view, window, nothing=True)
     return NoDataError(reason, "; ".join(told), view.notes)
+
+
+def between(view: View, window: TimeWindow) -> NoDataReason:
+    """Why a window with something on either of its sides has no answer.
+
+    While one recording takes over from another, the older one may not be on disk as far as the
+    newer one begins: what lies between is no gap.
+    """
+    written = may_be_written(view.snapshot, window)
+    return NoDataReason.NOT_CLOSED_YET if written else NoDataReason.GAP
 
 
 def beyond(view: View, at: Ns) -> NoDataReason:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.absence import beyond, moment, not_recorded, nothing_at, seconds
+from ros2_memory.absence import between, beyond, moment, not_recorded, nothing_at, seconds
 from ros2_memory.copies import united
 from ros2_memory.errors import (
     NoDataError,
@@ -189,17 +189,18 @@ def _explained(
         if not (unknown and connected(view, frames, _around(at, _LONGER_NS))):
             return then
         told = f"{then.detail}; within {seconds(_LONGER_NS)} the two were connected: ask about then"
-        return NoDataError(NoDataReason.GAP, told)
-    if failure.reason is not NoDataReason.OUTSIDE_RANGE:
+        return NoDataError(between(view, _around(at, TF_CACHE_NS)), told)
+    if failure.reason not in {NoDataReason.OUTSIDE_RANGE, NoDataReason.GAP}:
         return failure
-    between = topics and all(
+    inside = topics and all(
         next(view.stream(topics, side, newest_first=newest_first), None)
         for side, newest_first in (
             (TimeWindow.until(at), True),
             (TimeWindow(at + 1, MAX_NS), False),
         )
     )
-    return NoDataError(NoDataReason.GAP if between else beyond(view, at), failure.detail)
+    reason = between(view, _around(at, TF_CACHE_NS)) if inside else beyond(view, at)
+    return NoDataError(reason, failure.detail)
 
 
 def connected(view: View, frames: tuple[str, str], window: TimeWindow | None = None) -> bool:

@@ -77,9 +77,7 @@ def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> 
     ]
     if lost:
         yield not_read(lost)
-    active = [
-        aside for aside in snapshot.active if _touches(snapshot.places[aside], window, unknown=True)
-    ]
+    active = _being_written(snapshot, window)
     if active:
         yield _still_written(snapshot, active, window)
     faults = [
@@ -90,11 +88,22 @@ def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> 
     yield from amiss(snapshot.odd(window))
 
 
+def may_be_written(snapshot: Snapshot, window: TimeWindow) -> bool:
+    """Whether a file that is still being written may hold messages of a window unseen."""
+    return bool(_being_written(snapshot, window))
+
+
 def not_read(files: Sequence[SetAside]) -> str:
     """The sentence on files that no question can look into, the latest ones named."""
     names = [f"{short_name(each.path)} ({shortened(each.reason)})" for each in files[-NAMED:]]
     what = counted(len(files), "bag file")
     return f"{what} could not be read and may hold more: {listed(names, len(files))}"
+
+
+def _being_written(snapshot: Snapshot, window: TimeWindow) -> list[SetAside]:
+    return [
+        aside for aside in snapshot.active if _touches(snapshot.places[aside], window, unknown=True)
+    ]
 
 
 def _touches(place: TimeWindow | None, window: TimeWindow, *, unknown: bool) -> bool:

@@ -23,7 +23,7 @@ from ros2_memory.instructions import instructions
 from ros2_memory.memory import Call, Limits
 from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.recorder.counting import CountingReader
-from ros2_memory.recorder.handover import Counting, Handover, write_handover
+from ros2_memory.recorder.handover import Counting, Handover, Overlap, write_handover
 from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.replies import Replies
 from ros2_memory.storage.mcap_reader import McapReader
@@ -300,6 +300,38 @@ def test_splits_that_overlap_while_one_recording_takes_over_count_once(tmp_path:
     write_handover(tmp_path / "a", Handover(next="b", counts_until=cut))
     write_handover(tmp_path / "b", Handover(previous="a", counts_from=cut))
     assert tail.ticks() == list(range(tail.ticks()[-1] + 1))
+
+
+def test_what_the_older_of_two_recordings_has_yet_to_write_is_no_gap(tmp_path: Path) -> None:
+    tail = Tail(tmp_path, reader=CountingReader(McapReader()))
+    old, chunks = split(LAYOUTS[0])
+    new = written(tmp_path / "x" / "x_1.mcap", driven(80, 80, late=100_000))
+    behind, reach = max(chunk for chunk in chunks if chunk[1] < 80)
+    tail.write("a/a_0.mcap", old[:behind], at=12 * S)
+    tail.write("b/b_0.mcap", new[: len(new) * 9 // 10], at=12 * S)
+    cut = T0 + 90 * TENTH
+    write_handover(tmp_path / "a", Handover(next="b", counts_until=cut))
+    begin = Overlap(None, None, ("b_0.mcap",))
+    write_handover(tmp_path / "b", Handover(previous="a", counts_from=cut, begin=begin))
+    missing = {"timestamp": T0 / S + 8.5, "tolerance_s": 0.2}
+    within = {"topic": "/odom", "start": T0 / S + 8, "end": T0 / S + 8.8}
+    assert tail.ticks() == [*range(reach), *range(90, tail.ticks()[-1] + 1)]
+    for told in (
+        tail.asked("get_position_at", **missing),
+        tail.asked("get_topic_in_range", **within),
+    ):
+        assert told["reason"] == "not_closed_yet"
+        assert told["notes"] == ["still being written and not all on disk yet: a/a_0.mcap"]
+        assert "again in 3 s" in told["detail"]
+    tail.write("a/a_0.mcap", old, at=12 * S)
+    assert tail.asked("get_position_at", **missing)["x"] == pytest.approx(8.5)
+
+
+def test_between_messages_that_are_on_disk_a_gap_is_one_while_more_is_written(tail: Tail) -> None:
+    content = written(tail.bag_dir / "x" / "x_0.mcap", [*driven(0, 30), *driven(50, 60)])
+    tail.write("rec/rec_0.mcap", content[: len(content) * 9 // 10], at=11 * S)
+    told = tail.asked("get_position_at", timestamp=T0 / S + 4.5, tolerance_s=0.5)
+    assert told["reason"] == "gap"
 
 
 def test_where_the_robot_was_2_s_ago_is_answered_and_says_from_what(tail: Tail) -> None:
