@@ -26,6 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ros2_memory.errors import ConfigError
+from ros2_memory.origins import GROUPS, Asked, Sources
 from ros2_memory.refusals import validated
 from ros2_memory.settings import MessageSchemas, Settings
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 EXIT_CODE: Final = 2
+_INTERFACES: Final = "ROS_VISION_INTERFACES_PATH"
 _LAST_ROS_DOMAIN: Final = 232  # the highest whose DDS ports stay below 65536
 _FOREIGN: Final = (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError)
 
@@ -68,16 +70,6 @@ class _Assignment:
     source: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Asked:
-    """A parsed override that Hydra is to apply."""
-
-    key: str
-    text: str
-    source: str
-    is_group: bool
-
-
 def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None = None) -> Settings:
     """The validated configuration.
 
@@ -93,7 +85,7 @@ def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None =
 
 def load_explained(
     overrides: Sequence[str] = (), env: Mapping[str, str] | None = None
-) -> tuple[Settings, Callable[[str], str]]:
+) -> tuple[Settings, Sources]:
     """As `load_settings`, and what tells of a key, such as `server.port`, who set it.
 
     Raises:
@@ -107,18 +99,12 @@ def load_explained(
         *(_Assignment(text, "on the command line") for text in overrides),
     ]
     groups = {
-        group: sorted(option.stem for option in (folder / group).glob("*.yaml"))
-        for group in ("deployment", "storage", "recorder")
+        group: sorted(option.stem for option in (folder / group).glob("*.yaml")) for group in GROUPS
     }
     asked = [_parsed(assignment, groups) for assignment in assignments]
 
-    def source(key: str) -> str:
-        for one in reversed(asked):
-            mine, its = f"{key}.", f"{one.key}."
-            if not one.is_group and (mine.startswith(its) or its.startswith(mine)):
-                return one.source
-        return f"in {folder}"
-
+    joined = {"reader.custom_msg_paths": _INTERFACES} if _INTERFACES in given else {}
+    source = Sources(folder, asked, joined)
     with _foreign_errors_as_config_error(str(folder), source):
         with initialize_config_dir(version_base="1.3", config_dir=str(folder)):
             composed = compose("config", overrides=[one.text for one in asked])
@@ -181,7 +167,7 @@ def exit_on_config_error(program: str) -> Iterator[None]:
 def _given(env: Mapping[str, str]) -> dict[str, str]:
     """The variables that are set, checked as far as they say what is wrong by themselves."""
     given = {name: text for name, text in env.items() if text}
-    for name in ("MEMORY_CONFIG_DIR", "ROS_VISION_INTERFACES_PATH", *_VARIABLES):
+    for name in ("MEMORY_CONFIG_DIR", _INTERFACES, *_VARIABLES):
         # Environment files, unlike shells, leave this as it stands; Hydra would read it as its own.
         if "${" in given.get(name, ""):
             raise ConfigError(
@@ -233,7 +219,7 @@ def _names_a_token(text: str) -> bool:
     return re.search(r"token\w*\s*=", text, re.IGNORECASE) is not None
 
 
-def _parsed(assignment: _Assignment, groups: Mapping[str, Sequence[str]]) -> _Asked:
+def _parsed(assignment: _Assignment, groups: Mapping[str, Sequence[str]]) -> Asked:
     text, source = assignment.text, assignment.source
     if _names_a_token(text):
         raise ConfigError(
@@ -260,12 +246,13 @@ def _parsed(assignment: _Assignment, groups: Mapping[str, Sequence[str]]) -> _As
             f"(set {source})"
         )
     # Added by force, an unknown key reaches the validation, which names the known ones.
-    return _Asked(key, f"++{text}" if changes and not is_group else text, source, is_group)
+    option = str(override.value()) if is_group and changes else None
+    return Asked(key, f"++{text}" if changes and not is_group else text, source, is_group, option)
 
 
 def _add_interface_folder(composed: DictConfig, given: Mapping[str, str]) -> None:
     """Appends `ROS_VISION_INTERFACES_PATH`, unless what it would join is no list and is refused."""
-    folder = given.get("ROS_VISION_INTERFACES_PATH")
+    folder = given.get(_INTERFACES)
     if not folder:
         return
     if not _expanded(folder).is_dir():

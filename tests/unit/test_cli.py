@@ -169,11 +169,33 @@ class TestConfig:
         assert "MEMORY_API_TOKEN is set" in shown
         assert "a-secret" not in shown
 
-    def test_sources_say_who_set_a_key(self, capsys: Capture) -> None:
+    @pytest.mark.parametrize(
+        ("key", "who"),
+        [
+            ("deployment", "by MEMORY_DEPLOYMENT "),
+            ("storage", "deployment/robot.yaml "),
+            ("recorder", "by MEMORY_CONFIG_OVERRIDES "),
+            ("server.port", "on the command line "),
+            ("server.name", "config.yaml "),
+            ("server.transport", "deployment/robot.yaml "),
+            ("reader.include_active", "deployment/robot_live.yaml "),
+            ("reader.custom_msg_paths", "config.yaml, and by ROS_VISION_INTERFACES_PATH "),
+            ("recording.bag_dir", "by MEMORY_BAG_DIR "),
+            ("recorder._target_", "recorder/none.yaml "),
+            ("storage.cache_mb", "as reader.chunk_cache_mb "),
+        ],
+    )
+    def test_sources_say_in_a_line_which_file_or_variable_set_a_key(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: Capture, bag_dir: Path, key: str, who: str
+    ) -> None:
+        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot_live")
+        monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "recorder=none")
+        monkeypatch.setenv("ROS_VISION_INTERFACES_PATH", str(bag_dir))
         assert cli.main(["config", "show", "--sources", "server.port=9300"]) == 0
         rows = capsys.readouterr().out.splitlines()
-        assert "on the command line" in next(row for row in rows if "server.port" in row)
-        assert "MEMORY_BAG_DIR" in next(row for row in rows if "recording.bag_dir" in row)
+        assert rows[0].startswith("# files are those of ")
+        (row,) = [each for each in rows if each.partition(" ")[0] == key]
+        assert row.partition(" ")[2].lstrip().startswith(who)
 
     def test_a_wrong_key_is_named_and_the_exit_code_is_2(self, capsys: Capture) -> None:
         assert cli.main(["config", "show", "server.prot=1"]) == 2

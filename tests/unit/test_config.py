@@ -406,7 +406,7 @@ class TestRefusals:
             "server.transport",
         ]
         assert lines[0].endswith("(set on the command line)")
-        assert lines[1].endswith(f"(set in {own_config})")
+        assert lines[1].endswith(f"(set in {own_config / 'config.yaml'})")
         assert lines[2].endswith("(set by MEMORY_CONFIG_OVERRIDES)")
         assert lines[3].endswith("(set by MCP_TRANSPORT)")
 

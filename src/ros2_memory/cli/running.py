@@ -5,7 +5,7 @@ Typer reads annotations when the program starts, so modules with commands evalua
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Final
@@ -18,6 +18,7 @@ from ros2_memory.config import load_explained, quoted
 from ros2_memory.errors import EpisodicError
 from ros2_memory.logs import configure_logging
 from ros2_memory.memory import Memory
+from ros2_memory.origins import Sources
 from ros2_memory.settings import Settings
 
 NOT_SO: Final = 1
@@ -69,7 +70,7 @@ def settings_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Setti
 
 def explained_for(
     bag_dir: Path | None, overrides: Sequence[str] | None
-) -> tuple[Settings, Callable[[str], str]]:
+) -> tuple[Settings, Sources]:
     """As `settings_for`, and what tells of a key who set it.
 
     Raises:

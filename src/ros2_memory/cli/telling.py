@@ -26,8 +26,9 @@ from ros2_memory.cli.running import (
 )
 from ros2_memory.cli.showing import cell, plain, show
 from ros2_memory.model import JsonValue, TimeWindow
+from ros2_memory.origins import GROUPS, Sources
 from ros2_memory.recorder.snapshot import Snapshot
-from ros2_memory.settings import AdapterNode
+from ros2_memory.settings import AdapterNode, Settings
 from ros2_memory.timebase import NS_PER_S, unix_from_ns
 
 MASK: Final = "********"
@@ -138,16 +139,37 @@ def config_show(
     with reporting("config show"):
         settings, source = explained_for(bag_dir, overrides)
     if sources:
-        rows: list[JsonValue] = [
-            {"key": key, "value": _shown(key, value), "set": source(key)}
-            for key, value in leaves(settings)
-        ]
-        show(output(), rows)
+        for line in sourced(settings, source):
+            say(line)
         return
     say(yaml.safe_dump(nested(settings), sort_keys=False, allow_unicode=True).rstrip())
     for name in ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
         if os.environ.get(name):
             say(f"# {name} is set: {MASK}")
+
+
+def sourced(settings: Settings, source: Sources) -> Iterator[str]:
+    """A line for each group's choice and for each key: its name, who set it, its value.
+
+    A group's own keys that only take over another key's value name that one.
+    """
+    yield f"# files are those of {source.folder}"
+    rows: list[tuple[str, str, str]] = []
+    for group in GROUPS:
+        option, who = source.choice(group)
+        rows.append((group, who, option or "null"))
+    for key, value in leaves(settings):
+        shown = _shown(key, value)
+        rows.append((key, source(key), shown if isinstance(shown, str) else json.dumps(shown)))
+    told = [(key, _briefly(who, source.folder), value) for key, who, value in rows]
+    first, second = (max(len(row[column]) for row in told) for column in (0, 1))
+    for key, who, value in told:
+        yield f"{key:<{first}}  {who:<{second}}  {value}"
+
+
+def _briefly(who: str, folder: Path) -> str:
+    file, link, other = who.partition(", as ")
+    return f"as {other}" if link else file.replace(f"in {folder}/", "")
 
 
 def leaves(settings: object, prefix: str = "") -> Iterator[tuple[str, object]]:
