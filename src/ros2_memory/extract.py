@@ -113,6 +113,11 @@ class SchemaExtractor:
         """
         return self._whole(Exact(self._limit), message, type_name)
 
+    def exact_at(self, message: object, type_name: str, path: str) -> JsonValue:
+        """What `shown` means by one of its `fields`, exactly; null where this message has none."""
+        found = self._sought(message, type_name, path)
+        return None if found is ABSENT else Exact(self._limit).value(found, path)
+
     def shown(self, message: object, type_name: str, fields: Sequence[str] = ()) -> Extracted:
         """The value as it leaves in a reply: strict JSON, thinned and rounded, with notes.
 
@@ -205,6 +210,14 @@ class SchemaExtractor:
         return {name: rendering.value(node, name) for name, node in nodes}
 
     def _find(self, message: object, type_name: str, path: str) -> object:
+        found = self._sought(message, type_name, path)
+        if found is ABSENT:
+            plan = self._plan(type_name)
+            raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
+        return found
+
+    def _sought(self, message: object, type_name: str, path: str) -> object:
+        """What stands at one of `fields` in a message, or `ABSENT`."""
         plan = self._plan(type_name)
         segments = tuple(path.split("."))
         mapped = plan.path(segments[0])
@@ -212,11 +225,7 @@ class SchemaExtractor:
             found = descend(_at(message, mapped), segments[1:], view)
         else:
             found = ABSENT if plan.fields else descend(message, segments, view)
-        if found is ABSENT:
-            found = _plain(_at(message, segments))
-        if found is ABSENT:
-            raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
-        return found
+        return _plain(_at(message, segments)) if found is ABSENT else found
 
 
 def _compile(type_name: str, fields: Mapping[str, str]) -> _Plan:

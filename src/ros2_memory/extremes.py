@@ -9,7 +9,7 @@ import sys
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.answers import Extremes
-from ros2_memory.conditions import at_field, leaves
+from ros2_memory.conditions import leaves
 from ros2_memory.errors import UndecodableError
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ MOST_NUMBERS: Final = 400_000
 TOO_MANY: Final = "there is too much in the window to tell extremes: ask for a shorter one"
 
 _LARGEST: Final = sys.float_info.max
+_SUMMARY: Final = frozenset({"bytes", "numbers"})
+"""The keys of what stands for numbers that are too many to show."""
 
 
 def extremes_of(
@@ -47,9 +49,9 @@ def extremes_of(
             message = view.memory.reader.decode(each.record)
         except UndecodableError:
             continue
-        value = view.memory.extractor.exact(message, channel.type)
         for field in fields:
-            numbers = [*_numbers(value, field)]
+            value = view.memory.extractor.exact_at(message, channel.type, field)
+            numbers = [*_numbers(value)]
             looked_at += len(numbers)
             if numbers:
                 _take(found, field, each.time, numbers)
@@ -59,13 +61,14 @@ def extremes_of(
     return tuple(found[field] for field in dict.fromkeys(fields) if field in found)
 
 
-def _numbers(value: JsonValue, field: str) -> Iterator[float]:
-    for target in at_field(value, field):
-        for leaf in leaves(target):
-            if isinstance(leaf, bool) or not isinstance(leaf, int | float):
-                continue
-            if -_LARGEST <= leaf <= _LARGEST:
-                yield leaf
+def _numbers(value: JsonValue) -> Iterator[float]:
+    if isinstance(value, dict) and value.keys() <= _SUMMARY:
+        return  # it tells how much there is, and that is none of the field's numbers
+    for leaf in leaves(value):
+        if isinstance(leaf, bool) or not isinstance(leaf, int | float):
+            continue
+        if -_LARGEST <= leaf <= _LARGEST:
+            yield leaf
 
 
 def _take(found: dict[str, Extremes], field: str, time: Ns, numbers: Sequence[float]) -> None:

@@ -64,6 +64,15 @@ def test_without_fields_and_of_what_is_no_number_there_are_none(tmp_path: Path) 
     assert asked(tmp_path, [boolean(BEGIN, data=True)], "value").extremes == ()
 
 
+def test_a_full_path_in_the_message_has_extremes_as_the_values_own_field_has(
+    tmp_path: Path,
+) -> None:
+    driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(3)]
+    [own, full] = asked(tmp_path, driven, "position.x", "pose.pose.position.x").extremes
+    assert full.field == "pose.pose.position.x"
+    assert (full.least, full.most) == (own.least, own.most) == (0.0, 2.0)
+
+
 def test_a_field_that_leads_into_a_list_means_all_of_it(tmp_path: Path) -> None:
     seen = [detections(BEGIN, ["cup", "fork"]), detections(BEGIN + S, [])]
     [score] = asked(tmp_path, seen, "detections.point.x").extremes
@@ -82,10 +91,16 @@ def test_a_window_that_holds_too_much_says_so(
     assert extremes.TOO_MANY in answer.notes
 
 
+@pytest.mark.parametrize("summary", [{"bytes": 921_600}, {"numbers": 2_000_000}])
+def test_a_summary_of_many_numbers_has_no_extremes(summary: JsonValue) -> None:
+    assert [*extremes._numbers(summary)] == []
+    assert [*extremes._numbers({"bytes": 1, "rate": 2})] == [2.0, 1.0]
+
+
 @given(st.lists(st.lists(st.one_of(st.floats(), st.integers(-(10**400), 10**400)), max_size=4)))
 def test_extremes_are_the_least_and_the_greatest_finite_numbers(rows: list[list[float]]) -> None:
     found: dict[str, Extremes] = {}
-    finite = [[*extremes._numbers({"a": [*row, True, None, "9"]}, "a")] for row in rows]
+    finite = [[*extremes._numbers([*row, True, None, "9"])] for row in rows]
     for time, numbers in enumerate(finite):
         if numbers:
             extremes._take(found, "a", time, numbers)
