@@ -26,7 +26,8 @@ TIMEOUT_S = 120
 
 def environment(scratch: Path) -> dict[str, str]:
     """Ours, with temporary folders where the test sees them, and settings that must not count."""
-    return {**os.environ, "TMPDIR": str(scratch), "MEMORY_DEPLOYMENT": "no-such-deployment"}
+    folders = {"TMPDIR": str(scratch), "XDG_CACHE_HOME": str(scratch / "cache")}
+    return {**os.environ, **folders, "MEMORY_DEPLOYMENT": "no-such-deployment"}
 
 
 @pytest.fixture

@@ -37,8 +37,9 @@ def test_the_callers_settings_do_not_reach_the_server(tmp_path: Path) -> None:
         "MEMORY_CONFIG_DIR": "elsewhere",
         "MCP_TRANSPORT": "stdio",
         "ROS_VISION_INTERFACES_PATH": "elsewhere",
+        "XDG_CACHE_HOME": "/home/someone/.cache",
     }
-    environment = server_environment(caller, tmp_path, 9203, 5.0)
+    environment = server_environment(caller, tmp_path, 9203, 5.0, "/elsewhere")
     overrides = environment.pop("MEMORY_CONFIG_OVERRIDES").split()
     assert environment == {
         "PATH": "/bin",
@@ -46,6 +47,7 @@ def test_the_callers_settings_do_not_reach_the_server(tmp_path: Path) -> None:
         "MCP_HOST": "127.0.0.1",
         "MCP_PORT": "9203",
         "MEMORY_BAG_DIR": str(tmp_path),
+        "XDG_CACHE_HOME": "/elsewhere",
     }
     assert {"recorder=none", "recording.split_duration_s=5"} <= set(overrides)
 

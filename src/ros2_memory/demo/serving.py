@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import ConfigError, EpisodicError
@@ -47,7 +48,11 @@ def free_port(wanted: int) -> int:
 
 
 def server_environment(
-    environment: Mapping[str, str], bag_dir: Path, port: int, split_duration_s: float
+    environment: Mapping[str, str],
+    bag_dir: Path,
+    port: int,
+    split_duration_s: float,
+    cache: str,
 ) -> dict[str, str]:
     """The environment of a server that serves `bag_dir` and obeys no setting of the caller's."""
     kept = {name: value for name, value in environment.items() if not name.startswith(_OURS)}
@@ -56,6 +61,7 @@ def server_environment(
         "MCP_HOST": HOST,
         "MCP_PORT": str(port),
         "MEMORY_BAG_DIR": str(bag_dir),
+        "XDG_CACHE_HOME": cache,
         "MEMORY_CONFIG_OVERRIDES": (
             f"recorder=none storage=mcap reader.index_refresh_s=1 "
             f"recording.split_duration_s={split_duration_s:g}"
@@ -69,30 +75,32 @@ def served(
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A server that answers, until the end of the block.
 
-    Its log goes to `server.log` in the bag directory, or to stderr where `verbose`.
+    Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its catalogue
+    into a folder that is removed at the end: nobody else will ask for it.
 
     Raises:
         EpisodicError: it did not come up; the sentence ends with the last lines of its log.
     """
     log_path = bag_dir / LOG_NAME
-    environment = server_environment(os.environ, bag_dir, port, split_duration_s)
-    with log_path.open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "ros2_memory.server"],
-            stdin=subprocess.DEVNULL,
-            stdout=None if verbose else log,
-            stderr=None if verbose else log,
-            cwd=bag_dir,
-            env=environment,
-            # A Ctrl-C reaches the whole process group of a terminal; the order in which things
-            # end is ours to choose.
-            process_group=0,
-        )
-    try:
-        _wait_until_up(process, port, log_path)
-        yield process
-    finally:
-        _end(process)
+    with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
+        environment = server_environment(os.environ, bag_dir, port, split_duration_s, cache)
+        with log_path.open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "ros2_memory.server"],
+                stdin=subprocess.DEVNULL,
+                stdout=None if verbose else log,
+                stderr=None if verbose else log,
+                cwd=bag_dir,
+                env=environment,
+                # A Ctrl-C reaches the whole process group of a terminal; the order in which things
+                # end is ours to choose.
+                process_group=0,
+            )
+        try:
+            _wait_until_up(process, port, log_path)
+            yield process
+        finally:
+            _end(process)
 
 
 def _wait_until_up(process: subprocess.Popen[bytes], port: int, log_path: Path) -> None:
