@@ -28,7 +28,7 @@ from ros2_memory.stays import Stays
 from ros2_memory.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.trajectory import PoseCollector
 from ros2_memory.unseen import note_unseen
-from ros2_memory.ways import POSES, carries_no, stops
+from ros2_memory.ways import POSES, carries_no, leave_out, stops
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -118,8 +118,7 @@ def _pose_frame(view: View, topic: str) -> str:
     try:
         return _frame_of(view, found)
     except UndecodableError as error:
-        view.complete = False
-        view.note(f"poses of {topic} left out, since they cannot be decoded: {error.reason}")
+        leave_out(view, error)
         older = view.stream([topic], TimeWindow.until(found.time), newest_first=True)
         for each in islice(older, _MOST_TRIED):
             with suppress(UndecodableError):

@@ -144,15 +144,25 @@ def _batches(messages: Iterable[Found]) -> Iterator[list[Found]]:
 
 
 def stops(view: View, messages: Iterable[Found]) -> Iterator[Stop]:
-    """Where the poses of messages are; those left out that are no place or cannot be decoded."""
+    """Where the poses of messages are; what is no place is left out.
+
+    So is, with a note, what cannot be decoded.
+    """
     for found in messages:
         try:
             message = view.memory.reader.decode(found.record)
-        except UndecodableError:
+        except UndecodableError as error:
+            leave_out(view, error)
             continue
         pose = view.memory.extractor.pose(message, found.record.channel.type)
         if pose is not None and is_place(pose.position):
             yield Stop(found.time, pose.position)
+
+
+def leave_out(view: View, error: UndecodableError) -> None:
+    """Says that there are poses which cannot be decoded, and why."""
+    view.complete = False
+    view.note(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")
 
 
 def decoded(view: View, found: Found) -> object:

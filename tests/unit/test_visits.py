@@ -291,6 +291,18 @@ def test_a_newest_pose_that_cannot_be_decoded_hides_no_visit(
     assert [note for note in found.notes if "cannot be decoded" in note]
 
 
+@each_way
+def test_a_pose_on_the_way_that_cannot_be_decoded_is_told(tmp_path: Path, *, recalls: bool) -> None:
+    way = line((20.0, 0.1))
+    way[3] = replace(way[3], body=way[3].payload[:40])
+    memory = remembering(tmp_path, way)
+    if recalls:
+        memory = recalling(memory, tmp_path)
+    found = visits(memory, Call(), 0.0, 0.0)
+    assert len(found.visits) == 1
+    assert [note for note in found.notes if "cannot be decoded" in note]
+
+
 def test_of_poses_of_which_none_can_be_decoded_it_is_told_that(tmp_path: Path) -> None:
     way = [replace(each, body=each.payload[:40]) for each in line((3.0, 0.1))]
     with pytest.raises(UndecodableError, match="does not fit"):
