@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -206,6 +207,19 @@ class TestTheProgram:
     def test_a_command_that_there_is_not_ends_with_2(self, capsys: Capture) -> None:
         assert cli.main(["fly"]) == 2
         assert "fly" in capsys.readouterr().err
+
+    def test_warnings_are_one_sentence_and_with_v_the_events(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        for name in "ab":
+            (bag_dir / "rec" / f"{name}.mcap").write_bytes(b"")
+            os.utime(bag_dir / "rec" / f"{name}.mcap", (1_700_000_000,) * 2)
+        assert cli.main(["topics"]) == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "2 warnings logged (2 x bag_damaged); -v shows" in line
+        assert cli.main(["topics", "-v", "logging.level=warning"]) == 0
+        told = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+        assert [each["event"] for each in told] == ["bag_damaged", "bag_damaged"]
 
     def test_it_tells_its_version(self, capsys: Capture) -> None:
         assert cli.main(["--version"]) == 0

@@ -12,7 +12,12 @@ import pytest
 import structlog
 from mcp.server import streamable_http as transport
 
-from ros2_memory.logs import configure_logging, get_logger
+from ros2_memory.logs import (
+    configure_logging,
+    get_logger,
+    withheld_warnings,
+    withhold_warnings,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -160,3 +165,17 @@ def test_a_second_configuration_replaces_the_first(capsys: pytest.CaptureFixture
     configure_logging("info", "json")
     log.info("late")
     assert [event["event"] for event in events(capsys)] == ["late"]
+
+
+def test_withheld_warnings_are_counted_by_event_and_errors_are_shown(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    configure_logging("warning", "json")
+    withhold_warnings()
+    get_logger("ours").warning("bag_damaged", path="a")
+    get_logger("ours").warning("bag_damaged", path="b")
+    logging.getLogger("theirs").warning("100 %% of %s", "it")
+    get_logger("ours").error("not_deleted")
+    assert withheld_warnings() == {"bag_damaged": 2, "theirs": 1}
+    assert withheld_warnings() == {}
+    assert [each["event"] for each in events(capsys)] == ["not_deleted"]

@@ -19,6 +19,7 @@ from ros2_memory.cli.running import (
     Overrides,
     reporting,
     say,
+    say_withheld,
     settings_for,
 )
 from ros2_memory.demo.run import DemoOptions, run_demo
@@ -57,6 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
+    finally:
+        say_withheld()
     return 0
 
 

@@ -13,6 +13,7 @@ from ros2_memory.cli.running import (
     AsJson,
     BagDir,
     Sets,
+    Verbose,
     busy,
     opened,
     output,
@@ -49,9 +50,11 @@ def ask(
         list[str] | None,
         typer.Argument(metavar="key=value|JSON", help="What the tool is asked."),
     ] = None,
+    *,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     settings: Sets = None,
+    verbose: Verbose = False,
 ) -> None:
     """Ask any tool of the query server, without a server.
 
@@ -60,7 +63,7 @@ def ask(
     """
     with reporting("ask"):
         chosen = settings_for(bag_dir, settings)
-        memory = opened(chosen)
+        memory = opened(chosen, verbose=verbose)
         server = build_server(chosen, memory)
         schemas = _schemas(server)
         if tool is None:

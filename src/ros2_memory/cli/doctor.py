@@ -15,6 +15,7 @@ from ros2_memory.cli.running import (
     AsJson,
     BagDir,
     Overrides,
+    Verbose,
     busy,
     opened,
     output,
@@ -29,14 +30,19 @@ from ros2_memory.errors import ConfigError
 _STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
 
 
-def doctor(overrides: Overrides = None, as_json: AsJson = False, bag_dir: BagDir = None) -> None:
+def doctor(
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+    bag_dir: BagDir = None,
+    verbose: Verbose = False,
+) -> None:
     """Check configuration, disk, clock, bags, recorder, ROS environment, topics and server.
 
     Each finding says what to do. The exit code is 0 where all is in order, 1 where something wants
     attention, 2 where something does not work.
     """
     with reporting("doctor"):
-        found = [*examined(bag_dir, overrides)]
+        found = [*examined(bag_dir, overrides, verbose=verbose)]
     worst = max(each.level for each in found)
     if as_json:
         told = {"status": worst.name.lower(), "findings": [each.as_json() for each in found]}
@@ -46,11 +52,13 @@ def doctor(overrides: Overrides = None, as_json: AsJson = False, bag_dir: BagDir
     raise typer.Exit(int(worst))
 
 
-def examined(bag_dir: Path | None, overrides: Sequence[str] | None) -> Iterator[Finding]:
+def examined(
+    bag_dir: Path | None, overrides: Sequence[str] | None, *, verbose: bool = False
+) -> Iterator[Finding]:
     """All findings; of a configuration that is refused no other."""
     try:
         settings = settings_for(bag_dir, overrides)
-        memory = opened(settings)
+        memory = opened(settings, verbose=verbose)
     except ConfigError as error:
         yield Finding(Level.ERROR, "config", str(error), "correct the key that it names")
         return

@@ -14,6 +14,7 @@ from ros2_memory.cli.running import (
     NOT_SO,
     BagDir,
     Overrides,
+    Verbose,
     opened,
     reporting,
     say,
@@ -75,6 +76,7 @@ def export(
         typer.Option(metavar="NAME", help="Parquet by robot, too: one dataset for a fleet."),
     ] = None,
     bag_dir: BagDir = None,
+    verbose: Verbose = False,
 ) -> None:
     """Copy a time window out of the memory, each message once.
 
@@ -86,7 +88,7 @@ def export(
         if (mcap is None) == (parquet is None):
             raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
         settings = settings_for(bag_dir, overrides)
-        memory = opened(settings)
+        memory = opened(settings, verbose=verbose)
         view = View(memory, Call())
         window = window_of(memory, view.snapshot, start, end, last)
         topics = _topics(view, topic or ())

@@ -13,6 +13,7 @@ from ros2_memory.cli.running import (
     NOT_SO,
     BagDir,
     Overrides,
+    Verbose,
     busy,
     opened,
     reporting,
@@ -50,6 +51,7 @@ def forget(
         bool, typer.Option("--dry-run", help="Only say what would be deleted.")
     ] = False,
     bag_dir: BagDir = None,
+    verbose: Verbose = False,
 ) -> None:
     """Delete the closed bags that lie wholly inside a time window, after asking.
 
@@ -66,7 +68,7 @@ def forget(
             )
         if last is None and (start is None or end is None):
             raise InvalidArgumentsError("say what to forget: --start and --end, or --last")
-        memory = opened(settings)
+        memory = opened(settings, verbose=verbose)
         snapshot = memory.index.snapshot()
         if snapshot.problem:
             raise RecorderError(snapshot.problem)

@@ -16,10 +16,11 @@ from rich.console import Console
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_explained, quoted
 from ros2_memory.errors import EpisodicError
-from ros2_memory.logs import configure_logging
+from ros2_memory.logs import configure_logging, withheld_warnings, withhold_warnings
 from ros2_memory.memory import Memory
 from ros2_memory.origins import Sources
 from ros2_memory.settings import Settings
+from ros2_memory.wording import counted, listed
 
 NOT_SO: Final = 1
 """Exit code: it ran, and the answer is no: an error reply, something left undone."""
@@ -43,6 +44,10 @@ Overrides = Annotated[
 Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="key=value", help="A setting, as for ros2-memory-server."),
+]
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", help="Show the log on stderr, from logging.level on."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, for programs.")]
 
@@ -80,13 +85,17 @@ def explained_for(
     return load_explained([*(overrides or ()), *chosen])
 
 
-def opened(settings: Settings) -> Memory:
-    """The memory, whose bags have been looked through once; only warnings are logged.
+def opened(settings: Settings, *, verbose: bool = False) -> Memory:
+    """The memory, whose bags have been looked through once.
+
+    Log events are shown where that is asked for; else warnings are counted, for `say_withheld`.
 
     Raises:
         ConfigError: it cannot be built.
     """
-    configure_logging("warning", settings.logging.format)
+    configure_logging(settings.logging.level if verbose else "warning", settings.logging.format)
+    if not verbose:
+        withhold_warnings()
     memory = build_memory(settings)
     with busy(f"looking through {settings.recording.bag_dir}"):
         memory.index.refresh()
@@ -102,6 +111,19 @@ def busy(what: str) -> Iterator[None]:
         return
     with console.status(what):
         yield
+
+
+def say_withheld() -> None:
+    """One sentence on stderr, where warnings were not shown: how many, and how to see them."""
+    events = withheld_warnings()
+    if events:
+        warnings = counted(events.total(), "warning")
+        which = listed([each if n == 1 else f"{n} x {each}" for each, n in events.items()])
+        print(
+            f"ros2-memory: {warnings} logged ({which}); -v shows the log, `ros2-memory doctor` "
+            "says what to do",
+            file=sys.stderr,
+        )
 
 
 def output() -> Console:

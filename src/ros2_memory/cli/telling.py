@@ -17,6 +17,7 @@ from ros2_memory.cli.running import (
     AsJson,
     BagDir,
     Overrides,
+    Verbose,
     explained_for,
     opened,
     output,
@@ -42,14 +43,19 @@ config_app = typer.Typer(
 )
 
 
-def topics(overrides: Overrides = None, as_json: AsJson = False, bag_dir: BagDir = None) -> None:
+def topics(
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+    bag_dir: BagDir = None,
+    verbose: Verbose = False,
+) -> None:
     """Every recorded topic: type, messages, usual rate, when it was first and last heard.
 
     The rate is that of the topic's newest hour, without the gaps between bags.
     """
     with reporting("topics"):
         settings = settings_for(bag_dir, [*(overrides or ()), _WHOLE])
-        memory = opened(settings)
+        memory = opened(settings, verbose=verbose)
         text = asked(build_server(settings, memory), "list_recorded_topics", {}).text
         reply: JsonValue = json.loads(text)
         snapshot = memory.index.snapshot()
@@ -82,11 +88,16 @@ def usual_rate(snapshot: Snapshot, topic: str) -> float | None:
     return round(messages / unix_from_ns(spent), 2) if messages > 0 and spent > 0 else None
 
 
-def info(overrides: Overrides = None, as_json: AsJson = False, bag_dir: BagDir = None) -> None:
+def info(
+    overrides: Overrides = None,
+    as_json: AsJson = False,
+    bag_dir: BagDir = None,
+    verbose: Verbose = False,
+) -> None:
     """What the memory covers: range, gaps, damaged files, the budget, and how long it lasts."""
     with reporting("info"):
         settings = settings_for(bag_dir, [*(overrides or ()), _WHOLE, "server.tools=all"])
-        memory = opened(settings)
+        memory = opened(settings, verbose=verbose)
         replies: dict[str, JsonValue] = {
             tool: json.loads(asked(build_server(settings, memory), tool, {}).text)
             for tool in ("memory_status", "data_time_range")

@@ -13,7 +13,16 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.accounts import Status
-from ros2_memory.cli.running import BagDir, Overrides, opened, output, reporting, say, settings_for
+from ros2_memory.cli.running import (
+    BagDir,
+    Overrides,
+    Verbose,
+    opened,
+    output,
+    reporting,
+    say,
+    settings_for,
+)
 from ros2_memory.cli.showing import moment, plain, span
 from ros2_memory.cli.telling import usual_rate
 from ros2_memory.errors import BagError, InvalidArgumentsError
@@ -99,6 +108,7 @@ def watch(
         int | None, typer.Option(metavar="N", help="Leave after so many looks.")
     ] = None,
     bag_dir: BagDir = None,
+    verbose: Verbose = False,
 ) -> None:
     """Watch what is being recorded: the recorder, the newest data, rates against the usual ones.
 
@@ -109,7 +119,7 @@ def watch(
         if not every > 0 or (count is not None and count < 1):
             raise InvalidArgumentsError("--every and --count must be more than 0")
         settings = settings_for(bag_dir, ["reader.include_active=true", *(overrides or ())])
-        memory = opened(settings)
+        memory = opened(settings, verbose=verbose)
         console = output()
         try:
             if console.is_terminal:
