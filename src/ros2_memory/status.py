@@ -91,9 +91,14 @@ def _fallen_silent(snapshot: Snapshot) -> Iterator[Stillness]:
 
 
 def _budget(memory: Memory, snapshot: Snapshot) -> Budget:
-    """What the bags take, how fast that grows, and for how long the budget lasts."""
-    limits, latest = memory.limits, snapshot.dating.latest
+    """What the bags take, how fast that grows, and for how long the budget lasts.
+
+    Where nothing is recorded nothing grows, and there is no budget.
+    """
+    kept, latest = memory.limits.kept, snapshot.dating.latest
     used = sum(bag.size for bag in snapshot.bags)
+    if kept is None:
+        return Budget(used, None, None, None)
     grown, since = 0, latest
     if latest is not None:
         for bag in reversed(snapshot.bags):
@@ -103,7 +108,4 @@ def _budget(memory: Memory, snapshot: Snapshot) -> Budget:
             since = min(bag.start, latest if since is None else since)
     span = 0 if latest is None or since is None else latest - since
     per_day = grown * _GROWTH_NS // span if span > 0 else None
-    kept = limits.kept
-    if kept is None:
-        return Budget(used, None, per_day, None)
     return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns)

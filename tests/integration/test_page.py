@@ -92,8 +92,91 @@ def test_it_shows_the_memory_at_a_glance(page: Browser) -> None:
     assert "30.0 m in odom" in page.text("#way")
     drawn = page.run("return document.querySelector('#way polyline').getAttribute('points')")
     assert len(drawn.split(" ")) >= 2
+    # Nobody knows how it came over the gap.
+    assert page.run("return document.querySelectorAll('#way polyline').length") >= 2
     assert page.run("return document.querySelectorAll('#way circle.stop').length") >= 1
     assert "cup" in page.text("#seen")
+
+
+def write_odd_history(bag_dir: Path) -> None:
+    """Short bags with 22 gaps, 60 topics of long names, things of long names, damaged files."""
+    long = "/" + "/".join(["the_namespace_of_a_robot"] * 6)
+    for n in range(23):
+        at = T0 + n * 60 * NS_PER_S
+        messages = [odom(at + k * NS_PER_S, float(n), 0.0) for k in range(5)]
+        if n == 22:
+            messages += [text(at, "", f"{long}/{topic}") for topic in range(60)]
+            messages.append(detections(at, ["a thing of a long name " * 5, "w" * 60]))
+        write_mcap(bag_dir / f"rec_{n:02}" / f"rec_{n:02}_0.mcap", messages)
+    for n in range(30):
+        (bag_dir / f"broken_{n:02}.mcap").write_bytes(b"this is not a bag" * 100)
+
+
+@pytest.fixture(scope="module")
+def replayed(scratch: Path) -> Iterator[Served]:
+    """A server of bags that nobody records."""
+    write_odd_history(scratch / "odd")
+    given = ("storage=mcap", "recorder=none", "data.now=latest")
+    with serving(scratch / "odd", scratch / "log_odd", *given) as server:
+        yield server
+
+
+@pytest.fixture
+def odd(chromium: Browser, replayed: Served) -> Iterator[Browser]:
+    chromium.looks(width=360, height=740)
+    chromium.complaints()
+    chromium.open(replayed.url("/"))
+    chromium.awaits(READY)
+    yield chromium
+    assert chromium.complaints() == []
+
+
+def test_of_bags_that_nobody_records_it_shows_neither_a_recorder_nor_a_budget(odd: Browser) -> None:
+    state = odd.text("#state")
+    assert "Recorder\nnone belongs to this memory" in state
+    assert "Size\n" in state
+    assert "Budget" not in state
+    assert "Growth" not in state
+
+
+def test_it_says_that_ago_counts_from_the_newest_recorded_moment(odd: Browser) -> None:
+    newest = odd.run("return clock(range.latest)")
+    assert f"Newest data\n{newest}" in odd.text("#state")
+    assert f"counts from the newest recorded moment, {newest}" in odd.text("#state")
+
+
+def test_what_is_left_out_of_a_long_reply_is_counted_and_marked(odd: Browser) -> None:
+    line = odd.text("#line")
+    assert "gaps, 22" in line
+    assert "with 2 more gaps" in line
+    assert odd.run("return document.querySelectorAll('#line rect.coarse').length") == 1
+    assert "not in the answers (30)" in line
+    shut = odd.run(
+        "return [...document.querySelectorAll('#line details')].map((each) => each.open)"
+    )
+    assert shut == [False, False]
+
+
+def test_long_names_leave_room_for_what_stands_beside_them(odd: Browser) -> None:
+    assert odd.run("return document.documentElement.scrollWidth") <= 360
+    assert odd.run("return document.querySelectorAll('#topics tbody tr').length") == 62
+    narrow = odd.run(
+        "return [...document.querySelectorAll('td')].filter((each) => each.clientWidth < 60)"
+        ".map((each) => each.textContent)"
+    )
+    assert narrow == []
+
+
+def test_without_a_bag_directory_every_part_says_so(chromium: Browser, scratch: Path) -> None:
+    given = ("storage=mcap", "recorder=none")
+    with serving(scratch / "nowhere", scratch / "log_nowhere", *given) as server:
+        chromium.open(server.url("/"))
+        chromium.awaits("return !document.getElementById('again').disabled")
+        assert "does not exist" in chromium.text("#state")
+        assert "does not exist" in chromium.text("#line")
+        assert "does not exist" in chromium.text("#topics")
+        for part in ("#way", "#seen"):
+            assert chromium.text(part) == "There is no closed bag with a message."
 
 
 def test_what_was_recorded_is_shown_as_text_and_never_runs(page: Browser) -> None:
@@ -178,9 +261,8 @@ def test_with_a_token_it_shows_nothing_until_the_token_was_typed(
     chromium: Browser, served: Served, scratch: Path
 ) -> None:
     chromium.looks(width=1200, height=900)
-    with serving(
-        scratch / "bags", scratch / "log_token", "storage=mcap", MEMORY_API_TOKEN=GOOD
-    ) as closed:
+    given = ("storage=mcap", "data.now=wall")
+    with serving(scratch / "bags", scratch / "log_token", *given, MEMORY_API_TOKEN=GOOD) as closed:
         chromium.open(closed.url("/"))
         chromium.awaits("return !document.getElementById('locked').hidden")
         assert "odom" not in chromium.text("body")
@@ -192,6 +274,7 @@ def test_with_a_token_it_shows_nothing_until_the_token_was_typed(
         chromium.awaits(READY)
         assert chromium.run("return document.getElementById('locked').hidden")
         assert "/odom" in chromium.text("#topics")
+        assert "counts from the time of this look" in chromium.text("#state")
 
 
 def choose(page: Browser, tool: str) -> None:

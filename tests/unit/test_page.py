@@ -89,6 +89,10 @@ def test_text_never_becomes_markup_or_code() -> None:
     assert not re.search(r"\son\w+=", HTML)
 
 
+def test_nothing_of_it_moves_so_there_is_nothing_to_reduce() -> None:
+    assert not re.search(r"@keyframes|animation|transition|scroll-behavior|<animate", HTML)
+
+
 def test_it_keeps_the_token_nowhere() -> None:
     assert not re.search(r"localStorage|sessionStorage|cookie|indexedDB|history\.", HTML)
 

@@ -105,6 +105,13 @@ def test_an_empty_memory_has_a_status_too(tmp_path: Path) -> None:
     assert told["budget"] == {"used_gb": 0.0, "max_gb": None, "growth_gb_per_day": None}
 
 
+def test_where_nothing_is_recorded_there_is_no_budget_and_nothing_grows(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
+    budget = shown(memory, tmp_path)["budget"]
+    assert (budget["max_gb"], budget["growth_gb_per_day"]) == (None, None)
+    assert budget["used_gb"] >= 0
+
+
 def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
     size = (tmp_path / "bag.mcap").stat().st_size
