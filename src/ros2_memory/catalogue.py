@@ -315,11 +315,23 @@ class Catalogue:
         if paths:
             self._write(write)
 
-    def forget_other_configurations(self) -> None:
-        """Drops what was found under other configurations."""
+    def forget_older_configurations(self) -> None:
+        """Drops what was found under other configurations but for the one that wrote last.
+
+        Two programs of different configuration may share the catalogue: each dropping what the
+        other has found, they would digest all bags for ever.
+        """
 
         def write(base: sqlite3.Connection) -> None:
-            rows = base.execute("SELECT id FROM bags WHERE config <> ?", (self._config,))
+            latest = base.execute(
+                "SELECT config FROM bags WHERE config <> ? ORDER BY id DESC LIMIT 1",
+                (self._config,),
+            ).fetchone()
+            if latest is None:
+                return
+            rows = base.execute(
+                "SELECT id FROM bags WHERE config NOT IN (?, ?)", (self._config, latest[0])
+            )
             drop(base, [row[0] for row in rows.fetchall()])
 
         self._write(write)

@@ -158,7 +158,7 @@ class Filler:
             trajectory_summary(self._memory, Call(), Span(start_s=0.0, end_s=LAST_S))
 
     def tidy(self) -> None:
-        """Drops the entries of files that are gone, and those of other configurations.
+        """Drops the entries of files that are gone, and those of older configurations.
 
         Not while there are no bags at all.
         """
@@ -169,7 +169,7 @@ class Filler:
             return
         there = {self._key(bag).path for run in snapshot.runs for bag in run.bags}
         recall.catalogue.forget([path for path in recall.catalogue.paths() if path not in there])
-        recall.catalogue.forget_other_configurations()
+        recall.catalogue.forget_older_configurations()
 
     def _looks_like_itself(self, bag: BagFile) -> bool:
         """Whether the file and its sidecar look as the index saw them, and long enough so."""

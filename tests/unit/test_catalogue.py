@@ -138,7 +138,9 @@ def test_an_entry_that_was_dropped_is_not_taken_for_one_of_a_quiet_topic(tmp_pat
     catalogue.put(KEY, DIGEST)
     [number] = catalogue.find([KEY])
     assert number is not None
-    catalogue_in(tmp_path, "another configuration").forget_other_configurations()
+    for later in ("another configuration", "a third"):
+        catalogue_in(tmp_path, later).put(KEY, DIGEST)
+    catalogue_in(tmp_path, "a third").forget_older_configurations()
     assert catalogue.stories("/bumper", [number]) == {}
 
 
@@ -158,15 +160,31 @@ def test_an_entry_is_of_one_file_as_it_looked_then(tmp_path: Path, other: BagKey
     assert not holds(catalogue, other)
 
 
-def test_an_entry_of_another_configuration_is_not_seen_and_can_be_dropped(tmp_path: Path) -> None:
+def test_an_entry_of_another_configuration_is_not_seen(tmp_path: Path) -> None:
     catalogue_in(tmp_path, "one").put(KEY, DIGEST)
     other = catalogue_in(tmp_path, "two")
     assert not holds(other)
     other.put(KEY, DIGEST)
-    assert holds(catalogue_in(tmp_path, "one"))
-    other.forget_other_configurations()
-    assert not holds(catalogue_in(tmp_path, "one"))
     assert holds(other)
+    assert holds(catalogue_in(tmp_path, "one"))
+
+
+def test_of_other_configurations_the_last_to_write_is_kept(tmp_path: Path) -> None:
+    one, two, three = (catalogue_in(tmp_path, name) for name in ("one", "two", "three"))
+    for catalogue in (one, two, three):
+        catalogue.put(KEY, DIGEST)
+    two.put(KEY._replace(path="rec/rec_1.mcap"), DIGEST)
+    three.forget_older_configurations()
+    assert [holds(each) for each in (one, two, three)] == [False, True, True]
+    two.forget_older_configurations()
+    assert [holds(each) for each in (one, two, three)] == [False, True, True]
+
+
+def test_alone_in_a_catalogue_a_configuration_keeps_what_it_found(tmp_path: Path) -> None:
+    catalogue = catalogue_in(tmp_path)
+    catalogue.put(KEY, DIGEST)
+    catalogue.forget_older_configurations()
+    assert holds(catalogue)
 
 
 def test_a_changed_file_takes_the_place_of_its_entry_under_a_new_number(tmp_path: Path) -> None:
