@@ -9,93 +9,31 @@ from __future__ import annotations
 
 import os
 import stat
-from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import BagError, BagVanishedError
-from ros2_memory.storage.base import BagReader
+from ros2_memory.recorder.layered import LayeredReader
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import BagSummary, TimeWindow
-    from ros2_memory.storage.base import Channel, Closing, Layout, Record
-    from ros2_memory.timebase import Ns
+    from ros2_memory.storage.base import BagReader
 
 _LINK: Final = "it lies behind a symbolic link, which is not followed"
 
 
-class ConfinedReader(BagReader):
+class ConfinedReader(LayeredReader):
     """Reads through another reader, and only what lies below `root`, through no link inside it.
 
     The root itself may be a link, or lie behind one.
     """
 
     def __init__(self, reader: BagReader, root: Path) -> None:
-        self._reader = reader
+        super().__init__(reader)
         self._root = f"{str(root).rstrip(os.sep)}{os.sep}"
 
-    def reads(self, path: Path) -> bool:
-        """As the reader beneath."""
-        return self._reader.reads(path)
-
-    def closing(self, path: Path) -> Closing:
-        """As the reader beneath."""
-        self._require_inside(path)
-        return self._reader.closing(path)
-
-    def summarize(self, path: Path) -> BagSummary:
-        """As the reader beneath."""
-        self._require_inside(path)
-        return self._reader.summarize(path)
-
-    def records(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool = False,
-    ) -> Iterator[Record]:
-        """As the reader beneath."""
-
-        def found() -> Iterator[Iterator[Record]]:
-            self._require_inside(path)
-            yield self._reader.records(path, topics, window, newest_first=newest_first)
-
-        # Not a generator, which would end where some messages are lost.
-        return chain.from_iterable(found())
-
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """As the reader beneath."""
-        self._require_inside(path)
-        return self._reader.newest(path, topic, window)
-
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """As the reader beneath."""
-        self._require_inside(path)
-        return self._reader.log_times(path, topic, window)
-
-    def channels(self, path: Path) -> Sequence[Channel]:
-        """As the reader beneath."""
-        self._require_inside(path)
-        return self._reader.channels(path)
-
-    def undecodable(self, channel: Channel) -> str | None:
-        """As the reader beneath."""
-        return self._reader.undecodable(channel)
-
-    def decode(self, record: Record) -> object:
-        """As the reader beneath."""
-        return self._reader.decode(record)
-
-    def layout(self, record: Record) -> Layout | None:
-        """As the reader beneath."""
-        return self._reader.layout(record)
-
-    def _require_inside(self, path: Path) -> None:
-        """Refuses what is not below the root, or only through a link.
+    def _looked_at(self, path: Path) -> Path:
+        """The path, which must lie below the root, and not behind a link there.
 
         Raises:
             BagVanishedError: a directory on the way is not there.
@@ -115,3 +53,6 @@ class ConfinedReader(BagReader):
             if stat.S_ISLNK(mode):
                 raise BagError(text, _LINK)
             way += os.sep
+        return path
+
+    _read_from = _looked_at

@@ -22,6 +22,7 @@ from ros2_memory.recorder.handover import (
     read_handover,
     sure_handover,
 )
+from ros2_memory.recorder.layered import LayeredReader
 from ros2_memory.recorder.layout import HANDOVER_FILE
 from ros2_memory.storage.base import BagReader
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.recorder.handover import Exclusion
-    from ros2_memory.storage.base import Channel, Closing, Layout, Record
+    from ros2_memory.storage.base import Record
     from ros2_memory.timebase import Ns
 
 _KNOWN_SIDECARS: Final = 4096
@@ -38,39 +39,15 @@ _NONE: Final = HandoverReading(Handover(), None)
 """What is read where there is no sidecar."""
 
 
-class CountingReader(BagReader):
+class CountingReader(LayeredReader):
     """Reads through another reader, and gives only the messages that count where they stand.
 
     Latched messages all count: one that was received again is recognised by what it is.
     """
 
     def __init__(self, reader: BagReader) -> None:
-        self._reader = reader
+        super().__init__(reader)
         self._known: dict[str, tuple[tuple[int, int, int], HandoverReading]] = {}
-
-    def reads(self, path: Path) -> bool:
-        """As the reader beneath."""
-        return self._reader.reads(path)
-
-    def closing(self, path: Path) -> Closing:
-        """As the reader beneath."""
-        return self._reader.closing(path)
-
-    def channels(self, path: Path) -> Sequence[Channel]:
-        """As the reader beneath."""
-        return self._reader.channels(path)
-
-    def undecodable(self, channel: Channel) -> str | None:
-        """As the reader beneath."""
-        return self._reader.undecodable(channel)
-
-    def decode(self, record: Record) -> object:
-        """As the reader beneath."""
-        return self._reader.decode(record)
-
-    def layout(self, record: Record) -> Layout | None:
-        """As the reader beneath."""
-        return self._reader.layout(record)
 
     def summarize(self, path: Path) -> BagSummary:
         """Counts and times of the messages that count.
@@ -129,7 +106,8 @@ class CountingReader(BagReader):
         if handover.hides_all:
             return None
         if _touching(handover.exclusions(path.name), window):
-            return super().newest(path, topic, window)
+            # Out of those that count: the port's own way.
+            return BagReader.newest(self, path, topic, window)
         return self._reader.newest(path, topic, window)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
