@@ -19,6 +19,7 @@ from ros2_memory import api_token, config
 ROOT = Path(__file__).resolve().parents[2]
 GATES = (
     "uv sync --locked",
+    ".ci/browser",
     "uv run ruff check",
     "uv run ruff format --check",
     "uv run mypy",
@@ -119,7 +120,7 @@ class TestGates:
         steps = read_yaml(".github/workflows/ci.yml")["jobs"]["gates"]["steps"]
         assert [step["run"] for step in steps if "pytest" in step.get("run", "")] == [command]
 
-    @pytest.mark.parametrize("name", ["run", "newest"])
+    @pytest.mark.parametrize("name", ["run", "newest", "browser"])
     def test_the_scripts_are_sound_bash_and_executable(self, name: str) -> None:
         subprocess.run(["bash", "-n", ROOT / ".ci" / name], check=True)
         assert (ROOT / ".ci" / name).stat().st_mode & 0o111
