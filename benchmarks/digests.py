@@ -17,13 +17,14 @@ from ros2_memory.rests import SLOT_NS
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
-    from ros2_memory.digest import Digest, TopicDigest
+    from ros2_memory.digest import Digest
     from ros2_memory.memory import Memory
     from ros2_memory.model import BagSummary
     from ros2_memory.motion import PoseDigest, Stop
     from ros2_memory.rests import RestDigest, Slot
     from ros2_memory.settings import Settings
     from ros2_memory.stories import Story
+    from ros2_memory.topic_digest import TopicDigest
 
 _MAX_MS = 10.0
 

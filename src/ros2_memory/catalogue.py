@@ -27,7 +27,6 @@ from ros2_memory.catalogue_sql import (
     put,
     tale_rows,
 )
-from ros2_memory.digest import EdgeDigest
 from ros2_memory.former import former_files
 from ros2_memory.packing import (
     unpacked_poses,
@@ -36,6 +35,7 @@ from ros2_memory.packing import (
 )
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.stories import QUIET
+from ros2_memory.topic_digest import EdgeDigest
 
 if TYPE_CHECKING:
     import sqlite3

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Sequence
 
-    from ros2_memory.digest import Digest, TopicDigest
+    from ros2_memory.digest import Digest
     from ros2_memory.storage.base import Record
     from ros2_memory.summaries import BagSummary
+    from ros2_memory.topic_digest import TopicDigest
 
 _OPEN, _TEXTS, _FALSE, _TRUE = 1, 2, 4, 8
 EVIDENCE: Final = "flags, words, low, high, numbers, min_x, max_x, min_y, max_y, min_z, max_z"

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.catalogue import Catalogue
-    from ros2_memory.digest import EdgeDigest
     from ros2_memory.evidence import Evidence
     from ros2_memory.model import BagFile
     from ros2_memory.motion import PoseDigest
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.rests import RestDigest
     from ros2_memory.storage.base import Record
     from ros2_memory.stories import Story
+    from ros2_memory.topic_digest import EdgeDigest
 
 T = TypeVar("T")
 

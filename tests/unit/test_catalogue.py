@@ -20,7 +20,8 @@ from tests.fakes import FakeReader
 from tests.memories import extractor
 
 if TYPE_CHECKING:
-    from ros2_memory.digest import Digest, TopicDigest
+    from ros2_memory.digest import Digest
+    from ros2_memory.topic_digest import TopicDigest
     from tests.bags import Msg
 
 S = 10**9

@@ -8,30 +8,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.conditions import (
-    Beyond,
-    Condition,
-    Contains,
-    Equals,
-    NearPosition,
-    parse_condition,
-)
-from ros2_memory.digest import MOST_KEPT, Digester, EvidenceCollector
-from ros2_memory.evidence import MOST_WORDS, united
+from ros2_memory.conditions import Beyond, Contains, Equals, parse_condition
+from ros2_memory.digest import Digester
+from ros2_memory.evidence import MOST_WORDS
 from ros2_memory.model import Pose
 from ros2_memory.packing import filled, packed_poses, shape_of_text, shape_text, unpacked_poses
+from ros2_memory.topic_digest import MOST_KEPT
 from ros2_memory.trajectory import PoseCollector, TrajectoryBuilder
 from tests.bags import Msg, boolean, detections, odom, text, tf, transform
 from tests.fakes import FakeReader
 from tests.memories import extractor
-from tests.strategies import json_values
 
 if TYPE_CHECKING:
-    from ros2_memory.digest import Digest, TopicDigest
+    from ros2_memory.digest import Digest
     from ros2_memory.model import JsonValue
+    from ros2_memory.topic_digest import TopicDigest
 
 S = 10**9
 MS = 10**6
@@ -51,56 +45,6 @@ def topic_of(messages: list[Msg]) -> TopicDigest:
 
 
 # Evidence
-
-needles = st.one_of(
-    st.booleans(),
-    st.integers(-5, 5),
-    st.floats(allow_nan=False),
-    st.sampled_from(["a", "AB", "b", "1", " a", "b c", "true", "-3", "0.5", "ß", "-"]),
-    st.text(max_size=3),
-)
-texts = st.one_of(
-    st.text(max_size=6), st.sampled_from(["a b", "Ab_c", "straße", "--", "1", "true"])
-)
-places = st.builds(
-    lambda key, x, y, rest: {key: {"x": x, "y": y, **rest}},
-    st.sampled_from(["position", "point", "translation", "velocity"]),
-    st.one_of(st.floats(), st.integers(-(10**400), 10**400)),
-    st.floats(-5, 5),
-    st.dictionaries(st.just("z"), st.floats(), max_size=1),
-)
-values = st.one_of(json_values, st.lists(st.one_of(texts, places, json_values), max_size=4))
-conditions = st.builds(
-    Condition,
-    st.one_of(
-        st.builds(Contains, needles.filter(lambda needle: needle != "")),
-        st.builds(Equals, needles),
-        st.builds(Beyond, st.one_of(st.floats(allow_nan=False), st.integers()), st.booleans()),
-        st.builds(
-            NearPosition,
-            st.floats(-6, 6),
-            st.floats(-6, 6),
-            st.one_of(st.none(), st.floats(-6, 6)),
-            st.floats(0, 3),
-        ),
-    ),
-    st.sampled_from([None, "x", "position", "label", "velocity", "0", "position.x"]),
-)
-
-
-@given(st.lists(values, max_size=4), values, conditions)
-@example([], [{"point": {"x": 10**400, "y": 0.0}}], Condition(Equals(math.inf)))
-@example([], ["STRASSE"], Condition(Contains("straße")))
-def test_evidence_never_rules_out_what_matches(
-    others: list[JsonValue], value: JsonValue, condition: Condition
-) -> None:
-    collector = EvidenceCollector()
-    for each in (*others, value):
-        collector.add(each)
-    evidence = collector.evidence()
-    if condition.matches(value):
-        assert condition.may_match(evidence)
-        assert condition.may_match(united([EvidenceCollector().evidence(), evidence]))
 
 
 @pytest.mark.parametrize(
