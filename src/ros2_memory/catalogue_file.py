@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-VERSION: Final = 3
+VERSION: Final = 4
 """Of the tables below and of what stands in them; a file of any other is set aside."""
 
 BUSY_S: Final = 1.0

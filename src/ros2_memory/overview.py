@@ -89,7 +89,7 @@ def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
 def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
     """The bags that a crash left open, each with what is lost of it."""
     return tuple(
-        SetAside(bag.path, "; ".join(bag.summary.notes) or "left open by a crash")
+        SetAside(bag.path, "; ".join(bag.summary.remarks) or "left open by a crash")
         for bag in snapshot.odd(TimeWindow.everything())
         if bag.state is BagState.INCOMPLETE
     )
@@ -153,9 +153,9 @@ def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
 
 
 def _note_odd_bags(view: View) -> None:
-    """Says of the newest bags that are odd, and not left open, what is odd about them."""
+    """Says of the newest bags that are odd, not left open, and no fault of a clock, in what way."""
     bags = view.snapshot.odd(TimeWindow.everything())
-    odd = [bag for bag in bags if bag.state is not BagState.INCOMPLETE]
+    odd = [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
     for bag in odd[-_ODD_BAGS:]:
         view.note(f"{short_name(bag.path)}: {'; '.join(bag.summary.notes)}")
     more = len(odd) - _ODD_BAGS

@@ -197,7 +197,7 @@ def _frames(text: bytes) -> tuple[str, ...]:
 def shape_text(shape: Shape) -> str:
     """A shape as a text, the same for equal ones."""
     topics: JsonValue = [[*heading] for heading in shape.topics]
-    return json.dumps([topics, [*shape.silent], shape.complete, [*shape.notes]])
+    return json.dumps([topics, [*shape.silent], shape.complete, [*shape.notes], shape.set_back])
 
 
 def shape_of_text(text: str) -> Shape:
@@ -207,12 +207,12 @@ def shape_of_text(text: str) -> Shape:
         ValueError: it is of none.
         TypeError: likewise.
     """
-    topics, silent, complete, notes = json.loads(text)
+    topics, silent, complete, notes, set_back = json.loads(text)
     headings = (
         Heading(topic, type_name, encoding, bool(latched))
         for topic, type_name, encoding, latched in topics
     )
-    return shared_shape(tuple(headings), tuple(silent), bool(complete), tuple(notes))
+    return shared_shape(tuple(headings), tuple(silent), bool(complete), tuple(notes), int(set_back))
 
 
 def filled(shape: Shape, counts: bytes) -> BagSummary:

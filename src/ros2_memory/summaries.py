@@ -13,10 +13,13 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
+from ros2_memory.timebase import NS_PER_S, Ns
+
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from ros2_memory.timebase import Ns
+OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
+"""Messages are written out of order by less than this, also across two splits."""
 
 _NUMBERS: Final = struct.Struct("<qqq")
 """Count, first and last log time of a topic."""
@@ -58,6 +61,12 @@ class Shape:
     silent: tuple[str, ...] = ()
     complete: bool = True
     notes: tuple[str, ...] = ()
+    set_back: Ns = 0
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """The notes, and a sentence on a clock that was set back."""
+        return (*self.notes, set_back_while_written(self.set_back)) if self.set_back else self.notes
 
     @cached_property
     def places(self) -> dict[str, tuple[int, ...]]:
@@ -73,9 +82,18 @@ class Shape:
         return struct.Struct(f"<{3 * len(self.topics)}q")
 
 
+def set_back_while_written(by: Ns) -> str:
+    """The sentence on a bag in the writing of which the clock was set back by so much, or more."""
+    return f"the clock was set back by {by / NS_PER_S:.0f} s or more while it was being written"
+
+
 @lru_cache(maxsize=_SHAPES_AT_HAND)
 def shared_shape(
-    topics: tuple[Heading, ...], silent: tuple[str, ...], complete: bool, notes: tuple[str, ...]
+    topics: tuple[Heading, ...],
+    silent: tuple[str, ...],
+    complete: bool,
+    notes: tuple[str, ...],
+    set_back: Ns = 0,
 ) -> Shape:
     """One shape for all bags that have it, with one copy of each name."""
     intern = sys.intern
@@ -83,7 +101,7 @@ def shared_shape(
         Heading(intern(each.topic), intern(each.type), intern(each.encoding), each.latched)
         for each in topics
     )
-    return Shape(headings, tuple(intern(name) for name in silent), complete, notes)
+    return Shape(headings, tuple(intern(name) for name in silent), complete, notes, set_back)
 
 
 class BagSummary:
@@ -94,6 +112,8 @@ class BagSummary:
         silent: the topics that are declared without a message.
         complete: False where the file ends early and only what was readable is counted.
         notes: sentences on what is odd.
+        set_back: by how much the log times of a topic go back in the order of writing, at most; 0
+            where they do so by less than a second.
 
     Attributes:
         shape: the summary without its numbers.
@@ -111,9 +131,10 @@ class BagSummary:
         silent: tuple[str, ...] = (),
         complete: bool = True,
         notes: tuple[str, ...] = (),
+        set_back: Ns = 0,
     ) -> None:
         headings = (Heading(each.topic, each.type, each.encoding, each.latched) for each in topics)
-        self.shape = shared_shape(tuple(headings), silent, complete, notes)
+        self.shape = shared_shape(tuple(headings), silent, complete, notes, set_back)
         numbers = (part for each in topics for part in (each.count, each.first, each.last))
         self.numbers = self.shape.layout.pack(*numbers)
 
@@ -138,6 +159,7 @@ class BagSummary:
             self.silent,
             self.complete if complete is None else complete,
             self.notes if notes is None else notes,
+            self.shape.set_back,
         )
 
     @property
@@ -180,6 +202,11 @@ class BagSummary:
         return self.shape.notes
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """The notes, and a sentence on a clock that was set back."""
+        return self.shape.remarks
+
+    @property
     def count(self) -> int:
         """Messages on all topics."""
         return sum(self._unpacked()[0::3])
@@ -213,5 +240,5 @@ class BagSummary:
     def __repr__(self) -> str:
         return (
             f"BagSummary(topics={self.topics!r}, silent={self.silent!r},"
-            f" complete={self.complete!r}, notes={self.notes!r})"
+            f" complete={self.complete!r}, notes={self.notes!r}, set_back={self.shape.set_back})"
         )

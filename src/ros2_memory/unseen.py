@@ -136,7 +136,7 @@ def _left_open(bags: Sequence[BagFile]) -> Iterator[str]:
 
 def _odd(bags: Sequence[BagFile]) -> Iterator[str]:
     for bag in bags[-NAMED:]:
-        yield f"{short_name(bag.path)}: {shortened('; '.join(bag.summary.notes))}"
+        yield f"{short_name(bag.path)}: {shortened('; '.join(bag.summary.remarks))}"
     if len(bags) > NAMED:
         more = counted(len(bags) - NAMED, "older bag is", "older bags are")
         yield f"{more} odd too"
@@ -157,4 +157,4 @@ def misdated(faults: Sequence[ClockFault]) -> str:
 
 def _with_notes(bag: BagFile) -> str:
     name = short_name(bag.path)
-    return f"{name} ({shortened('; '.join(bag.summary.notes))})" if bag.summary.notes else name
+    return f"{name} ({shortened('; '.join(bag.summary.remarks))})" if bag.summary.remarks else name

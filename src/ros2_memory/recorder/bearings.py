@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.recorder.clock_faults import Part, dating_of
-from ros2_memory.recorder.courses import neighbours, steps_of
+from ros2_memory.recorder.courses import StepBack, neighbours, steps_of
 from ros2_memory.recorder.whereabouts import LONGEST_NS, whereabouts
 from ros2_memory.timebase import MAX_NS
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.model import BagFile, SetAside
     from ros2_memory.recorder.clock_faults import Dating
-    from ros2_memory.recorder.courses import StepBack
     from ros2_memory.recorder.timeline import Run, Timeline
     from ros2_memory.timebase import Ns
 
@@ -65,7 +64,9 @@ def _parts(runs: Sequence[Run]) -> list[Part]:
 
 
 def _steps(runs: Sequence[Run]) -> list[StepBack]:
-    return steps_of([run.courses for run in runs], lambda at: _bags(runs, at))
+    between = steps_of([run.courses for run in runs], lambda at: _bags(runs, at))
+    within = (bag for run in runs for bag in run.set_back)
+    return [*between, *(StepBack(bag, bag, bag.summary.shape.set_back) for bag in within)]
 
 
 def _bags(runs: Sequence[Run], at: Sequence[int]) -> chain[BagFile]:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.summaries import set_back_while_written
 from ros2_memory.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -49,7 +50,8 @@ class ClockFault(NamedTuple):
     """A bag that a wrong clock dated.
 
     `by` is how far its last message lies after the present, or how far the clock was set back after
-    the bag `before`. `misleads`: it is left out of what spans the memory.
+    the bag `before` was begun (None: at least so far, while this one was being written).
+    `misleads`: it is left out of what spans the memory.
     """
 
     bag: BagFile
@@ -84,9 +86,11 @@ class ClockFault(NamedTuple):
                     f"dated up to {_seconds(self.bag.end)}, {_length(self.by)} after now: "
                     "the clock was ahead"
                 )
-            case FaultyClock.SET_BACK:
-                name = "the split before it" if self.before is None else self.before.path.name
+            case FaultyClock.SET_BACK if self.before is not None:
+                name = self.before.path.name
                 return f"the clock was set back by {_length(self.by)} after {name} was begun"
+            case FaultyClock.SET_BACK:
+                return set_back_while_written(self.by)
             case FaultyClock.STRAY:
                 return (
                     f"dated {_seconds(self.bag.start)}, a day or more from the rest of its "
@@ -183,8 +187,10 @@ def _of_steps(
     for step in steps:
         if step.before.file in known or step.after.file in known:
             continue
-        yield ClockFault(step.after, FaultyClock.SET_BACK, step.by, step.before, misleads=False)
-        if step.by < FAR_BACK_NS:
+        within = step.before is step.after
+        before = None if within else step.before
+        yield ClockFault(step.after, FaultyClock.SET_BACK, step.by, before, misleads=False)
+        if within or step.by < FAR_BACK_NS:
             continue
         half = FAR_BACK_NS // 2
         sides = [around(at - half, at + half) for at in (step.after.start, step.before.end)]

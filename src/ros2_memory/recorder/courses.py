@@ -8,20 +8,18 @@ lie on both sides of one that cannot be read.
 from __future__ import annotations
 
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from ros2_memory.recorder.scan import COMPRESSED
-from ros2_memory.timebase import NS_PER_S, Ns
+from ros2_memory.summaries import OUT_OF_ORDER_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from ros2_memory.model import BagFile
+    from ros2_memory.timebase import Ns
 
 Bags: TypeAlias = "Callable[[Sequence[int]], Iterable[BagFile]]"
-
-OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
-"""Messages arrive out of order by less than this, also across two splits."""
 
 Series: TypeAlias = str
 """The path of a bag file up to its count: what the files of one recording share."""
@@ -42,7 +40,10 @@ class Neighbours(NamedTuple):
 
 
 class StepBack(NamedTuple):
-    """A clock that was set back while a recording ran: `after` begins `by` before `before` ends."""
+    """A clock that was set back while a recording ran: `after` begins `by` before `before` ends.
+
+    Both are one bag where that was while it was being written.
+    """
 
     before: BagFile
     after: BagFile

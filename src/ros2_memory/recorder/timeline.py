@@ -103,8 +103,15 @@ class Run:
     def odd(self) -> tuple[BagFile, ...]:
         """The bags of which not all could be read, or that contradict themselves."""
         return tuple(
-            bag for bag in self.bags if bag.summary.shape.notes or bag.state is BagState.INCOMPLETE
+            bag
+            for bag in self.bags
+            if bag.summary.shape.remarks or bag.state is BagState.INCOMPLETE
         )
+
+    @cached_property
+    def set_back(self) -> tuple[BagFile, ...]:
+        """The bags in which times go back."""
+        return tuple(bag for bag in self.recorded if bag.summary.shape.set_back)
 
     @cached_property
     def _shapes(self) -> tuple[Shape, ...]:

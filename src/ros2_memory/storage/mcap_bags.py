@@ -82,7 +82,9 @@ class McapBags:
             for number, total in index.totals.items()
         ]
         declared = index.channels.values()
-        return bag_summary(held, declared, complete=index.complete, notes=index.notes)
+        return bag_summary(
+            held, declared, complete=index.complete, notes=index.notes, set_back=index.set_back
+        )
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """The channels declared in the file."""

@@ -26,6 +26,7 @@ from ros2_memory.storage.mcap_chunk import (
 )
 from ros2_memory.storage.mcap_records import RECORD, Statistics
 from ros2_memory.storage.mcap_summary import Chunk, DoubtError, read_summary
+from ros2_memory.summaries import OUT_OF_ORDER_NS
 from ros2_memory.timebase import MAX_NS, unix_from_ns
 
 if TYPE_CHECKING:
@@ -52,7 +53,9 @@ class Total:
 class McapIndex(NamedTuple):
     """What is known of a file without its payloads.
 
-    `loose` are the messages outside chunks, by channel, at their places in the file.
+    `loose` are the messages outside chunks, by channel, at their places in the file. `set_back` is
+    by how much a channel's log times go back from one chunk, or one loose message, to a later one,
+    at most; 0 where that is no more than `OUT_OF_ORDER_NS`.
     """
 
     channels: Mapping[int, Channel]
@@ -61,6 +64,7 @@ class McapIndex(NamedTuple):
     loose: Mapping[int, Column] = MappingProxyType({})
     complete: bool = True
     notes: tuple[str, ...] = ()
+    set_back: Ns = 0
 
     @property
     def bytes_held(self) -> int:
@@ -104,6 +108,33 @@ def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
         if not start <= first <= last <= end:
             raise _outside()
     return extents
+
+
+def _set_back(file: OpenFile, chunks: Sequence[Chunk]) -> Ns:
+    """As in `McapIndex`, of chunks with message indexes in the order of writing.
+
+    Chunks that overlap are no sign of it by themselves: some writers sort channels into chunks.
+    """
+    latest = -1
+    for chunk in chunks:
+        if chunk.start < latest - OUT_OF_ORDER_NS:
+            break
+        latest = max(latest, chunk.end)
+    else:
+        return 0
+    most: Ns = 0
+    lasts: dict[int, Ns] = {}
+    for chunk in chunks:
+        for channel, (_, first, last) in _chunk_extents(file, chunk).items():
+            before = lasts.get(channel, first)
+            most = max(most, before - first)
+            lasts[channel] = max(before, last)
+    return beyond_disorder(most)
+
+
+def beyond_disorder(back: Ns) -> Ns:
+    """By how much times go back; 0 where messages are merely out of order."""
+    return back if back > OUT_OF_ORDER_NS else 0
 
 
 def _index_region(file: OpenFile, chunk: Chunk) -> bytes:
@@ -159,7 +190,8 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     if found != counts or sum(found.values()) != stated.messages:
         raise DoubtError
     notes = disagreements(stated, totals)
-    return McapIndex(channels, tuple(held), totals, notes=notes)
+    back = _set_back(file, held)
+    return McapIndex(channels, tuple(held), totals, notes=notes, set_back=back)
 
 
 def _agrees(stated: Statistics, chunks: Sequence[Chunk], held: Sequence[Chunk]) -> bool:

@@ -10,6 +10,7 @@ from array import array
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.storage.base import Closing
@@ -35,6 +36,7 @@ from ros2_memory.storage.mcap_index import (
     McapIndex,
     Total,
     add_column,
+    beyond_disorder,
     disagreements,
 )
 from ros2_memory.storage.mcap_records import (
@@ -47,10 +49,12 @@ from ros2_memory.storage.mcap_records import (
     statistics,
 )
 from ros2_memory.storage.mcap_summary import Chunk
+from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:
     from ros2_memory.storage.mcap_chunk import ChunkHead, Column
     from ros2_memory.storage.open_file import OpenFile
+    from ros2_memory.timebase import Ns
 
 _BLOCK: Final = 256 * 1024
 
@@ -87,6 +91,7 @@ class _Scan:
     messages: int = 0
     damaged: list[str] = field(default_factory=list)
     partial: int = 0  # bytes of a last, compressed chunk that was read in part
+    back: Ns = 0  # as `set_back` of `McapIndex`, however little
     unpacked: int = 0  # bytes that the chunks so far have come to
     _block: bytes = b""
     _block_at: int = 0
@@ -193,6 +198,9 @@ class _Scan:
         self.messages += walked.messages
         held = {channel: column for channel, column in walked.columns.items() if column.times.size}
         for channel, column in held.items():
+            known = self.totals.get(channel)
+            if known is not None:
+                self.back = max(self.back, known.last - int(column.times[0]))
             add_column(self.totals, channel, column)
         if held:
             self.chunks.append(
@@ -217,6 +225,7 @@ class _Scan:
     def index(self, note: str) -> McapIndex:
         """What was found."""
         columns = {channel: column_of(*lists) for channel, lists in self.loose.items()}
+        back = max([self.back, *(_back_in(times) for times, _ in self.loose.values())])
         for channel, column in columns.items():
             add_column(self.totals, channel, column)
         channels = self.declarations.channels()
@@ -229,6 +238,7 @@ class _Scan:
             _held(columns),
             complete=self.data_ended and self.closed,
             notes=tuple(notes),
+            set_back=beyond_disorder(back),
         )
 
     def _notes(self, known: dict[int, Total]) -> list[str]:
@@ -264,3 +274,11 @@ class _Scan:
 
 def _held(columns: dict[int, Column]) -> dict[int, Column]:
     return {channel: column for channel, column in columns.items() if column.times.size}
+
+
+def _back_in(times: array[int]) -> Ns:
+    """By how much possible log times go back in this order, at most."""
+    written = np.array([time for time in times if time <= MAX_NS], np.int64)
+    if not written.size:
+        return 0
+    return int((np.maximum.accumulate(written) - written).max())

@@ -30,6 +30,7 @@ def bag_summary(
     *,
     complete: bool = True,
     notes: tuple[str, ...] = (),
+    set_back: Ns = 0,
 ) -> BagSummary:
     """The summary of a file: channels of one topic and type count as one."""
     found: dict[tuple[str, str], Held] = {}
@@ -44,7 +45,7 @@ def bag_summary(
     for (topic, type_name), (channel, *stated) in sorted(found.items(), key=itemgetter(0)):
         headings.append(Heading(topic, type_name, channel.encoding, channel.latched))
         numbers += stated
-    shape = shared_shape(tuple(headings), tuple(sorted(silent)), complete, notes)
+    shape = shared_shape(tuple(headings), tuple(sorted(silent)), complete, notes, set_back)
     return BagSummary.packed(shape, shape.layout.pack(*numbers))
 
 
