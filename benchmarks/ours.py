@@ -8,8 +8,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from ros2_memory import queries
-from ros2_memory.bootstrap import build_memory, build_server
+from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
+from ros2_memory.endpoint import build_server
 from ros2_memory.logs import configure_logging
 from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow

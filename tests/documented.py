@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Final
 
 import anyio
 
-from ros2_memory.bootstrap import build_server, limits_of
+from ros2_memory.bootstrap import limits_of
 from ros2_memory.config import load_settings
+from ros2_memory.endpoint import build_server
 from ros2_memory.recorder.handover import Handover, Overlap, write_handover
 from ros2_memory.recorder.heartbeat import (
     HEARTBEAT_FILE,

@@ -1,4 +1,4 @@
-"""The composition root of the query server: `adapters`, and what answers with them."""
+"""Builds what answers: a memory over the adapters, and the dispatcher of questions to it."""
 
 from __future__ import annotations
 
@@ -19,10 +19,8 @@ from ros2_memory.dispatch import Dispatcher
 from ros2_memory.errors import ConfigError
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.filling import Filler
-from ros2_memory.instructions import instructions
 from ros2_memory.measures import Measuring
 from ros2_memory.memory import Limits, Memory
-from ros2_memory.protocol import EpisodicServer
 from ros2_memory.recall import Recall
 from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.counting import CountingReader
@@ -176,10 +174,10 @@ def _optional(key: str) -> Iterator[None]:
         ) from error
 
 
-def build_server(
+def build_dispatcher(
     settings: Settings, memory: Memory, telemetry: Telemetry = SILENT
-) -> EpisodicServer:
-    """The MCP server that answers from a memory."""
+) -> Dispatcher:
+    """What answers tool calls from a memory."""
     served = settings.server
     tools = build_tools(
         memory.limits,
@@ -187,20 +185,13 @@ def build_server(
         additions=served.tools == "all",
         writing=served.write_tools,
     )
-    dispatcher = Dispatcher(
+    return Dispatcher(
         memory,
         tools,
         Replies(settings.recording.bag_dir, served.max_reply_chars),
         call_timeout_s=served.call_timeout_s,
         readable=readable_tools(memory.limits),
         telemetry=telemetry,
-    )
-    return EpisodicServer(
-        dispatcher,
-        tools,
-        name=served.name,
-        version=package_version(),
-        instructions=instructions(memory.limits, additions=served.tools == "all"),
     )
 
 

@@ -60,6 +60,9 @@ class Dispatcher:
     """Answers tool calls from one memory, a bounded number at a time.
 
     `readable`: what no tool call reaches, but a resource that is read.
+
+    Attributes:
+        tools: what a call can name, in the order of their declaration.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class Dispatcher:
         readable: Sequence[Tool] = (),
         telemetry: Telemetry = SILENT,
     ) -> None:
+        self.tools = (*tools,)
         self._memory = memory
         self._tools = {tool.name: tool for tool in tools}
         self._readable = self._tools | {each.name: each for each in readable}

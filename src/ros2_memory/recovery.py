@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.adapters import build_repairer
 from ros2_memory.errors import BagError, BagVanishedError, RecorderError
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.kept_names import KeptNames
@@ -19,6 +18,7 @@ from ros2_memory.recorder.layout import METADATA_FILE
 from ros2_memory.recorder.repair import open_files
 from ros2_memory.recorder.scan import Tree
 from ros2_memory.timebase import NS_PER_S, Ns, WallClock, unix_from_ns
+from ros2_memory.upkeep import build_repairer
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,12 +21,12 @@ from ros2_memory.api_token import take_token
 from ros2_memory.bootstrap import (
     build_filler,
     build_memory,
-    build_server,
     build_telemetry,
     package_version,
 )
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.connections import BoundedConnection
+from ros2_memory.endpoint import build_server
 from ros2_memory.filling import keep_filled
 from ros2_memory.health import Health, keep_fresh
 from ros2_memory.http import STREAM_PATH, web_app

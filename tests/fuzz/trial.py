@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 import structlog
 
 from ros2_memory import cli
-from ros2_memory.bootstrap import build_filler, build_memory, build_server
+from ros2_memory.bootstrap import build_filler, build_memory
 from ros2_memory.config import load_settings
+from ros2_memory.endpoint import build_server
 from ros2_memory.errors import EpisodicError
 from ros2_memory.indexing import Bar, fill
 from ros2_memory.model import BagState, TimeWindow

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.adapters import build_repairer
-from ros2_memory.bootstrap import build_filler, build_memory, build_server
+from ros2_memory.bootstrap import build_filler, build_memory
 from ros2_memory.catalogue_file import open_file
 from ros2_memory.config import load_settings
+from ros2_memory.endpoint import build_server
 from ros2_memory.errors import BagError, RecorderError
 from ros2_memory.memory import Limits
 from ros2_memory.model import TimeWindow
@@ -41,6 +41,7 @@ from ros2_memory.storage.open_file import OpenFile
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.timebase import NS_PER_S
 from ros2_memory.tools import build_tools
+from ros2_memory.upkeep import build_repairer
 from tests.bags import boolean, text, write_db3, write_mcap
 from tests.questions import ANSWERED, T0, T0_S, write_run
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory import keepsakes
-from ros2_memory.bootstrap import build_server
 from ros2_memory.config import load_settings
+from ros2_memory.endpoint import build_server
 from ros2_memory.errors import RefusedError
 from ros2_memory.keepsakes import MOST_LISTED, list_moments, remember_moment
 from ros2_memory.memory import Call, Limits, Memory

@@ -13,11 +13,12 @@ import pytest
 from mcp import Client
 from mcp.types import TextContent
 
-from ros2_memory.bootstrap import build_server, limits_of
+from ros2_memory.bootstrap import limits_of
 from ros2_memory.config import load_settings
 from ros2_memory.demo.checking import Asked, WrongAnswerError
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.demo.streams import Timeline
+from ros2_memory.endpoint import build_server
 from ros2_memory.fitting import compact
 from ros2_memory.timebase import FixedClock, ns_from_unix
 from tests.memories import memory_of

@@ -10,8 +10,9 @@ from mcp import Client
 from mcp.shared.exceptions import MCPError
 from mcp.types import INVALID_PARAMS, TextContent, TextResourceContents
 
-from ros2_memory.bootstrap import build_memory, build_server
+from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
+from ros2_memory.endpoint import build_server
 from tests.questions import write_run
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Annotated
 import anyio
 import typer
 
-from ros2_memory.bootstrap import build_server
+from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.running import (
     NOT_SO,
     AsJson,
@@ -22,10 +22,10 @@ from ros2_memory.cli.running import (
     settings_for,
 )
 from ros2_memory.cli.showing import show
+from ros2_memory.dispatch import Dispatcher
 from ros2_memory.errors import InvalidArgumentsError
 from ros2_memory.memory import Limits
 from ros2_memory.model import JsonValue
-from ros2_memory.protocol import EpisodicServer
 from ros2_memory.replies import Reply
 from ros2_memory.tools import build_tools
 
@@ -64,14 +64,14 @@ def ask(
     with reporting("ask"):
         chosen = settings_for(bag_dir, settings)
         memory = opened(chosen, verbose=verbose)
-        server = build_server(chosen, memory)
-        schemas = _schemas(server)
+        dispatcher = build_dispatcher(chosen, memory)
+        schemas = {each.name: each.schema for each in dispatcher.tools}
         if tool is None:
             show(output(), [_row(name, schema) for name, schema in schemas.items()])
             return
         arguments = parsed(given or (), schemas.get(tool, {}))
         with busy(f"asking {tool}"):
-            reply = asked(server, tool, arguments)
+            reply = asked(dispatcher, tool, arguments)
     if as_json:
         say(reply.text)
     else:
@@ -82,12 +82,12 @@ def ask(
         raise typer.Exit(NOT_SO)
 
 
-def asked(server: EpisodicServer, tool: str, arguments: Mapping[str, object]) -> Reply:
+def asked(dispatcher: Dispatcher, tool: str, arguments: Mapping[str, object]) -> Reply:
     """The reply of one tool."""
     try:
-        return anyio.run(server.dispatcher.answer, tool, arguments)
+        return anyio.run(dispatcher.answer, tool, arguments)
     finally:
-        server.dispatcher.stop()
+        dispatcher.stop()
 
 
 def is_without_answer(reply: JsonValue) -> bool:
@@ -137,10 +137,6 @@ def _is_text(schema: Mapping[str, object], key: str) -> bool:
     properties = schema.get("properties")
     known = properties.get(key) if isinstance(properties, dict) else None
     return isinstance(known, dict) and known.get("type") == "string"
-
-
-def _schemas(server: EpisodicServer) -> Schemas:
-    return {tool.name: tool.input_schema for tool in anyio.run(server.list_tools)}
 
 
 def _row(name: str, schema: Mapping[str, object]) -> dict[str, JsonValue]:

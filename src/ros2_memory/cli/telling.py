@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 import yaml
 
-from ros2_memory.bootstrap import build_server
+from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.asking import asked, is_without_answer
 from ros2_memory.cli.running import (
     NOT_SO,
@@ -56,7 +56,7 @@ def topics(
     with reporting("topics"):
         settings = settings_for(bag_dir, [*(overrides or ()), _WHOLE])
         memory = opened(settings, verbose=verbose)
-        text = asked(build_server(settings, memory), "list_recorded_topics", {}).text
+        text = asked(build_dispatcher(settings, memory), "list_recorded_topics", {}).text
         reply: JsonValue = json.loads(text)
         snapshot = memory.index.snapshot()
     rows = [each for each in reply if isinstance(each, dict)] if isinstance(reply, list) else []
@@ -99,7 +99,7 @@ def info(
         settings = settings_for(bag_dir, [*(overrides or ()), _WHOLE, "server.tools=all"])
         memory = opened(settings, verbose=verbose)
         replies: dict[str, JsonValue] = {
-            tool: json.loads(asked(build_server(settings, memory), tool, {}).text)
+            tool: json.loads(asked(build_dispatcher(settings, memory), tool, {}).text)
             for tool in ("memory_status", "data_time_range")
         }
     if as_json:

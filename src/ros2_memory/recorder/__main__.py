@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory.adapters import build_housekeeper, build_reader, build_recorder
+from ros2_memory.adapters import build_reader, build_recorder
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.errors import ConfigError, EpisodicError
 from ros2_memory.logs import configure_logging
@@ -23,6 +23,7 @@ from ros2_memory.recorder.daemon import (
 from ros2_memory.recorder.notify import ServiceManager
 from ros2_memory.recorder.topics import load_topics
 from ros2_memory.settings import NullRecorderNode
+from ros2_memory.upkeep import build_housekeeper
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,0 +1,49 @@
+"""Builds what repairs and deletes bags: for the recorder daemon, and for `ros2-memory recover`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ros2_memory.adapters import GB, retention_limits
+from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
+from ros2_memory.recorder.repair import Repairer
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.mcap_writer import McapWriter
+from ros2_memory.timebase import WallClock
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.recorder.ports import Housekeeper
+    from ros2_memory.settings import Settings
+    from ros2_memory.storage.base import BagReader
+
+
+def moments_bytes(settings: Settings) -> int:
+    """What moments may take; never more than half the budget, so that there is room for today."""
+    kept = settings.retention
+    return round(min(kept.max_moments_gb, kept.max_total_gb / 2) * GB)
+
+
+def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> Housekeeper:
+    """What repairs and deletes in the bag directory of the recorder; nobody else may delete."""
+    limits = retention_limits(settings)
+    return InBackground(
+        Housekeeping(
+            bag_dir,
+            CountingReader(reader),
+            McapWriter(settings.reader.max_chunk_mb),
+            WallClock(),
+            limits,
+            split_duration_s=settings.recording.split_duration_s,
+            moments_bytes=moments_bytes(settings),
+            static_topics=settings.data.tf_static_topics,
+            grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
+        )
+    )
+
+
+def build_repairer() -> Repairer:
+    """What repairs single MCAP files."""
+    return Repairer(McapReader(), McapWriter())
