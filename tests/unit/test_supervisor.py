@@ -55,6 +55,16 @@ class TestStart:
         assert beat["state"] == "recording"
         assert beat["subscribed"] == ["/bumper", "/door"]
 
+    def test_one_whose_words_for_it_are_not_known_records_once_it_subscribes(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.defaults = {"ready_s": 10**9}
+        world.supervisor.start()
+        world.run(130)
+        assert world.supervisor.is_recording
+        assert len(world.recorders) == 1
+
     def test_a_second_start_changes_nothing(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()
@@ -205,7 +215,7 @@ class TestDeath:
         self, tmp_path: Path
     ) -> None:
         world = World(tmp_path)
-        world.defaults = {"ready_s": 10**9}
+        world.defaults = {"ready_s": 10**9, "subscribe_s": 10**9}
         world.supervisor.start()
         with capture_logs() as logs:
             world.run(119)
@@ -218,7 +228,7 @@ class TestDeath:
         world = World(tmp_path, session_duration_s=20)
         world.supervisor.start()
         world.run(19)
-        world.defaults = {"ready_s": 10**9}
+        world.defaults = {"ready_s": 10**9, "subscribe_s": 10**9}
         world.run(125)
         old, new = world.recorders[:2]
         assert (old.status, new.status) == (None, 0)

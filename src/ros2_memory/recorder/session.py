@@ -53,6 +53,8 @@ class Session:
                     told.append(line)
                 self.ready = True
             elif line.said is Said.SUBSCRIBED and line.topic is not None:
+                # One that subscribes records, in whatever words it says that it began.
+                self.ready = True
                 self.subscribed.add(line.topic)
                 told.append(line)
             elif line.said in _TOLD and self._is_new(line):
