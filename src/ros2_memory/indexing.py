@@ -9,6 +9,8 @@ import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TextIO
 
+from ros2_memory.wording import counted
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -51,8 +53,9 @@ def line(progress: Progress) -> str:
     known = progress.closed - progress.waiting - progress.refused
     part = known / progress.closed if progress.closed else 1.0
     bar = "#" * int(part * _WIDTH)
+    bags = counted(progress.closed, "bag is", "bags are")
     refused = f", {progress.refused} cannot be" if progress.refused else ""
-    return f"[{bar:<{_WIDTH}}] {known} of {progress.closed} bags are in the catalogue{refused}"
+    return f"[{bar:<{_WIDTH}}] {known} of {bags} in the catalogue{refused}"
 
 
 def fill(filler: Filler, bar: Bar | None, abandoned: Callable[[], bool]) -> Progress:

@@ -19,6 +19,7 @@ from ros2_memory.recorder.repair import open_files
 from ros2_memory.recorder.scan import Tree
 from ros2_memory.timebase import NS_PER_S, Ns, WallClock, unix_from_ns
 from ros2_memory.upkeep import build_repairer
+from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -47,7 +48,8 @@ class Outcome:
     def __str__(self) -> str:
         """One line for people."""
         return (
-            f"MCAP files: {self.whole} whole, {self.repaired} repaired ({self.messages} messages), "
+            f"MCAP files: {self.whole} whole, {self.repaired} repaired "
+            f"({counted(self.messages, 'message')}), "
             f"{self.removed} empty and removed, {self.failed} not repaired"
         )
 
@@ -231,7 +233,8 @@ def _told(repaired: Repaired) -> str:
         return "empty, removed"
     notes = f"; {'; '.join(rewritten.notes)}" if rewritten.notes else ""
     return (
-        f"repaired: {rewritten.messages} messages, {rewritten.lost_bytes} bytes lost "
+        f"repaired: {counted(rewritten.messages, 'message')}, "
+        f"{counted(rewritten.lost_bytes, 'byte')} lost "
         f"({repaired.was_bytes} bytes before, {repaired.is_bytes} now){notes}"
     )
 

@@ -236,7 +236,7 @@ def test_the_command_fills_the_catalogue_beside_the_bags(
     hour_ago = time.time_ns() - 3600 * NS_PER_S
     os.utime(path, ns=(hour_ago, hour_ago))
     assert main(["index"]) == 0
-    assert "1 of 1 bags are in the catalogue" in capsys.readouterr().err
+    assert "1 of 1 bag is in the catalogue" in capsys.readouterr().err
     assert (tmp_path / FOLDER / FILE).is_file()
 
 

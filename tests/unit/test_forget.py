@@ -111,7 +111,7 @@ def test_latched_messages_that_later_answers_need_are_carried_on(
     bag_dir: Path, capsys: Capture
 ) -> None:
     assert forget(0, 15, "--yes") == 0
-    assert "1 latched messages are carried on" in capsys.readouterr().out
+    assert "1 latched message is carried on" in capsys.readouterr().out
     (record,) = McapReader().records(
         bag_dir / "latched" / "carried.mcap", ["/tf_static"], TimeWindow.everything()
     )

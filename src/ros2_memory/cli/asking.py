@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Final
 
 import anyio
 import typer
@@ -24,11 +24,14 @@ from ros2_memory.cli.running import (
 from ros2_memory.cli.showing import show
 from ros2_memory.dispatch import Dispatcher
 from ros2_memory.errors import InvalidArgumentsError
-from ros2_memory.memory import Limits
+from ros2_memory.memory import Limits, Memory
 from ros2_memory.model import JsonValue
 from ros2_memory.replies import Reply
+from ros2_memory.timebase import unix_from_ns
 from ros2_memory.tools import build_tools
 
+NEVER: Final = "never: no recorded message meets the condition"
+"""What `null` says, the reply of tools that look for the last match."""
 Schemas = Mapping[str, Mapping[str, object]]
 """By tool, the JSON schema of its arguments."""
 
@@ -72,14 +75,24 @@ def ask(
         arguments = parsed(given or (), schemas.get(tool, {}))
         with busy(f"asking {tool}"):
             reply = asked(dispatcher, tool, arguments)
+    answer: JsonValue = json.loads(reply.text)
     if as_json:
         say(reply.text)
+    elif answer is None:
+        say(NEVER)
     else:
-        show(output(), json.loads(reply.text))
+        show(output(), answer, _now(memory))
     if tool not in schemas:
         typer.echo(f"tools: {', '.join(schemas)}", err=True)
-    if reply.is_error or is_without_answer(json.loads(reply.text)):
+    if reply.is_error or is_without_answer(answer):
         raise typer.Exit(NOT_SO)
+
+
+def _now(memory: Memory) -> float:
+    """What ages count from (Unix seconds)."""
+    latest = memory.index.snapshot().dating.latest
+    wall = memory.limits.now == "wall" or latest is None
+    return unix_from_ns(memory.clock.now() if wall or latest is None else latest)
 
 
 def asked(dispatcher: Dispatcher, tool: str, arguments: Mapping[str, object]) -> Reply:

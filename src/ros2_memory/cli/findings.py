@@ -191,7 +191,8 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         yield Finding(Level.ERROR, "bags", snapshot.problem, do)
         return
     newest = "" if told.latest is None else f", the newest from {iso_local(told.latest)}"
-    yield Finding(Level.OK, "bags", f"{counted(told.bags, 'bag')} answer{newest}")
+    answering = counted(told.bags, "bag answers", "bags answer")
+    yield Finding(Level.OK, "bags", f"{answering}{newest}")
     left = (*told.damaged, *told.incomplete)
     if left:
         yield Finding(
@@ -204,11 +205,13 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
     if told.unread:
         names = listed([each.path.name for each in told.unread])
         do = "storage=rosbag2 reads sqlite and compressed bags, too"
-        yield Finding(Level.WARNING, "bags", f"{len(told.unread)} are not read: {names}", do)
+        files = counted(len(told.unread), "file is", "files are")
+        yield Finding(Level.WARNING, "bags", f"{files} not read: {names}", do)
     if told.undecodable:
         topics = listed([f"{each.topic} ({each.reason})" for each in told.undecodable])
+        number = counted(len(told.undecodable), "topic")
         do = "name the folder with the .msg files in reader.custom_msg_paths"
-        yield Finding(Level.WARNING, "bags", f"these topics cannot be decoded: {topics}", do)
+        yield Finding(Level.WARNING, "bags", f"{number} cannot be decoded: {topics}", do)
 
 
 def of_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
@@ -280,12 +283,13 @@ def of_topics(settings: Settings, snapshot: Snapshot) -> Iterator[Finding]:
         yield Finding(Level.ERROR, "topics", str(error), "correct recording.topics_file")
         return
     missing = never_heard(selection, snapshot)
+    listed_there = counted(len(selection.entries), "entry", "entries")
     file = settings.recording.topics_file
     if not snapshot.bags:
-        seen = f"{file} lists {len(selection.entries)}; nothing is recorded yet"
+        seen = f"{file} lists {listed_there}; nothing is recorded yet"
         yield Finding(Level.OK, "topics", seen)
     elif not missing:
-        yield Finding(Level.OK, "topics", f"all {len(selection.entries)} of {file} are recorded")
+        yield Finding(Level.OK, "topics", f"{listed_there} of {file}: all are recorded")
     for entry, near in missing.items():
         hint = f"is it {' or '.join(near)}? " if near else ""
         yield Finding(

@@ -180,12 +180,16 @@ def _forgotten(bag_dir: Path, memory: Memory, plan: Plan, carrier: Carrier) -> l
         removal.remove(doomed)
     say(
         f"deleted: {counted(removal.bags, 'bag')}, {removal.freed / _MB:.1f} MB"
-        f"{'' if carried is None else f'; {carried} latched messages are carried on'}"
+        f"{'' if carried is None else f'; {_carried(carried)} on'}"
     )
     stays += removal.faults
     for line in stays:
         say(f"stays: {line}")
     return stays
+
+
+def _carried(messages: int) -> str:
+    return counted(messages, "latched message is carried", "latched messages are carried")
 
 
 @contextmanager

@@ -132,9 +132,13 @@ def budget_in_words(budget: dict[str, JsonValue]) -> str:
     if growth is not None:
         text += f"; grows by {cell(growth)} GB a day"
     if "full_in_days" in budget:
-        text += f"; full in {cell(budget['full_in_days'])} days"
-        text += f", and keeps {cell(budget['keeps_days'])} days"
+        text += f"; full in {_days(budget['full_in_days'])}"
+        text += f", and keeps {_days(budget['keeps_days'])}"
     return text
+
+
+def _days(value: JsonValue) -> str:
+    return f"{cell(value)} {'day' if value == 1 else 'days'}"
 
 
 @config_app.command("show")
