@@ -106,9 +106,7 @@ def _moved_story(story: Story, by: int) -> Story:
         story,
         first=story.first + by,
         last=story.last + by,
-        seen=tuple(
-            each._replace(first=each.first + by, last=each.last + by) for each in story.seen
-        ),
+        seen=story.seen.moved(by),
         known=tuple(each._replace(at=each.at + by) for each in story.known),
         flips=tuple(each._replace(time=each.time + by) for each in story.flips),
         faults=tuple(

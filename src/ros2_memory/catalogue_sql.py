@@ -128,7 +128,7 @@ def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
 
 def _put_tale(base: sqlite3.Connection, bag: int, topic: TopicDigest, summary: BagSummary) -> None:
     """Inserts where a topic's poses stand still and what its messages say, if there is any."""
-    story = "" if topic.story is None else packed_story(topic.story)
+    story = b"" if topic.story is None else packed_story(topic.story)
     spans = [(each.first, each.last) for each in summary.of(topic.topic)]
     quiet = Story(min(first for first, _ in spans), max(last for _, last in spans))
     if topic.rests is None and topic.story == quiet:

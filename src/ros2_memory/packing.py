@@ -8,14 +8,14 @@ from __future__ import annotations
 import json
 import math
 import struct
-from dataclasses import astuple
 from functools import lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.motion import PoseDigest, Stop
+from ros2_memory.presences import Seen
 from ros2_memory.rests import Box3, Rest, RestDigest, Slot
-from ros2_memory.stories import Fault, Flip, Known, Presence, Story
+from ros2_memory.stories import Fault, Flip, Known, Story
 from ros2_memory.summaries import BagSummary, Heading, shared_shape
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ _VERTEX: Final = struct.Struct("<qdddd")
 _REST_HEAD: Final = struct.Struct("<BBqddd")
 _SLOT: Final = struct.Struct("<qqdddqdddddd")
 _REST: Final = struct.Struct("<qqdddddd")
+_STORY: Final = struct.Struct("<qqqqI")
 _NOWHERE: Final = Stop(0, (math.nan, math.nan, math.nan))
 
 
@@ -126,32 +127,49 @@ def _slot(numbers: tuple[int | float, ...]) -> Slot:
     return Slot(int(number), Stop(int(time), (x, y, z)), int(last), Box3((a, b, c), (d, e, f)))
 
 
-def packed_story(story: Story) -> str:
-    """A story as text."""
-    return json.dumps(astuple(story), ensure_ascii=False, separators=(",", ":"))
+def packed_story(story: Story) -> bytes:
+    """A story as bytes."""
+    counts = (story.first, story.last, story.left_out, story.undecodable)
+    rest = json.dumps(
+        [story.seen.labels, story.known, story.flips, story.faults],
+        ensure_ascii=False,
+        separators=(",", ":"),
+    )
+    rows = story.seen.rows
+    # Half a pair of surrogates is no UTF-8, and is kept all the same.
+    return _STORY.pack(*counts, len(rows)) + rows + rest.encode("utf-8", "surrogatepass")
 
 
-def unpacked_story(text: str) -> Story:
-    """The story that this text is of.
+def unpacked_story(packed: bytes) -> Story:
+    """The story that these bytes are of.
 
     Raises:
-        ValueError: it is of none.
+        ValueError: they are of none.
     """
     try:
-        first, last, seen, from_start, to_end, known, flips, faults, *counts = json.loads(text)
-        return Story(
-            first,
-            last,
-            tuple(Presence(*each) for each in seen),
-            tuple(from_start),
-            tuple(to_end),
-            tuple(Known(*each) for each in known),
-            tuple(Flip(*each) for each in flips),
-            tuple(Fault(*each) for each in faults),
-            *counts,
-        )
-    except TypeError as error:
+        first, last, left_out, undecodable, size = _STORY.unpack_from(packed)
+        end = _STORY.size + size
+        labels, known, flips, faults = _told(packed[end:])
+    except (TypeError, struct.error) as error:
         raise ValueError(f"not a story: {error}") from error
+    seen = Seen(labels, packed[_STORY.size : end])
+    if not seen.is_sound:
+        raise ValueError("not a story: it tells of things without a name")
+    return Story(first, last, seen, known, flips, faults, left_out, undecodable)
+
+
+@lru_cache(512)
+def _told(
+    text: bytes,
+) -> tuple[tuple[str, ...], tuple[Known, ...], tuple[Flip, ...], tuple[Fault, ...]]:
+    """What a story says in words: of many bags the same."""
+    labels, known, flips, faults = json.loads(text.decode("utf-8", "surrogatepass"))
+    return (
+        tuple(labels),
+        tuple(Known(*each) for each in known),
+        tuple(Flip(*each) for each in flips),
+        tuple(Fault(*each) for each in faults),
+    )
 
 
 def _unpacked_poses(packed: bytes) -> PoseDigest:

@@ -15,7 +15,8 @@ from ros2_memory.absence import resolve_topic
 from ros2_memory.accounts import Event, Recap
 from ros2_memory.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.moments import open_span
-from ros2_memory.stories import SILENCE_NS, tells
+from ros2_memory.presences import SILENCE_NS, united
+from ros2_memory.stories import tells
 from ros2_memory.tales import rests_in, story_in
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, ns_from_unix
 from ros2_memory.unseen import note_edges, note_unseen
@@ -23,22 +24,21 @@ from ros2_memory.ways import way_driven
 from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.history import View
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import TimeWindow
     from ros2_memory.moments import Span
+    from ros2_memory.presences import Presence, Seen
     from ros2_memory.rests import Rest
-    from ros2_memory.stories import Fault, Presence, Story
+    from ros2_memory.stories import Fault, Story
     from ros2_memory.timebase import Ns
     from ros2_memory.ways import Way
 
 MOST_EVENTS: Final = 25
 SHORTEST_STOP_NS: Final[Ns] = 3 * NS_PER_S
 """A robot that stands for less is turning round, or minding its step."""
-FLICKER_NS: Final[Ns] = 3 * NS_PER_S
-"""A thing that is missed for less did not leave."""
 
 _KINDS: Final = ("gap", "error", "stop", "flip", "thing")
 """Kinds of events, the one that matters most first."""
@@ -70,33 +70,33 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     view, window = open_span(memory, call, span)
     drive = _drive(view, window)
     events = [] if drive is None else [*_stops(drive)]
-    seen: list[Presence] = []
+    seen: list[Seen] = []
     throughout: set[str] = set()
     there_still: dict[str, Ns] = {}
     known_to = min(window.stop, view.snapshot.latest or window.stop)
     for topic, story in _stories(view, window):
         events += [*_flips(topic, story), *map(_error, story.faults)]
-        here = [*_steady(story.seen)]
-        seen += here
-        throughout.update(
-            each.label for each in here if (each.first, each.last) == (story.first, story.last)
-        )
+        seen.append(story.seen)
+        throughout.update(story.seen.labels_of(first=story.first, last=story.last))
         if known_to - story.last <= SILENCE_NS:
-            there_still.update((each.label, each.last) for each in here if each.last == story.last)
+            there_still |= dict.fromkeys(story.seen.labels_of(last=story.last), story.last)
         if story.undecodable:
             messages = counted(story.undecodable, "message")
             view.note(f"{messages} of {topic} could not be decoded: what they say is not told")
         if story.left_out:
             view.note(f"{topic} changes too often to tell each: {story.left_out} more")
+    things = united(seen).without(throughout)
     events += [
         _thing(each, goes_on=each.last == there_still.get(each.label))
-        for each in _steady(seen)
-        if each.label not in throughout
+        for each in things.longest(MOST_EVENTS)
     ]
     events += _gaps(view, window)
     note_unseen(view, window)
     note_edges(view, window)
-    told = _most_important(view, events)
+    counts = Counter(each.kind for each in events)
+    if things.size:
+        counts["thing"] = things.size
+    told = _most_important(view, events, counts)
     latest = view.snapshot.latest
     trajectory = None if drive is None else drive.way.trajectory
     return Recap(
@@ -109,7 +109,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         frame_id=None if drive is None else drive.way.frames[0],
         events=tuple(told),
         throughout=tuple(sorted(throughout)),
-        counts=tuple(_counts(events)),
+        counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
         notes=view.notes,
     )
 
@@ -166,23 +166,6 @@ def _thing(presence: Presence, *, goes_on: bool) -> Event:
     return Event("thing", presence.first, presence.last, text, goes_on)
 
 
-def _steady(seen: Iterable[Presence]) -> Iterator[Presence]:
-    """Presences, those of a thing joined that overlap, or between which it was missed for a moment.
-
-    Several detectors may see the same thing, and each misses it now and then.
-    """
-    last: dict[str, Presence] = {}
-    for each in sorted(seen, key=lambda presence: presence.first):
-        before = last.get(each.label)
-        if before is None or each.first - before.last > FLICKER_NS:
-            if before is not None:
-                yield before
-            last[each.label] = each
-        else:
-            last[each.label] = before._replace(last=max(before.last, each.last))
-    yield from last.values()
-
-
 def _gaps(view: View, window: TimeWindow) -> Iterator[Event]:
     """Where nothing was recorded for more than two splits, inside what the memory spans."""
     longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
@@ -202,20 +185,16 @@ def _gaps(view: View, window: TimeWindow) -> Iterator[Event]:
         yield Event("gap", reach, end, "nothing was recorded")
 
 
-def _counts(events: Sequence[Event]) -> Iterator[tuple[str, int]]:
-    """How many events there are of each kind that happened."""
-    counts = Counter(each.kind for each in events)
-    for kind in _KINDS:
-        if counts[kind]:
-            yield _PLURALS[kind], counts[kind]
+def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -> list[Event]:
+    """At most `MOST_EVENTS`, in order of time: of a kind those that lasted longest.
 
-
-def _most_important(view: View, events: Sequence[Event]) -> list[Event]:
-    """At most `MOST_EVENTS`, in order of time: of a kind those that lasted longest."""
+    `counts` is how many there are of each kind; all of those that may be told are among `events`.
+    """
     ranked = sorted(
         events, key=lambda each: (_KINDS.index(each.kind), each.start - (each.end or each.start))
     )
-    left_out = Counter(each.kind for each in ranked[MOST_EVENTS:])
+    told = ranked[:MOST_EVENTS]
+    left_out = counts - Counter(each.kind for each in told)
     if left_out:
         named = ", ".join(
             counted(left_out[kind], kind if kind != "thing" else "sight of a thing", _PLURALS[kind])
@@ -223,4 +202,4 @@ def _most_important(view: View, events: Sequence[Event]) -> list[Event]:
             if left_out[kind]
         )
         view.note(f"left out, since they are too many: {named}; ask for a shorter time")
-    return sorted(ranked[:MOST_EVENTS], key=lambda each: (each.start, _KINDS.index(each.kind)))
+    return sorted(told, key=lambda each: (each.start, _KINDS.index(each.kind)))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.model import TimeWindow
 from ros2_memory.portions import Kept, is_whole
-from ros2_memory.stories import SILENCE_NS
+from ros2_memory.presences import SILENCE_NS
 from ros2_memory.timebase import MAX_NS, unix_from_ns
 from ros2_memory.ways import POSES, stops
 

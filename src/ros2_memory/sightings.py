@@ -27,8 +27,8 @@ from ros2_memory.geometry import rotate
 from ros2_memory.history import View
 from ros2_memory.model import TimeWindow
 from ros2_memory.moments import Span, ns_argument
+from ros2_memory.presences import SILENCE_NS
 from ros2_memory.search import Search
-from ros2_memory.stories import SILENCE_NS
 from ros2_memory.things import things_of
 from ros2_memory.timebase import (
     AT_OR_BEFORE_SLACK_NS,

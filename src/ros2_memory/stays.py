@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from ros2_memory.stories import SILENCE_NS
+from ros2_memory.presences import SILENCE_NS
 from ros2_memory.timebase import NS_PER_S, Ns
 
 FLICKER_NS: Final[Ns] = 3 * NS_PER_S

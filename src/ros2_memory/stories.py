@@ -7,26 +7,24 @@ long as nothing is left out for being too much.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.presences import Part, Seen, Watcher, joined
 from ros2_memory.things import things_of
-from ros2_memory.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterator
 
     from ros2_memory.model import JsonValue
-
-T = TypeVar("T")
-
-SILENCE_NS: Final[Ns] = 10 * NS_PER_S
-"""After so long without a message a thing counts as gone: many detectors speak only of what is."""
+    from ros2_memory.timebase import Ns
 
 MOST_TOLD: Final = 64
 """Presences, flips and faults of one topic in one bag that are kept, each; the rest is counted."""
 MOST_HELD: Final = 20_000
 """The same of a topic in all bags together: what a question about a week may hold in memory."""
 MOST_FLAGS: Final = 16
+_MOST_WAITING: Final = 4
+"""Times `MOST_HELD` presences wait to be joined."""
 
 _ERROR: Final = 2
 _STALE: Final = 3
@@ -54,15 +52,7 @@ class State(NamedTuple):
 
 
 NOTHING: Final = State()
-
-
-class Presence(NamedTuple):
-    """A thing in message after message: log times of the first and last (inclusive)."""
-
-    label: str
-    first: Ns
-    last: Ns
-    messages: int
+NOBODY: Final = Seen()
 
 
 class Flip(NamedTuple):
@@ -98,9 +88,7 @@ class Story:
     Attributes:
         first: log time of its first message.
         last: of its last.
-        seen: the presences, by the time of their first message.
-        from_start: the things that are in the first message.
-        to_end: those in the last.
+        seen: the presences.
         known: each boolean's value at either end.
         flips: in order.
         faults: by the time of their first report.
@@ -111,9 +99,7 @@ class Story:
 
     first: Ns
     last: Ns
-    seen: tuple[Presence, ...] = ()
-    from_start: tuple[str, ...] = ()
-    to_end: tuple[str, ...] = ()
+    seen: Seen = NOBODY
     known: tuple[Known, ...] = ()
     flips: tuple[Flip, ...] = ()
     faults: tuple[Fault, ...] = ()
@@ -123,7 +109,7 @@ class Story:
     @property
     def says_nothing(self) -> bool:
         """Whether it is only that there were messages."""
-        return not (self.seen or self.known or self.faults or self.undecodable)
+        return not (self.seen.rows or self.known or self.faults or self.undecodable)
 
 
 QUIET: Final = Story(0, 0)
@@ -151,11 +137,9 @@ class StoryBuilder:
     """Takes the messages of one topic, or whole bags of them, in log-time order."""
 
     def __init__(self) -> None:
-        self._first: Ns | None = None
-        self._last: Ns = 0
-        self._from_start: tuple[str, ...] = ()
-        self._open: dict[str, Presence] = {}
-        self._over: list[Presence] = []
+        self._parts: list[Part] = []
+        self._rows = 0
+        self._watcher: Watcher | None = None
         self._known: dict[str, Known] = {}
         self._flips: list[Flip] = []
         self._faults: dict[str, Fault] = {}
@@ -168,62 +152,48 @@ class StoryBuilder:
 
     def add(self, time: Ns, state: State) -> None:
         """Takes the next message."""
-        if self._first is None:
-            self._first, self._from_start = time, state.labels
-        if state is not NOTHING or self._open:
-            self._carry(time, [Presence(label, time, time, 1) for label in state.labels])
-            for path, value in state.flags:
-                self._flag(Known(path, time, value, value))
-            for text in state.faults:
-                self._fault(Fault(text, time, time, 1))
-        self._last = time
+        if self._watcher is None:
+            self._watcher = Watcher(MOST_HELD)
+        self._watcher.add(time, state.labels)
+        for path, value in state.flags:
+            self._flag(Known(path, time, value, value))
+        for text in state.faults:
+            self._fault(Fault(text, time, time, 1))
 
     def join(self, story: Story) -> None:
         """Takes all messages of a bag that come next, as if they were added one by one."""
         self._undecodable += story.undecodable
         if story.first > story.last:
             return
-        if self._first is None:
-            self._first, self._from_start = story.first, story.from_start
-        spans: dict[str, list[Presence]] = {}
-        for each in story.seen:
-            spans.setdefault(each.label, []).append(each)
-        begun = [spans[label].pop(0) for label in story.from_start if label in spans]
-        self._carry(story.first, begun)
-        for label, later in spans.items():
-            for each in later:
-                self._end(label)
-                self._open[label] = each
-        for label in self._open.keys() - set(story.to_end):
-            self._end(label)
-        flips = [
-            Flip(known.path, known.at, known.first) for known in story.known if self._turns(known)
-        ]
-        for flip in sorted([*flips, *story.flips], key=lambda flip: flip.time):
-            self._add(self._flips, flip)
-        for known in story.known:
-            self._learn(known)
+        self._settle()
+        self._take(Part(story.first, story.last, story.seen))
+        if story.known:
+            flips = [
+                Flip(known.path, known.at, known.first)
+                for known in story.known
+                if self._turns(known)
+            ]
+            for flip in sorted([*flips, *story.flips], key=lambda flip: flip.time):
+                self._turn(flip)
+            for known in story.known:
+                self._learn(known)
         for fault in story.faults:
             self._fault(fault)
         self._left_out += story.left_out
-        self._last = story.last
 
     def story(self, at_most: int | None = None) -> Story | None:
         """What was told so far, `at_most` of each kind; None without a message."""
-        if self._first is None:
+        self._settle()
+        if not self._parts:
             return Story(1, 0, undecodable=self._undecodable) if self._undecodable else None
-        seen = sorted(
-            (*self._over, *self._open.values()), key=lambda each: (each.first, each.label)
-        )
+        first, last, seen = self._one_part()
         faults = sorted(self._faults.values(), key=lambda each: (each.first, each.text))
-        told = (len(seen), len(self._flips), len(faults))
+        told = (seen.size, len(self._flips), len(faults))
         left_out = 0 if at_most is None else sum(max(0, many - at_most) for many in told)
         return Story(
-            self._first,
-            self._last,
-            tuple(seen[:at_most]),
-            self._from_start,
-            tuple(sorted(self._open)),
+            first,
+            last,
+            seen if at_most is None else seen.earliest(at_most),
             tuple(self._known.values()),
             tuple(self._flips[:at_most]),
             tuple(faults[:at_most]),
@@ -231,20 +201,27 @@ class StoryBuilder:
             self._undecodable,
         )
 
-    def _carry(self, time: Ns, present: Iterable[Presence]) -> None:
-        """Goes on with what is present in the next message; what is not is over."""
-        silent = self._first is not None and time - self._last > SILENCE_NS
-        goes_on: dict[str, Presence] = {}
-        for each in present:
-            before = None if silent else self._open.pop(each.label, None)
-            goes_on[each.label] = (
-                each
-                if before is None
-                else before._replace(last=each.last, messages=before.messages + each.messages)
-            )
-        for each in self._open.values():
-            self._add(self._over, each)
-        self._open = goes_on
+    def _settle(self) -> None:
+        """Takes what was added message by message."""
+        part = None if self._watcher is None else self._watcher.part()
+        if self._watcher is not None and part is not None:
+            self._left_out += self._watcher.left_out
+            self._watcher = None
+            self._take(part)
+
+    def _take(self, part: Part) -> None:
+        self._parts.append(part)
+        self._rows += part.seen.size
+        if self._rows > _MOST_WAITING * MOST_HELD:
+            self._one_part()
+
+    def _one_part(self) -> Part:
+        """All parts as one, and no more presences than may be held."""
+        part = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
+        seen = part.seen.earliest(MOST_HELD)
+        self._left_out += part.seen.size - seen.size
+        self._parts, self._rows = [part._replace(seen=seen)], seen.size
+        return self._parts[0]
 
     def _turns(self, known: Known) -> bool:
         before = self._known.get(known.path)
@@ -252,7 +229,7 @@ class StoryBuilder:
 
     def _flag(self, known: Known) -> None:
         if self._turns(known):
-            self._add(self._flips, Flip(known.path, known.at, known.first))
+            self._turn(Flip(known.path, known.at, known.first))
         self._learn(known)
 
     def _learn(self, known: Known) -> None:
@@ -262,15 +239,10 @@ class StoryBuilder:
             return
         self._known[known.path] = known if before is None else before._replace(last=known.last)
 
-    def _end(self, label: str) -> None:
-        """A thing is gone, if it was there."""
-        if label in self._open:
-            self._add(self._over, self._open.pop(label))
-
-    def _add(self, to: list[T], each: T) -> None:
-        """Adds one to what is over, or counts it where that is too much."""
-        if len(to) < MOST_HELD:
-            to.append(each)
+    def _turn(self, flip: Flip) -> None:
+        """Adds a flip, or counts it where there are too many."""
+        if len(self._flips) < MOST_HELD:
+            self._flips.append(flip)
         else:
             self._left_out += 1
 

@@ -34,8 +34,8 @@ _RESTS: Final = Kind(
 _STORIES: Final = Kind(
     "story",
     ask=lambda notes, topic: notes.stories(topic),
-    packed=lambda story: "" if story is None else packed_story(story),
-    unpacked=lambda text: unpacked_story(text) if text else None,
+    packed=lambda story: "" if story is None else packed_story(story).hex(),
+    unpacked=lambda text: unpacked_story(bytes.fromhex(text)) if text else None,
 )
 
 

@@ -17,12 +17,12 @@ from ros2_memory.errors import InvalidArgumentsError, NoDataError, QueryTimeoutE
 from ros2_memory.history import View
 from ros2_memory.memory import Call, Limits
 from ros2_memory.model import JsonValue, TimeWindow
+from ros2_memory.presences import SILENCE_NS
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.replies import Replies
 from ros2_memory.search import Search
 from ros2_memory.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.stories import SILENCE_NS
 from ros2_memory.timebase import Deadline, FixedClock, unix_from_ns
 from tests.bags import boolean, detections, odom, tf, transform, write_mcap
 from tests.closed_form import SESSIONS, position
