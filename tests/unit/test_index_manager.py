@@ -14,7 +14,8 @@ from structlog.testing import capture_logs
 
 from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.recorder.index_manager import PATROL, IndexManager, Snapshot
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from ros2_memory.recorder.survey import PATROL
 from ros2_memory.timebase import Clock
 from tests.plain_bags import PlainReader, close, grow, plain
 
