@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,10 +56,15 @@ class HandClock(Clock):
 
 
 class World:
-    """A bag directory in which things happen; every mtime is that of the hand-moved clock."""
+    """A bag directory in which things happen; every mtime is that of the hand-moved clock.
 
-    def __init__(self, root: Path) -> None:
+    `held` keeps what was written open: the inode of a file that has gone would be the next one's,
+    which then looks like the same file, grown.
+    """
+
+    def __init__(self, root: Path, held: ExitStack) -> None:
         self.root = root
+        self._held = held
         self.clock = HandClock()
         self.index = self.fresh_index()
         self.index.refresh()
@@ -164,6 +170,7 @@ class World:
     def _stamp(self, path: Path) -> None:
         """The file system's clock is the test's: it stamps what was touched."""
         if path.is_file():
+            self._held.enter_context(path.open("rb"))
             os.utime(path, ns=(self.clock.at,) * 2)
         for folder in path.parents:
             if folder.is_relative_to(self.root) and folder.is_dir():
@@ -175,8 +182,8 @@ class World:
 def test_an_index_that_followed_every_change_knows_what_a_fresh_one_finds(
     script: list[tuple[str, str, int]],
 ) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        world = World(Path(folder))
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as held:
+        world = World(Path(folder), held)
         for deed in script:
             world.do(*deed)
         followed, fresh = world.index.refresh(), world.fresh_index().refresh()
