@@ -142,7 +142,33 @@ class TestInfo:
 
     def test_where_nothing_is_recorded_there_is_no_budget(self, capsys: Capture) -> None:
         assert cli.main(["info"]) == 0
-        assert "no budget" in capsys.readouterr().out
+        shown = capsys.readouterr().out
+        assert "nothing is recorded or deleted here" in " ".join(shown.split())
+        assert "grows" not in shown
+
+    def test_it_lists_recordings_that_overlap_and_are_answered_together(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        messages = [odom(T0 + n * NS_PER_S // 10, 0.0, 0.0) for n in range(20, 120)]
+        write_mcap(bag_dir / "other" / "other_0.mcap", messages)
+        assert cli.main(["info", "--json"]) == 0
+        (pair,) = json.loads(capsys.readouterr().out)["overlapping_recordings"]
+        assert (pair["recording"], pair["and"]) == ("other", "rec")
+        assert (pair["from"], pair["to"]) == (1_700_000_002.0, 1_700_000_009.9)
+        assert cli.main(["info"]) == 0
+        assert "overlapping_recordings" in capsys.readouterr().out
+
+    def test_it_says_until_when_a_fresh_file_without_an_end_counts_as_being_written(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        whole = (bag_dir / "rec" / "rec_0.mcap").read_bytes()
+        copy = bag_dir / "copy" / "copy_0.mcap"
+        copy.parent.mkdir()
+        copy.write_bytes(whole[: len(whole) // 2])
+        assert cli.main(["info", "--json"]) == 0
+        (row,) = json.loads(capsys.readouterr().out)["counted_as_active"]
+        assert row["file"] == "copy/copy_0.mcap"
+        assert row["until"] == pytest.approx(copy.stat().st_mtime + 30.0)
 
     def test_where_something_is_it_says_for_how_long_the_budget_lasts(
         self, capsys: Capture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -103,8 +104,8 @@ def test_where_all_is_well_the_exit_code_is_0(robot: Path, capsys: Capture) -> N
 def test_people_read_a_line_for_each_concern(robot: Path, capsys: Capture) -> None:
     assert cli.main(["doctor"]) == 0
     told = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
-    about = ["config", "bag_dir", "disk", "clock", "bags", "ros", "recorder", "topics", "server"]
-    assert told == [["ok", each] for each in about]
+    about = ["config", "bag_dir", "disk", "clock", "bags", "ros", "recorder", "topics", "extras"]
+    assert told == [["ok", each] for each in [*about, "server"]]
 
 
 def test_a_refused_configuration_is_an_error(capsys: Capture) -> None:
@@ -220,3 +221,60 @@ class TestTheServer:
         code, wrong = examined(capsys)
         assert code == 1
         assert "the bag directory is gone" in wrong["server"][0]["seen"]
+
+
+def test_runs_that_are_answered_together_are_told(robot: Path, capsys: Capture) -> None:
+    write_mcap(
+        robot / "other" / "other_0.mcap",
+        [odom(time.time_ns() - (60 - n) * NS_PER_S, 0.0, 0.0) for n in range(50)],
+    )
+    code, wrong = examined(capsys)
+    (finding,) = wrong["bags"]
+    assert code == 1
+    assert "recordings other and rec overlap from 20" in finding["seen"]
+
+
+def test_a_fresh_file_without_an_end_is_told_until_when_it_counts_as_being_written(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot / "recorder.json").unlink()
+    whole = (robot / "rec" / "rec_0.mcap").read_bytes()
+    (robot / "copy").mkdir()
+    (robot / "copy" / "copy_0.mcap").write_bytes(whole[: len(whole) // 2])
+    code, wrong = examined(capsys, "recorder=none")
+    (finding,) = wrong["bags"]
+    assert code == 1
+    assert "copy/copy_0.mcap has no end and was written lately: until 20" in finding["seen"]
+
+
+class TestExtras:
+    def test_what_the_configuration_asks_for_must_be_installed(
+        self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "prometheus_client", None)
+        monkeypatch.setitem(sys.modules, "opentelemetry.sdk", None)
+        code, wrong = examined(capsys, "server.metrics=true", "server.traces=true")
+        assert code == 2
+        seen = [each["seen"].partition(",")[0] for each in wrong["extras"]]
+        assert seen == [
+            "server.metrics=true needs prometheus_client",
+            "server.traces=true needs opentelemetry.sdk",
+        ]
+        assert all("pip install 'ros2-memory[observability]'" in e["do"] for e in wrong["extras"])
+
+    def test_what_is_installed_is_in_order(self, robot: Path, capsys: Capture) -> None:
+        pytest.importorskip("prometheus_client")
+        assert examined(capsys, "server.metrics=true") == (0, {})
+
+    def test_metrics_without_http_are_told(self, robot: Path, capsys: Capture) -> None:
+        pytest.importorskip("prometheus_client")
+        code, wrong = examined(capsys, "server.metrics=true", "server.transport=stdio")
+        assert code == 2
+        assert "has no /metrics" in wrong["extras"][0]["seen"]
+
+    def test_parquet_is_asked_for_by_nobody(
+        self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "pyarrow", None)
+        assert cli.main(["doctor"]) == 0
+        assert "pip install 'ros2-memory[parquet]'" in capsys.readouterr().out

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from ros2_memory.cli import findings
+from ros2_memory.cli.extras import of_extras
 from ros2_memory.cli.findings import Finding, Level
 from ros2_memory.cli.running import (
     AsJson,
@@ -68,9 +69,11 @@ def examined(
         yield from findings.of_bag_dir(settings)
         yield from findings.of_clock(snapshot, now)
         yield from findings.of_bags(settings, memory)
+        yield from findings.of_what_lies_there(memory, snapshot)
         yield from findings.of_ros(settings, memory.reader)
         yield from findings.of_recorder(settings, now)
         yield from findings.of_topics(settings, snapshot)
+        yield from of_extras(settings)
         yield from findings.of_server(settings)
 
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.adapters import GB, build_recorder
 from ros2_memory.api_token import api_token
+from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.errors import EpisodicError
 from ros2_memory.memory import Call
 from ros2_memory.overview import data_time_range
@@ -28,7 +29,7 @@ from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.recorder.topics import TopicSelection, load_topics
 from ros2_memory.settings import NullRecorderNode
 from ros2_memory.timebase import NS_PER_S, iso_local, unix_from_ns
-from ros2_memory.wording import counted, listed
+from ros2_memory.wording import NAMED, counted, listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -212,6 +213,29 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         number = counted(len(told.undecodable), "topic")
         do = "name the folder with the .msg files in reader.custom_msg_paths"
         yield Finding(Level.WARNING, "bags", f"{number} cannot be decoded: {topics}", do)
+
+
+def of_what_lies_there(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
+    """Whether what lies in the directory is one history, and whether all of it is told of."""
+    pairs = merged(snapshot)
+    for pair in pairs[:NAMED]:
+        seen = (
+            f"recordings {pair.first} and {pair.second} overlap from {iso_local(pair.start)} to "
+            f"{iso_local(pair.end)}, and are answered together"
+        )
+        do = "give the bags of each robot or run a folder of their own, and a server each"
+        yield Finding(Level.WARNING, "bags", seen, do)
+    if len(pairs) > NAMED:
+        seen = f"{counted(len(pairs) - NAMED, 'more pair overlaps', 'more pairs overlap')}"
+        do = "`ros2-memory info` lists them all"
+        yield Finding(Level.WARNING, "bags", seen, do)
+    for path, until in counted_as_active(memory, snapshot):
+        seen = (
+            f"{path.parent.name}/{path.name} has no end and was written lately: until "
+            f"{iso_local(until)} it counts as still being written"
+        )
+        do = "if nobody writes it, as a copy, wait until then: what is whole of it answers"
+        yield Finding(Level.WARNING, "bags", seen, do)
 
 
 def of_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:

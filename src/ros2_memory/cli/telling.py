@@ -12,6 +12,7 @@ import yaml
 
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.asking import asked, is_without_answer
+from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.cli.running import (
     NOT_SO,
     AsJson,
@@ -26,6 +27,7 @@ from ros2_memory.cli.running import (
     settings_for,
 )
 from ros2_memory.cli.showing import cell, plain, show
+from ros2_memory.memory import Memory
 from ros2_memory.model import JsonValue, TimeWindow
 from ros2_memory.origins import GROUPS, Sources
 from ros2_memory.recorder.snapshot import Snapshot
@@ -102,15 +104,39 @@ def info(
             tool: json.loads(asked(build_dispatcher(settings, memory), tool, {}).text)
             for tool in ("memory_status", "data_time_range")
         }
+        beside = _beside(memory)
     if as_json:
-        say(json.dumps(replies))
+        say(json.dumps(replies | beside))
     else:
         console = output()
         for reply in replies.values():
             show(console, _in_words(reply))
             console.print()
+        for name, rows in beside.items():
+            if rows:
+                show(console, {name: rows})
     if all(is_without_answer(reply) for reply in replies.values()):
         raise typer.Exit(NOT_SO)
+
+
+def _beside(memory: Memory) -> dict[str, JsonValue]:
+    """What the tools' replies do not say; mostly there is nothing."""
+    snapshot = memory.index.snapshot()
+    return {
+        "overlapping_recordings": [
+            {
+                "recording": each.first,
+                "and": each.second,
+                "from": unix_from_ns(each.start),
+                "to": unix_from_ns(each.end),
+            }
+            for each in merged(snapshot)
+        ],
+        "counted_as_active": [
+            {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
+            for path, until in counted_as_active(memory, snapshot)
+        ],
+    }
 
 
 def _in_words(reply: JsonValue) -> JsonValue:
@@ -126,7 +152,7 @@ def budget_in_words(budget: dict[str, JsonValue]) -> str:
     used, most, growth = (budget.get(key) for key in ("used_gb", "max_gb", "growth_gb_per_day"))
     text = f"{cell(used)} GB"
     if most is None:
-        text += "; no budget: nothing is recorded here, and nothing deleted"
+        text += "; recorder=none: nothing is recorded or deleted here, so no budget and no growth"
     else:
         text += f" of {cell(most)} GB"
     if growth is not None:
