@@ -100,10 +100,6 @@ class SchemaExtractor:
         self._max_chars = max_chars
         self._plans = {name: _compile(name, fields) for name, fields in schemas.items()}
 
-    def fields_of(self, type_name: str) -> tuple[str, ...]:
-        """The fields that the schema map names for a type, in its order; none if it has none."""
-        return tuple(name for name, _ in self._plan(type_name).fields)
-
     def exact(self, message: object, type_name: str) -> JsonValue:
         """The whole extracted value, neither thinned nor rounded: what conditions are tested on.
 

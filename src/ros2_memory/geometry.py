@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import heapq
 import math
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from ros2_memory.model import Quaternion, Transform, Vector3
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Columns: TypeAlias = "tuple[Numbers, Numbers, Numbers]"
@@ -65,11 +64,6 @@ def rpy(q: Quaternion) -> tuple[float, float, float]:
 def yaw(q: Quaternion) -> float:
     """The heading about Z (rad, in [-pi, pi]), as `rpy` gives it."""
     return rpy(q)[2]
-
-
-def quaternion_from_yaw(angle: float) -> Quaternion:
-    """The rotation by `angle` (rad) about Z."""
-    return (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -145,47 +139,31 @@ def distance(a: Vector3, b: Vector3) -> float:
     return math.dist(a, b)
 
 
-def path_length(points: Iterable[Vector3]) -> float:
-    """Metres along the points in the order given; 0 for fewer than two."""
-    return math.fsum(math.dist(a, b) for a, b in pairwise(points))
-
-
-def simplify(points: Sequence[Vector3], tolerance_m: float) -> list[int]:
-    """Indices of the vertices that are enough to draw the path (Ramer, Douglas and Peucker).
-
-    Ascending; both ends are kept, and every point that is dropped lies within `tolerance_m` of
-    the kept segment that spans it. Points must be finite. Cost is bounded: where the splits stay
-    lopsided, intervals are halved instead, which keeps some vertices more than needed.
-    """
-    return _refine(points, tolerance_m, len(points))[0]
-
-
 def simplify_to(
     points: Sequence[Vector3], tolerance_m: float, at_most: int
 ) -> tuple[list[int], float]:
-    """As `simplify`, with the tolerance widened as far as it takes to keep at most `at_most`.
+    """The vertices that are enough to draw a path (Ramer, Douglas and Peucker), and no more.
+
+    Both ends are kept, and every point that is dropped lies within `tolerance_m` of the kept
+    segment that spans it, unless that takes more than `at_most` vertices: then as near as these
+    allow. Points must be finite. Cost is bounded: where the splits stay lopsided, intervals are
+    halved instead, which keeps some vertices more than needed.
 
     Returns:
-        The indices, and the largest distance (m) of a dropped point from the kept segment that
-        spans it.
+        Their indices, ascending, and the largest distance (m) of a dropped point from the kept
+        segment that spans it.
 
     Raises:
         ValueError: `at_most` is below 2: both ends are always kept.
     """
     if at_most < 2:
         raise ValueError(f"a path cannot be drawn with {at_most} vertices; allow 2 or more")
-    return _refine(points, tolerance_m, at_most)
-
-
-def _refine(points: Sequence[Vector3], tolerance_m: float, at_most: int) -> tuple[list[int], float]:
-    """Starts from the chord of the whole path and splits the worst interval again and again.
-
-    Splitting the worst first makes the limits on tolerance and on count one loop: with no limit
-    on count the kept set is that of the recursive algorithm, in another order.
-    """
     last = len(points) - 1
     if last < 2:
         return list(range(last + 1)), 0.0
+    # From the chord of the whole path the worst interval is split again and again. Splitting the
+    # worst first makes the limits on tolerance and on count one loop: with no limit on count the
+    # kept set is that of the recursive algorithm, in another order.
     kept = [0, last]
     columns = _columns(points)
     worst = [_farthest(points, columns, 0, last)]

@@ -15,8 +15,6 @@ from ros2_memory.motion import Motion, PoseDigest, Vertex, faster, is_place
 from ros2_memory.paths import DrawnPath
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from ros2_memory.model import Pose, Quaternion, Vector3
     from ros2_memory.timebase import Ns
 
@@ -72,25 +70,15 @@ class Trajectory:
     jumped_m: float
 
 
-def summarise(
-    poses: Iterable[tuple[Ns, Pose, float | None]],
-    max_plausible_speed_mps: float,
-    max_waypoints: int = 50,
-    tolerance_m: float = TOLERANCE_M,
-) -> Trajectory:
-    """The trajectory of (log time, pose, the message's own speed in m/s or None) in time order.
+class TrajectoryBuilder:
+    """Takes poses in log-time order, one at a time, and holds a bounded number of them.
+
+    A step that would take more than `max_plausible_speed_mps` (m/s) is a jump. The path is drawn
+    with at most `max_waypoints`, within `tolerance_m` (m) where these are enough.
 
     Raises:
         ValueError: `max_waypoints` is below 2, or a limit is not positive.
     """
-    builder = TrajectoryBuilder(max_plausible_speed_mps, max_waypoints, tolerance_m)
-    for time, pose, speed in poses:
-        builder.add(time, pose, speed)
-    return builder.result()
-
-
-class TrajectoryBuilder:
-    """Takes poses in log-time order, one at a time, and holds a bounded number of them."""
 
     def __init__(
         self,
@@ -98,11 +86,6 @@ class TrajectoryBuilder:
         max_waypoints: int = 50,
         tolerance_m: float = TOLERANCE_M,
     ) -> None:
-        """Limits as for `summarise`.
-
-        Raises:
-            ValueError: `max_waypoints` is below 2, or a limit is not positive.
-        """
         if max_waypoints < 2 or not (max_plausible_speed_mps > 0 and tolerance_m > 0):
             raise ValueError(
                 f"a trajectory needs 2 or more waypoints ({max_waypoints}), a plausible speed"

@@ -145,7 +145,6 @@ def test_a_type_without_an_entry_is_shown_with_all_its_fields() -> None:
 
 def test_a_type_named_as_before_2019_is_found_in_the_map() -> None:
     assert shown(odometry(), "nav_msgs/Odometry") == shown(odometry(), ODOMETRY)
-    assert EXTRACTOR.fields_of("std_msgs/String") == ("value",)
 
 
 @pytest.mark.parametrize("message", [{"level": 2, "q": {"x": 0, "w": 1}}, [1, "a"], "text", None])
@@ -276,11 +275,6 @@ def test_no_list_of_texts_is_too_long_to_be_shown(message: object) -> None:
 
 
 # The map itself
-
-
-def test_the_fields_of_a_type_are_those_of_the_map() -> None:
-    assert EXTRACTOR.fields_of(DETECTIONS) == ("skill", "detections")
-    assert EXTRACTOR.fields_of("custom_msgs/msg/Unknown") == ()
 
 
 @pytest.mark.parametrize("path", ["", "pose..x", "pose/x", ".pose", "pose.", "__dict__"])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyped]
 
 from ros2_memory.errors import NoDataError, NoDataReason
-from ros2_memory.geometry import IDENTITY, invert, quaternion_from_yaw
+from ros2_memory.geometry import IDENTITY, invert
 from ros2_memory.model import StampedTransform, Transform
 from ros2_memory.tf_tree import TF_CACHE_NS, FrameEdge, FrameGraph, agreeing_clock
 from ros2_memory.timebase import NS_PER_S, ns_from_unix
@@ -453,7 +453,8 @@ def test_the_clock_of_a_replayed_robot_is_log_time() -> None:
 
 
 def test_a_yaw_between_two_messages_turns_the_shorter_way() -> None:
-    ends = [Transform((0.0, 0.0, 0.0), quaternion_from_yaw(angle)) for angle in (3.0, -3.0)]
+    turns = [(0.0, 0.0, math.sin(half), math.cos(half)) for half in (1.5, -1.5)]
+    ends = [Transform((0.0, 0.0, 0.0), turn) for turn in turns]
     graph = FrameGraph([edge("a", "b", 0, ends[0]), edge("a", "b", 2, ends[1])])
     turned = Rotation.from_quat(graph.lookup("a", "b", 1).transform.rotation)
     assert abs(turned.as_euler("xyz")[2]) == pytest.approx(math.pi)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import json
 import math
 import random
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,10 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.geometry import path_length, quaternion_from_yaw
 from ros2_memory.model import Pose
 from ros2_memory.timebase import NS_PER_MS, NS_PER_S
-from ros2_memory.trajectory import PoseCollector, Trajectory, TrajectoryBuilder, summarise
+from ros2_memory.trajectory import (
+    TOLERANCE_M,
+    PoseCollector,
+    Trajectory,
+    TrajectoryBuilder,
+)
 from tests.real_messages import messages
 from tests.shared_bags import REAL, needs_real
 from tests.strategies import points
@@ -43,6 +47,22 @@ def driven(
 
 def along_x(*metres: float) -> list[Vector3]:
     return [(x, 0.0, 0.0) for x in metres]
+
+
+def summarise(
+    poses: Iterable[tuple[int, Pose, float | None]],
+    max_plausible_speed_mps: float,
+    max_waypoints: int = 50,
+    tolerance_m: float = TOLERANCE_M,
+) -> Trajectory:
+    builder = TrajectoryBuilder(max_plausible_speed_mps, max_waypoints, tolerance_m)
+    for time, pose, speed in poses:
+        builder.add(time, pose, speed)
+    return builder.result()
+
+
+def path_length(positions: Iterable[Vector3]) -> float:
+    return math.fsum(math.dist(a, b) for a, b in pairwise(positions))
 
 
 def off_polyline(position: Vector3, vertices: Sequence[Vector3]) -> float:
@@ -285,7 +305,7 @@ def test_a_straight_way_needs_its_ends_only() -> None:
 
 
 def test_a_waypoint_carries_its_heading_where_the_pose_has_one() -> None:
-    x, y, z, w = quaternion_from_yaw(0.5)
+    x, y, z, w = 0.0, 0.0, math.sin(0.25), math.cos(0.25)
     poses = [
         (START, Pose((0.0, 0.0, 0.0), (2 * x, 2 * y, 2 * z, 2 * w)), None),
         (START + S, Pose((1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)), None),
