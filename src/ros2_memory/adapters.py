@@ -31,7 +31,7 @@ def build_reader(settings: Settings) -> BagReader:
     Raises:
         ConfigError: it cannot be built.
     """
-    return _built("storage", settings.storage, BagReader)  # type: ignore[type-abstract]
+    return _built("storage", settings.storage, BagReader)  # type: ignore[type-abstract]  # not built
 
 
 def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
@@ -42,7 +42,8 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
     Raises:
         ConfigError: it cannot be built.
     """
-    return _built("recorder", settings.recorder, Recorder, **collaborators)  # type: ignore[type-abstract]
+    node = settings.recorder
+    return _built("recorder", node, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
 
 
 def retention_limits(settings: Settings) -> RetentionLimits:

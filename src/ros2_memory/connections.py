@@ -40,7 +40,7 @@ class BoundedConnection(H11Protocol):
     _unread: asyncio.TimerHandle | None = None
     _is_refused = False
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         """A client has connected."""
         super().connection_made(transport)
         # Zero: any unsent byte counts as unread, and none is kept for long.

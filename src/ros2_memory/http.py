@@ -42,7 +42,7 @@ THREADS: Final = 4
 """For what nobody asked, such as a look at the bags. One that was needed once stays a while."""
 
 _LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
-_ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104
+_ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - only compared with
 
 
 def web_app(

@@ -48,7 +48,11 @@ LATELY_NS: Final = 3600 * NS_PER_S
 
 _SERVER_PATIENCE_S: Final = 5.0
 _MOST_REPLY: Final = 1 << 20
-_HERE: Final[Mapping[str, str]] = {"0.0.0.0": "127.0.0.1", "::": "::1", "": "127.0.0.1"}  # noqa: S104
+_HERE: Final[Mapping[str, str]] = {
+    "0.0.0.0": "127.0.0.1",  # noqa: S104 - looked up, never bound
+    "::": "::1",
+    "": "127.0.0.1",
+}
 """Where a server that listens everywhere is reached from its own machine."""
 
 

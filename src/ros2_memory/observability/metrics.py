@@ -53,7 +53,7 @@ class Metrics(Observer):
         self._patience_s = patience_s
         self._lane = Lane("metrics", 1)
         # A series more for each, of no use in this format.
-        disable_created_metrics()  # type: ignore[no-untyped-call]
+        disable_created_metrics()  # type: ignore[no-untyped-call]  # has no types
         self._registry = CollectorRegistry(auto_describe=False)
         self._answers = Counter(
             "ros2_memory_answers",

@@ -215,8 +215,7 @@ def _visit(
     Its mtime is taken first: what changes during the listing is then found by the next walk. Only
     the root may be a link: one that took a folder's place since that was found is none.
     """
-    # A Path for each of 1,000 folders costs more.
-    status = os.stat(path, follow_symlinks=is_root)  # noqa: PTH116
+    status = os.stat(path, follow_symlinks=is_root)  # noqa: PTH116 - a Path costs more
     if not stat.S_ISDIR(status.st_mode):
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), path)
     mtime_ns, device = status.st_mtime_ns, status.st_dev
