@@ -107,6 +107,12 @@ def test_every_test_that_a_document_names_exists(document: str, reference: str) 
         assert name in held_by(ROOT / file), f"{document} names {reference}"
 
 
+def anchors(path: Path) -> set[str]:
+    """What the headings of a page are linked to as."""
+    headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: document.name)
 def test_every_file_that_a_document_links_to_or_names_exists(document: Path) -> None:
     text = document.read_text(encoding="utf-8")
@@ -114,4 +120,11 @@ def test_every_file_that_a_document_links_to_or_names_exists(document: Path) -> 
     named = re.findall(r"`((?:docs|deploy|tests|benchmarks|config)/[\w./-]+\.\w+)`", text)
     folder = document.parent
     assert [each for each in linked if not (folder / each).exists()] == []
+    led = re.findall(r"\]\((?!https?://)([^)#\s]*)#([^)\s]+)\)", text)
+    lost = [
+        (path, anchor)
+        for path, anchor in led
+        if anchor not in anchors(folder / path if path else document)
+    ]
+    assert lost == []
     assert [each for each in named if not (ROOT / each).exists()] == []
