@@ -7,9 +7,8 @@ import json
 import os
 from contextlib import contextmanager
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ros2_memory.adapters import build_reader, retention_limits
 from ros2_memory.catalogue import FILE, FOLDER, Catalogue
@@ -26,6 +25,7 @@ from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.stand_in import StandInReader
+from ros2_memory.release import PACKAGE, package_version
 from ros2_memory.replies import Replies
 from ros2_memory.settings import NullRecorderNode
 from ros2_memory.telemetry import SILENT, Telemetry
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.settings import Settings
     from ros2_memory.telemetry import Observer
-
-_PACKAGE: Final = "ros2-memory"
 
 
 def build_memory(settings: Settings) -> Memory:
@@ -77,7 +75,7 @@ def catalogue_places(settings: Settings) -> tuple[Path, ...]:
     except RuntimeError:  # a user without a home
         return places
     name = hashlib.sha256(os.fsencode(bag_dir.absolute())).hexdigest()[:16]
-    return (*places, cache / _PACKAGE / name / FILE) if cache.is_absolute() else places
+    return (*places, cache / PACKAGE / name / FILE) if cache.is_absolute() else places
 
 
 def way_of_reading(settings: Settings) -> str:
@@ -193,11 +191,3 @@ def build_dispatcher(
         readable=readable_tools(memory.limits),
         telemetry=telemetry,
     )
-
-
-def package_version() -> str:
-    """The installed version of this package; `0` where it is run without being installed."""
-    try:
-        return version(_PACKAGE)
-    except PackageNotFoundError:
-        return "0"

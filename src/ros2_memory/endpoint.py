@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.bootstrap import build_dispatcher, package_version
+from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.instructions import instructions
 from ros2_memory.protocol import EpisodicServer
+from ros2_memory.release import package_version
 from ros2_memory.telemetry import SILENT
 
 if TYPE_CHECKING:

@@ -22,7 +22,6 @@ from ros2_memory.bootstrap import (
     build_filler,
     build_memory,
     build_telemetry,
-    package_version,
 )
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.connections import BoundedConnection
@@ -33,6 +32,7 @@ from ros2_memory.http import STREAM_PATH, web_app
 from ros2_memory.listening import CannotListenError, bound, resolved
 from ros2_memory.logs import configure_logging, get_logger
 from ros2_memory.recorder.notify import READY, STOPPING, ServiceManager
+from ros2_memory.release import package_version
 
 if TYPE_CHECKING:
     import socket

@@ -12,12 +12,8 @@ import pytest
 import structlog
 from mcp.server import streamable_http as transport
 
-from ros2_memory.logs import (
-    configure_logging,
-    get_logger,
-    withheld_warnings,
-    withhold_warnings,
-)
+from ros2_memory.logs import configure_logging, get_logger
+from ros2_memory.withheld import withheld_warnings, withhold_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

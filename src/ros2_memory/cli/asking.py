@@ -8,6 +8,7 @@ import anyio
 import typer
 
 from ros2_memory.bootstrap import build_dispatcher
+from ros2_memory.cli.opening import opened
 from ros2_memory.cli.running import (
     NOT_SO,
     AsJson,
@@ -15,12 +16,11 @@ from ros2_memory.cli.running import (
     Sets,
     Verbose,
     busy,
-    opened,
     output,
     reporting,
     say,
-    settings_for,
 )
+from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.showing import show
 from ros2_memory.dispatch import Dispatcher
 from ros2_memory.errors import InvalidArgumentsError

@@ -12,18 +12,9 @@ from rich.text import Text
 from ros2_memory.cli import findings
 from ros2_memory.cli.extras import of_extras
 from ros2_memory.cli.findings import Finding, Level
-from ros2_memory.cli.running import (
-    AsJson,
-    BagDir,
-    Overrides,
-    Verbose,
-    busy,
-    opened,
-    output,
-    reporting,
-    say,
-    settings_for,
-)
+from ros2_memory.cli.opening import opened
+from ros2_memory.cli.running import AsJson, BagDir, Overrides, Verbose, busy, output, reporting, say
+from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.showing import plain
 from ros2_memory.config import config_dir
 from ros2_memory.errors import ConfigError

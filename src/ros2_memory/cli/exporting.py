@@ -10,16 +10,9 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from ros2_memory.cli.running import (
-    NOT_SO,
-    BagDir,
-    Overrides,
-    Verbose,
-    opened,
-    reporting,
-    say,
-    settings_for,
-)
+from ros2_memory.cli.opening import opened
+from ros2_memory.cli.running import NOT_SO, BagDir, Overrides, Verbose, reporting, say
+from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.windows import End, Last, Start, window_of
 from ros2_memory.copies import Found
 from ros2_memory.errors import (

@@ -9,17 +9,9 @@ from typing import Annotated
 import typer
 
 from ros2_memory.catalogue import BagKey
-from ros2_memory.cli.running import (
-    NOT_SO,
-    BagDir,
-    Overrides,
-    Verbose,
-    busy,
-    opened,
-    reporting,
-    say,
-    settings_for,
-)
+from ros2_memory.cli.opening import opened
+from ros2_memory.cli.running import NOT_SO, BagDir, Overrides, Verbose, busy, reporting, say
+from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.showing import moment
 from ros2_memory.cli.windows import End, Last, Start, window_of
 from ros2_memory.errors import BagError, ConfigError, InvalidArgumentsError, RecorderError

@@ -13,16 +13,9 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.accounts import Status
-from ros2_memory.cli.running import (
-    BagDir,
-    Overrides,
-    Verbose,
-    opened,
-    output,
-    reporting,
-    say,
-    settings_for,
-)
+from ros2_memory.cli.opening import opened
+from ros2_memory.cli.running import BagDir, Overrides, Verbose, output, reporting, say
+from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.showing import moment, plain, span
 from ros2_memory.cli.telling import usual_rate
 from ros2_memory.errors import BagError, InvalidArgumentsError
