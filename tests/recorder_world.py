@@ -22,6 +22,7 @@ from ros2_memory.timebase import NS_PER_S, Clock
 from tests.bags import McapLayout, boolean, write_mcap
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.recorder.ports import Housekeeper
@@ -136,7 +137,12 @@ class World:
     """Time, a bag directory, and the recorders that were started in it."""
 
     def __init__(
-        self, bag_dir: Path, *, housekeeper: Housekeeper | None = None, **orders: object
+        self,
+        bag_dir: Path,
+        *,
+        housekeeper: Housekeeper | None = None,
+        expected: Sequence[str] = (),
+        **orders: object,
     ) -> None:
         self.bag_dir = bag_dir
         self.mono = 1_000.0
@@ -166,6 +172,7 @@ class World:
             monotonic=lambda: self.mono,
             free_bytes_of=lambda _directory: self.free,
             device=lambda _directory: self.device,
+            expected=lambda: expected,
         )
 
     def _start(self, name: str, directory: Path) -> PlayedRecorder:

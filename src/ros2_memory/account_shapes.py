@@ -135,6 +135,7 @@ def _status(answer: accounts.Status, _bag_dir: Path) -> JsonObject:
         "trust": "; ".join(answer.problems) or "nothing is known to be missing",
         "recorder": answer.recorder,
         "recorder_alive": answer.live,
+        "restarts": answer.restarts,
         "now": moment(answer.now),
         "earliest": moment(answer.earliest),
         "latest": moment(latest),
@@ -148,14 +149,18 @@ def _status(answer: accounts.Status, _bag_dir: Path) -> JsonObject:
             for each in answer.fell_silent[:_MOST_TOPICS]
         ],
         "never_heard": [*answer.never_heard[:_MOST_TOPICS]],
+        "missing": [*answer.missing[:_MOST_TOPICS]],
         "damaged": answer.damaged,
         "incomplete": answer.incomplete,
         "unread": answer.unread,
         "budget": _budget(answer),
     }
-    for name, topics in (("fell_silent", answer.fell_silent), ("never_heard", answer.never_heard)):
-        if len(topics) > _MOST_TOPICS:
-            reply[f"{name}_count"] = len(topics)
+    counts = {
+        "fell_silent": len(answer.fell_silent),
+        "never_heard": len(answer.never_heard),
+        "missing": len(answer.missing),
+    }
+    reply |= {f"{name}_count": n for name, n in counts.items() if n > _MOST_TOPICS}
     return with_notes(reply, answer.notes)
 
 

@@ -134,6 +134,8 @@ class Status:
         latest: the newest one.
         recorder: its state; None where no recorder has written here.
         live: whether it is there still.
+        restarts: how often it had to start `ros2 bag record` anew; 0 where there is none.
+        missing: topics that it is to record by name, and that no publisher has offered to it.
         never_heard: topics it subscribed to that brought no message.
         fell_silent: topics that brought some, and none lately.
         damaged: files that cannot be read.
@@ -148,6 +150,8 @@ class Status:
     latest: Ns | None
     recorder: str | None
     live: bool
+    restarts: int
+    missing: tuple[str, ...]
     never_heard: tuple[str, ...]
     fell_silent: tuple[Stillness, ...]
     damaged: int

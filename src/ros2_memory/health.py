@@ -32,6 +32,7 @@ NAMED: Final = 3
 """Files of each kind that does not answer, and topics that cannot be decoded, that are named."""
 
 _MOST_TOPICS: Final = 20
+_MOST_MISSING: Final = 6
 _MOST_CHARS: Final = 300
 
 log = get_logger(__name__)
@@ -149,11 +150,16 @@ def _of_recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
         "state": str(heartbeat.state),
         "live": heartbeat.is_live(now),
         "heartbeat_age_s": _seconds(now - heartbeat.updated),
-        "silent_topics": [_short(topic) for topic in heartbeat.silent[:_MOST_TOPICS]],
+        "restarts": heartbeat.restarts,
         "last_error": None if error is None else _short(error),
     }
-    if len(heartbeat.silent) > _MOST_TOPICS:
-        shown["more_silent_topics"] = len(heartbeat.silent) - _MOST_TOPICS
+    for kind, topics, most in (
+        ("silent", heartbeat.silent, _MOST_TOPICS),
+        ("missing", heartbeat.missing, _MOST_MISSING),
+    ):
+        shown[f"{kind}_topics"] = [_short(topic) for topic in topics[:most]]
+        if len(topics) > most:
+            shown[f"more_{kind}_topics"] = len(topics) - most
     return shown
 
 

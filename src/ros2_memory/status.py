@@ -41,6 +41,8 @@ def memory_status(memory: Memory, call: Call) -> Status:
         latest=latest,
         recorder=None if heartbeat is None else str(heartbeat.state),
         live=heartbeat is not None and heartbeat.is_live(wall),
+        restarts=0 if heartbeat is None else heartbeat.restarts,
+        missing=() if heartbeat is None else heartbeat.missing,
         never_heard=() if heartbeat is None else heartbeat.silent,
         fell_silent=tuple(_fallen_silent(snapshot)),
         damaged=len(snapshot.damaged),

@@ -247,6 +247,16 @@ def test_a_fresh_file_without_an_end_is_told_until_when_it_counts_as_being_writt
     assert "copy/copy_0.mcap has no end and was written lately: until 20" in finding["seen"]
 
 
+def test_a_topic_that_nobody_offers_and_restarts_are_told(robot: Path, capsys: Capture) -> None:
+    beat(robot, missing=("/odom", "/gone"), restarts=1, last_error="it died")
+    code, wrong = examined(capsys)
+    assert code == 1
+    seen = [each["seen"] for each in wrong["topics"]]
+    assert [each.split()[0] for each in seen] == ["/odom", "/gone"]
+    assert all("no publisher has offered it since the recorder started" in each for each in seen)
+    assert "start ros2 bag record anew 1 time; its last error" in wrong["recorder"][0]["seen"]
+
+
 class TestExtras:
     def test_what_the_configuration_asks_for_must_be_installed(
         self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture

@@ -113,14 +113,16 @@ async def test_a_missing_bag_directory_is_told(tmp_path: Path) -> None:
 
 
 async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
-    write_heartbeat(tmp_path, beat(RecorderState.RECORDING))
+    write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), restarts=2, missing=("/c",)))
     told = await Health(memory_at(tmp_path, seconds=3), "1")()
     assert told["status"] == "ok"
     assert told["recorder"] == {
         "state": "recording",
         "live": True,
         "heartbeat_age_s": 3.0,
+        "restarts": 2,
         "silent_topics": ["/b"],
+        "missing_topics": ["/c"],
         "last_error": None,
     }
 
@@ -239,9 +241,10 @@ async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> 
         (tmp_path / f"{'x' * 200}{number}.mcap").write_bytes(b"no bag at all, but not empty")
     names = tuple(f"/topic_{n}/{'y' * 300}" for n in range(1000))
     told = beat(RecorderState.PAUSED, updated=T0 + 3600 * NS_PER_S, last_error="z" * 100_000)
-    write_heartbeat(tmp_path, replace(told, silent=names, subscribed=names))
+    write_heartbeat(tmp_path, replace(told, silent=names, subscribed=names, missing=names))
     said = await Health(memory_at(tmp_path, seconds=3600), "1")()
     assert len(json.dumps(said)) < 10_000
     assert said["damaged"] == 50
     assert isinstance(said["recorder"], dict)
     assert said["recorder"]["more_silent_topics"] == 980
+    assert said["recorder"]["more_missing_topics"] == 994

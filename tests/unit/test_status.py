@@ -61,7 +61,18 @@ def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
     assert (told["recorder"], told["recorder_alive"]) == ("recording", True)
     assert told["newest_age_s"] == 11.0
     assert told["never_heard"] == ["/b"]
+    assert (told["restarts"], told["missing"]) == (0, [])
     assert told["fell_silent"] == []
+
+
+def test_restarts_and_topics_that_nobody_offers_are_told(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    missing = tuple(f"/gone_{n:02}" for n in range(30))
+    beating(tmp_path, RecorderState.RECORDING, 59, restarts=3, missing=missing)
+    told = shown(memory, tmp_path)
+    assert told["restarts"] == 3
+    assert told["missing"] == [*missing[: len(told["missing"])]]
+    assert told["missing_count"] == 30
 
 
 @pytest.mark.parametrize(

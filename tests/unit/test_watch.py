@@ -14,6 +14,7 @@ import pytest
 from ros2_memory import cli
 from ros2_memory.cli.showing import span
 from ros2_memory.cli.watching import AS_USUAL, Course
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import boolean, odom, text, write_mcap
 
@@ -98,6 +99,18 @@ def test_a_terminal_gets_a_table() -> None:
     assert b"/odom" in shown
     assert b"usually" in shown
     assert b"silent" in shown
+
+
+def test_restarts_and_topics_that_nobody_offers_are_told(bag_dir: Path, capsys: Capture) -> None:
+    now = time.time_ns()
+    beat = Heartbeat(
+        1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, ("/gone", "/lost")
+    )
+    write_heartbeat(bag_dir, beat)
+    assert cli.main(["watch", "--count", "1"]) == 0
+    told = capsys.readouterr().out
+    assert "recorder: recording, restarted 2 times;" in told
+    assert "offered by no publisher: /gone, /lost" in told
 
 
 class TestOldData:

@@ -63,7 +63,7 @@ def examined(
         yield from findings.of_what_lies_there(memory, snapshot)
         yield from findings.of_ros(settings, memory.reader)
         yield from findings.of_recorder(settings, now)
-        yield from findings.of_topics(settings, snapshot)
+        yield from findings.of_topics(settings, snapshot, now)
         yield from of_extras(settings)
         yield from findings.of_server(settings)
 

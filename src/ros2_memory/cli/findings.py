@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 LATELY_NS: Final = 3600 * NS_PER_S
 """A topic that is not in the newest data of this length is not recorded just now."""
 
+_UNOFFERED: Final = "no publisher has offered it since the recorder started"
 _SERVER_PATIENCE_S: Final = 5.0
 _MOST_REPLY: Final = 1 << 20
 _HERE: Final[Mapping[str, str]] = {
@@ -281,6 +282,9 @@ def _troubles(heartbeat: Heartbeat) -> Iterator[Finding]:
         yield Finding(Level.WARNING, "recorder", seen, do)
     if heartbeat.last_error:
         seen = f"its last error: {heartbeat.last_error}"
+        if heartbeat.restarts:
+            times = counted(heartbeat.restarts, "time")
+            seen = f"it had to start ros2 bag record anew {times}; {seen}"
         yield Finding(Level.WARNING, "recorder", seen, "its log has more of it")
 
 
@@ -301,7 +305,7 @@ def of_ros(settings: Settings, reader: BagReader) -> Iterator[Finding]:
         yield Finding(Level.OK, "ros", seen)
 
 
-def of_topics(settings: Settings, snapshot: Snapshot) -> Iterator[Finding]:
+def of_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
     """Whether what `topics.yaml` names has been recorded lately."""
     if isinstance(settings.recorder, NullRecorderNode):
         return
@@ -311,22 +315,31 @@ def of_topics(settings: Settings, snapshot: Snapshot) -> Iterator[Finding]:
         yield Finding(Level.ERROR, "topics", str(error), "correct recording.topics_file")
         return
     missing = never_heard(selection, snapshot)
+    heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
+    live = heartbeat is not None and heartbeat.is_live(now)
+    unoffered = [*heartbeat.missing] if live and heartbeat is not None else []
     listed_there = counted(len(selection.entries), "entry", "entries")
     file = settings.recording.topics_file
     if not snapshot.bags:
         seen = f"{file} lists {listed_there}; nothing is recorded yet"
         yield Finding(Level.OK, "topics", seen)
-    elif not missing:
+    elif not missing and not unoffered:
         yield Finding(Level.OK, "topics", f"{listed_there} of {file}: all are recorded")
     for entry, near in missing.items():
         hint = f"is it {' or '.join(near)}? " if near else ""
+        why = f"; {_UNOFFERED}" if entry in unoffered else ""
         yield Finding(
             Level.WARNING,
             "topics",
-            f"{entry} is in {file}, and not in the newest hour of data",
+            f"{entry} is in {file}, and not in the newest hour of data{why}",
             f"{hint}compare with `ros2 topic list`; a name that nobody publishes is recorded by "
             "nobody",
         )
+
+    for entry in unoffered:
+        if entry not in missing:
+            do = "is its publisher running? compare with `ros2 topic list`"
+            yield Finding(Level.WARNING, "topics", f"{entry} is in {file}; {_UNOFFERED}", do)
 
 
 def never_heard(selection: TopicSelection, snapshot: Snapshot) -> Mapping[str, list[str]]:

@@ -25,7 +25,7 @@ from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.recorder.snapshot import Snapshot
 from ros2_memory.status import memory_status
 from ros2_memory.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
-from ros2_memory.wording import counted
+from ros2_memory.wording import counted, listed
 
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S
 """The newest data of this length is what goes on just now."""
@@ -79,8 +79,18 @@ class Look:
     @property
     def recorder(self) -> str:
         """The recorder's state, in some words."""
-        state = self.status.recorder or "none"
-        return state if self.status.live or self.status.recorder is None else f"{state}, not alive"
+        status = self.status
+        if status.recorder is None:
+            return "none"
+        times = f", restarted {counted(status.restarts, 'time')}" if status.restarts else ""
+        return f"{status.recorder}{times}{'' if status.live else ', not alive'}"
+
+    @property
+    def troubles(self) -> list[str]:
+        """Why answers may be missing something."""
+        missing = self.status.missing if self.status.live else ()
+        never = [f"offered by no publisher: {listed(missing)}"] if missing else []
+        return [plain(each) for each in (*never, *self.status.problems)]
 
     @property
     def newest(self) -> str:
@@ -200,7 +210,7 @@ def line(look: Look) -> str:
         said = [_not_live(look)] if look.courses else []
     return (
         f"{moment(unix_from_ns(look.now))} recorder: {look.recorder}; newest: {look.newest}"
-        f"{''.join(f'; {each}' for each in [*said, *map(plain, look.status.problems)])}"
+        f"{''.join(f'; {each}' for each in [*said, *look.troubles])}"
     )
 
 
@@ -235,7 +245,7 @@ def shown(look: Look) -> Sequence[Text | Table]:
             f"{each.age_s:.1f} s",
             Text(each.judged, style=_STYLES[each.judged]) if look.live else Text(""),
         )
-    problems = [Text(plain(each), style="red") for each in look.status.problems]
+    problems = [Text(each, style="red") for each in look.troubles]
     if look.courses and not look.live:
         told = f"{_not_live(look)}; the rates are those of the last 10 s of data"
         problems.insert(0, Text(told, style="yellow"))

@@ -33,7 +33,7 @@ WHOLE_RECORDING_S: Final = 15.0
 
 
 class Crew:
-    """The sessions of one bag directory.
+    """The sessions of one bag directory; `restarts` is how often one had to be begun anew.
 
     Args:
         bag_dir: where recordings lie.
@@ -71,6 +71,7 @@ class Crew:
         self._leaving: list[Session] = []
         self._completed: list[Takeover] = []
         self._retired_bytes = 0
+        self.restarts = 0
 
     @property
     def sessions(self) -> tuple[Session, ...]:
@@ -165,6 +166,7 @@ class Crew:
             return False
         sentence = f"ros2 bag record does not begin to record: {current.last_words}"
         self._journal.fail("recorder_not_ready", sentence, recording=current.name)
+        self.restarts += 1
         self._leave(current)
         self.current = None
         return True
@@ -260,6 +262,7 @@ class Crew:
     def _has_vanished(self, session: Session) -> None:
         sentence = f"the directory of recording {session.name} has gone; a new one is begun"
         self._journal.fail("recording_vanished", sentence, recording=session.name)
+        self.restarts += 1
         if self.takeover is not None and session is self.takeover.new:
             self._abandon(self.takeover)
         elif session is self.current:
@@ -272,6 +275,7 @@ class Crew:
         status = session.child.exit_status()
         sentence = f"ros2 bag record ended by itself with status {status}: {session.last_words}"
         self._journal.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
+        self.restarts += 1
         if session is self.current:
             self._retire(session, now)
         return lived_s

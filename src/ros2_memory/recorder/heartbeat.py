@@ -51,7 +51,9 @@ class Heartbeat:
     `interval_s` seconds. `recordings` are the recordings being written, as directories relative to
     the bag directory with forward slashes; at a rotation there are two. `subscribed` are the
     topics subscribed to, `silent` those among them that have brought no message; `bytes_written`
-    counts all recordings since the recorder started.
+    counts all recordings since the recorder started, `restarts` how often it had to start
+    `ros2 bag record` anew. `missing` are the topics that are to be recorded, by name, and that no
+    publisher has offered since then.
     """
 
     pid: int
@@ -64,6 +66,8 @@ class Heartbeat:
     silent: tuple[str, ...]
     last_error: str | None
     interval_s: float
+    restarts: int = 0
+    missing: tuple[str, ...] = ()
 
     def is_live(self, now: Ns) -> bool:
         """Whether the recorder that wrote this is likely to be there still.
@@ -156,6 +160,9 @@ def _parsed(text: str) -> Heartbeat:
         silent=_strings(fields, "silent"),
         last_error=_text_or_null(fields, "last_error"),
         interval_s=_interval(fields),
+        # Those of an older recorder do not have them.
+        restarts=_int(fields, "restarts", least=0) if "restarts" in fields else 0,
+        missing=_strings(fields, "missing") if "missing" in fields else (),
     )
 
 

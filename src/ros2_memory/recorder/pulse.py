@@ -10,6 +10,7 @@ from ros2_memory.errors import RecorderError
 from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from ros2_memory.recorder.crew import Crew
@@ -18,13 +19,25 @@ if TYPE_CHECKING:
 
 
 class Pulse:
-    """Writes `recorder.json`; `interval_s` is how often it is asked to."""
+    """Writes `recorder.json`; `interval_s` is how often it is asked to.
 
-    def __init__(self, bag_dir: Path, interval_s: float, clock: Clock, journal: Journal) -> None:
+    `expected` gives the topics that are to be recorded by name.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        interval_s: float,
+        clock: Clock,
+        journal: Journal,
+        expected: Callable[[], Sequence[str]] = tuple,
+    ) -> None:
         self._bag_dir = bag_dir
         self._interval_s = interval_s
         self._clock = clock
         self._journal = journal
+        self._expected = expected
+        self._offered = set[str]()
         self._state = RecorderState.STOPPED
         self._since = clock.now()
         self._announced: tuple[str, ...] = ()
@@ -67,7 +80,17 @@ class Pulse:
             silent=tuple(sorted(silent)),
             last_error=self._journal.last_error,
             interval_s=self._interval_s,
+            restarts=crew.restarts,
+            missing=self._missing(crew),
         )
+
+    def _missing(self, crew: Crew) -> tuple[str, ...]:
+        """What no publisher has offered; nothing before the first recorder has looked around."""
+        for session in crew.sessions:
+            self._offered |= session.subscribed | session.splits.heard
+        if not any(session.ready for session in crew.sessions):
+            return ()
+        return tuple(sorted({*self._expected()} - self._offered))
 
     def _write(self, heartbeat: Heartbeat) -> None:
         self._told = _news(heartbeat)

@@ -105,6 +105,7 @@ class Ros2BagRecorder(Recorder):
             reader,
             housekeeper or NoHousekeeping(),
             clock or WallClock(),
+            expected=lambda: self._topics.exact,
         )
 
     def check(self) -> None:

@@ -22,7 +22,7 @@ from ros2_memory.recorder.rotation import BOTH_S, SUBSCRIBE_TIMEOUT_S, Moment, S
 from ros2_memory.recorder.watchdog import Space, resume_bytes, space, time_was_set_back
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from ros2_memory.recorder.ports import Housekeeper, RecorderProcess
@@ -66,7 +66,8 @@ class Orders:
 class Supervisor:
     """Keeps one recording going, two during a handover.
 
-    `start_child` starts the recorder of a recording, given its name and its directory.
+    `start_child` starts the recorder of a recording, given its name and its directory. `expected`
+    gives the topics that are to be recorded by name.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class Supervisor:
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
+        expected: Callable[[], Sequence[str]] = tuple,
     ) -> None:
         self._orders = orders
         self._housekeeper = housekeeper
@@ -89,7 +91,7 @@ class Supervisor:
         self._home = HomeDisk(orders.bag_dir, device)
         self._away = False
         self._journal = Journal()
-        self._pulse = Pulse(orders.bag_dir, orders.heartbeat_s, clock, self._journal)
+        self._pulse = Pulse(orders.bag_dir, orders.heartbeat_s, clock, self._journal, expected)
         self._crew = Crew(
             orders.bag_dir,
             start_child,
