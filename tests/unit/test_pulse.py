@@ -1,4 +1,4 @@
-"""What the heartbeat counts and names besides the state: restarts, and topics that nobody offers."""
+"""What the heartbeat counts and names besides the state: restarts, topics that nobody offers."""
 
 from __future__ import annotations
 
