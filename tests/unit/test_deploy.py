@@ -138,6 +138,8 @@ def test_the_container_is_published_on_the_loopback_address_and_needs_a_token() 
     assert service["environment"]["MEMORY_API_TOKEN"].startswith("${MEMORY_API_TOKEN:?")
     assert all(volume.endswith(":ro") for volume in service["volumes"])
     assert service["read_only"] is True
+    # The bags of the units are their group's; without one given, a group that owns nothing.
+    assert service["group_add"] == ["${MEMORY_BAG_GID:-65534}"]
 
 
 @needs_sysusers
