@@ -13,6 +13,7 @@ import pytest
 
 from ros2_memory.errors import EpisodicError, NoDataReason
 from ros2_memory.memory import Limits
+from ros2_memory.resources import SCHEMA, STATUS, TOPICS
 from ros2_memory.tools import build_tools
 from tests import reference
 from tests.documented import CALLS, MISTAKES, replies, shown_files, write_history
@@ -83,6 +84,13 @@ def test_every_preset_and_every_variable_stands_there() -> None:
     example = (ROOT / ".env.example").read_text(encoding="utf-8")
     for variable in re.findall(r"^([A-Z_]+)=", example, re.MULTILINE):
         assert f"`{variable}`" in page("configuration")
+
+
+def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
+    told = dict(re.findall(r"^\| `(episodic://\S+)` \| (.+) \|$", page("tools"), re.MULTILINE))
+    assert set(told) == {each.uri for each in (TOPICS, STATUS, SCHEMA)}
+    for each in (TOPICS, STATUS):
+        assert told[each.uri] == f"`{each.tool}`"
 
 
 def test_every_log_event_stands_there_with_its_fields() -> None:
