@@ -53,3 +53,9 @@ def _logging_left_as_it_was() -> Iterator[None]:
     """A program that a test ran in process configures logging; the next test has its own."""
     yield
     structlog.reset_defaults()
+
+
+@pytest.fixture
+def no_flushing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that are not about power cuts: flushing takes most of their time."""
+    monkeypatch.setattr(os, "fsync", lambda _descriptor: None)

@@ -1,92 +1,40 @@
-"""What is kept, over real files: by the keeper, past retention, and as the index finds it."""
+"""What is kept, over real files: by the keeper, through crashes, and past a wipe."""
 
 from __future__ import annotations
 
 import errno
-import json
 import os
-import shutil
 from typing import TYPE_CHECKING, Any
 
 import pytest
 import structlog
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from ros2_memory import queries
-from ros2_memory.memory import Call
-from ros2_memory.moments import Moment, Span
 from ros2_memory.recorder import keeper
 from ros2_memory.recorder.keeper import Keeper
 from ros2_memory.recorder.keepsake import Keepsake, Wish, held_in, make_folder, write_keepsake
 from ros2_memory.recorder.layout import MOMENT_FILE, REQUESTS_FOLDER
-from ros2_memory.recorder.mailbox import Slot
 from ros2_memory.recorder.wipe import clear_bags
 from ros2_memory.recovery import recover
-from tests.bags import McapLayout, odom, tf, transform, write_mcap
-from tests.keeping import PLENTY, files_in, keeper_of, recording_now, size_of
+from tests.bags import McapLayout
+from tests.keeping import PLENTY, files_in, recording_now
+from tests.kept_moments import (
+    NOW,
+    T0,
+    A,
+    B,
+    S,
+    asked,
+    bag,
+    house_of,
+    in_moments,
+    kept,
+    recording,
+    told_of,
+)
 from tests.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
-
-    from ros2_memory.model import Sample
-    from ros2_memory.recorder.housekeeping import Housekeeping
-    from ros2_memory.recorder.mailbox import Outcome
-
-S = 10**9
-T0 = 1_790_000_000 * S
-NOW = T0 + 4 * 3600 * S
-A, B = "rec_20260921T101320Z", "rec_20260921T102320Z"
-
-
-def bag(path: Path, start: int, layout: McapLayout | None = None) -> Path:
-    """A split of ten seconds; where the robot is tells the time."""
-    times = [T0 + (start + n) * S for n in range(10)]
-    return write_mcap(path, [odom(at, (at - T0) / S, 2.0) for at in times], layout)
-
-
-def recording(bag_dir: Path, name: str, start: int, splits: int = 6) -> list[Path]:
-    made = [bag(bag_dir / name / f"{name}_{n}.mcap", start + n * 10) for n in range(splits)]
-    (bag_dir / name / "handover.json").write_text('{"format": 1}')
-    return made
-
-
-def asked(bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW) -> Slot:
-    """Asks for what was recorded in these seconds."""
-    slot = Slot(bag_dir, label, T0 + start * S, T0 + end * S, at)
-    slot.post()
-    return slot
-
-
-def kept(
-    house: Housekeeping, bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW
-) -> Outcome:
-    slot = asked(bag_dir, start, end, label, at)
-    house.keep_moments(bag_dir)
-    outcome = slot.outcome()
-    slot.close()
-    assert outcome is not None
-    return outcome
-
-
-def house_of(bag_dir: Path, **limits: Any) -> Housekeeping:
-    return keeper_of(bag_dir, **{"clock": SettableClock(NOW), **limits})
-
-
-def in_moments(bag_dir: Path) -> list[str]:
-    """The bags that are kept, each as moment and name."""
-    return [
-        path.relative_to(bag_dir / "moments").as_posix()
-        for path in sorted((bag_dir / "moments").rglob("*.mcap"))
-    ]
-
-
-def told_of(bag_dir: Path) -> dict[str, Any]:
-    [path] = (bag_dir / "moments").glob(f"*/{MOMENT_FILE}")
-    told: dict[str, Any] = json.loads(path.read_text())
-    return told
 
 
 class TestKeeping:
@@ -310,186 +258,6 @@ class TestCrashes:
         with structlog.testing.capture_logs() as captured:
             assert kept(house, tmp_path, 30, 35).bags == 1
         assert "moment_not_written" in {event["event"] for event in captured}
-
-
-class TestRetention:
-    def test_a_moment_outlives_its_bags_and_answers_as_before(self, tmp_path: Path) -> None:
-        made = recording(tmp_path, A, 0)
-        young = recording(tmp_path, B, 3 * 3600)
-        house = house_of(tmp_path, max_age_h=1)
-        memory = memory_of(tmp_path, clock=SettableClock(NOW))
-        questions: list[Callable[[], object]] = [
-            lambda: queries.position(memory, Call(), Moment(at_s=T0 / S + 17)),
-            lambda: queries.topic_range(
-                memory, Call(), "/odom", Span(start_s=T0 / S + 10, end_s=T0 / S + 29)
-            ),
-        ]
-        before = [ask() for ask in questions]
-        kept(house, tmp_path, 15, 25)
-        assert [ask() for ask in questions] == before
-        house.apply(tmp_path)
-        assert not any(path.exists() for path in made)
-        assert not (tmp_path / A).exists()
-        assert [ask() for ask in questions] == before
-        assert all(path.exists() for path in young)
-
-    def test_a_kept_bag_is_one_bag_wherever_it_is_counted(self, tmp_path: Path) -> None:
-        made = recording(tmp_path, A, 0)
-        memory = memory_of(tmp_path)
-        plain = queries.list_recorded_topics(memory, Call())
-        house = house_of(tmp_path)
-        kept(house, tmp_path, 15, 25, "one")
-        kept(house, tmp_path, 12, 38, "two")
-
-        def counted() -> tuple[int, int]:
-            snapshot = memory.index.refresh()
-            fresh = memory_of(tmp_path).index.snapshot()
-            assert [bag.file for bag in fresh.bags] == [bag.file for bag in snapshot.bags]
-            [row] = queries.list_recorded_topics(memory, Call())
-            return len(snapshot.bags), row.count
-
-        assert queries.list_recorded_topics(memory, Call()) == plain
-        assert counted() == (6, 60)
-        for path in made[1:3]:
-            path.unlink()
-        assert counted() == (6, 60)
-        shutil.rmtree(min((tmp_path / "moments").iterdir()))
-        assert counted() == (6, 60)
-        shutil.rmtree(tmp_path / "moments")
-        assert counted() == (4, 40)
-
-    def test_the_budget_counts_a_kept_bag_once_and_never_as_freed(self, tmp_path: Path) -> None:
-        made = recording(tmp_path, A, 0)
-        kept(house_of(tmp_path), tmp_path, 0, 15)
-        total = size_of(tmp_path)
-        with structlog.testing.capture_logs() as captured:
-            house_of(tmp_path, max_bytes=total).apply(tmp_path)
-            assert all(path.exists() for path in made)
-            house_of(tmp_path, max_bytes=total - 1).apply(tmp_path)
-        # The first two would free nothing.
-        assert [path.exists() for path in made] == [True, True, False, True, True, True]
-        told = [event for event in captured if event["event"] == "retention_applied"]
-        assert [event["total_bytes"] for event in told] == [total, size_of(tmp_path)]
-
-    def test_a_bag_that_lies_in_moments_alone_counts_once_in_the_budget(
-        self, tmp_path: Path
-    ) -> None:
-        recording(tmp_path, A, 0)
-        recording(tmp_path, B, 3 * 3600)
-        house = house_of(tmp_path, max_age_h=1)
-        kept(house, tmp_path, 15, 25, "one")
-        kept(house, tmp_path, 15, 35, "two")
-        house.apply(tmp_path)
-        assert not (tmp_path / A).exists()
-        with structlog.testing.capture_logs() as captured:
-            house.apply(tmp_path)
-        [told] = [event for event in captured if event["event"] == "retention_applied"]
-        sidecars = [path.stat() for path in (tmp_path / "moments").rglob("handover.json")]
-        assert told["total_bytes"] - size_of(tmp_path) in {0, sidecars[0].st_size}
-
-    def test_moments_stay_where_the_budget_cannot_be_held(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        house = house_of(tmp_path, max_bytes=1)
-        kept(house, tmp_path, 0, 15)
-        for _ in range(2):
-            house.apply(tmp_path)
-            house.make_room(tmp_path, PLENTY * 2)
-        assert len(in_moments(tmp_path)) == 2
-
-    def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
-        self, tmp_path: Path
-    ) -> None:
-        def fixed(at: int, x: float) -> None:
-            mounted = transform(at, "base_link", "laser", (x, 0.0, 0.0))
-            path = tmp_path / A / f"{A}_{(at - T0) // S}.mcap"
-            write_mcap(path, [odom(at, 0.0, 0.0), tf(at, mounted, topic="/tf_static")])
-
-        fixed(T0 - 100 * S, 0.1)
-        recording(tmp_path, A, 0)
-        fixed(T0 + 100 * S, 0.2)
-        recording(tmp_path, B, 3 * 3600)
-        house = house_of(tmp_path, max_age_h=1)
-        kept(house, tmp_path, 15, 25)
-        memory = memory_of(tmp_path, clock=SettableClock(NOW))
-
-        def mounted() -> Sample:
-            moment = Moment(at_s=T0 / S + 17)
-            return queries.topic_value(memory, Call(), "/tf_static", moment).sample
-
-        before = mounted()
-        assert "0.1" in str(before.value)
-        for _ in range(2):
-            house.apply(tmp_path)
-            assert mounted() == before
-        assert not (tmp_path / A).exists()
-
-    def test_the_sidecar_of_a_recording_that_goes_on_is_followed(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        house = house_of(tmp_path)
-        kept(house, tmp_path, 15, 25)
-        anew = tmp_path / A / "anew"
-        anew.write_text('{"format": 1, "state": "counts", "clock": "publish", "notes": ["x"]}')
-        anew.replace(tmp_path / A / "handover.json")
-        house.apply(tmp_path)
-        [sidecar] = (tmp_path / "moments").rglob("handover.json")
-        assert sidecar.samefile(tmp_path / A / "handover.json")
-
-    def test_what_is_kept_beside_bags_counts_in_the_budget(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        kept(house_of(tmp_path), tmp_path, 15, 25)
-        with structlog.testing.capture_logs() as captured:
-            house_of(tmp_path).apply(tmp_path)
-        [told] = [event for event in captured if event["event"] == "retention_applied"]
-        assert told["total_bytes"] == size_of(tmp_path)
-
-
-STEPS = st.lists(
-    st.one_of(
-        st.just(("split", 0, 0)),
-        st.just(("apply", 0, 0)),
-        st.tuples(st.just("keep"), st.integers(0, 80), st.integers(0, 30)),
-        st.tuples(st.just("forget"), st.integers(0, 3), st.just(0)),
-    ),
-    max_size=14,
-)
-
-
-@settings(max_examples=25, deadline=None)
-@given(steps=STEPS, budget=st.integers(3, 9), share=st.integers(0, 5))
-def test_no_moments_in_any_order_break_a_budget_or_lose_what_is_kept(
-    tmp_path_factory: pytest.TempPathFactory,
-    steps: list[tuple[str, int, int]],
-    budget: int,
-    share: int,
-) -> None:
-    """Splits are recorded, moments kept and deleted, limits applied. A size is one of a split."""
-    root = tmp_path_factory.mktemp("bags")
-    size = bag(root / A / f"{A}_0.mcap", 0).stat().st_size
-    splits, rooms = 1, size * budget + 40_000
-    house = house_of(root, max_bytes=rooms, moments_bytes=size * share + 10)
-    promised: dict[Path, int] = {}
-    for what, first, second in steps:
-        if what == "split":
-            bag(root / A / f"{A}_{splits}.mcap", splits * 10)
-            splits += 1
-        elif what == "keep":
-            kept(house, root, first, first + second)
-            links = [path for path in root.glob("moments/**/*.mcap") if path not in promised]
-            promised.update((path, path.stat().st_ino) for path in links)
-        elif what == "forget":
-            for folder in sorted((root / "moments").glob("*"))[first : first + 1]:
-                shutil.rmtree(folder)
-            promised = {path: inode for path, inode in promised.items() if path.exists()}
-        else:
-            with structlog.testing.capture_logs() as captured:
-                house.apply(root)
-            [told] = [each for each in captured if each["event"] == "retention_applied"]
-            assert told["total_bytes"] == size_of(root) <= rooms
-        assert {path: path.stat().st_ino for path in promised} == promised
-        held = {path.stat().st_ino: path.stat().st_size for path in promised}
-        assert sum(held.values()) <= size * share + 10
-        files = {path.stat().st_ino for path in root.rglob("*.mcap")}
-        assert len(memory_of(root).index.snapshot().bags) == len(files)
 
 
 class TestOthers:

@@ -1,0 +1,127 @@
+"""What a refused configuration says, and how a program ends over it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ros2_memory.config import exit_on_config_error, load_settings
+from tests.configs import copied, edit, refusal
+
+
+@pytest.fixture
+def own_config(tmp_path: Path) -> Path:
+    """A configuration folder of one's own to change."""
+    return copied(tmp_path)
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("override", "fragments"),
+        [
+            ("datas.now=wall", ["datas: there is no such key", "recording, data, reader"]),
+            ("data.nwo=wall", ["data.nwo: there is no such key", "now, tf_clock"]),
+            ("+data.nwo=wall", ["data.nwo: there is no such key"]),
+            ("storage.cache=1", ["storage.cache: there is no such key", "cache_mb"]),
+            ("~data.now", ["data.now: missing"]),
+            ("~server", ["server: missing"]),
+            ("~nothing", ["'nothing' does not exist"]),
+            ("server=3", ["server: 3 is not allowed", "must hold keys"]),
+            ("data.now.deep=1", ["data.now: {'deep': 1}", "wall, latest"]),
+            ("data.now=walls", ["data.now: 'walls'", "wall, latest"]),
+            ("data.tf_clock=sim", ["data.tf_clock: 'sim'", "auto, stamp, log"]),
+            ("logging.level=loud", ["'loud'", "debug, info, warning, error"]),
+            ("logging.format=xml", ["'xml'", "json, pretty"]),
+            ("recording.split_duration_s=-10", ["recording.split_duration_s: -10", "than 0"]),
+            ("recording.split_duration_s=0", ["recording.split_duration_s: 0", "than 0"]),
+            ("recording.split_duration_s=2.5", ["2.5", "valid integer"]),
+            ("recording.split_duration_s='10'", ["'10'", "valid integer"]),
+            ("recording.clear_on_startup=perhaps", ["'perhaps'", "boolean"]),
+            ("recording.bag_dir=''", ["recording.bag_dir: ''", "must name a path"]),
+            ("recording.bag_dir=7", ["recording.bag_dir: 7", "must be a path"]),
+            ("recording.bag_dir='~nobody-here/x'", ["recording.bag_dir", "can be found"]),
+            ("data.time_tolerance_s=true", ["data.time_tolerance_s: True", "valid number"]),
+            ("data.time_tolerance_s=-0.1", ["-0.1", "greater than or equal to 0"]),
+            ("data.max_plausible_speed_mps=nan", ["nan", "finite"]),
+            ("data.pose_topic=''", ["data.pose_topic: ''", "must not be empty"]),
+            ("data.tf_topics=/tf", ["data.tf_topics: '/tf'", "must be a list"]),
+            ("data.tf_topics=[1]", ["data.tf_topics.0: 1", "valid string"]),
+            ("reader.index_refresh_s=0", ["reader.index_refresh_s: 0", "than 0"]),
+            ("retention.max_age_h=inf", ["retention.max_age_h: inf", "finite"]),
+            ("retention.max_total_gb=0", ["retention.max_total_gb: 0", "than 0"]),
+            ("server.call_timeout_s=-1", ["server.call_timeout_s: -1", "than 0"]),
+            ("server.max_reply_chars=10", ["server.max_reply_chars: 10", "1000"]),
+            ("server.port=-1", ["server.port: -1", "equal to 0"]),
+            ("data.now=${nothing}", ["data.now: ", "'nothing' not found"]),
+            ("server.host=${oc.env:NO_SUCH_VARIABLE}", ["server.host: ", "NO_SUCH_VARIABLE"]),
+            ("data.now=???", ["data.now: ", "issing"]),
+            ("storage=parquet", ["storage: 'parquet'", "mcap, rosbag2"]),
+            ("storage=null", ["storage: None", "mcap, rosbag2"]),
+            ("storage=[mcap,rosbag2]", ["storage: ['mcap', 'rosbag2']", "mcap, rosbag2"]),
+            ("recorder=fast", ["recorder: 'fast'", "none, ros2bag"]),
+            ("deployment=moon", ["deployment: 'moon'", "local, query_only, replay, robot"]),
+            ("server.port", ["'server.port' is no override", "key=value"]),
+            ("data.now='wall", ["is no override", "key=value"]),
+            ("=3", ["'=3' is not one value for one key"]),
+            ("data.now=wall,latest", ["is not one value for one key", "key=[a,b]"]),
+        ],
+    )
+    def test_name_the_key_the_value_and_what_is_allowed(
+        self, override: str, fragments: list[str]
+    ) -> None:
+        message = refusal(override)
+        assert "\n" not in message
+        for fragment in fragments:
+            assert fragment in message
+
+    def test_are_all_listed_each_with_its_source(self, own_config: Path) -> None:
+        edit(own_config / "config.yaml", "max_age_h: 168", "max_age_h: -1")
+        message = refusal(
+            "data.now=walls",
+            MCP_TRANSPORT="http",
+            MEMORY_CONFIG_OVERRIDES="server.call_timeout_s=0",
+            MEMORY_CONFIG_DIR=str(own_config),
+        )
+        lines = sorted(message.splitlines())
+        assert [line.split(":")[0] for line in lines] == [
+            "data.now",
+            "retention.max_age_h",
+            "server.call_timeout_s",
+            "server.transport",
+        ]
+        assert lines[0].endswith("(set on the command line)")
+        assert lines[1].endswith(f"(set in {own_config / 'config.yaml'})")
+        assert lines[2].endswith("(set by MEMORY_CONFIG_OVERRIDES)")
+        assert lines[3].endswith("(set by MCP_TRANSPORT)")
+
+    @pytest.mark.parametrize(
+        "override", ["reader.chunk_cache_mb=-1", "reader.custom_msg_paths=[/no/such/folder]"]
+    )
+    def test_come_once_for_a_value_that_an_adapter_repeats(self, override: str) -> None:
+        assert refusal(override).splitlines() == [refusal(override)]
+        assert refusal(override).startswith("reader.")
+
+    def test_long_values_are_cut(self) -> None:
+        message = refusal(f"data.now={'x' * 500}")
+        assert len(message) < 200
+        assert "xxx..." in message
+
+
+class TestExit:
+    def test_a_refused_configuration_is_explained_on_stderr_with_exit_code_2(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with pytest.raises(SystemExit) as caught, exit_on_config_error("ros2-memory-server"):
+            load_settings(["data.now=walls"], {})
+        assert caught.value.code == 2
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert err.splitlines() == [
+            "ros2-memory-server cannot start, its configuration is refused:",
+            "data.now: 'walls' is not allowed; use one of: wall, latest (set on the command line)",
+        ]
+
+    def test_any_other_error_passes(self) -> None:
+        with pytest.raises(ZeroDivisionError), exit_on_config_error("ros2-memory"):
+            raise ZeroDivisionError

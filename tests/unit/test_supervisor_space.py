@@ -1,0 +1,231 @@
+"""What the supervisor does when the disk fills or is unmounted, and for the house."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+from tests.recorder_world import World
+from tests.supervision import Housekeeping, assert_each_counts_once, events
+
+pytestmark = pytest.mark.usefixtures("no_flushing")
+
+
+class TestSpace:
+    def world(self, tmp_path: Path) -> tuple[World, Housekeeping]:
+        housekeeping = Housekeeping()
+        world = World(tmp_path, housekeeper=housekeeping)
+        housekeeping.world = world
+        return world, housekeeping
+
+    def test_a_disk_that_fills_is_first_made_room_on(self, tmp_path: Path) -> None:
+        world, housekeeping = self.world(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+        housekeeping.frees_to = 5000
+        world.free = 900
+        world.run(3)
+        assert "room 1200" in housekeeping.asked
+        assert world.supervisor.is_recording
+        assert world.heartbeat()["state"] == "recording"
+
+    def test_where_that_does_not_help_recording_pauses_with_an_error(self, tmp_path: Path) -> None:
+        world, _ = self.world(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+        world.free = 900
+        with capture_logs() as logs:
+            world.run(3)
+        (paused,) = events(logs, "recording_paused")
+        assert paused["log_level"] == "error"
+        assert "min_free_gb" in str(paused["reason"])
+        assert world.running == []
+        beat = world.heartbeat()
+        assert (beat["state"], beat["recordings"]) == ("paused", [])
+        assert beat["last_error"] == paused["reason"]
+
+    def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
+        self, tmp_path: Path
+    ) -> None:
+        housekeeping = Housekeeping()
+        housekeeping.making = True
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(3)
+        world.free = 600
+        world.run(200)
+        assert housekeeping.asked.count("room 1200") == 1
+        assert world.supervisor.is_recording
+        world.free = 400
+        world.run(2)
+        assert world.heartbeat()["state"] == "paused"
+
+    def test_room_that_was_made_too_little_has_recording_pause(self, tmp_path: Path) -> None:
+        housekeeping = Housekeeping()
+        housekeeping.making = True
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(3)
+        world.free = 600
+        world.run(3)
+        housekeeping.making = False
+        world.run(2)
+        assert world.heartbeat()["state"] == "paused"
+
+    def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
+        world, _ = self.world(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+        world.free = 900
+        world.run(3)
+        world.free = 1100
+        world.run(10)
+        assert world.running == []
+        world.free = 1200
+        world.run(3)
+        assert len(world.running) == 1
+        assert world.heartbeat()["state"] == "recording"
+
+    def test_while_it_pauses_room_is_asked_for_again_now_and_then(self, tmp_path: Path) -> None:
+        world, housekeeping = self.world(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+        world.free = 900
+        world.run(200)
+        assert 3 <= housekeeping.asked.count("room 1200") <= 5
+
+    def test_a_disk_that_is_full_at_the_start_is_waited_for(self, tmp_path: Path) -> None:
+        world, _ = self.world(tmp_path)
+        world.free = 5
+        world.supervisor.start()
+        world.run(5)
+        assert world.recorders == []
+        assert world.heartbeat()["state"] == "paused"
+        world.free = 10**9
+        world.run(3)
+        assert world.supervisor.is_recording
+
+    def test_pausing_in_a_handover_loses_and_doubles_nothing(self, tmp_path: Path) -> None:
+        housekeeping = Housekeeping()
+        world = World(tmp_path, housekeeper=housekeeping, session_duration_s=20)
+        world.supervisor.start()
+        world.run(22.25)
+        world.free = 900
+        world.run(3)
+        assert world.running == []
+        assert_each_counts_once(world)
+
+    def test_a_split_that_stays_empty_is_told(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(8)
+        world.disk_full = True
+        with capture_logs() as logs:
+            world.run(30)
+        told = events(logs, "split_empty")
+        assert len(told) >= 2
+        assert len({each["reason"] for each in told}) == len(told)
+
+
+class TestUnmounted:
+    """The disk is unmounted: its recordings are not there, and an empty directory is."""
+
+    @staticmethod
+    def unmounted(world: World) -> Path:
+        aside = world.bag_dir.with_name("aside")
+        world.bag_dir.rename(aside)
+        world.bag_dir.mkdir()
+        world.device = 2
+        return aside
+
+    def test_nothing_is_recorded_onto_another_disk_and_that_is_told(self, tmp_path: Path) -> None:
+        housekeeping = Housekeeping()
+        world = World(tmp_path / "bags", housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(3)
+        self.unmounted(world)
+        with capture_logs() as logs:
+            world.run(200)
+        assert len(events(logs, "disk_gone")) == 1
+        assert world.running == []
+        assert len(world.recorders) == 1
+        assert housekeeping.asked == []
+        world.supervisor.stop()
+        assert list(world.bag_dir.iterdir()) == []
+
+    def test_it_goes_on_by_itself_when_the_disk_is_back(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags")
+        world.supervisor.start()
+        world.run(3)
+        aside = self.unmounted(world)
+        world.run(20)
+        shutil.rmtree(world.bag_dir)
+        aside.rename(world.bag_dir)
+        world.device = 1
+        with capture_logs() as logs:
+            world.run(0.5)
+            assert len(world.recorders) == 1
+            world.run(5)
+        assert len(events(logs, "disk_back")) == 1
+        assert world.supervisor.is_recording
+        beat = world.heartbeat()
+        assert beat["state"] == "recording"
+        assert "has been unmounted" in beat["last_error"]
+
+    def test_one_that_comes_and_goes_is_waited_for_longer_each_time(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags")
+        world.supervisor.start()
+        world.run(3)
+        for _ in range(5):
+            aside = self.unmounted(world)
+            world.run(1)
+            shutil.rmtree(world.bag_dir)
+            aside.rename(world.bag_dir)
+            world.device = 1
+            world.run(1)
+        world.run(10)
+        assert len(world.recorders) <= 3
+
+
+class TestHouse:
+    def test_what_failed_while_nobody_waited_is_told_once_and_in_the_heartbeat(
+        self, tmp_path: Path
+    ) -> None:
+        housekeeping = Housekeeping()
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(3)
+        housekeeping.failed = {"make_room": "the oldest bags cannot be deleted"}
+        with capture_logs() as logs:
+            world.run(130)
+        (told,) = events(logs, "housekeeping_failed")
+        assert (told["task"], told["reason"]) == ("make_room", "the oldest bags cannot be deleted")
+        assert world.heartbeat()["last_error"] == "the oldest bags cannot be deleted"
+
+    def test_it_is_kept_after_splits_were_closed(self, tmp_path: Path) -> None:
+        housekeeping = Housekeeping()
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(31)
+        assert housekeeping.asked.count("apply") == 3
+
+    def test_it_is_kept_now_and_then_when_nothing_comes(self, tmp_path: Path) -> None:
+        housekeeping = Housekeeping()
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.silent = True
+        world.supervisor.start()
+        world.run(130)
+        assert housekeeping.asked.count("apply") == 2
+
+    def test_what_goes_wrong_there_is_told_once_and_stops_nothing(self, tmp_path: Path) -> None:
+        housekeeping = Housekeeping()
+        housekeeping.fails = True
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        with capture_logs() as logs:
+            world.run(60)
+        assert len([each for each in logs if "catalogue is locked" in str(each)]) == 1
+        assert world.supervisor.is_recording
