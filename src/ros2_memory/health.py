@@ -85,7 +85,7 @@ class Health:
 def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
-    heartbeat = memory.index.heartbeat()
+    heartbeat = memory.heartbeat()
     dating = snapshot.dating
     amiss = {
         "damaged": snapshot.damaged,

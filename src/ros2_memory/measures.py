@@ -84,7 +84,7 @@ class Measuring:
         """The figures of this moment. Reads the heartbeat, and no bag."""
         memory = self._memory
         now, snapshot = memory.clock.now(), memory.index.published
-        heartbeat, kept = memory.index.heartbeat(), memory.limits.kept
+        heartbeat, kept = memory.heartbeat(), memory.limits.kept
         return Measures(
             None if snapshot is None else _of_index(snapshot, now),
             None if heartbeat is None else self._of_recorder(heartbeat, now),

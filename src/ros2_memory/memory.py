@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.recall import Recall
+    from ros2_memory.recorder.heartbeat import Heartbeat
     from ros2_memory.recorder.index_manager import IndexManager
     from ros2_memory.recorder.retention import RetentionLimits
     from ros2_memory.storage.base import BagReader
@@ -57,6 +58,16 @@ class Memory:
     clock: Clock
     limits: Limits
     recall: Recall | None = None
+
+    def heartbeat(self) -> Heartbeat | None:
+        """What the recorder of these bags last said; None where none was heard of.
+
+        None of bags of another day, too, which nobody records (`recorder=none`, `data.now=latest`):
+        a heartbeat that was copied with them says nothing of today.
+        """
+        if self.limits.kept is None and self.limits.now == "latest":
+            return None
+        return self.index.heartbeat()
 
 
 class Stages:

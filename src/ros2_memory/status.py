@@ -32,7 +32,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     wall = memory.clock.now()
     view = View(memory, call, wall)
     view.count_all()
-    snapshot, heartbeat = view.snapshot, memory.index.heartbeat()
+    snapshot, heartbeat = view.snapshot, memory.heartbeat()
     latest = snapshot.dating.latest
     now = wall if memory.limits.now == "wall" or latest is None else latest
     return Status(

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
@@ -63,6 +63,20 @@ def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
     assert told["never_heard"] == ["/b"]
     assert (told["restarts"], told["missing"]) == (0, [])
     assert told["fell_silent"] == []
+
+
+@pytest.mark.parametrize(
+    ("now", "told"), [("wall", ("recording", False)), ("latest", (None, False))]
+)
+def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
+    now: Literal["wall", "latest"], told: tuple[str | None, bool], tmp_path: Path
+) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=1e6)
+    memory = replace(memory, limits=replace(memory.limits, now=now))
+    beating(tmp_path, RecorderState.RECORDING, 1)
+    reply = shown(memory, tmp_path)
+    assert (reply["recorder"], reply["recorder_alive"]) == told
+    assert ("stopped without saying so" in reply["trust"]) == (now == "wall")
 
 
 def test_restarts_and_topics_that_nobody_offers_are_told(tmp_path: Path) -> None:
