@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory.recorder.heartbeat import write_heartbeat
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import boolean, detections, odom, text, write_mcap
 from tests.browser import ENTER, TAB, Browser, browsing, needs_chromium
+from tests.documented import heartbeat
 from tests.integration.test_server_process import serving
 from tests.questions import T0, T0_S
 
@@ -165,6 +169,24 @@ def test_long_names_leave_room_for_what_stands_beside_them(odd: Browser) -> None
         ".map((each) => each.textContent)"
     )
     assert narrow == []
+
+
+def test_it_shows_what_the_recorder_says_of_itself(chromium: Browser, scratch: Path) -> None:
+    bag_dir = scratch / "robot"
+    write_mcap(bag_dir / "rec" / "rec_0.mcap", [odom(T0, 0.0, 0.0)])
+    missing = tuple(f"/gone_{n:02}" for n in range(25))
+    # One that comes each hour is live for as long as the test may take.
+    beat = replace(heartbeat(time.time_ns()), interval_s=3600.0, restarts=2, silent=("/scan",))
+    beat = replace(beat, missing=missing)
+    write_heartbeat(bag_dir, beat)
+    with serving(bag_dir, scratch / "log_robot", "storage=mcap") as server:
+        chromium.open(server.url("/"))
+        chromium.awaits("return !document.getElementById('again').disabled")
+        state = chromium.text("#state")
+    assert "recording, 2 restarts" in state
+    assert "Never heard: /scan" in state
+    assert "Offered by nobody: /gone_00, /gone_01" in state
+    assert "and 15 more" in state
 
 
 def test_without_a_bag_directory_every_part_says_so(chromium: Browser, scratch: Path) -> None:
