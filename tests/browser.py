@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import httpx2
 import pytest
 
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")
 CHROMEDRIVER: Final = shutil.which("chromedriver")
-WAITS_S: Final = 60.0
 TAB: Final = "\ue004"
 ENTER: Final = "\ue007"
 
@@ -37,7 +36,7 @@ class Browser:
     """One window, with the profile of nobody."""
 
     def __init__(self, driver: str, profile: Path) -> None:
-        self._http = httpx2.Client(timeout=WAITS_S * 2)
+        self._http = httpx2.Client(timeout=PATIENCE_S)
         self._session = driver
         flags = (
             "headless",
@@ -71,7 +70,7 @@ class Browser:
 
     def awaits(self, script: str) -> None:
         """Until it returns something that is true."""
-        until(lambda: self.run(script) or None, timeout_s=WAITS_S)
+        until(lambda: self.run(script) or None)
 
     def keys(self, typed: str) -> None:
         """Types on the keyboard, wherever the focus is."""
@@ -118,7 +117,7 @@ def browsing(scratch: Path) -> Iterator[Browser]:
     )
     try:
         url = f"http://127.0.0.1:{port}"
-        until(lambda: _is_ready(url) or None, timeout_s=WAITS_S)
+        until(lambda: _is_ready(url) or None)
         browser = Browser(url, scratch / "profile")
         try:
             yield browser
@@ -131,6 +130,6 @@ def browsing(scratch: Path) -> Iterator[Browser]:
 
 def _is_ready(url: str) -> bool:
     try:
-        return bool(httpx2.get(f"{url}/status", timeout=WAITS_S).json()["value"]["ready"])
+        return bool(httpx2.get(f"{url}/status", timeout=PATIENCE_S).json()["value"]["ready"])
     except httpx2.TransportError:
         return False

@@ -94,6 +94,7 @@ class Campaign:
     """What came of it."""
 
     terms: Terms
+    robot_late_s: float = 0.0
     t0: int = 0
     faults: list[Fault] = field(default_factory=list)
     subscribed: dict[str, int] = field(default_factory=dict)
@@ -178,6 +179,7 @@ def run_campaign(terms: Terms, folder: Path) -> Campaign:
             await_moment(time.time_ns() + terms.split_s * NS_PER_S)
             recorder.stop()
             campaign.reached = robot.reached()
+            campaign.robot_late_s = robot.late_s
             end(robot.process)
             # The recorder that was killed last may have been replaced by the same daemon, which
             # repairs what is left in its own time. The next start does it at once.

@@ -33,7 +33,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_server_process import Served, serving
 from tests.questions import ask
 from tests.ros_live import wait_for
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -85,9 +85,7 @@ class LiveRecorder:
         """What it logged under this name so far."""
         return [event for event in self.all_events() if event["event"] == name]
 
-    def wait_for(
-        self, name: str, count: int = 1, *, timeout_s: float = 40, **values: object
-    ) -> list[dict[str, Any]]:
+    def wait_for(self, name: str, count: int = 1, **values: object) -> list[dict[str, Any]]:
         """Events of this name with these values, as soon as there are `count`."""
 
         def come() -> list[dict[str, Any]] | None:
@@ -97,14 +95,14 @@ class LiveRecorder:
             assert self.process.poll() is None, f"it ended before {name}:\n{self.log.read_text()}"
             return None
 
-        return until(come, timeout_s=timeout_s)
+        return until(come)
 
     def wait_for_state(self, state: RecorderState) -> None:
         def is_so() -> bool:
             beat = self.heartbeat.heartbeat
             return beat is not None and beat.state is state and beat.pid == self.process.pid
 
-        wait_for(is_so, f"state {state}", timeout_s=40, alive=self.process)
+        wait_for(is_so, f"state {state}", alive=self.process)
 
     def wait_for_subscriptions(self) -> None:
         """Returns once its newest recorder runs and has subscribed to everything."""
@@ -113,7 +111,7 @@ class LiveRecorder:
             running = self.children()
             return bool(running) and running[-1].recording in self.subscribed_all()
 
-        wait_for(all_there, "all subscriptions", timeout_s=40, alive=self.process)
+        wait_for(all_there, "all subscriptions", alive=self.process)
 
     def subscribed_all(self) -> dict[str, int]:
         """The recordings that subscribed to all of `RECORDED_TOPICS`, and when they had (ns)."""
@@ -156,14 +154,14 @@ class LiveRecorder:
         for child in children if with_children else ():
             with suppress(ProcessLookupError):
                 os.kill(child.pid, signal.SIGKILL)
-        self.process.wait(timeout=10)
+        self.process.wait(timeout=PATIENCE_S)
         wait_for(lambda: not any(_is_running(child.pid) for child in children), "their end")
         return Killed(at, time.time_ns(), tuple(child.recording for child in children))
 
     def stop(self) -> None:
         """Has it end, as a service manager does."""
         self.process.send_signal(signal.SIGTERM)
-        code = self.process.wait(timeout=60)
+        code = self.process.wait(timeout=PATIENCE_S)
         assert code == 0, f"the recorder ended with {code}:\n{self.log.read_text()}"
 
     def discard(self) -> None:
@@ -171,7 +169,7 @@ class LiveRecorder:
         children = self.children()
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait(timeout=10)
+        self.process.wait(timeout=PATIENCE_S)
         for child in children:
             with suppress(ProcessLookupError):
                 os.kill(child.pid, signal.SIGKILL)
@@ -272,7 +270,7 @@ def answers(served: Served, *questions: tuple[str, dict[str, Any]]) -> list[Answ
 
     async def go() -> list[Answer]:
         found: list[Answer] = []
-        async with Client(sse_client(served.url("/sse"))) as client:
+        async with Client(sse_client(served.url("/sse"), timeout=PATIENCE_S)) as client:
             for tool, given in questions:
                 asked = time.time_ns()
                 told, _ = await ask(client, tool, given)
@@ -295,12 +293,12 @@ def await_answerable(served: Served, moment: int) -> None:
         latest = json.loads(served.get("/health")[1]).get("latest")
         return latest is not None and latest * NS_PER_S >= moment
 
-    wait_for(reaches, "bags that reach so far", timeout_s=40)
+    wait_for(reaches, "bags that reach so far")
 
 
 def await_moment(moment: int) -> None:
     """Returns at this moment (ns), or at once where it is past."""
-    wait_for(lambda: time.time_ns() >= moment, "a moment", timeout_s=120)
+    wait_for(lambda: time.time_ns() >= moment, "a moment")
 
 
 class Tick(NamedTuple):

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from tests.bags import VISION_DEFINITIONS
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -132,6 +133,11 @@ class Robot:
         wait_for(self.truth_file.is_file, "the robot's start", alive=self.process)
         return int(self._truth()["t0_ns"])
 
+    @property
+    def late_s(self) -> float:
+        """How late it published at worst, in seconds."""
+        return float(self._truth()["late_s"])
+
     def reached(self) -> list[int]:
         """When it first reached each further subscriber of its first topic (ns)."""
         matched = [(int(at), int(count)) for at, count in self._truth()["matched"]]
@@ -139,7 +145,7 @@ class Robot:
 
     def finish(self) -> dict[str, int]:
         """How many messages were published on each topic; waits for the end of the drive."""
-        code = self.process.wait(timeout=60)
+        code = self.process.wait(timeout=PATIENCE_S)
         assert code == 0, f"the robot's publishers ended with {code}"
         return {str(topic): int(count) for topic, count in self._truth()["published"].items()}
 
@@ -187,7 +193,7 @@ def wait_for(
     condition: Callable[[], object],
     what: str,
     *,
-    timeout_s: float = 60.0,
+    timeout_s: float = PATIENCE_S,
     alive: subprocess.Popen[bytes] | None = None,
 ) -> None:
     """Returns once the condition holds; fails where it does not in time, or `alive` died."""
@@ -202,7 +208,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
     """Whatever is left of a process that a test started."""
     if process.poll() is None:
         process.kill()
-    process.wait(timeout=10)
+    process.wait(timeout=PATIENCE_S)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 
 from tests.ros_live import end, wait_for
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -72,7 +73,7 @@ class Recording:
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
         """Sends the signal; the exit code, negative where a signal ended it."""
         self.process.send_signal(number)
-        return self.process.wait(timeout=20)
+        return self.process.wait(timeout=PATIENCE_S)
 
 
 def messages(recording: Recording) -> list[tuple[str, int, int, bytes]]:

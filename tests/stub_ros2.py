@@ -91,9 +91,9 @@ def record(directory: Path, split_s: float, pattern: str) -> None:
     say("INFO", "Press SPACE for pausing/resuming")
     say("INFO", "Recording...")
     time.sleep(float(os.environ.get("STUB_SUBSCRIBE_S", "0.2")))
+    done = time.time_ns() // period
     for topic in topics:
         say("INFO", f"Subscribed to topic '{topic}'")
-    done = time.time_ns() // period
     while not ENDED:
         now = time.time_ns()
         tick = now // period

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 T = TypeVar("T")
 
+PATIENCE_S: Final = 180.0
+"""How long any condition is waited for, and any program to end, before it counts as vain.
 
-def until(what: Callable[[], T | None], *, timeout_s: float = 20.0) -> T:
+No promise of the product: where all is well nobody waits for so long, and a machine that has more
+to do than it has processors may need most of it to start one program.
+"""
+
+
+def until(what: Callable[[], T | None], *, timeout_s: float = PATIENCE_S) -> T:
     """The first result of `what` that is neither None nor False.
 
     Raises:

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import uvicorn
 
 from ros2_memory.connections import BoundedConnection
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-BOUND_S: Final = 20
+BOUND_S: Final = PATIENCE_S
 """No test waits longer for what it expects."""
 
 

@@ -16,12 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tests.faults.world import T0_S
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-
-PATIENCE_S = 60.0
 
 
 def questions(count: int) -> list[tuple[str, dict[str, Any]]]:
@@ -122,7 +120,7 @@ def start(
         return bool(said)
 
     try:
-        until(listening, timeout_s=PATIENCE_S)
+        until(listening)
     except BaseException:
         running.kill()
         raise

@@ -95,7 +95,7 @@ def test_the_helper_that_digests_dies_with_its_server(tmp_path: Path) -> None:
     finally:
         running.kill()
     for helper in helpers:
-        until(partial(gone, helper), timeout_s=5.0)
+        until(partial(gone, helper))
 
 
 def test_a_helper_whose_server_is_gone_before_it_begins_does_nothing(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 from ros2_memory.catalogue import FILE, FOLDER
 from tests.faults import test_catalogue_faults as faults
-from tests.faults.running import PATIENCE_S, Running, serving
+from tests.faults.running import Running, serving
 from tests.faults.small_disk import filled, mount, needs_mounts, small_disk, unmount
 from tests.faults.world import write_bag, write_bags
 from tests.waiting import until
@@ -50,7 +50,7 @@ def holds(path: Path, bags: int) -> bool:
 
 
 def recovers(running: Running, bags: int) -> None:
-    until(partial(is_ready, running, bags), timeout_s=PATIENCE_S)
+    until(partial(is_ready, running, bags))
 
 
 def problem(running: Running, words: str) -> str | None:
@@ -61,7 +61,7 @@ def problem(running: Running, words: str) -> str | None:
 
 
 def says(running: Running, words: str) -> None:
-    until(partial(problem, running, words), timeout_s=PATIENCE_S)
+    until(partial(problem, running, words))
 
 
 def is_honest(answer: str) -> bool:
@@ -82,7 +82,7 @@ def test_the_catalogue_comes_back_whatever_becomes_of_it(tmp_path: Path) -> None
             assert running.ask_all(COUNT) == right, fault.__name__
             if path.is_dir():
                 path.rmdir()
-            until(partial(holds, path, COUNT), timeout_s=PATIENCE_S)
+            until(partial(holds, path, COUNT))
             recovers(running, COUNT)
             assert running.ask_all(COUNT) == right, fault.__name__
     with serving(bag_dir, tmp_path / "log") as running:
@@ -171,7 +171,7 @@ def test_a_full_disk_under_the_catalogue_is_said_and_got_over(tmp_path: Path) ->
         full.enter_context(filled(cache))
         write_bags(bag_dir, 8, first=COUNT)
         says(running, "database or disk is full")
-        until(lambda: running.health()["bags"] == COUNT + 8, timeout_s=PATIENCE_S)
+        until(lambda: running.health()["bags"] == COUNT + 8)
         right = running.ask_all(COUNT + 8)
         full.close()
         recovers(running, COUNT + 8)

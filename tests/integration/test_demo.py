@@ -19,9 +19,9 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory.demo.questions import QUESTIONS
 from ros2_memory.demo.run import DemoOptions, run_demo
+from tests.waiting import PATIENCE_S
 
 PROGRAM = [str(Path(sys.executable).with_name("ros2-memory")), "demo"]
-TIMEOUT_S = 120
 
 
 def environment(scratch: Path) -> dict[str, str]:
@@ -42,7 +42,7 @@ def test_once_it_answers_every_question_rightly_and_leaves_nothing_behind(scratc
         [*PROGRAM, "--once", "--port", "0"],
         capture_output=True,
         text=True,
-        timeout=TIMEOUT_S,
+        timeout=PATIENCE_S,
         check=False,
         env=environment(scratch),
     )
@@ -83,7 +83,7 @@ async def test_it_stays_for_other_clients_and_leaves_a_closed_recording(
                 tools = (await client.list_tools()).tools
                 result = await client.call_tool("get_position_seconds_ago", {"seconds_ago": 10})
             demo.send_signal(ending)
-            assert demo.wait(timeout=30) == 0
+            assert demo.wait(timeout=PATIENCE_S) == 0
         finally:
             demo.kill()
     assert len(tools) >= 17
@@ -103,7 +103,7 @@ def test_a_port_in_use_is_named_and_nothing_is_started(scratch: Path) -> None:
             [*PROGRAM, "--once", "--port", str(port)],
             capture_output=True,
             text=True,
-            timeout=TIMEOUT_S,
+            timeout=PATIENCE_S,
             check=False,
             env=environment(scratch),
         )
@@ -125,7 +125,7 @@ def test_it_says_so_when_its_server_is_ended_by_someone_else(scratch: Path) -> N
             _invited(demo)
             children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
             os.kill(int(children[0]), signal.SIGKILL)
-            _, said = demo.communicate(timeout=30)
+            _, said = demo.communicate(timeout=PATIENCE_S)
         finally:
             demo.kill()
     assert demo.returncode == 2

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from tests.questions import T0_S, write_run
 from tests.soak.clients import hostile_bodies, opening
 from tests.soak.wire import call
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,7 +50,7 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
         assert process.poll() is None
         writer.join()
         process.stdin.close()
-        assert process.wait(timeout=20) == 0
+        assert process.wait(timeout=PATIENCE_S) == 0
     finally:
         process.kill()
         process.wait()

@@ -29,9 +29,10 @@ from tests.live_recorder import (
     ticks,
 )
 from tests.ros_live import needs_ros, publishing_robot, ros_environment
+from tests.stalls import Watch, driven
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from pathlib import Path
 
 pytestmark = needs_ros
 
@@ -51,6 +52,7 @@ NAMES: Final = ("steady", "rotating")
 class Drive:
     """What was answered while the robot drove, and what it turned out to have recorded."""
 
+    watch: Watch
     recorders: dict[str, LiveRecorder]
     t0: int = 0
     published: int = 0
@@ -61,8 +63,20 @@ class Drive:
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
-    folder = tmp_path_factory.mktemp("tail")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return driven(lambda watch: drive_once(tmp_path_factory.mktemp("tail"), watch), judge)
+
+
+def judge(drive: Drive) -> None:
+    """All that is promised by the clock."""
+    for name in NAMES:
+        is_asked_often(drive, name)
+        is_fresh(drive, name)
+        is_right(drive, name)
+        is_recorded(drive, name)
+
+
+def drive_once(folder: Path, watch: Watch) -> Drive:
     options = ("--hz", f"{HZ:g}", "--subscribers", "2")
     with (
         ros_environment(folder) as env,
@@ -77,10 +91,11 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
         }
         splits = f"recording.split_duration_s={SPLIT_S}"
         drive = Drive(
+            watch,
             {
                 "steady": site.record("steady", splits),
                 "rotating": site.record("rotating", splits, "recording.session_duration_s=6"),
-            }
+            },
         )
         drive.t0 = robot.t0
         await_moment(drive.t0 + (FRESH_S + 1) * NS_PER_S)
@@ -90,22 +105,33 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drive]:
                 drive.newest.setdefault(name, []).append(newest)
                 drive.ago.setdefault(name, []).append(ago)
         drive.published = robot.stop()["/odom"]
+        watch.tell("the robot", robot.late_s)
         for name, recorder in drive.recorders.items():
             recorder.stop()
             files = bag_files(recorder.bag_dir)
             drive.files[name] = len(files)
             drive.recorded[name] = ticks(files, drive.t0, HZ)
-        yield drive
+        return drive
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_questions_went_over_the_end_of_a_split(drive: Drive, name: str) -> None:
+    with drive.watch.excusing():
+        is_asked_often(drive, name)
+
+
+def is_asked_often(drive: Drive, name: str) -> None:
     assert drive.files[name] >= DRIVE_S // SPLIT_S
     assert len(drive.newest[name]) >= 5
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_was_recorded_3_s_before_a_question_is_found_by_it(drive: Drive, name: str) -> None:
+    with drive.watch.excusing():
+        is_fresh(drive, name)
+
+
+def is_fresh(drive: Drive, name: str) -> None:
     for told, asked, _ in drive.newest[name]:
         assert "timestamp" in told, told
         recorded = _newest_recorded(drive, name, asked - FRESH_S)
@@ -114,6 +140,11 @@ def test_what_was_recorded_3_s_before_a_question_is_found_by_it(drive: Drive, na
 
 @pytest.mark.parametrize("name", NAMES)
 def test_where_the_robot_was_a_moment_ago_is_right(drive: Drive, name: str) -> None:
+    with drive.watch.excusing():
+        is_right(drive, name)
+
+
+def is_right(drive: Drive, name: str) -> None:
     for told, asked, answered in drive.ago[name]:
         assert "x" in told, told
         now = told["timestamp"] + told["age_s"]
@@ -128,8 +159,9 @@ def test_where_the_robot_was_a_moment_ago_is_right(drive: Drive, name: str) -> N
 
 
 def _newest_recorded(drive: Drive, name: str, at: float) -> int:
-    """The log time of the newest message at or before a moment (Unix s)."""
-    return max(t.log_time for t in drive.recorded[name] if t.log_time <= at * NS_PER_S)
+    """The log time of the newest message at or before a moment (Unix s); 0 without one."""
+    times = (t.log_time for t in drive.recorded[name] if t.log_time <= at * NS_PER_S)
+    return max(times, default=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -139,5 +171,10 @@ def test_an_answer_from_what_is_being_written_says_so(drive: Drive, name: str) -
 
 @pytest.mark.parametrize("name", NAMES)
 def test_recording_goes_on_as_if_nobody_had_asked(drive: Drive, name: str) -> None:
+    with drive.watch.excusing():
+        is_recorded(drive, name)
+
+
+def is_recorded(drive: Drive, name: str) -> None:
     numbers = [tick.number for tick in drive.recorded[name]]
     assert numbers == list(range(drive.published))

@@ -21,10 +21,13 @@ from ros2_memory.recorder.child import (
     end_all,
     run_bounded,
 )
-from tests.waiting import until
+from tests.waiting import PATIENCE_S, until
 
 ENV = {"PATH": os.environ["PATH"], "ONLY": "this"}
-QUICK = Patience(interrupt_s=0.2, terminate_s=0.2, kill_s=5.0)
+PATIENT = Patience(interrupt_s=PATIENCE_S, terminate_s=PATIENCE_S, kill_s=PATIENCE_S)
+# For children that do not answer the first signal, and the second.
+DEAF = Patience(interrupt_s=0.2, terminate_s=PATIENCE_S, kill_s=PATIENCE_S)
+DEAFER = Patience(interrupt_s=0.2, terminate_s=0.2, kill_s=PATIENCE_S)
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -48,8 +51,13 @@ def started() -> Iterator[list[Child]]:
     assert end_all(children) == []
 
 
-def start(started: list[Child], *argv: str, keep_open: tuple[int, ...] = ()) -> Child:
-    child = Child.start(argv, ENV, keep_open=keep_open, patience=QUICK)
+def start(
+    started: list[Child],
+    *argv: str,
+    keep_open: tuple[int, ...] = (),
+    patience: Patience = PATIENT,
+) -> Child:
+    child = Child.start(argv, ENV, keep_open=keep_open, patience=patience)
     started.append(child)
     return child
 
@@ -66,7 +74,11 @@ def lines_until(child: Child, last: str) -> list[str]:
 
 
 def finished(child: Child) -> int:
-    return until(child.exit_status)
+    """Its exit status, when all that it printed has been read."""
+    status = until(child.exit_status)
+    reader = f"output of {child.pid}"
+    until(lambda: all(thread.name != reader for thread in threading.enumerate()))
+    return status
 
 
 def is_gone(pid: int) -> bool:
@@ -197,17 +209,22 @@ class TestEnd:
         assert child.take_lines() == ["closing"]
 
     @pytest.mark.parametrize(
-        ("ignored", "status"),
+        ("ignored", "patience", "status"),
         [
-            ("[signal.SIGINT]", -signal.SIGTERM),
-            ("[signal.SIGINT, signal.SIGTERM]", -signal.SIGKILL),
+            ("[signal.SIGINT]", DEAF, -signal.SIGTERM),
+            ("[signal.SIGINT, signal.SIGTERM]", DEAFER, -signal.SIGKILL),
         ],
     )
     def test_one_that_does_not_answer_is_ended_by_stronger_signals(
-        self, tmp_path: Path, started: list[Child], ignored: str, status: int
+        self,
+        tmp_path: Path,
+        started: list[Child],
+        ignored: str,
+        patience: Patience,
+        status: int,
     ) -> None:
         body = f"for s in {ignored}: signal.signal(s, signal.SIG_IGN)\nup()\nidle()"
-        child = start(started, program(tmp_path, body))
+        child = start(started, program(tmp_path, body), patience=patience)
         lines_until(child, "up")
         assert end_all([child]) == []
         assert child.exit_status() == status
@@ -216,14 +233,14 @@ class TestEnd:
         self, tmp_path: Path, started: list[Child]
     ) -> None:
         body = "signal.pthread_sigmask(signal.SIG_BLOCK, range(1, 65))\nup()\nidle()"
-        child = start(started, program(tmp_path, body))
+        child = start(started, program(tmp_path, body), patience=DEAFER)
         lines_until(child, "up")
         assert end_all([child]) == []
         assert child.exit_status() == -signal.SIGKILL
 
     def test_several_are_ended_side_by_side(self, tmp_path: Path, started: list[Child]) -> None:
         path = program(tmp_path, "signal.signal(signal.SIGINT, signal.SIG_IGN)\nup()\nidle()")
-        children = [start(started, path) for _ in range(3)]
+        children = [start(started, path, patience=DEAF) for _ in range(3)]
         for child in children:
             lines_until(child, "up")
         assert end_all(children) == []
@@ -244,7 +261,7 @@ class TestEnd:
             "print(p.pid, flush=True)\nos._exit(3)"
         )
         child = start(started, program(tmp_path, body))
-        assert finished(child) == 3
+        assert until(child.exit_status) == 3
         (pid,) = child.take_lines()
         until(lambda: is_dead(int(pid)))
 
@@ -339,16 +356,20 @@ def test_a_parent_that_died_before_is_noticed(tmp_path: Path) -> None:
 class TestRunBounded:
     def test_it_gives_status_and_both_streams(self, tmp_path: Path) -> None:
         body = "print('out'); sys.stderr.write('err'); sys.exit(5)"
-        assert run_bounded([program(tmp_path, body)], ENV, 20) == (5, b"out\n", b"err")
+        assert run_bounded([program(tmp_path, body)], ENV, PATIENCE_S) == (5, b"out\n", b"err")
 
     def test_it_kills_what_takes_too_long_with_all_it_started(self, tmp_path: Path) -> None:
         body = (
             "p = subprocess.Popen([sys.executable, '-IS', '-c', 'import time; time.sleep(600)'])\n"
             f"open({str(tmp_path / 'pid')!r}, 'w').write(str(p.pid))\nidle()"
         )
-        with pytest.raises(RecorderError, match="did not come to an end within 1 s"):
-            run_bounded([program(tmp_path, body)], ENV, 1)
-        pid = int((tmp_path / "pid").read_text())
+        told = tmp_path / "pid"
+        for bound_s in (1, 10, 100):
+            with pytest.raises(RecorderError, match=f"did not come to an end within {bound_s} s"):
+                run_bounded([program(tmp_path, body)], ENV, bound_s)
+            if told.exists() and told.read_text():
+                break
+        pid = int(told.read_text())
         until(lambda: is_dead(pid))
 
     def test_it_does_not_wait_for_what_goes_on_in_the_background(self, tmp_path: Path) -> None:
@@ -356,10 +377,10 @@ class TestRunBounded:
             "p = subprocess.Popen([sys.executable, '-IS', '-c', 'import time; time.sleep(600)'])\n"
             "print(p.pid)"
         )
-        status, output, _ = run_bounded([program(tmp_path, body)], ENV, 60)
+        status, output, _ = run_bounded([program(tmp_path, body)], ENV, PATIENCE_S)
         assert status == 0
         os.kill(int(output), signal.SIGKILL)
 
     def test_a_program_that_is_not_there_is_named(self) -> None:
         with pytest.raises(RecorderError, match="/nowhere/x cannot be started: No such file"):
-            run_bounded(["/nowhere/x"], ENV, 5)
+            run_bounded(["/nowhere/x"], ENV, PATIENCE_S)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +14,7 @@ from ros2_memory.recorder.null import NullRecorder
 from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader
 from tests import stub_ros2
+from tests.waiting import until
 
 if TYPE_CHECKING:
     from ros2_memory.recorder.base import Recorder
@@ -56,12 +56,12 @@ def drive(recorder: Recorder) -> bool:
     """Lets it work until it records; False for one that never does."""
     if not isinstance(recorder, Ros2BagRecorder):
         return False
-    give_up = time.monotonic() + 30
-    while not recorder.is_running():
-        assert time.monotonic() < give_up
+
+    def ticked() -> bool:
         recorder.tick()
-        time.sleep(0.02)
-    return True
+        return recorder.is_running()
+
+    return until(ticked)
 
 
 def children() -> set[str]:

@@ -9,9 +9,12 @@ import socket
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import pytest
@@ -23,7 +26,8 @@ from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests import stub_ros2
-from tests.waiting import until
+from tests.stalls import in_time
+from tests.waiting import PATIENCE_S, until
 
 PERIOD_NS = 10_000_000
 
@@ -50,14 +54,14 @@ class Daemon:
             found = self.events(name)
             return found if len(found) >= count else None
 
-        return until(come, timeout_s=40)
+        return until(come)
 
     def wait_for_state(self, state: RecorderState) -> None:
         def is_so() -> bool:
             beat = read_heartbeat(self.bag_dir).heartbeat
             return beat is not None and beat.state is state and beat.pid == self.process.pid
 
-        until(is_so, timeout_s=40)
+        until(is_so)
 
     @property
     def child(self) -> int:
@@ -66,7 +70,7 @@ class Daemon:
 
     def stop(self, number: int = signal.SIGTERM) -> int:
         self.process.send_signal(number)
-        return self.process.wait(40)
+        return self.process.wait(PATIENCE_S)
 
     def recordings(self) -> list[Path]:
         return sorted(path for path in self.bag_dir.glob("rec_*") if path.is_dir())
@@ -121,16 +125,35 @@ class Site:
     def refusal(self, *overrides: str) -> tuple[int, str]:
         """Exit code and output of a daemon that does not begin."""
         daemon = self.run(*overrides, wait=False)
-        return daemon.process.wait(40), daemon.log.read_text()
+        return daemon.process.wait(PATIENCE_S), daemon.log.read_text()
+
+
+@contextmanager
+def sited(folder: Path) -> Iterator[Site]:
+    """A site on which no daemon is left running."""
+    site = Site(folder)
+    try:
+        yield site
+    finally:
+        for daemon in site.daemons:
+            if daemon.process.poll() is None:
+                daemon.stop()
 
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Site]:
-    site = Site(tmp_path)
-    yield site
-    for daemon in site.daemons:
-        if daemon.process.poll() is None:
-            daemon.stop()
+    with sited(tmp_path) as site:
+        yield site
+
+
+def at_a_site(folder: Path, test: Callable[[Site], None]) -> None:
+    """Runs what a test does by the clock, on a site of its own (see `tests/stalls.py`)."""
+
+    def once() -> None:
+        with sited(Path(mkdtemp(dir=folder))) as site:
+            test(site)
+
+    in_time(once)
 
 
 def published(bag_dir: Path, *, counting: bool) -> Counter[int]:
@@ -150,7 +173,12 @@ def assert_nothing_lost_or_doubled(bag_dir: Path) -> None:
     assert len(stands) == (max(stands) - min(stands)) // PERIOD_NS + 1
 
 
-def test_over_rotations_no_message_is_lost_or_counts_twice(site: Site) -> None:
+def test_over_rotations_no_message_is_lost_or_counts_twice(tmp_path: Path) -> None:
+    at_a_site(tmp_path, over_rotations)
+
+
+def over_rotations(site: Site) -> None:
+    """Both recorders receive within a second what both of them record."""
     daemon = site.run("recording.session_duration_s=2")
     daemon.wait_for("rotated", 3)
     assert daemon.stop() == 0
@@ -201,8 +229,13 @@ def test_a_killed_daemon_takes_its_recorder_with_it_and_the_next_goes_on(site: S
 
 
 def test_one_that_starts_while_the_child_of_a_killed_one_still_closes_waits_for_it(
-    site: Site,
+    tmp_path: Path,
 ) -> None:
+    """Not for ever: it gives up after 15 s."""
+    at_a_site(tmp_path, starts_while_another_closes)
+
+
+def starts_while_another_closes(site: Site) -> None:
     daemon = site.run()
     child = daemon.child
     os.kill(child, signal.SIGSTOP)
@@ -217,7 +250,12 @@ def test_one_that_starts_while_the_child_of_a_killed_one_still_closes_waits_for_
 
 
 @pytest.mark.parametrize("step", ["rotation_begun", "rotated"])
-def test_killed_at_a_rotation_the_next_start_settles_what_counts(site: Site, step: str) -> None:
+def test_killed_at_a_rotation_the_next_start_settles_what_counts(tmp_path: Path, step: str) -> None:
+    at_a_site(tmp_path, partial(killed_at_a_rotation, step))
+
+
+def killed_at_a_rotation(step: str, site: Site) -> None:
+    """Two recorders differ by less than 0.1 s in when they received a message."""
     daemon = site.run("recording.session_duration_s=1")
     daemon.wait_for(step)
     children = [int(event["pid"]) for event in daemon.wait_for("recorder_started", 2)]
@@ -248,7 +286,11 @@ def test_a_disk_with_too_little_room_pauses_recording_within_seconds(site: Site)
     assert daemon.stop() == 0
 
 
-def test_a_robot_that_falls_silent_has_its_last_words_closed(site: Site) -> None:
+def test_a_robot_that_falls_silent_has_its_last_words_closed(tmp_path: Path) -> None:
+    at_a_site(tmp_path, falls_silent)
+
+
+def falls_silent(site: Site) -> None:
     daemon = site.run()
     daemon.wait_for("split_closed", 5)
     site.silent.touch()
@@ -275,7 +317,7 @@ def test_the_service_manager_is_told(site: Site) -> None:
     address = site.folder / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(address))
-        manager.settimeout(40)
+        manager.settimeout(PATIENCE_S)
         site.env |= {"NOTIFY_SOCKET": str(address), "WATCHDOG_USEC": "1000000"}
         daemon = site.run(wait=False)
         assert manager.recv(100) == b"READY=1"

@@ -27,12 +27,13 @@ from ros2_memory.recorder.layout import is_carried
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import NS_PER_S, WallClock
 from tests.bags import McapLayout, odom, write_mcap
-from tests.integration.test_recorder_daemon import Site
+from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving
 from tests.keeping import keeper_of, size_of
 from tests.memories import memory_of
 from tests.questions import ask_everything, write_run
 from tests.split_writer import DOCK
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -94,7 +95,8 @@ class Asker:
         """Waits until every question was asked once more, by what is there at this moment."""
         with self._round:
             before = self.rounds
-            assert self._round.wait_for(lambda: self.rounds >= before + 2, timeout=20), self.wrong
+            asked = self._round.wait_for(lambda: self.rounds >= before + 2, PATIENCE_S)
+            assert asked, self.wrong
 
     def _answered(self, question: Callable[[], object], *, may_lack: bool) -> None:
         try:
@@ -138,7 +140,7 @@ def writer(bag_dir: Path, begin: int) -> Iterator[Callable[[], dict[str, Any]]]:
         try:
             yield step
             orders.close()
-            assert process.wait(timeout=60) == 0
+            assert process.wait(timeout=PATIENCE_S) == 0
         finally:
             process.kill()
 
@@ -185,11 +187,8 @@ def test_the_budget_is_held_while_it_is_recorded_and_asked(tmp_path: Path) -> No
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Site]:
-    site = Site(tmp_path)
-    yield site
-    for daemon in site.daemons:
-        if daemon.process.poll() is None:
-            daemon.stop()
+    with sited(tmp_path) as site:
+        yield site
 
 
 def test_the_daemon_repairs_what_a_crash_left_and_keeps_its_budget(site: Site) -> None:
@@ -276,7 +275,7 @@ def test_a_recorder_that_records_nothing_touches_nothing(old_bags: Path) -> None
     command = [sys.executable, "-m", "ros2_memory.recorder", *GREEDY]
     env = os.environ | {"MEMORY_BAG_DIR": str(old_bags)}
     ran = subprocess.run(
-        [*command, "recording.clear_on_startup=true"], env=env, timeout=60, check=False
+        [*command, "recording.clear_on_startup=true"], env=env, timeout=PATIENCE_S, check=False
     )
     assert ran.returncode == 0
     assert state(old_bags) == before

@@ -8,6 +8,7 @@ import subprocess
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING
 
 import pytest
@@ -25,6 +26,8 @@ from tests.ros_recordings import (
     summary_of,
 )
 from tests.shared_bags import RECORDED, needs_recorded
+from tests.stalls import in_time
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -111,8 +114,10 @@ def test_repeated_signals_kill_it_once_its_files_are_complete(
 ) -> None:
     recording = started["twice"]
     recording.await_splits(2)
-    recording.process.send_signal(signal.SIGTERM)
-    assert recording.stop(signal.SIGINT) == -signal.SIGINT
+    # Both are there before it gets to see the first.
+    for number in (signal.SIGSTOP, signal.SIGTERM, signal.SIGINT):
+        recording.process.send_signal(number)
+    assert recording.stop(signal.SIGCONT) == -signal.SIGINT
     assert all(is_closed(split) for split in recording.splits())
     assert (recording.directory / "metadata.yaml").is_file()
 
@@ -125,7 +130,7 @@ def test_other_signals_leave_the_recording_open(
     recording.await_splits(2)
     wait_for(lambda: is_closed(recording.splits()[0]), "the first split's footer")
     assert recording.stop(number) == -number
-    assert is_closed(recording.splits()[-2])
+    assert is_closed(recording.splits()[0])
     assert recording.splits()[-1].stat().st_size == 0
     assert not (recording.directory / "metadata.yaml").exists()
 
@@ -134,7 +139,11 @@ def test_other_signals_leave_the_recording_open(
 def test_a_signal_at_the_very_beginning_kills_it_before_it_has_a_directory(
     env: dict[str, str], tmp_path: Path, number: signal.Signals
 ) -> None:
-    with Recording(env, tmp_path / "a", "-e", "/odom") as recording:
+    in_time(lambda: kill_at_once(env, Path(mkdtemp(dir=tmp_path)), number))
+
+
+def kill_at_once(env: dict[str, str], folder: Path, number: signal.Signals) -> None:
+    with Recording(env, folder / "a", "-e", "/odom") as recording:
         assert recording.stop(number) == -number
     assert not recording.directory.exists()
 
@@ -162,7 +171,7 @@ def test_its_help_exits_with_0_and_an_unknown_option_with_2(quiet: dict[str, str
 def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     with Recording(quiet, tmp_path / "a", "-e", "/odom") as recording:
-        assert recording.process.wait(timeout=20) == 1
+        assert recording.process.wait(timeout=PATIENCE_S) == 1
     said = f"[ERROR] [ros2bag]: Output folder '{tmp_path / 'a'}' already exists.\n"
     assert recording.said == said
 
@@ -275,7 +284,7 @@ def test_a_directory_that_vanishes_aborts_it_at_the_next_split(
     recording = started["moved"]
     recording.await_subscribed("/odom")
     recording.directory.rename(recording.directory.with_name("elsewhere"))
-    assert recording.process.wait(timeout=20) == -signal.SIGABRT
+    assert recording.process.wait(timeout=PATIENCE_S) == -signal.SIGABRT
 
 
 def test_closed_splits_that_vanish_do_not_disturb_it(started: dict[str, Recording]) -> None:
@@ -311,12 +320,13 @@ def test_a_full_disk_is_no_error_and_it_goes_on_once_there_is_room(
             recording.await_splits(3)
             sizes = [split.stat().st_size for split in recording.splits()]
             ballast.unlink()
-            recording.await_splits(5)
+            full = len(recording.splits())
+            recording.await_splits(full + 2)
             assert recording.stop() == 0
         assert sizes[0] % 4096 == 0
-        assert sizes[1:] == [0, 0]
+        assert set(sizes[1:]) == {0}
         assert not is_closed(recording.splits()[1])
-        assert is_closed(recording.splits()[3])
+        assert is_closed(recording.splits()[full])
         assert "ERROR" not in recording.said
     finally:
         subprocess.run(["umount", str(disk)], check=True)

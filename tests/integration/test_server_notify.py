@@ -9,11 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.waiting import PATIENCE_S
+
 
 def test_it_is_ready_when_it_listens_and_says_when_it_stops(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
-        manager.settimeout(40)
+        manager.settimeout(PATIENCE_S)
         env = {
             **os.environ,
             "NOTIFY_SOCKET": str(tmp_path / "notify"),
@@ -26,4 +28,4 @@ def test_it_is_ready_when_it_listens_and_says_when_it_stops(tmp_path: Path) -> N
             assert manager.recv(100) == b"READY=1"
             server.send_signal(signal.SIGTERM)
             assert manager.recv(100) == b"STOPPING=1"
-            assert server.wait(20) == 0
+            assert server.wait(PATIENCE_S) == 0

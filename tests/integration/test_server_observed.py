@@ -23,6 +23,7 @@ from tests.integration.test_server_process import (
     serving,
 )
 from tests.questions import ask, write_run
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -40,7 +41,7 @@ def bag_dir(tmp_path: Path) -> Path:
 
 
 def get(served: Served, path: str, headers: dict[str, str]) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=PATIENCE_S)
     try:
         connection.request("GET", path, headers=headers)
         response = connection.getresponse()
@@ -156,7 +157,7 @@ def refused(bag_dir: Path, program: list[str]) -> str:
         capture_output=True,
         text=True,
         check=False,
-        timeout=60,
+        timeout=PATIENCE_S,
     )
     assert ended.returncode == 2
     assert ended.stdout == ""
@@ -200,6 +201,6 @@ def test_a_server_that_is_not_observed_loads_nothing_for_it(bag_dir: Path) -> No
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=PATIENCE_S,
     )
     assert ended.stdout == "[]\n"

@@ -9,7 +9,7 @@ from collections import Counter
 from contextlib import suppress
 from functools import partial
 from itertools import chain, count
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from mcp import Client
 from mcp.client.sse import sse_client
@@ -29,10 +29,16 @@ LONG: Final = ("get_topic_in_range", {"topic": "/odom", "start": 0, "end": 2e9})
 MOST_CALLS_UNREAD: Final = 4000
 
 
+def transports(port: int) -> tuple[Any, str]:
+    """Both, as the SDK's client takes them."""
+    url = f"http://127.0.0.1:{port}"
+    return sse_client(f"{url}/sse", timeout=BOUND_S), f"{url}/mcp"
+
+
 async def all_tools(port: int) -> Seen:
     """Every tool, by the SDK's client, over both transports."""
     seen: Seen = Counter()
-    for transport in (sse_client(f"http://127.0.0.1:{port}/sse"), f"http://127.0.0.1:{port}/mcp"):
+    for transport in transports(port):
         async with Client(transport) as client:
             for name, given, key in ANSWERED:
                 told, is_error = await ask(client, name, given)
@@ -52,7 +58,7 @@ async def many_calls_at_once(port: int) -> Seen:
         assert not is_error or told["error"] in {"busy", "timeout"}, told
         seen["busy" if is_error else "answered"] += 1
 
-    for transport in (sse_client(f"http://127.0.0.1:{port}/sse"), f"http://127.0.0.1:{port}/mcp"):
+    for transport in transports(port):
         async with Client(transport) as client, asyncio.timeout(BOUND_S):
             await asyncio.gather(*(one(client, number) for number in range(64)))
     return seen

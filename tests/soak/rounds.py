@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from tests.soak import clients
 from tests.soak.server import Held
+from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -105,7 +106,7 @@ async def _watch(served: Served, soak: Soak) -> None:
 def _settled(served: Served) -> Held:
     """What it holds when nothing has changed for a while: connections of the warm-up are over."""
     alike, held = 0, served.held()
-    give_up = time.monotonic() + 30
+    give_up = time.monotonic() + PATIENCE_S
     while alike < 20 and time.monotonic() < give_up:
         time.sleep(0.1)
         before, held = held, served.held()

@@ -47,7 +47,7 @@ class Served:
                 if line.endswith("\n"):
                     yield json.loads(line)
 
-    def came_back_to(self, start: Held, within_s: float = 30.0) -> Held:
+    def came_back_to(self, start: Held) -> Held:
         """Waits until there are no more files and threads than there were at the start."""
 
         def back() -> Held | None:
@@ -55,7 +55,7 @@ class Served:
             return held if held.files <= start.files and held.threads <= start.threads else None
 
         try:
-            return until(back, timeout_s=within_s)
+            return until(back)
         except AssertionError:
             raise AssertionError(f"{start} at the start, and {self.held()} at the end") from None
 
@@ -77,7 +77,7 @@ def serving(bag_dir: Path, log: Path, *overrides: str) -> Iterator[Served]:
             ports = [each["port"] for each in served.events() if each["event"] == "listening"]
             return ports[0] if ports else None
 
-        served.port = until(port, timeout_s=60.0)
+        served.port = until(port)
         yield served
     finally:
         process.kill()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING
 
 from tests.questions import write_run
 from tests.soak.clients import slow_loris
 from tests.soak.rounds import SHORT, soaked
 from tests.soak.server import serving
+from tests.stalls import in_time
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -21,10 +23,15 @@ GROWTH_MB = 24.0
 MOST_THREADS = 24
 
 
-async def test_bad_clients_leave_no_files_threads_or_memory_behind(tmp_path: Path) -> None:
+def test_bad_clients_leave_no_files_threads_or_memory_behind(tmp_path: Path) -> None:
+    """A client that is refused has a second to read why."""
     write_run(tmp_path / "bags")
+    in_time(lambda: soak_once(tmp_path))
+
+
+def soak_once(tmp_path: Path) -> None:
     with serving(tmp_path / "bags", tmp_path / "log") as served:
-        soak = await soaked(served, SECONDS, slow=(slow_loris,))
+        soak = asyncio.run(soaked(served, SECONDS, slow=(slow_loris,)))
         events = list(served.events())
     assert soak.end is not None
     assert soak.most is not None

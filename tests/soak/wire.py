@@ -8,10 +8,12 @@ import socket
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Final
 
+from tests.waiting import PATIENCE_S
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-BOUND_S: Final = 120.0
+BOUND_S: Final = PATIENCE_S
 """No client waits longer: that is a hang."""
 
 _HEADERS: Final = (
