@@ -10,10 +10,12 @@ from contextlib import closing
 from typing import TYPE_CHECKING
 
 import pytest
+import yaml
 
 from ros2_memory import cli
 from ros2_memory.catalogue import FILE, FOLDER
 from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.recorder.lock import BagDirLock
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import NS_PER_S
@@ -188,3 +190,66 @@ def test_without_a_window_nothing_is_forgotten(bag_dir: Path, capsys: Capture) -
 def test_of_an_empty_window_it_says_so(bag_dir: Path, capsys: Capture) -> None:
     assert forget(-100, -50, "--yes") == 0
     assert "no closed bag" in capsys.readouterr().out
+
+
+class TestMetadata:
+    @pytest.fixture
+    def metadata(self, bag_dir: Path) -> Path:
+        """That of the first recording, as its recorder would have left it."""
+        starts = [T0, T0 + 20 * NS_PER_S]
+        counts = {"/odom": 20, "/chatter": 2, "/tf_static": 1}
+        info = {
+            "version": 5,
+            "storage_identifier": "mcap",
+            "duration": {"nanoseconds": 29 * NS_PER_S},
+            "starting_time": {"nanoseconds_since_epoch": T0},
+            "message_count": 23,
+            "topics_with_message_count": [
+                {"topic_metadata": {"name": name}, "message_count": count}
+                for name, count in counts.items()
+            ],
+            "relative_file_paths": ["rec_0.mcap", "rec_1.mcap"],
+            "files": [
+                {
+                    "path": f"rec_{number}.mcap",
+                    "starting_time": {"nanoseconds_since_epoch": start},
+                    "duration": {"nanoseconds": 9 * NS_PER_S},
+                    "message_count": 12 - number,
+                }
+                for number, start in enumerate(starts)
+            ],
+        }
+        path = bag_dir / "rec_0" / "metadata.yaml"
+        path.write_text(yaml.safe_dump({"rosbag2_bagfile_information": info}))
+        return path
+
+    def test_it_lists_what_is_left(self, metadata: Path, capsys: Capture) -> None:
+        assert forget(0, 15, "--yes") == 0
+        info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+        assert (info["relative_file_paths"], info["message_count"]) == (["rec_1.mcap"], 11)
+        assert "rec_0/metadata.yaml lists what is left" in capsys.readouterr().out
+
+    def test_where_that_cannot_be_it_says_so_and_what_to_do(
+        self, metadata: Path, capsys: Capture
+    ) -> None:
+        metadata.write_text(metadata.read_text().replace("message_count: 12", "message_count: 13"))
+        before = metadata.read_text()
+        assert forget(0, 15, "--yes") == 0
+        told = capsys.readouterr().out
+        assert "rec_0/metadata.yaml still lists what was deleted (its numbers" in told
+        assert f"ros2 bag reindex {metadata.parent}" in told
+        assert metadata.read_text() == before
+
+    def test_that_of_a_recording_that_is_being_written_is_its_recorders(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        now = time.time_ns()
+        beat = Heartbeat(1, now, RecorderState.RECORDING, ("rec_0",), now, 0, (), (), None, 2.0)
+        write_heartbeat(bag_dir, beat)
+        assert forget(20, 35, "--yes") == 0
+        assert "rec_0/metadata.yaml will list what was deleted" in capsys.readouterr().out
+
+    def test_a_dry_run_leaves_it(self, metadata: Path) -> None:
+        before = metadata.read_text()
+        assert forget(0, 15, "--dry-run") == 0
+        assert metadata.read_text() == before

@@ -1,6 +1,7 @@
 """`ros2-memory forget`: deletes the bags of a time window, by the means of retention."""
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from ros2_memory.adapters import build_reader
 from ros2_memory.catalogue import BagKey
 from ros2_memory.cli.opening import opened
 from ros2_memory.cli.running import NOT_SO, BagDir, Overrides, Verbose, busy, reporting, say
@@ -19,12 +21,14 @@ from ros2_memory.memory import Memory
 from ros2_memory.model import BagFile, BagState, TimeWindow
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.latched import Carrier
-from ros2_memory.recorder.layout import MOMENTS_FOLDER
+from ros2_memory.recorder.layout import METADATA_FILE, MOMENTS_FOLDER
 from ros2_memory.recorder.lock import BagDirLock
+from ros2_memory.recorder.metadata import take_out
 from ros2_memory.recorder.removal import Inode, remove_bag, remove_emptied
 from ros2_memory.recorder.scan import other_form
 from ros2_memory.recorder.snapshot import Snapshot
 from ros2_memory.settings import NullRecorderNode
+from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.timebase import unix_from_ns
 from ros2_memory.wording import counted
@@ -85,7 +89,8 @@ def forget(
             say(f"to be deleted: {_told(plan)}")
             if not yes:
                 typer.confirm("Delete them? This cannot be undone.", abort=True)
-            stays += _forgotten(settings.recording.bag_dir, memory, plan, carrier)
+            counts = _counts(build_reader(settings), plan.doomed)
+            stays += _forgotten(settings.recording.bag_dir, memory, plan, carrier, counts)
     if stays:
         raise typer.Exit(NOT_SO)
 
@@ -146,7 +151,27 @@ def _named(path: Path, bag_dir: Path) -> str:
     return str(path.relative_to(bag_dir)) if path.is_relative_to(bag_dir) else str(path)
 
 
-def _forgotten(bag_dir: Path, memory: Memory, plan: Plan, carrier: Carrier) -> list[str]:
+def _counts(reader: BagReader, doomed: Sequence[BagFile]) -> dict[Path, Counter[str]]:
+    """How many messages of which topic each file holds, also those that do not count.
+
+    For metadata.yaml; of one that cannot be read there is nothing, and then that stays.
+    """
+    counts: dict[Path, Counter[str]] = {}
+    for bag in doomed:
+        with suppress(BagError):
+            held = counts.setdefault(bag.path, Counter())
+            for topic in reader.summarize(bag.path).topics:
+                held[topic.topic] += topic.count
+    return counts
+
+
+def _forgotten(
+    bag_dir: Path,
+    memory: Memory,
+    plan: Plan,
+    carrier: Carrier,
+    counts: Mapping[Path, Counter[str]],
+) -> list[str]:
     """Deletes what was planned, as far as it is still so; what stays all the same, and why.
 
     A recorder that runs carries latched messages itself, and nobody else may beside it. Bags with
@@ -170,6 +195,7 @@ def _forgotten(bag_dir: Path, memory: Memory, plan: Plan, carrier: Carrier) -> l
                 for bag in sorted(latched)
             ]
         removal.remove(doomed)
+        notes = removal.correct_metadata(counts)
     say(
         f"deleted: {counted(removal.bags, 'bag')}, {removal.freed / _MB:.1f} MB"
         f"{'' if carried is None else f'; {_carried(carried)} on'}"
@@ -177,6 +203,8 @@ def _forgotten(bag_dir: Path, memory: Memory, plan: Plan, carrier: Carrier) -> l
     stays += removal.faults
     for line in stays:
         say(f"stays: {line}")
+    for line in notes:
+        say(line)
     return stays
 
 
@@ -240,6 +268,7 @@ class _Removal:
     bags: int = 0
     freed: int = 0
     faults: list[str] = field(default_factory=list)
+    gone: list[BagFile] = field(default_factory=list)
 
     def carry(self, carrier: Carrier, snapshot: Snapshot, doomed: Sequence[BagFile]) -> int | None:
         """Carries latched messages on; how many, where their bag was written anew.
@@ -261,6 +290,7 @@ class _Removal:
             else:
                 gone.append(bag)
         self.bags += len(gone)
+        self.gone += gone
         heartbeat = read_heartbeat(self.bag_dir).heartbeat
         named = {self.bag_dir / name for name in heartbeat.recordings} if heartbeat else set()
         for recording in {bag.recording for bag in gone} - named:
@@ -271,6 +301,34 @@ class _Removal:
         if self.memory.recall is not None:
             paths = [BagKey.of(bag, self.bag_dir).path for bag in gone]
             self.memory.recall.catalogue.forget(paths)
+
+    def correct_metadata(self, counts: Mapping[Path, Counter[str]]) -> list[str]:
+        """Has metadata.yaml of each recording list what is left of it; what there is to say.
+
+        That of a recording that is being written is its recorder's, who writes it at the end.
+        """
+        heartbeat = read_heartbeat(self.bag_dir).heartbeat
+        open_ones = {self.bag_dir / name for name in heartbeat.recordings} if heartbeat else set()
+        said = []
+        for recording in sorted({bag.recording for bag in self.gone}):
+            name = f"{_named(recording, self.bag_dir)}/{METADATA_FILE}"
+            if recording in open_ones and not (recording / METADATA_FILE).exists():
+                said.append(f"{name} will list what was deleted: its recorder writes it at the end")
+                continue
+            gone = {
+                bag.path.name: counts.get(bag.path, Counter[str]())
+                for bag in self.gone
+                if bag.recording == recording
+            }
+            try:
+                if take_out(recording, gone):
+                    said.append(f"{name} lists what is left")
+            except (OSError, ValueError) as error:
+                said.append(
+                    f"{name} still lists what was deleted ({error}); rosbag2 opens the folder "
+                    f"after `ros2 bag reindex {recording}`"
+                )
+        return said
 
     def _delete(self, bag: BagFile) -> None:
         for path in (bag.path, Path(other_form(bag.file))):
