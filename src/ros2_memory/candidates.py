@@ -19,25 +19,27 @@ if TYPE_CHECKING:
     from ros2_memory.history import View
     from ros2_memory.model import BagFile
     from ros2_memory.recall import RunNotes
-    from ros2_memory.recorder.timeline import Run
+    from ros2_memory.recorder.runs import Run
     from ros2_memory.timebase import Ns
 
 """Of a bag of a run that is ruled out as a whole."""
 
 
 class Stretch(NamedTuple):
-    """A half-open span of time and the files in it that are not ruled out."""
+    """A half-open span of time, and what in it is not ruled out: the topics, and the files."""
 
     window: TimeWindow
+    topics: tuple[str, ...]
     bags: frozenset[str]
     recordings: frozenset[Path]
 
 
 class _Candidate(NamedTuple):
-    """A bag that may hold a match between two log times (inclusive)."""
+    """A bag that may hold a match on a topic between two log times (inclusive)."""
 
     first: Ns
     last: Ns
+    topic: str
     bag: BagFile
 
 
@@ -104,7 +106,7 @@ class Candidates:
                 continue
             number = known.get(bag.file)
             if number is None or number in possible:
-                yield _Candidate(first, last, bag)
+                yield _Candidate(first, last, topic, bag)
             else:
                 self.ruled_out = True
 
@@ -123,6 +125,7 @@ def _stretch(group: Sequence[_Candidate], start: Ns, until: Ns) -> Stretch:
     bags = [each.bag for each in group]
     return Stretch(
         TimeWindow(start, stop),
+        tuple(sorted({each.topic for each in group})),
         frozenset(bag.file for bag in bags),
         frozenset(bag.recording for bag in bags),
     )

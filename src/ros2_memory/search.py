@@ -121,16 +121,17 @@ class Search:
     def _messages(self, stretch: Stretch) -> Iterator[Found]:
         """The messages of a stretch, newest first.
 
-        Of bags that are ruled out those are read which may hold the original of a copy.
+        Of bags that are ruled out those are read which may hold the original of a copy. Of topics
+        none is: a stretch of a topic may be as short as a message, and there may be thousands.
         """
         window = stretch.window
         wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
         among = [
             held
-            for held in self._view.holdings(self.topics, wider)
+            for held in self._view.holdings(stretch.topics, wider)
             if held.bag.file in stretch.bags or stretch.recordings != {held.bag.recording}
         ]
-        return self._view.stream(self.topics, window, newest_first=True, among=among)
+        return self._view.stream(stretch.topics, window, newest_first=True, among=among)
 
     def matches(self, found: Found) -> bool:
         """Whether a message meets the condition; one that cannot be decoded does not."""

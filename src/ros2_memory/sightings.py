@@ -8,7 +8,7 @@ may speak only of what it sees.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import OrderedDict, deque
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Final
@@ -147,10 +147,14 @@ def _gather(
     candidates = search.candidates(window.stop)
     before = window.stop
     try:
-        for part in _parts(view, search.topics, candidates.stretches(), window):
+        for part, topics in _parts(view, search.topics, candidates.stretches(), window):
+            runs.end_silent(part.stop)
             _pass_over(view, runs, TimeWindow(part.stop, max(before, part.stop)))
-            for found in view.stream(search.topics, part, newest_first=True):
+            # There may be thousands of topics: read are those that can begin a row or end one.
+            bearing = sorted({*topics, *runs.under_way()})
+            for found in view.stream(bearing, part, newest_first=True):
                 before = found.time
+                runs.end_silent(found.time)
                 if search.matches(found):
                     runs.add(found)
                 else:
@@ -200,17 +204,14 @@ class _Runs:
         self._limit = limit
         self._oldest_first = oldest_first
         self._kept: deque[_Run] = deque(maxlen=limit if oldest_first else None)
-        self._open: dict[str, _Run] = {}
+        self._open: OrderedDict[str, _Run] = OrderedDict()  # the one longest without a match first
         self.count = 0
         self.cut = False
 
     def add(self, found: Found) -> None:
-        """Takes the next older match."""
+        """Takes the next older match; rows that ended in silence before it have been ended."""
         topic = found.record.channel.topic
         run = self._open.get(topic)
-        if run is not None and run.first - found.time > SILENCE_NS:
-            self.end(topic)
-            run = None
         if run is None:
             self._open[topic] = run = _Run(found, found.time)
             self._kept.append(run)
@@ -218,6 +219,15 @@ class _Runs:
         else:
             run.first = found.time
             run.messages += 1
+            self._open.move_to_end(topic)
+
+    def end_silent(self, until: Ns) -> None:
+        """Ends the rows in which no message from before a moment can be."""
+        while self._open:
+            run = next(iter(self._open.values()))
+            if run.first - until <= SILENCE_NS:
+                return
+            self.end(run.newest.record.channel.topic)
 
     def end(self, topic: str) -> None:
         """What comes next of the topic belongs to another row."""
@@ -248,18 +258,18 @@ class _Runs:
 
 def _parts(
     view: View, topics: Sequence[str], stretches: Iterator[Stretch], window: TimeWindow
-) -> Iterator[TimeWindow]:
-    """The parts of a window in which there may be matches, newest first."""
+) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
+    """The parts of a window in which topics may have matches, and these, newest first."""
     if view.received_twice(topics):
         # What ends a row may be a copy of a message in a bag that is ruled out.
-        yield window
+        yield window, topics
         return
     for stretch in stretches:
         if stretch.window.stop <= window.start:
             return
         part = stretch.window.intersect(window)
         if not part.empty:
-            yield part
+            yield part, stretch.topics
 
 
 def _any_between(view: View, topic: str, gap: TimeWindow) -> bool:

@@ -15,6 +15,7 @@ from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.memory import Call
 from ros2_memory.moments import Span
 from ros2_memory.replies import Replies
+from ros2_memory.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import NS_PER_S, Deadline
 from tests.bags import Msg, boolean, detections, odom, write_mcap
@@ -203,3 +204,40 @@ def test_a_catalogue_that_is_gone_in_the_middle_changes_no_answer(bag_dir: Path)
         assert last(memory, "contains", wanted) == last(
             replace(memory, recall=None), "contains", wanted
         )
+
+
+class Topical(McapReader):
+    """Counts of how many topics messages were asked for, over all reads."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = 0
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        self.asked += len(topics)
+        return super().records(path, topics, window, newest_first=newest_first)
+
+
+@pytest.mark.parametrize("tool", ["find_last_match", "find_matches"])
+def test_a_search_of_many_short_topics_reads_each_where_it_has_messages(
+    tmp_path: Path, tool: str
+) -> None:
+    count = 60
+    write_mcap(
+        tmp_path / "bag.mcap",
+        [boolean(T0 + nth * NS_PER_S, True, topic=f"/door_{nth:02}") for nth in range(count)],
+    )
+    reader = Topical()
+    memory = memory_of(tmp_path, reader=reader)
+    if tool == "find_last_match":
+        assert queries.find_last_match(memory, Call(), "/*", "equals", False).found is None
+    else:
+        assert not find_matches(memory, Call(), "/*", "equals", False).sightings
+    assert reader.asked <= 2 * count
