@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ros2_memory.copies import Found
     from ros2_memory.history import View
     from ros2_memory.model import BagFile
-    from ros2_memory.recorder.timeline import Run
+    from ros2_memory.recorder.runs import Run
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment dynamic transforms are read; the last is as far as tf2 remembers."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import BagFile
     from ros2_memory.recall import RunNotes
-    from ros2_memory.recorder.timeline import Run
+    from ros2_memory.recorder.runs import Run
     from ros2_memory.storage.base import Channel, Record
     from ros2_memory.timebase import Ns
 

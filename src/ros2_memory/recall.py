@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ros2_memory.evidence import Evidence
     from ros2_memory.model import BagFile
     from ros2_memory.motion import PoseDigest
-    from ros2_memory.recorder.timeline import Run
+    from ros2_memory.recorder.runs import Run
     from ros2_memory.rests import RestDigest
     from ros2_memory.storage.base import Record
     from ros2_memory.stories import Story

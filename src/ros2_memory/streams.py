@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import BagFile
-    from ros2_memory.recorder.timeline import Run
+    from ros2_memory.recorder.runs import Run
     from ros2_memory.timebase import Ns
 
 RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S

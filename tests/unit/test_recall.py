@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.memory import Memory
-    from ros2_memory.recorder.timeline import Run
+    from ros2_memory.recorder.runs import Run
 
 T0 = 1_700_000_000 * 10**9
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.model import BagFile, SetAside
     from ros2_memory.recorder.clock_faults import Dating
-    from ros2_memory.recorder.timeline import Run, Timeline
+    from ros2_memory.recorder.runs import Run
+    from ros2_memory.recorder.timeline import Timeline
     from ros2_memory.timebase import Ns
 
 

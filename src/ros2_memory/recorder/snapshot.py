@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.model import BagFile, SetAside, TimeWindow
     from ros2_memory.recorder.clock_faults import ClockFault, Dating
-    from ros2_memory.recorder.timeline import Extent, Held, Run, Span, Stated
+    from ros2_memory.recorder.runs import Extent, Held, Run, Span, Stated
     from ros2_memory.timebase import Ns
 
 __all__ = ["RUN_LIMIT", "Snapshot", "Timeline"]
