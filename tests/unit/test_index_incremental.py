@@ -59,12 +59,14 @@ class World:
     """A bag directory in which things happen; every mtime is that of the hand-moved clock.
 
     `held` keeps what was written open: the inode of a file that has gone would be the next one's,
-    which then looks like the same file, grown.
+    which then looks like the same file, grown. And who sees a file grow cannot tell that it grew
+    long before, as a fresh index does by the mtime: no time passes before that is seen.
     """
 
     def __init__(self, root: Path, held: ExitStack) -> None:
         self.root = root
         self._held = held
+        self._grown = False
         self.clock = HandClock()
         self.index = self.fresh_index()
         self.index.refresh()
@@ -77,13 +79,20 @@ class World:
         path = self.root / place
         assert path.is_relative_to(self.root)
         if deed == "wait":
+            if self._grown:
+                self._scan()
             self.clock.at += round(WAITS_S[number] * S)
         elif deed == "scan":
-            self.index.refresh()
+            self._scan()
         else:
+            self._grown |= deed in {"grow", "close", "overwrite"}
             path.parent.mkdir(parents=True, exist_ok=True)
             self._deeds()[deed](path, number)
             self._stamp(path)
+
+    def _scan(self) -> None:
+        self.index.refresh()
+        self._grown = False
 
     def _deeds(self) -> dict[str, Callable[[Path, int], None]]:
         return {
