@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 import yaml
 from pydantic import TypeAdapter
 
+from ros2_memory.cli.app import COMMANDS
+from ros2_memory.cli.exits import EVERYWHERE, EXITS
 from ros2_memory.recorder import journal
 from ros2_memory.recorder.output import Said
 from ros2_memory.settings import Ros2BagNode, Rosbag2Node, Settings
@@ -65,6 +67,17 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join(
         "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
     )
+
+
+def told_exits() -> str:
+    """Each command, what it is for, and what its exit codes say."""
+    common = "; ".join(f"{code}: {why}" for code, why in EVERYWHERE.items())
+    rows = [
+        (f"`{name}`", purpose, "; ".join(f"{code}: {why}" for code, why in EXITS[name].items()))
+        for name, (_, purpose) in COMMANDS.items()
+    ]
+    columns = ("command", "what it is for", "exit code")
+    return f"{table(columns, rows)}\n\nWhere nothing else is said, {common}."
 
 
 def told_tools(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:

@@ -12,7 +12,9 @@ import pytest
 import yaml
 
 from ros2_memory import cli
+from ros2_memory.cli.app import COMMANDS
 from ros2_memory.cli.asking import complete, parsed
+from ros2_memory.cli.exits import epilog
 from ros2_memory.cli.showing import cell, plain
 from ros2_memory.errors import InvalidArgumentsError
 from ros2_memory.timebase import NS_PER_S
@@ -246,6 +248,13 @@ class TestTheProgram:
         assert cli.main(["topics", "-v", "logging.level=warning"]) == 0
         told = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
         assert [each["event"] for each in told] == ["bag_damaged", "bag_damaged"]
+
+    @pytest.mark.parametrize("command", COMMANDS)
+    def test_the_help_of_every_command_says_what_its_exit_codes_mean(
+        self, capsys: Capture, command: str
+    ) -> None:
+        assert cli.main([command, "--help"]) == 0
+        assert " ".join(capsys.readouterr().out.split()).endswith(epilog(command))
 
     def test_it_tells_its_version(self, capsys: Capture) -> None:
         assert cli.main(["--version"]) == 0

@@ -93,6 +93,10 @@ def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
         assert told[each.uri] == f"`{each.tool}`"
 
 
+def test_every_command_stands_there_with_its_exit_codes() -> None:
+    compare("commands", "exits", reference.told_exits())
+
+
 def test_every_log_event_stands_there_with_its_fields() -> None:
     expected = reference.told_events(page("log-events"))
     compare("log-events", "events", expected)

@@ -62,7 +62,7 @@ def ask(
     """Ask any tool of the query server, without a server.
 
     Values are JSON where they read as such (seconds_ago=10, value=true), else text. With --json
-    the reply is exactly what an MCP client receives. The exit code is 1 where there is no answer.
+    the reply is exactly what an MCP client receives.
     """
     with reporting("ask"):
         chosen = settings_for(bag_dir, settings)

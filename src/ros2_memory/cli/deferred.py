@@ -9,6 +9,8 @@ import typer
 from typer.core import TyperCommand
 from typer.main import get_group
 
+from ros2_memory.cli.exits import epilog
+
 if TYPE_CHECKING:
     from typer._click import Command, Context  # of which Typer has no public names
 
@@ -42,7 +44,7 @@ class Deferred(TyperCommand):
         found: object = getattr(import_module(module), attribute)
         holder = typer.Typer(add_completion=False, rich_markup_mode=None)
         if isinstance(found, typer.Typer):
-            holder.add_typer(found, name=self._name)
+            holder.add_typer(found, name=self._name, epilog=epilog(self._name))
         elif callable(found):
-            holder.command(self._name)(found)
+            holder.command(self._name, epilog=epilog(self._name))(found)
         return get_group(holder).commands[self._name]

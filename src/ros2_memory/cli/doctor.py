@@ -30,8 +30,7 @@ def doctor(
 ) -> None:
     """Check configuration, disk, clock, bags, recorder, ROS environment, topics and server.
 
-    Each finding says what to do. The exit code is 0 where all is in order, 1 where something wants
-    attention, 2 where something does not work.
+    Each finding says what to do.
     """
     with reporting("doctor"):
         found = [*examined(bag_dir, overrides, verbose=verbose)]

@@ -74,8 +74,7 @@ def export(
     """Copy a time window out of the memory, each message once.
 
     MCAP has the original messages, definitions, log and publish times. Parquet has one row for a
-    message: what it says as JSON, and its pose in columns. Needs ros2-memory[parquet]. The exit
-    code is 1 where something of the window could not be read; stderr says what.
+    message: what it says as JSON, and its pose in columns. Needs ros2-memory[parquet].
     """
     with reporting("export"):
         if (mcap is None) == (parquet is None):

@@ -53,7 +53,7 @@ def forget(
 
     What reaches beyond it stays, and so does what is being written; both are named. Latched
     messages (maps, static transforms) that later answers need are carried on. Only where this
-    deployment records. The exit code is 1 where something in the window stays.
+    deployment records.
     """
     with reporting("forget"):
         settings = settings_for(bag_dir, overrides)

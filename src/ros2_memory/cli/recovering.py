@@ -24,8 +24,7 @@ def recover(
     """Repair MCAP files that a crash, a full disk or a pulled plug left unfinished.
 
     Rewrites each from all that can be read of it, in place: the original stays until the whole one
-    has been read back and is on the disk. Files of 0 bytes are removed. The exit code is 1 if a
-    file could not be repaired.
+    has been read back and is on the disk. Files of 0 bytes are removed.
     """
     with reporting("recover"):
         outcome = recover_files(path, say, force=force)
