@@ -10,6 +10,7 @@ from typing import Annotated, Final
 import typer
 import yaml
 
+from ros2_memory.cli.exits import epilog
 from ros2_memory.cli.running import BagDir, Overrides, reporting, say
 from ros2_memory.cli.settling import explained_for
 from ros2_memory.cli.showing import plain
@@ -25,7 +26,7 @@ config = typer.Typer(
 )
 
 
-@config.command("show")
+@config.command("show", epilog=epilog("config"))
 def config_show(
     overrides: Overrides = None,
     bag_dir: BagDir = None,
