@@ -237,6 +237,9 @@ class Robot:
 
     def drive(self, hz: float, duration_s: float) -> None:
         """Publishes for `duration_s` of the robot's time, or until a signal, and leaves."""
+        for topic in self._publishers:
+            # The first of its type is slow to make.
+            Messages(0).payload(topic, 0.0)
         t0 = time.time_ns() // 10**6 * 10**6
         begin = time.monotonic()
         messages, published = Messages(t0), Counter[str]()

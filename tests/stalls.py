@@ -34,8 +34,8 @@ LATE_S: Final = 0.1
 WAITED: Final = 0.5
 """Nor did one that was ready to run, and did not, for more than this part of a second."""
 TICK_S: Final = 0.05
-BROKEN: Final = (AssertionError, subprocess.TimeoutExpired)
-"""What a judgement by the clock raises, and a program that does not end in time."""
+BROKEN: Final = (AssertionError, TimeoutError, subprocess.TimeoutExpired)
+"""What a judgement by the clock raises, what waits in vain, and a program that does not end."""
 DRIVES: Final = 3
 """How often a drive is driven at most."""
 NAMED: Final = 3
@@ -81,9 +81,9 @@ class Watch:
         """A judgement by the clock: one that fails is skipped where programs were kept waiting."""
         try:
             yield
-        except BROKEN as error:
+        except Exception as error:
             starved = self.starved
-            if starved is None:
+            if starved is None or not _is_broken_promise(error):
                 raise
             broken = str(error).partition("\n")[0]
             pytest.skip(f"{starved}, in each of {DRIVES} drives; at last: {broken}")
@@ -122,50 +122,54 @@ def driven(
     """What came of a drive: of the first that is good, or that the machine let run in time.
 
     After `DRIVES` of them it is the last one, whatever it is: the tests' judgements by the clock
-    then stand within `excusing`.
+    then stand within `excusing`. One that breaks off is driven again, excused and blamed likewise.
 
     Args:
         drive: drives once, and may tell the watch how late its programs were.
         judge: raises one of `BROKEN` where a promise by the clock was broken.
         watched: what gives a drive its watch.
     """
-    for _ in range(DRIVES - 1):
+    left = DRIVES
+    while True:
+        left -= 1
+        broken: Exception | None = None
         with watched() as watch:
-            found = drive(watch)
-        if watch.starved is None or _is_good(judge, found):
+            try:
+                found = drive(watch)
+            except Exception as error:
+                if not _is_broken_promise(error):
+                    raise
+                broken = error
+        last = watch.starved is None or not left
+        if broken is not None and last:
+            with watch.excusing():
+                raise broken
+        if broken is None and (last or _is_good(judge, found)):
             return found
-    with watched() as watch:
-        return drive(watch)
 
 
 def in_time(
     test: Callable[[], None], watched: Callable[[], AbstractContextManager[Watch]] = watching
 ) -> None:
     """Runs what a test does by the clock, from its first step; again where it was kept waiting."""
-
-    def attempted(watch: Watch) -> tuple[Watch, Exception | None]:
-        try:
-            test()
-        except BROKEN as error:
-            return watch, error
-        return watch, None
-
-    watch, broken = driven(attempted, lambda found: _raise(found[1]), watched)
-    with watch.excusing():
-        _raise(broken)
-
-
-def _raise(broken: Exception | None) -> None:
-    if broken is not None:
-        raise broken
+    driven(lambda _: test(), lambda _: None, watched)
 
 
 def _is_good(judge: Callable[[T], object], found: T) -> bool:
     try:
         judge(found)
-    except BROKEN:
+    except Exception as error:
+        if not _is_broken_promise(error):
+            raise
         return False
     return True
+
+
+def _is_broken_promise(error: Exception) -> bool:
+    """Also of several tasks of which each came to such an end."""
+    if isinstance(error, ExceptionGroup):
+        return error.split(BROKEN)[1] is None
+    return isinstance(error, BROKEN)
 
 
 def _started(*more: str, own_session: bool) -> subprocess.Popen[bytes]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -74,6 +75,28 @@ def test_a_broken_promise_is_excused_by_a_machine_that_kept_programs_waiting_alo
         judge("k")
     with pytest.raises(pytest.skip.Exception), watch.excusing():
         judge("b")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        AssertionError("no"),
+        TimeoutError("no"),
+        subprocess.TimeoutExpired("ros2", 5.0),
+        ExceptionGroup("tasks", [ExceptionGroup("more", [AssertionError("no")])]),
+    ],
+)
+def test_what_is_asserted_and_what_does_not_come_in_time_is_excused(error: Exception) -> None:
+    with pytest.raises(pytest.skip.Exception), Watch(late_s={"a witness": 1.0}).excusing():
+        raise error
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("no"), ExceptionGroup("tasks", [AssertionError("no"), ValueError("no")])]
+)
+def test_what_fails_otherwise_is_not(error: Exception) -> None:
+    with pytest.raises(type(error)), Watch(late_s={"a witness": 1.0}).excusing():
+        raise error
 
 
 class Failing:
