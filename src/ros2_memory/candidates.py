@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.runs import Run
     from ros2_memory.timebase import Ns
 
-"""Of a bag of a run that is ruled out as a whole."""
-
 
 class Stretch(NamedTuple):
     """A half-open span of time, and what in it is not ruled out: the topics, and the files."""
