@@ -11,7 +11,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.errors import EpisodicError, RecorderError
+from ros2_memory.errors import RecorderError
+from ros2_memory.recorder.chores import QUIET_HOUSE_S, Chores
 from ros2_memory.recorder.crew import Crew
 from ros2_memory.recorder.disk import HomeDisk, device_of, free_bytes
 from ros2_memory.recorder.heartbeat import RecorderState
@@ -31,9 +32,6 @@ if TYPE_CHECKING:
 
 LOOK_S: Final = 0.5
 SPACE_S: Final = 1.0
-HOUSE_S: Final = 10.0
-QUIET_HOUSE_S: Final = 60.0
-"""How often the house is kept when no split is closed: what is there grows old all the same."""
 MOMENTS_S: Final = 1.0
 """How often it is looked whether somebody asks for a moment to be kept, and waits for the reply."""
 FAULT_S: Final = 60.0
@@ -84,13 +82,13 @@ class Supervisor:
         expected: Callable[[], Sequence[str]] = tuple,
     ) -> None:
         self._orders = orders
-        self._housekeeper = housekeeper
         self._clock = clock
         self._monotonic = monotonic
         self._free_bytes_of = free_bytes_of
         self._home = HomeDisk(orders.bag_dir, device)
         self._away = False
         self._journal = Journal()
+        self._chores = Chores(orders.bag_dir, housekeeper, self._journal, monotonic())
         self._pulse = Pulse(orders.bag_dir, orders.heartbeat_s, clock, self._journal, expected)
         self._crew = Crew(
             orders.bag_dir,
@@ -110,8 +108,6 @@ class Supervisor:
         self._rotate_now = False
         self._paused = False
         self._room_made = False
-        self._splits_closed = False
-        self._house_kept_s = monotonic()
         self._stopped = True
         self._due_s: dict[str, float] = {}
         self._last = self._now()
@@ -188,7 +184,7 @@ class Supervisor:
 
     def _look(self, now: Moment) -> None:
         if self._is_due("look", LOOK_S, now):
-            self._splits_closed |= self._crew.look(now)
+            self._chores.splits_closed |= self._crew.look(now)
 
     def _mind_disk(self, now: Moment) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
@@ -248,7 +244,7 @@ class Supervisor:
             self._orders.min_free_bytes,
             paused=self._paused,
             room_made=self._room_made,
-            making=self._housekeeper.making_room(),
+            making=self._chores.making_room(),
         )
 
     def _pause(self, now: Moment, free: int) -> None:
@@ -327,36 +323,16 @@ class Supervisor:
             ) from error
 
     def _make_room(self) -> None:
-        wanted = resume_bytes(self._orders.min_free_bytes)
-        self._keep("make_room", lambda: self._housekeeper.make_room(self._bag_dir, wanted))
+        self._chores.make_room(resume_bytes(self._orders.min_free_bytes))
 
     def _keep_house(self, now: Moment) -> None:
-        self._tell_of_house()
-        every_s = HOUSE_S if self._splits_closed else QUIET_HOUSE_S
-        if self._away or now.monotonic_s - self._house_kept_s < every_s:
-            return
-        self._house_kept_s = now.monotonic_s
-        self._splits_closed = False
-        self._keep("apply", lambda: self._housekeeper.apply(self._bag_dir))
+        self._chores.tell()
+        if not self._away:
+            self._chores.keep_house(now.monotonic_s)
 
     def _keep_moments(self, now: Moment) -> None:
         if not self._away and self._is_due("moments", MOMENTS_S, now):
-            self._keep("keep_moments", lambda: self._housekeeper.keep_moments(self._bag_dir))
-
-    def _keep(self, task: str, do: Callable[[], None]) -> None:
-        """Has the housekeeper do something; recording goes on, whatever comes of it."""
-        try:
-            do()
-        except (EpisodicError, OSError) as error:
-            self._journal.fail_once("housekeeping_failed", task, str(error), task=task)
-        else:
-            if task not in self._housekeeper.faults():
-                self._journal.over("housekeeping_failed", task)
-
-    def _tell_of_house(self) -> None:
-        """Reports what the housekeeper could not do where nobody waited for it."""
-        for task, sentence in self._housekeeper.faults().items():
-            self._journal.fail_once("housekeeping_failed", task, sentence, task=task)
+            self._chores.keep_moments()
 
     def _announce(self, name: str) -> None:
         self._pulse.announce(name)
