@@ -60,6 +60,13 @@ def test_moments_in_notes_are_local_times() -> None:
     assert "1300000000 samples" in told
 
 
+def test_long_times_are_in_a_unit_that_suits_them() -> None:
+    rows: JsonValue = [{"topic": "/a", "ago_s": 186_462_260.5}, {"topic": "/b", "ago_s": 12.25}]
+    told = shown({"duration_s": 7500.0, "total": 7500, "topics": rows}).split()
+    assert told[:4] == ["duration_s", "2.1", "h", "total"]
+    assert told[-3:] == ["days", "/b", "12.25"]
+
+
 def test_what_there_is_not_is_said_in_words() -> None:
     assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
     assert shown([]) == "none"

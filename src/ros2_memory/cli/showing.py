@@ -64,7 +64,7 @@ def _show_object(console: Console, value: Mapping[str, JsonValue], now: float | 
             for note in each:
                 lines.add_row("note", Text(_with_local_times(cell(note))))
         else:
-            lines.add_row(Text(plain(key)), Text(_line(each, now)))
+            lines.add_row(Text(plain(key)), Text(_line(key, each, now)))
     if lines.row_count:
         console.print(lines)
     for key, rows in lists.items():
@@ -83,16 +83,24 @@ def _show_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> Non
         _show_object(console, row, None)
 
 
-def _line(value: JsonValue, now: float | None) -> str:
+def _line(key: str, value: JsonValue, now: float | None) -> str:
     """What stands behind a key; of a moment how long ago it was, too."""
     if value is None or value == []:
         return _NONE
     if not isinstance(value, float) or not is_moment(value):
-        return cell(value)
+        return _under(key, value)
     ago = 0.0 if now is None else now - value
     if abs(ago) < _AT_ONCE_S:
         return moment(value)
     return f"{moment(value)} ({span(ago)} ago)" if ago > 0 else f"{moment(value)} (in {span(-ago)})"
+
+
+def _under(key: str, value: JsonValue) -> str:
+    """A value as its key means it: long times are in minutes, hours or days."""
+    seconds = isinstance(value, int | float) and not isinstance(value, bool) and key.endswith("_s")
+    if seconds and isinstance(value, int | float) and abs(value) >= _MINUTES_FROM_S:
+        return cell(value) if is_moment(value) else span(value)
+    return cell(value)
 
 
 def _with_local_times(note: str) -> str:
@@ -123,7 +131,7 @@ def table(rows: Sequence[Mapping[str, JsonValue]], width: int) -> Table | None:
             max_width=each.least if narrow and each.moments else None,
         )
     for row in flattened:
-        shown.add_row(*(Text(cell(row.get(each.key))) for each in columns))
+        shown.add_row(*(Text(_under(each.key, row.get(each.key))) for each in columns))
     return shown
 
 
@@ -146,7 +154,7 @@ class _Column:
             for each in values
             if each is not None
         )
-        longest = max(len(key), *(len(cell(each)) for each in values))
+        longest = max(len(key), *(len(_under(key, each)) for each in values))
         if moments:
             return cls(key, numeric, moments, longest, _TIME_OF_DAY)
         return cls(key, numeric, moments, longest, longest if numeric else min(longest, _UNBROKEN))
