@@ -79,7 +79,7 @@ async def test_it_stays_for_other_clients_and_leaves_a_closed_recording(
     ) as demo:
         try:
             url = _invited(demo)
-            async with Client(sse_client(url)) as client:
+            async with Client(sse_client(url, timeout=PATIENCE_S)) as client:
                 tools = (await client.list_tools()).tools
                 result = await client.call_tool("get_position_seconds_ago", {"seconds_ago": 10})
             demo.send_signal(ending)

@@ -112,7 +112,7 @@ async def test_everything_is_answered_over_sse_and_streamable_http(
     bag_dir: Path, tmp_path: Path
 ) -> None:
     with serving(bag_dir, tmp_path / "log") as served:
-        async with Client(sse_client(served.url("/sse"))) as client:
+        async with Client(sse_client(served.url("/sse"), timeout=PATIENCE_S)) as client:
             await ask_everything(client)
         async with Client(served.url("/mcp")) as client:
             await ask_everything(client)
@@ -131,7 +131,7 @@ async def test_several_clients_are_served_at_once(bag_dir: Path, tmp_path: Path)
     with serving(bag_dir, tmp_path / "log") as served:
         async with anyio.create_task_group() as tasks:
             for _ in range(4):
-                tasks.start_soon(one, sse_client(served.url("/sse")))
+                tasks.start_soon(one, sse_client(served.url("/sse"), timeout=PATIENCE_S))
                 tasks.start_soon(one, served.url("/mcp"))
 
 
@@ -183,7 +183,7 @@ async def _end_with_clients(bag_dir: Path, tmp_path: Path, number: signal.Signal
         connected = anyio.Event()
 
         async def stay() -> None:
-            async with Client(sse_client(served.url("/sse"))) as client:
+            async with Client(sse_client(served.url("/sse"), timeout=PATIENCE_S)) as client:
                 await ask(client, "data_time_range", {})
                 connected.set()
                 await anyio.sleep_forever()

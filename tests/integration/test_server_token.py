@@ -87,7 +87,9 @@ async def test_whoever_shows_the_token_is_answered_and_nobody_else(
     (credentials / "memory_api_token").write_text(GOOD + "\n")
     more = {"MCP_HOST": EVERYWHERE, "CREDENTIALS_DIRECTORY": str(credentials)}
     with serving(bag_dir, tmp_path / "log", "logging.level=debug", **more) as served:
-        async with Client(sse_client(served.url("/sse"), headers=SHOWN)) as client:
+        async with Client(
+            sse_client(served.url("/sse"), headers=SHOWN, timeout=PATIENCE_S)
+        ) as client:
             assert (await ask(client, "data_time_range", {}))[0]["bags"] == 1
         async with (
             httpx2.AsyncClient(headers=SHOWN) as shown,
@@ -122,6 +124,8 @@ async def test_a_token_is_demanded_on_the_loopback_address_too(
     file.write_text(GOOD)
     with serving(bag_dir, tmp_path / "log", MEMORY_API_TOKEN_FILE=str(file)) as served:
         assert status(served, "GET", "/sse", {})[0] == 401
-        async with Client(sse_client(served.url("/sse"), headers=SHOWN)) as client:
+        async with Client(
+            sse_client(served.url("/sse"), headers=SHOWN, timeout=PATIENCE_S)
+        ) as client:
             told, _ = await ask(client, "data_time_range", {})
             assert told["bags"] == 1

@@ -17,6 +17,7 @@ from ros2_memory.http import web_app
 from ros2_memory.protocol import EpisodicServer
 from ros2_memory.replies import Replies, Reply
 from tests.soak.wire import call, posted
+from tests.waiting import PATIENCE_S
 from tests.webserver import listening
 
 if TYPE_CHECKING:
@@ -56,8 +57,8 @@ async def serving() -> AsyncIterator[tuple[str, int, Listening]]:
 async def test_each_event_stream_is_a_client_of_its_own() -> None:
     async with (
         serving() as (url, _, dispatcher),
-        Client(sse_client(f"{url}/sse")) as one,
-        Client(sse_client(f"{url}/sse")) as two,
+        Client(sse_client(f"{url}/sse", timeout=PATIENCE_S)) as one,
+        Client(sse_client(f"{url}/sse", timeout=PATIENCE_S)) as two,
     ):
         for client in (one, two, one):
             await client.call_tool("any", {})

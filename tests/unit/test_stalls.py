@@ -55,7 +55,7 @@ def test_one_that_is_broken_on_a_machine_that_was_in_time_is_not_driven_again() 
     assert drives.driven == 1
 
 
-@pytest.mark.parametrize("kinds", [("bs", "k"), ("bs", "b"), ("bs", "bs", "ks")])
+@pytest.mark.parametrize("kinds", [("bs", "k"), ("bs", "b"), ("bs", "ks")])
 def test_where_programs_were_kept_waiting_the_drive_is_repeated(kinds: tuple[str, ...]) -> None:
     drives = Drives(*kinds)
     assert driven(drives.once, judge, unwatched) == kinds[-1]
@@ -63,7 +63,7 @@ def test_where_programs_were_kept_waiting_the_drive_is_repeated(kinds: tuple[str
 
 
 def test_the_last_drive_is_given_whatever_it_is() -> None:
-    assert driven(Drives("bs", "bs", "bs").once, judge, unwatched) == "bs"
+    assert driven(Drives(*["bs"] * DRIVES).once, judge, unwatched) == "bs"
 
 
 def test_a_broken_promise_is_excused_by_a_machine_that_kept_programs_waiting_alone() -> None:
@@ -118,9 +118,7 @@ class Failing:
         judge("b" if self.runs <= self.failing else "k")
 
 
-@pytest.mark.parametrize(
-    ("failing", "starved", "runs"), [(0, 3, 1), (1, 1, 2), (2, 2, 3), (2, 3, 3)]
-)
+@pytest.mark.parametrize(("failing", "starved", "runs"), [(0, 2, 1), (1, 1, 2), (1, 2, 2)])
 def test_a_test_by_the_clock_runs_until_it_was_given_time(
     failing: int, starved: int, runs: int
 ) -> None:
@@ -129,7 +127,7 @@ def test_a_test_by_the_clock_runs_until_it_was_given_time(
     assert test.runs == runs
 
 
-@pytest.mark.parametrize(("failing", "starved"), [(1, 0), (2, 1), (3, 2)])
+@pytest.mark.parametrize(("failing", "starved"), [(1, 0), (2, 1)])
 def test_one_that_fails_though_it_was_given_time_fails(failing: int, starved: int) -> None:
     test = Failing(failing, starved)
     with pytest.raises(AssertionError, match="it was broken"):
@@ -144,7 +142,7 @@ def test_where_the_machine_never_gave_time_it_is_skipped_with_the_figures() -> N
     assert test.runs == DRIVES
     assert str(caught.value) == (
         "the machine did not run its programs in time: a witness was 0.20 s late, "
-        "in each of 3 drives; at last: it was broken"
+        "in each of 2 drives; at last: it was broken"
     )
 
 
