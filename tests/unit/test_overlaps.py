@@ -66,6 +66,14 @@ def test_however_long_a_handover_took_its_recordings_are_one(tmp_path: Path, sid
     assert overlapping_recordings(taken) == ()
 
 
+def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
+    spans = {"a": [(0, 10)], "moments/20261120T080000Z-cup/a": [(5, 15)], "b": [(8, 20)]}
+    taken = snapshot(tmp_path, spans)
+    assert pairs(overlapping_recordings(taken)) == [("a", "b", 8.0, 15.0)]
+    write_handover(tmp_path / "b", Handover(previous="a"))
+    assert overlapping_recordings(taken) == ()
+
+
 def test_folders_of_one_name_are_told_apart() -> None:
     pair = Together(Path("/bags/robin/run"), Path("/bags/wren/run"), 0, 1)
     other = Together(Path("/bags/a"), Path("/bags/b"), 0, 1)

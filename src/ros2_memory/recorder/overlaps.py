@@ -7,10 +7,12 @@ message counts once, and it is nothing to report.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.recorder.handover import read_handover
+from ros2_memory.recorder.layout import MOMENTS_FOLDER
 from ros2_memory.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 LONG_NS: Final[Ns] = 30 * NS_PER_S
 """No handover takes longer; a shorter overlap is one where it is half of a recording."""
 SHORT_NS: Final[Ns] = NS_PER_S
+_KEPT: Final = f"/{MOMENTS_FOLDER}/"
+_MOMENT: Final = re.compile(rf"(?P<bag_dir>.*){_KEPT}\d{{8}}T\d{{6}}Z[^/]*/(?P<recording>.+)")
 _MOST_READ: Final = 200
 """Of so many pairs it is looked whether one took over from the other; each costs two files."""
 
@@ -37,7 +41,8 @@ class Together(NamedTuple):
 def overlapping_recordings(snapshot: Snapshot) -> tuple[Together, ...]:
     """The pairs of recordings that overlap and that no handover joins, in order of time.
 
-    Bags that a wrong clock dated are left out: their own dates say nothing.
+    Bags that a wrong clock dated are left out: their own dates say nothing. Those of a moment that
+    is kept are of the recording that they were taken from.
     """
     spans, pairs = _swept(snapshot)
     found = []
@@ -60,6 +65,8 @@ def _swept(
         if bag.file in left_out:
             continue
         own, start, end = bag.file.rpartition("/")[0], bag.start, bag.end
+        if _KEPT in own:
+            own = _home(own)
         before = reach.get(own)
         if len(reach) > (before is not None):
             for other, until in [*reach.items()]:
@@ -75,6 +82,12 @@ def _swept(
         reach[own] = end if before is None or end > before else before
         spans[own] = spans.get(own, 0) + end - start
     return spans, pairs
+
+
+def _home(folder: str) -> str:
+    """The recording that a folder of a kept moment has bags of, where it lies or lay."""
+    found = _MOMENT.fullmatch(folder)
+    return f"{found['bag_dir']}/{found['recording']}" if found else folder
 
 
 def _took_over(pair: Together) -> bool:
