@@ -96,7 +96,7 @@ class Candidates:
         if notes is not None and known:
             if self._condition.may_match(notes.evidence_of_all(topic)):
                 possible = self._possible(notes, topic)
-            elif notes.whole:
+            if notes.whole and not possible:
                 self.ruled_out = True
                 return
         for bag, first, last in run.extents(topic):
