@@ -33,7 +33,7 @@ from ros2_memory.timebase import WallClock
 from ros2_memory.tools import build_tools, readable_tools
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from ros2_memory.settings import Settings
     from ros2_memory.telemetry import Observer
@@ -46,11 +46,13 @@ def build_memory(settings: Settings) -> Memory:
         ConfigError: the reader cannot be built, or the schema map is refused.
     """
     clock = WallClock()
-    extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
+    schemas = load_message_schemas(settings)
+    extractor = SchemaExtractor(schemas, settings.data.max_array_length)
     bag_dir = settings.recording.bag_dir
     counting = CountingReader(build_reader(settings))
     reader = StandInReader(ConfinedReader(counting, bag_dir), bag_dir)
-    catalogue = Catalogue(catalogue_places(settings), way_of_reading(settings), waits_for=bag_dir)
+    reading = way_of_reading(settings, schemas)
+    catalogue = Catalogue(catalogue_places(settings), reading, waits_for=bag_dir)
     index = IndexManager(
         bag_dir,
         reader,
@@ -78,11 +80,10 @@ def catalogue_places(settings: Settings) -> tuple[Path, ...]:
     return (*places, cache / PACKAGE / name / FILE) if cache.is_absolute() else places
 
 
-def way_of_reading(settings: Settings) -> str:
+def way_of_reading(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> str:
     """A hash of all that digests depend on besides the bags: settings, definitions, this program.
 
-    Raises:
-        ConfigError: the schema map is refused.
+    `schemas` is the schema map of these settings.
     """
     folders = [str(folder) for folder in settings.storage.custom_msg_paths]
     definitions = [
@@ -90,7 +91,6 @@ def way_of_reading(settings: Settings) -> str:
         for folder in settings.storage.custom_msg_paths
         for path in sorted(Path(folder).rglob("*.msg"))
     ]
-    schemas = load_message_schemas(settings)
     depends_on = (
         package_version(),
         DIGEST_VERSION,

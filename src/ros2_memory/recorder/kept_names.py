@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ros2_memory.recorder.layout import MOMENTS_FOLDER
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
     from pathlib import Path
 
 
@@ -30,6 +30,11 @@ class KeptNames:
     def is_kept(self, path: str) -> bool:
         """Whether a path lies in the folder of the moments."""
         return path.startswith(self._moments)
+
+    def kept_among(self, paths: Iterable[str]) -> list[str]:
+        """As `is_kept`, of 60,000 at once."""
+        moments = self._moments
+        return [path for path in paths if path.startswith(moments)]
 
     def recorded_as(self, path: str) -> str:
         """Where the bag of a moment was recorded; any other path is its own."""

@@ -111,7 +111,7 @@ class Run:
     @cached_property
     def _shapes(self) -> tuple[Shape, ...]:
         """The shapes of the bags. Most runs have one."""
-        return tuple(each.shape for each in _at_hand(self).alike)
+        return tuple({id(bag.summary.shape): bag.summary.shape for bag in self.bags}.values())
 
     @cached_property
     def stated(self) -> dict[str, dict[str, Stated]]:
@@ -198,7 +198,11 @@ class Run:
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
         """By topic, the types that its messages have."""
-        return {topic: frozenset(by_type) for topic, by_type in self.stated.items()}
+        types: dict[str, set[str]] = {}
+        for shape in self._shapes:
+            for heading in shape.topics:
+                types.setdefault(heading.topic, set()).add(heading.type)
+        return {topic: frozenset(names) for topic, names in types.items()}
 
     @cached_property
     def latched(self) -> frozenset[str]:

@@ -142,7 +142,7 @@ class Survey:
         if self._all_awake or not known:
             return []
         # Which of a bag's names answers is to be weighed.
-        kept = {path: stamps.pop(path) for path in [*stamps] if self._names.is_kept(path)}
+        kept = {path: stamps.pop(path) for path in self._names.kept_among(stamps)}
         bags = self._dormant.take(stamps, known, self._reader, scene)
         stamps.update(kept)
         return bags
