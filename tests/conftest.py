@@ -2,7 +2,9 @@
 
 import os
 import shutil
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from tempfile import mkdtemp
 
 import pytest
@@ -19,6 +21,14 @@ settings.load_profile("steady")
 # Also for the programs that tests start: nothing is to be left in the user's own.
 _CACHE = mkdtemp(prefix="ros2-memory-tests-")
 os.environ["XDG_CACHE_HOME"] = _CACHE
+
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    # Hundreds of programs are started here; each would compile all that it imports. Nothing is
+    # written beside the sources, which is what such an environment wants.
+    _COMPILED = str(Path(__file__).resolve().parents[1] / "build" / "bytecode")
+    os.environ.setdefault("PYTHONPYCACHEPREFIX", _COMPILED)
+    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"]
+    sys.dont_write_bytecode = False
 
 
 def pytest_unconfigure() -> None:
