@@ -11,6 +11,7 @@ then writes what it saw at worst, as JSON: `late_s`, and `waited` by program.
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import time
@@ -31,6 +32,7 @@ class Witness:
         self._root = root
         self._over = False
         self._due = time.monotonic()
+        self._parent = os.getppid()
         self._late_s = 0.0
         self.waited: dict[str, float] = {}
 
@@ -39,12 +41,13 @@ class Witness:
         self._over = True
 
     def watch(self) -> dict[str, object]:
-        """Watches until it is told to end; what it saw."""
+        """Watches until it is told to end, or nobody is there to be told; what it saw."""
         due = looked = self._due
         waits: Waits = {}
         over = False
         while not over:
-            over = self._over  # what it slept through before that counts
+            # What it slept through before counts.
+            over = self._over or os.getppid() != self._parent
             due += self._tick_s
             time.sleep(max(0.0, due - time.monotonic()))
             for _ in range(WORK):
@@ -108,7 +111,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, witness.end)
     sys.stdout.write("ready\n")
     sys.stdout.flush()
-    sys.stdout.write(json.dumps(witness.watch()) + "\n")
+    with suppress(BrokenPipeError):
+        sys.stdout.write(json.dumps(witness.watch()) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

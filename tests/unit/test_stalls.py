@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -180,6 +181,26 @@ def test_witnesses_that_did_not_run_for_a_while_say_so() -> None:
     assert watch.starved is not None
     assert len(watch.late_s) == 2
     assert min(watch.late_s.values()) > 2 * LATE_S
+
+
+def test_a_witness_ends_with_the_tests_that_it_stood_beside() -> None:
+    tests = (
+        "import subprocess, sys; "
+        f"witness = subprocess.Popen([sys.executable, '-IS', {str(WITNESS)!r}, '0.01'], "
+        "stdout=subprocess.PIPE, start_new_session=True); "
+        "witness.stdout.readline(); print(witness.pid)"
+    )
+    ended = subprocess.run([sys.executable, "-c", tests], check=True, stdout=subprocess.PIPE)
+    until(lambda: has_ended(int(ended.stdout)))
+
+
+def has_ended(pid: int) -> bool:
+    """Also where nobody has reaped it."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state in {"Z", "X"}
 
 
 def own_witnesses() -> list[int]:
