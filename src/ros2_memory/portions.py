@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from ros2_memory.model import BagState
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.groups import Group
     from ros2_memory.history import View
@@ -30,13 +30,13 @@ class Kind(Generic[T]):
 
     Attributes:
         name: tells it from the others.
-        ask: what the catalogue has of a topic in one run of bags, by entry.
+        ask: what the catalogue has of a topic in some entries of one run of bags, by entry.
         packed: one as text.
         unpacked: back; a ValueError where it is none.
     """
 
     name: str
-    ask: Callable[[RunNotes, str], Mapping[int, T]]
+    ask: Callable[[RunNotes, str, Sequence[int]], Mapping[int, T]]
     packed: Callable[[T], str]
     unpacked: Callable[[str], T]
 
@@ -50,12 +50,13 @@ def is_whole(group: Group, window: TimeWindow) -> bool:
 
 
 class Kept(Generic[T]):
-    """What the catalogue keeps of one topic; of one run of bags at a time."""
+    """What the catalogue keeps of one topic in a window; of one run of bags at a time."""
 
-    def __init__(self, view: View, topic: str, kind: Kind[T]) -> None:
+    def __init__(self, view: View, topic: str, kind: Kind[T], window: TimeWindow) -> None:
         self._view = view
         self._topic = topic
         self._kind = kind
+        self._window = window
         self._question = f"{kind.name} {topic}"
         self._notes: RunNotes | None = None
         self._known: Mapping[int, T] = {}
@@ -74,7 +75,11 @@ class Kept(Generic[T]):
                 return None
             self._view.check_deadline()
             self._notes, number = entry
-            self._known = self._kind.ask(self._notes, self._topic)
+            run = self._view.snapshot.run_of(held.bag)
+            numbers = self._notes.numbers
+            inside = [each.bag.file for each in run.extents(self._topic, self._window)]
+            among = [numbers[file] for file in dict.fromkeys(inside) if file in numbers]
+            self._known = self._kind.ask(self._notes, self._topic, among)
         if number not in self._known:
             return None
         return self._known[number], (held.first, held.last)

@@ -92,17 +92,17 @@ class RunNotes:
         """The places in the evidence; kept, since they are few numbers and asked for often."""
         return self._kept_as(self._boxes, topic, lambda: Boxes(self.evidence(topic)))
 
-    def poses(self, topic: str) -> Mapping[int, PoseDigest]:
-        """For each entry that has it the digest of its poses."""
-        return self._catalogue.poses(topic, self._of(topic))
+    def poses(self, topic: str, among: Sequence[int]) -> Mapping[int, PoseDigest]:
+        """For each of these entries that has it the digest of its poses."""
+        return self._catalogue.poses(topic, among)
 
-    def rests(self, topic: str) -> Mapping[int, RestDigest]:
-        """For each entry that has it where its poses stand still."""
-        return self._catalogue.rests(topic, self._of(topic))
+    def rests(self, topic: str, among: Sequence[int]) -> Mapping[int, RestDigest]:
+        """For each of these entries that has it where its poses stand still."""
+        return self._catalogue.rests(topic, among)
 
-    def stories(self, topic: str) -> Mapping[int, Story | None]:
-        """For each entry what the messages of the topic say, as the catalogue has it."""
-        return self._catalogue.stories(topic, self._of(topic))
+    def stories(self, topic: str, among: Sequence[int]) -> Mapping[int, Story | None]:
+        """For each of these entries what the messages of the topic say, as the catalogue has it."""
+        return self._catalogue.stories(topic, among)
 
     def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
         """For each entry that has them the frame edges."""

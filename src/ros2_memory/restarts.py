@@ -27,7 +27,7 @@ MOVED_M: Final = 1.0
 def restarts(view: View, topic: str, since: Ns) -> list[Ns]:
     """The times of the first poses of odometry that began anew after a moment, in order."""
     window = TimeWindow(since, MAX_NS)
-    kept: Kept[PoseDigest] = Kept(view, topic, POSES)
+    kept: Kept[PoseDigest] = Kept(view, topic, POSES, window)
     fastest = view.memory.limits.max_plausible_speed_mps
     found: list[Ns] = []
     before: Stop | None = None

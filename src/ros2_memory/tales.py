@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 
 _RESTS: Final = Kind(
     "rests",
-    ask=lambda notes, topic: notes.rests(topic),
+    ask=lambda notes, topic, among: notes.rests(topic, among),
     packed=lambda digest: packed_rests(digest).hex(),
     unpacked=lambda text: unpacked_rests(bytes.fromhex(text)),
 )
 _STORIES: Final = Kind(
     "story",
-    ask=lambda notes, topic: notes.stories(topic),
+    ask=lambda notes, topic, among: notes.stories(topic, among),
     packed=lambda story: "" if story is None else packed_story(story).hex(),
     unpacked=lambda text: unpacked_story(bytes.fromhex(text)) if text else None,
 )
@@ -58,7 +58,7 @@ def rests_in(view: View, topic: str, window: TimeWindow) -> tuple[Rest, ...]:
         InvalidArgumentsError: a message of the topic carries no position.
     """
     builder = RestBuilder()
-    kept: Kept[RestDigest] = Kept(view, topic, _RESTS)
+    kept: Kept[RestDigest] = Kept(view, topic, _RESTS, window)
     sights = Sights(view.memory.reader, view.memory.extractor)
     for group in view.groups(topic, window):
         failures: list[UndecodableError] = []
@@ -80,7 +80,7 @@ def rests_in(view: View, topic: str, window: TimeWindow) -> tuple[Rest, ...]:
 def story_in(view: View, topic: str, window: TimeWindow) -> Story | None:
     """What the messages of a topic say in a window; None where there is no message."""
     builder = StoryBuilder()
-    kept: Kept[Story | None] = Kept(view, topic, _STORIES)
+    kept: Kept[Story | None] = Kept(view, topic, _STORIES, window)
     for group in view.groups(topic, window):
         if not is_whole(group, window):
             _hear(view, builder, group.once())

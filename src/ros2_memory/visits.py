@@ -145,7 +145,7 @@ class _Looking:
         self._place = place
         self._x, self._y, self._radius = wanted
         self._here = place.in_poses(self._x, self._y)
-        self._kept: Kept[PoseDigest] = Kept(view, topic, POSES)
+        self._kept: Kept[PoseDigest] = Kept(view, topic, POSES, TimeWindow.everything())
 
     @property
     def newest_time(self) -> Ns | None:

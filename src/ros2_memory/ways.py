@@ -50,7 +50,7 @@ class Way:
 
 POSES: Final = Kind(
     "poses",
-    ask=lambda notes, topic: notes.poses(topic),
+    ask=lambda notes, topic, among: notes.poses(topic, among),
     packed=lambda digest: packed_poses(digest).hex(),
     unpacked=lambda text: unpacked_poses(bytes.fromhex(text)),
 )
@@ -67,7 +67,7 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     """
     failures: list[UndecodableError] = []
     builder = TrajectoryBuilder(max_plausible_speed_mps=view.memory.limits.max_plausible_speed_mps)
-    digests = Kept(view, topic, POSES)
+    digests = Kept(view, topic, POSES, window)
     sights = Sights(view.memory.reader, view.memory.extractor)
     first: Ns | None = None
     last: Ns | None = None

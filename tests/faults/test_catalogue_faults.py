@@ -344,7 +344,8 @@ def test_entries_that_another_program_makes_anew_are_not_taken_for_the_lost_ones
         base.commit()
     # It is noticed by the next question about the way driven, which has other bounds.
     [run] = memory.index.snapshot().runs
-    memory.recall.notes(run, memory.recall.as_of()).poses("/odom")
+    notes = memory.recall.notes(run, memory.recall.as_of())
+    notes.poses("/odom", [*notes.numbers.values()])
     _, other = served(tmp_path)
     fill_up(other)
     assert told(memory) == right
