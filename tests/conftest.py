@@ -31,6 +31,25 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     sys.dont_write_bytecode = False
 
 
+UNMEASURED = (
+    "fuzz/*.py",
+    "soak/*.py",
+    "unit/test_benchmarks.py",
+    "unit/test_documents.py",
+    "unit/test_hostile_arguments.py",
+    "unit/test_*_real_bags.py",
+    "unit/test_planner_questions.py",
+    "unit/test_real_bags*.py",
+    "unit/test_recorded_sessions.py",
+    "unit/test_same_answers.py",
+    "unit/test_week.py",
+)
+"""Tests in which coverage is not measured, which takes up to five times as long as the test itself.
+
+They ask much of everything at once; what they run is run by each room's own tests as well.
+"""
+
+
 def pytest_unconfigure() -> None:
     """Removes what tests left in that cache."""
     shutil.rmtree(_CACHE, ignore_errors=True)
@@ -39,6 +58,9 @@ def pytest_unconfigure() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest first, so that the others are done meanwhile."""
     items.sort(key=lambda item: place(item.nodeid))
+    for item in items:
+        if any(item.path.match(pattern) for pattern in UNMEASURED):
+            item.add_marker(pytest.mark.no_cover)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -56,6 +78,15 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Groups:
     """Tests that share a worker, see `tests/workers.py`."""
     return Groups(config, log)
+
+
+@pytest.fixture(autouse=True)
+def _programs_as_measured_as_the_test(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is coverage measured in programs that an unmeasured test starts."""
+    if request.node.get_closest_marker("no_cover"):
+        monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
 
 
 @pytest.fixture(autouse=True)
