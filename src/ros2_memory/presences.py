@@ -8,7 +8,7 @@ things now and then. Where a history is cut into bags changes nothing.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -25,6 +25,8 @@ FLICKER_NS: Final[Ns] = 3 * NS_PER_S
 """A thing that is missed for less did not leave."""
 
 _ROW: Final = np.dtype([("first", "<i8"), ("last", "<i8"), ("label", "<u4"), ("ends", "u1")])
+Rows: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.void]]"
+
 _FROM_START: Final = 1
 _TO_END: Final = 2
 
@@ -66,11 +68,12 @@ class Seen(NamedTuple):
         told = _rows(self.rows).tolist()
         return tuple(Presence(self.labels[label], first, last) for first, last, label, _ in told)
 
-    def earliest(self, at_most: int) -> Seen:
-        """The first so many."""
+    def most_lasting(self, at_most: int) -> Seen:
+        """So many of them, those that lasted longest; of equal ones the earliest."""
         if self.size <= at_most:
             return self
-        rows = _rows(self.rows)[:at_most].copy()
+        rows = _rows(self.rows)
+        rows = rows[np.sort(_by_length(rows)[:at_most])]
         kept, rows["label"] = np.unique(rows["label"], return_inverse=True)
         return Seen(tuple(self.labels[place] for place in kept.tolist()), rows.tobytes())
 
@@ -93,8 +96,7 @@ class Seen(NamedTuple):
     def longest(self, at_most: int) -> tuple[Presence, ...]:
         """Those that lasted longest, the longest first; of equal ones the earliest."""
         rows = _rows(self.rows)
-        order = np.argsort(rows["first"] - rows["last"], kind="stable")[:at_most]
-        return Seen(self.labels, rows[order].tobytes()).presences()
+        return Seen(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).presences()
 
     def moved(self, by: Ns) -> Seen:
         """The same so many nanoseconds later."""
@@ -245,5 +247,10 @@ def _reach(label: NDArray[np.intp], last: NDArray[np.int64]) -> NDArray[np.int64
     return latest
 
 
-def _rows(packed: bytes) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+def _by_length(rows: Rows) -> NDArray[np.intp]:
+    """The places of the rows, that which lasted longest first; of equal ones the earliest."""
+    return np.argsort(rows["first"] - rows["last"], kind="stable")
+
+
+def _rows(packed: bytes) -> Rows:
     return np.frombuffer(packed, _ROW)

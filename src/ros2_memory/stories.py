@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 MOST_TOLD: Final = 64
 """Presences, flips and faults of one topic in one bag that are kept, each; the rest is counted."""
 MOST_HELD: Final = 20_000
-"""The same of a topic in all bags together: what a question about a week may hold in memory."""
+"""Flips and faults of a topic in all bags together: what a question about a week may hold."""
+MOST_SEEN: Final = 100_000
+"""Presences likewise; they are held as numbers."""
 MOST_FLAGS: Final = 16
-_MOST_WAITING: Final = 4
-"""Times `MOST_HELD` presences wait to be joined."""
 
 _ERROR: Final = 2
 _STALE: Final = 3
@@ -92,7 +92,8 @@ class Story:
         known: each boolean's value at either end.
         flips: in order.
         faults: by the time of their first report.
-        left_out: presences, flips and faults beyond what is kept; the earliest ones are.
+        left_out: presences, flips and faults beyond what is kept: of presences those that lasted
+            longest are, of the others the earliest.
         undecodable: messages that cannot be decoded, of which nothing is told; where there are no
             others, `first` lies after `last`.
     """
@@ -153,7 +154,7 @@ class StoryBuilder:
     def add(self, time: Ns, state: State) -> None:
         """Takes the next message."""
         if self._watcher is None:
-            self._watcher = Watcher(MOST_HELD)
+            self._watcher = Watcher(MOST_SEEN)
         self._watcher.add(time, state.labels)
         for path, value in state.flags:
             self._flag(Known(path, time, value, value))
@@ -193,7 +194,7 @@ class StoryBuilder:
         return Story(
             first,
             last,
-            seen if at_most is None else seen.earliest(at_most),
+            seen if at_most is None else seen.most_lasting(at_most),
             tuple(self._known.values()),
             tuple(self._flips[:at_most]),
             tuple(faults[:at_most]),
@@ -212,13 +213,13 @@ class StoryBuilder:
     def _take(self, part: Part) -> None:
         self._parts.append(part)
         self._rows += part.seen.size
-        if self._rows > _MOST_WAITING * MOST_HELD:
+        if self._rows > 2 * MOST_SEEN:
             self._one_part()
 
     def _one_part(self) -> Part:
         """All parts as one, and no more presences than may be held."""
         part = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
-        seen = part.seen.earliest(MOST_HELD)
+        seen = part.seen.most_lasting(MOST_SEEN)
         self._left_out += part.seen.size - seen.size
         self._parts, self._rows = [part._replace(seen=seen)], seen.size
         return self._parts[0]

@@ -128,14 +128,20 @@ def test_what_lasted_longest_comes_first_and_of_equals_the_earliest() -> None:
     assert [each.label for each in seen.longest(1)] == ["a"]
 
 
-def test_the_earliest_are_kept_with_the_names_that_they_need() -> None:
-    seen = watched([(0, ("b",)), (20 * NS_PER_S, ("a",))]).seen
-    assert seen.labels == ("a", "b")
-    assert seen.earliest(1) == watched([(0, ("b",)), (20 * NS_PER_S, ())]).seen._replace(
-        rows=seen.earliest(1).rows
+def test_the_most_lasting_are_kept_in_order_with_the_names_that_they_need() -> None:
+    late = 40 * NS_PER_S
+    seen = watched(
+        [(0, ("b",)), (1, ("b",)), (20 * NS_PER_S, ("a",)), (late, ("c",)), (late + 1, ("c",))]
+    ).seen
+    assert seen.labels == ("a", "b", "c")
+    kept = seen.most_lasting(2)
+    assert kept.labels == ("b", "c")
+    assert kept.presences() == (
+        Presence("b", 0, 1),
+        Presence("c", late, late + 1),
     )
-    assert seen.earliest(1).presences() == (Presence("b", 0, 0),)
-    assert seen.earliest(2) is seen
+    assert [each.label for each in seen.most_lasting(1).presences()] == ["b"]
+    assert seen.most_lasting(3) is seen
 
 
 def test_presences_without_some_things_are_those_of_the_others() -> None:

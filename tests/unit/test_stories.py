@@ -121,6 +121,7 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(stories, "MOST_HELD", 10)
+    monkeypatch.setattr(stories, "MOST_SEEN", 10)
     builder = StoryBuilder()
     for nth in range(15):
         at = nth * 100 * NS_PER_S
