@@ -3,12 +3,13 @@
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from tempfile import mkdtemp
 
 import pytest
 import structlog
+from coverage import Coverage
 from hypothesis import settings
 from xdist.remote import Producer
 
@@ -48,6 +49,8 @@ UNMEASURED = (
 
 They ask much of everything at once; what they run is run by each room's own tests as well.
 """
+_IN_PROGRAMS = "COVERAGE_PROCESS_CONFIG"
+"""By this, coverage.py measures in the programs that are started."""
 
 
 def pytest_unconfigure() -> None:
@@ -58,9 +61,22 @@ def pytest_unconfigure() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest first, so that the others are done meanwhile."""
     items.sort(key=lambda item: place(item.nodeid))
-    for item in items:
-        if any(item.path.match(pattern) for pattern in UNMEASURED):
-            item.add_marker(pytest.mark.no_cover)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Measures no coverage in some tests, their fixtures, and the programs that they start."""
+    measuring = Coverage.current()
+    if measuring is None or not any(item.path.match(pattern) for pattern in UNMEASURED):
+        return (yield)
+    in_programs = os.environ.pop(_IN_PROGRAMS, None)
+    measuring.stop()
+    try:
+        return (yield)
+    finally:
+        measuring.start()
+        if in_programs is not None:
+            os.environ[_IN_PROGRAMS] = in_programs
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -78,15 +94,6 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Groups:
     """Tests that share a worker, see `tests/workers.py`."""
     return Groups(config, log)
-
-
-@pytest.fixture(autouse=True)
-def _programs_as_measured_as_the_test(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Nor is coverage measured in programs that an unmeasured test starts."""
-    if request.node.get_closest_marker("no_cover"):
-        monkeypatch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
 
 
 @pytest.fixture(autouse=True)
