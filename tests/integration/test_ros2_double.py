@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+import signal
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Any, Final
@@ -29,6 +31,7 @@ from tests.shared_bags import RECORDED, needs_recorded
 from tests.stalls import in_time
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from mcap.summary import Summary
@@ -94,6 +97,8 @@ def drive_once(folder: Path) -> Session:
         ros_environment(folder) as env,
         Recording(env, folder / "bags" / "small", *every, *small) as first,
         Recording(env, folder / "bags" / "default", *every, *default) as second,
+        Recording(env, folder / "bags" / "late", *every, *default) as third,
+        halted(third),
         publishing_robot(
             env, folder / "truth.json", "--subscribers", "2", duration_s=DRIVE_S
         ) as robot,
@@ -102,13 +107,21 @@ def drive_once(folder: Path) -> Session:
         beginning = first.splits()[0]
         wait_for(lambda: beginning.stat().st_size > 0, "a chunk of 16 KiB")
         active_bytes = second.splits()[0].stat().st_size
-        with Recording(env, folder / "bags" / "late", *every, *default) as third:
-            first.await_splits(2)
-            wait_for(lambda: is_closed(beginning), "the footer of the first split")
-            closed_early = summary_of(beginning)
-            published = robot.finish()
-            codes = [recording.stop() for recording in (first, second, third)]
+        third.process.send_signal(signal.SIGCONT)
+        first.await_splits(2)
+        wait_for(lambda: is_closed(beginning), "the footer of the first split")
+        closed_early = summary_of(beginning)
+        published = robot.finish()
+        codes = [recording.stop() for recording in (first, second, third)]
         return Session(t0, published, first, second, third, active_bytes, closed_early, codes)
+
+
+@contextmanager
+def halted(recording: Recording) -> Iterator[None]:
+    """It has begun, which takes it seconds, and does not get to see who publishes what."""
+    recording.await_said("Recording...")
+    recording.process.send_signal(signal.SIGSTOP)
+    yield
 
 
 def test_a_clean_end_exits_with_0(session: Session) -> None:
