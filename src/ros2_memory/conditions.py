@@ -256,7 +256,9 @@ def positions(value: JsonValue) -> Iterator[Vector3]:
             waiting.extend(reversed(held))
         elif isinstance(held, dict):
             for key in POSITION_KEYS:
-                yield from _own_positions(held.get(key))
+                inner = held.get(key)
+                if isinstance(inner, dict | list):
+                    yield from _own_positions(inner)
             waiting.extend(reversed(held.values()))
 
 

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory import rounding
-from ros2_memory.messages import ABSENT, field_of, layout_of
+from ros2_memory.messages import ABSENT, layout_of
 from ros2_memory.sampling import array_note, evenly
 from ros2_memory.timebase import unix_from_ns, unix_rounded_up
-from ros2_memory.views import Degrees, Kind, Metric, euler, kind_of, nanoseconds, replaced, xyz
+from ros2_memory.views import Degrees, Kind, Metric, euler, kind_of, nanoseconds, summaries_of, xyz
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -89,8 +89,14 @@ class Rendering(ABC):
         layout = layout_of(node)
         if layout is None:
             return self._text(f"<{type(node).__name__}>", path)
-        fields = ((name, replaced(node, name, field_of(node, name))) for name in layout.attributes)
-        return {name: self.value(field, _join(path, name), depth) for name, field in fields}
+        summaries = summaries_of(layout)
+        shown: dict[str, JsonValue] = {}
+        for name, attribute in layout.attributes.items():
+            found: object = getattr(node, attribute, ABSENT)
+            if name in summaries:
+                found = summaries[name](node, found)
+            shown[name] = self.value(found, _join(path, name), depth)
+        return shown
 
     def _rotation(self, node: object, path: str) -> JsonValue:
         angles = euler(node)

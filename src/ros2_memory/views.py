@@ -2,7 +2,7 @@
 
 The extracted view, which replies and conditions see, is the message with a quaternion as
 `roll_deg`, `pitch_deg` and `yaw_deg`, a time as one number, and the data of images, point clouds
-and maps as summaries. `view` steps through it; `kind_of` and `replaced` say what differs.
+and maps as summaries. `view` steps through it; `kind_of` and `summaries_of` say what differs.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from ros2_memory.messages import Layout
     from ros2_memory.model import Quaternion, Vector3
 
 ANGLES: Final = ("roll_deg", "pitch_deg", "yaw_deg")
@@ -77,14 +78,14 @@ def view(node: object, name: str) -> object:
     found = field_of(node, name)
     if kind is Kind.VECTOR:
         return Metric(found) if isinstance(found, float) else found
-    return found if found is ABSENT else replaced(node, name, found)
+    layout = None if found is ABSENT else layout_of(node)
+    summaries = _NONE if layout is None else summaries_of(layout)
+    return summaries[name](node, found) if name in summaries else found
 
 
-def replaced(message: object, name: str, found: object) -> object:
-    """What the extracted view has for a field: what was `found` there, or its summary."""
-    layout = layout_of(message)
-    views = None if layout is None else _VIEWS.get(layout.type)
-    return views[name](message, found) if views and name in views else found
+def summaries_of(layout: Layout) -> Mapping[str, Callable[[object, object], object]]:
+    """By field of such messages, what makes a summary of the message and what was found there."""
+    return _VIEWS.get(layout.type, _NONE)
 
 
 _XYZ: Final = attrgetter("x", "y", "z")
@@ -215,6 +216,7 @@ _KINDS: Final[Mapping[str, tuple[Kind, str]]] = {
     "builtin_interfaces/msg/Time": (Kind.TIME, "sec nanosec"),
     "builtin_interfaces/msg/Duration": (Kind.TIME, "sec nanosec"),
 }
+_NONE: Final[Mapping[str, Callable[[object, object], object]]] = {}
 _VIEWS: Final[Mapping[str, Mapping[str, Callable[[object, object], object]]]] = {
     "sensor_msgs/msg/Image": {"data": _image},
     "sensor_msgs/msg/CompressedImage": {"data": _compressed_image},
