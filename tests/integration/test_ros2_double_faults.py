@@ -27,7 +27,7 @@ from tests.ros_recordings import (
 )
 from tests.shared_bags import RECORDED, needs_recorded
 from tests.stalls import in_time
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -144,8 +144,16 @@ def test_a_signal_at_the_very_beginning_kills_it_before_it_has_a_directory(
 
 def kill_at_once(env: dict[str, str], folder: Path, number: signal.Signals) -> None:
     with Recording(env, folder / "a", "-e", "/odom") as recording:
+        # As these tests may, where they run in the background of a shell.
+        until(lambda: not ignores(recording.process.pid, number))
         assert recording.stop(number) == -number
     assert not recording.directory.exists()
+
+
+def ignores(pid: int, number: signal.Signals) -> bool:
+    status = Path(f"/proc/{pid}/status").read_text()
+    (mask,) = [line.split()[1] for line in status.splitlines() if line.startswith("SigIgn:")]
+    return bool(int(mask, 16) >> (number - 1) & 1)
 
 
 def test_a_sigint_that_was_ignored_before_it_began_stays_ignored(
