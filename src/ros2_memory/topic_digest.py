@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -212,11 +213,11 @@ class TopicCollector:
         """Takes the waiting messages: those of one mould together, the others one by one."""
         records, self._waiting, self._waiting_bytes = self._waiting, [], 0
         seen: list[_Seen | None] = [None] * len(records)
-        rest: Sequence[int] = range(len(records))
+        rest = deque(range(len(records)))
         for mould, first, state in self._moulds:
             rest = self._cast(mould, (first, state), records, rest, seen)
         while rest:
-            at, rest = rest[0], rest[1:]
+            at = rest.popleft()
             seen[at] = one = self._decoded(records[at])
             made = self._new_mould(records[at]) if one is not None else None
             if made is not None and one is not None:
@@ -248,9 +249,9 @@ class TopicCollector:
         mould: Mould,
         model: tuple[Record, State],
         records: Sequence[Record],
-        rest: Sequence[int],
+        rest: deque[int],
         seen: list[_Seen | None],
-    ) -> Sequence[int]:
+    ) -> deque[int]:
         """Takes those of `rest` that are of the mould of `model`; gives the others."""
         first, state = model
         chosen, rows = mould.those_like(first, records, rest)
@@ -261,4 +262,4 @@ class TopicCollector:
         for at, pose, speed in zip(chosen, mould.poses(rows), speeds, strict=True):
             seen[at] = _Seen(pose, speed, state)
         taken = set(chosen)
-        return [at for at in rest if at not in taken]
+        return deque(at for at in rest if at not in taken)
