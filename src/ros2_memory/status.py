@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.accounts import Budget, Status, Stillness
 from ros2_memory.history import View
-from ros2_memory.model import BagState
 from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.timebase import NS_PER_S, Ns
 from ros2_memory.wording import counted
@@ -46,7 +45,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         never_heard=() if heartbeat is None else heartbeat.silent,
         fell_silent=tuple(_fallen_silent(snapshot)),
         damaged=len(snapshot.damaged),
-        incomplete=sum(bag.state is BagState.INCOMPLETE for bag in snapshot.bags),
+        incomplete=snapshot.taken[1],
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot),
         problems=tuple(problems_of(snapshot, heartbeat, wall)),
@@ -98,7 +97,7 @@ def _budget(memory: Memory, snapshot: Snapshot) -> Budget:
     Where nothing is recorded nothing grows, and there is no budget.
     """
     kept, latest = memory.limits.kept, snapshot.dating.latest
-    used = sum(bag.size for bag in snapshot.bags)
+    used, _ = snapshot.taken
     if kept is None:
         return Budget(used, None, None, None)
     grown, since = 0, latest

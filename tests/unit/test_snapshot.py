@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.model import BagFile, BagState, BagSummary, TimeWindow, TopicSummary
+from ros2_memory.recorder.layout import CARRY_FILE, CARRY_FOLDER
 from ros2_memory.recorder.snapshot import RUN_LIMIT, Snapshot, Timeline
 
 ODOM = "nav_msgs/msg/Odometry"
@@ -45,6 +46,23 @@ def test_an_empty_timeline_has_neither_beginning_nor_end() -> None:
     assert (empty.earliest, empty.latest, empty.topics()) == (None, None, ())
     assert empty.holding("/odom") == ()
     assert empty.overlapping(TimeWindow.everything()) == ()
+
+
+def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> None:
+    bags = [
+        _bag(f"rec/rec_{nth}.mcap", ("/odom", nth, nth))._replace(
+            size=nth, state=BagState.INCOMPLETE if nth % 3 == 0 else BagState.CLOSED
+        )
+        for nth in range(RUN_LIMIT + 10)
+    ]
+    carried = _bag(f"{CARRY_FOLDER}/{CARRY_FILE}", ("/tf_static", -5, -5))._replace(size=7)
+    whole = Timeline.of([carried, *bags])
+    snapshot = Snapshot(bags=whole.recorded, timeline=whole)
+    left_open = sum(bag.state is BagState.INCOMPLETE for bag in snapshot.bags)
+    assert snapshot.taken == (sum(bag.size for bag in snapshot.bags), left_open)
+    assert len(snapshot.bags) == len(bags)
+    assert Timeline.of([carried]).taken == (7, 0)
+    assert Snapshot().taken == (0, 0)
 
 
 def test_the_latest_message_may_stand_in_a_bag_that_began_earlier() -> None:

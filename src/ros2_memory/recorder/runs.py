@@ -85,6 +85,11 @@ class Run:
         return self.bags
 
     @cached_property
+    def taken(self) -> tuple[int, int]:
+        """As `taken_by`, of those."""
+        return taken_by(self.recorded)
+
+    @cached_property
     def folders(self) -> frozenset[str]:
         """The folders in which the bags lie."""
         return frozenset([bag.file[: bag.file.rfind("/")] for bag in self.bags])
@@ -215,6 +220,12 @@ class Run:
     def silent(self) -> frozenset[str]:
         """The topics that some bag declares without a message."""
         return frozenset(chain.from_iterable(shape.silent for shape in self._shapes))
+
+
+def taken_by(bags: Sequence[BagFile]) -> tuple[int, int]:
+    """The bytes that bags take on disk, and how many of them a crash left open."""
+    left_open = [bag.state is BagState.INCOMPLETE for bag in bags]
+    return sum([bag.size for bag in bags]), sum(left_open)
 
 
 def wider(known: Span | None, span: Span) -> Span:

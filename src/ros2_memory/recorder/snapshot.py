@@ -138,6 +138,11 @@ class Snapshot:
         return topic in self._timeline.latched
 
     @property
+    def taken(self) -> tuple[int, int]:
+        """The bytes that the bags take on disk, and how many of them a crash left open."""
+        return self._timeline.taken
+
+    @property
     def runs(self) -> Sequence[Run]:
         """The bags, some at a time, in order; what is worked out for a run holds while it stays."""
         return self._timeline.runs

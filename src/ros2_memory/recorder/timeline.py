@@ -12,7 +12,7 @@ from functools import cached_property
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.recorder.runs import Run, in_time, wider
+from ros2_memory.recorder.runs import Run, in_time, taken_by, wider
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -128,6 +128,12 @@ class Timeline:
         tells of itself where there is no other.
         """
         return tuple(chain.from_iterable(run.recorded for run in self._runs)) or self.bags
+
+    @property
+    def taken(self) -> tuple[int, int]:
+        """The bytes that the recorded bags take, and how many of them a crash left open."""
+        parts = [run.taken for run in self._runs if run.recorded] or [taken_by(self.bags)]
+        return sum(size for size, _ in parts), sum(left_open for _, left_open in parts)
 
     @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:
