@@ -158,11 +158,11 @@ def unpacked_story(packed: bytes) -> Story:
     return Story(first, last, seen, known, flips, faults, left_out, undecodable)
 
 
-@lru_cache(512)
+@lru_cache(2048)
 def _told(
     text: bytes,
 ) -> tuple[tuple[str, ...], tuple[Known, ...], tuple[Flip, ...], tuple[Fault, ...]]:
-    """What a story says in words: of many bags the same."""
+    """What a story says in words: of many bags the same, and asked of an hour again and again."""
     labels, known, flips, faults = json.loads(text.decode("utf-8", "surrogatepass"))
     return (
         tuple(labels),
