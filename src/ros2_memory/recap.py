@@ -140,7 +140,7 @@ def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, Story]]:
 def _stops(drive: _Drive) -> Iterator[Event]:
     for rest in drive.rests:
         x, y, _ = rest.box.centre
-        text = f"stood at x {x:.2f}, y {y:.2f}"
+        text = f"stood at x {x:z.2f}, y {y:z.2f}"
         yield Event("stop", rest.start, rest.end, text, goes_on=rest.end >= drive.way.last)
 
 

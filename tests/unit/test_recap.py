@@ -223,6 +223,13 @@ def _answer(memory: Memory, span: Span) -> str:
         return repr(error)
 
 
+def test_a_stop_a_hair_below_0_is_told_without_a_sign(tmp_path: Path) -> None:
+    stood = [odom(BEGIN + at * S // 2, -0.0001, 2.0, 0.0) for at in range(40)]
+    write_mcap(tmp_path / "bag.mcap", stood)
+    told = [each.text for each in over(memory_of(tmp_path), 0, 30).events]
+    assert told == ["stood at x 0.00, y 2.00"]
+
+
 def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> None:
     stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
     seen = [
