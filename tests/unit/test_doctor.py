@@ -138,6 +138,14 @@ def test_a_disk_without_the_room_that_is_asked_of_it_is_told(
     assert words in wrong["disk"][0]["do"]
 
 
+def test_of_bags_that_are_not_there_nothing_is_used(tmp_path: Path, capsys: Capture) -> None:
+    with (tmp_path / "other.bin").open("wb") as other:
+        other.truncate(10**8)
+    cli.main(["doctor", "--json", f"recording.bag_dir={tmp_path / 'gone'}"])
+    seen = {each["about"]: each["seen"] for each in json.loads(capsys.readouterr().out)["findings"]}
+    assert "; 0.0 of 5 GB used" in seen["disk"]
+
+
 def test_data_from_the_future_means_that_the_clock_is_wrong(robot: Path, capsys: Capture) -> None:
     ahead = time.time_ns() + 7200 * NS_PER_S
     for path in robot.glob("rec/*.mcap"):

@@ -142,7 +142,7 @@ def _room(settings: Settings, bag_dir: Path) -> Iterator[Finding]:
         return
     mount = next(each for each in (there, *there.parents) if os.path.ismount(each))
     kept = settings.retention
-    free, used = disk.free / GB, _size(there) / GB
+    free, used = disk.free / GB, _size(bag_dir) / GB
     seen = f"{free:.1f} GB free on {mount}; {used:.1f} of {kept.max_total_gb:g} GB used"
     if free < kept.min_free_gb:
         do = (
