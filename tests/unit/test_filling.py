@@ -251,6 +251,29 @@ def test_where_no_catalogue_can_be_written_the_command_says_so(
     assert "XDG_CACHE_HOME" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("own_logging")
+def test_a_missing_bag_directory_is_what_the_command_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert main(["index", "--bag-dir", str(tmp_path / "gone")]) == 2
+    assert "the bag directory does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("own_logging")
+def test_the_command_counts_the_warnings_of_the_log_instead_of_showing_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "rec_0.mcap").touch()
+    hour_ago = time.time_ns() - 3600 * NS_PER_S
+    os.utime(tmp_path / "rec" / "rec_0.mcap", ns=(hour_ago, hour_ago))
+    assert main(["index", "--bag-dir", str(tmp_path)]) == 0
+    told = capsys.readouterr().err
+    assert "1 warning logged (bag_damaged)" in told
+    assert '"event"' not in told
+
+
 def test_texts_of_the_newest_bag_are_found_before_and_after_it_is_digested(tmp_path: Path) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "scissors")])
     memory = recalling(tmp_path)
