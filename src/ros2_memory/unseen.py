@@ -70,12 +70,7 @@ def _moment(at: Ns) -> str:
 
 def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> Iterator[str]:
     """The sentences for a window; none where all of it was read."""
-    lost = [
-        aside
-        for aside in (*snapshot.damaged, *snapshot.unread)
-        if _touches(snapshot.places[aside], window, unknown=nothing)
-    ]
-    if lost:
+    if lost := lost_in(snapshot, window, nothing=nothing):
         yield not_read(lost)
     active = _being_written(snapshot, window)
     if active:
@@ -86,6 +81,15 @@ def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> 
     if faults and not nothing:
         yield misdated(faults)
     yield from amiss(snapshot.odd(window))
+
+
+def lost_in(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> list[SetAside]:
+    """The files of a window that were not read at all; those of unknown time with `nothing`."""
+    return [
+        aside
+        for aside in (*snapshot.damaged, *snapshot.unread)
+        if _touches(snapshot.places[aside], window, unknown=nothing)
+    ]
 
 
 def may_be_written(snapshot: Snapshot, window: TimeWindow) -> bool:

@@ -180,6 +180,16 @@ class TestMcap:
         assert cli.main(["export", "--mcap", str(tmp_path / "out.mcap")]) == 1
         assert "rec_0_0.mcap" in capsys.readouterr().err
 
+    def test_a_file_of_the_window_that_is_not_read_at_all_is_told_and_the_exit_code_is_1(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        source = bag_dir / "rec_0" / "rec_0_0.mcap"
+        source.write_bytes(b"no MCAP file")
+        at = T0 / NS_PER_S + 10
+        os.utime(source, (at, at))
+        assert cli.main(["export", "--mcap", str(tmp_path / "out.mcap")]) == 1
+        assert "rec_0_0.mcap" in capsys.readouterr().err
+
 
 class TestParquet:
     def test_duckdb_computes_the_way_that_trajectory_summary_tells(

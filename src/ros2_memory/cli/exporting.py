@@ -29,7 +29,7 @@ from ros2_memory.model import TimeWindow
 from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.timebase import MIN_NS, Ns
-from ros2_memory.unseen import note_unseen
+from ros2_memory.unseen import lost_in, note_unseen
 from ros2_memory.wording import counted
 
 _TELL_EVERY: Final = 512
@@ -95,7 +95,7 @@ def export(
     say(done)
     for note in view.notes:
         typer.echo(f"note: {note}", err=True)
-    if not view.complete:
+    if not view.complete or lost_in(view.snapshot, window):
         raise typer.Exit(NOT_SO)
 
 
