@@ -164,6 +164,7 @@ def test_damaged_bags_lead_to_recover(robot: Path, capsys: Capture) -> None:
     code, wrong = examined(capsys)
     assert code == 1
     assert wrong["bags"][0]["do"] == f"ros2-memory recover {robot}"
+    assert "old_0.mcap (not an MCAP file" in wrong["bags"][0]["seen"]
 
 
 @pytest.mark.parametrize(

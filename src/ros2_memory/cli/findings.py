@@ -205,7 +205,7 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
             Level.WARNING,
             "bags",
             f"{len(told.damaged)} damaged and {len(told.incomplete)} unfinished: "
-            f"{listed([each.path.name for each in left])}",
+            f"{listed([f'{each.path.name} ({each.reason})' for each in left])}",
             f"ros2-memory recover {settings.recording.bag_dir}",
         )
     if told.unread:
