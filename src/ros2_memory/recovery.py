@@ -82,7 +82,8 @@ def recover(
     for folder in recovery.without_metadata():
         say(f"{folder} has no {METADATA_FILE}: `ros2 bag reindex {folder}` makes one")
     if others:
-        say(f"{others} bag files of other kinds were left alone: only MCAP files are repaired")
+        left = counted(others, "bag file of another kind was", "bag files of other kinds were")
+        say(f"{left} left alone: only MCAP files are repaired")
     say(str(recovery.outcome))
     return recovery.outcome
 

@@ -121,7 +121,7 @@ def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
     write_db3(tmp_path / "a/a_0.db3", MESSAGES)
     outcome, said = recovered(tmp_path)
     assert outcome == Outcome()
-    assert said[0].startswith("1 bag files of other kinds")
+    assert said[0].startswith("1 bag file of another kind was left alone")
 
 
 def test_what_is_not_there_cannot_be_repaired(tmp_path: Path) -> None:
