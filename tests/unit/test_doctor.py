@@ -29,9 +29,12 @@ class Answering(BaseHTTPRequestHandler):
     """What stands for the server's `/health`."""
 
     reply = b'{"status": "ok"}'
+    asks_for: str | None = None
 
     def do_GET(self) -> None:
-        self.send_response(200)
+        shown = self.headers["Authorization"]
+        taken = shown is None or self.asks_for in (None, shown)
+        self.send_response(200 if taken else 401)
         self.end_headers()
         self.wfile.write(self.reply)
 
@@ -41,7 +44,7 @@ class Answering(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    Answering.reply = b'{"status": "ok"}'
+    Answering.reply, Answering.asks_for = b'{"status": "ok"}', None
     with HTTPServer(("127.0.0.1", 0), Answering) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
@@ -224,6 +227,17 @@ class TestTheServer:
         code, wrong = examined(capsys)
         assert code == 2
         assert "another program" in wrong["server"][0]["seen"]
+
+    def test_a_token_that_it_does_not_take_is_told_as_such(
+        self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    ) -> None:
+        Answering.asks_for = f"Bearer {'s' * 32}"
+        monkeypatch.setenv("MEMORY_API_TOKEN", "t" * 32)
+        code, wrong = examined(capsys)
+        assert code == 1
+        assert "takes another token" in wrong["server"][0]["seen"]
+        monkeypatch.setenv("MEMORY_API_TOKEN", "s" * 32)
+        assert examined(capsys) == (0, {})
 
     def test_its_problems_are_told(self, robot: Path, capsys: Capture) -> None:
         Answering.reply = b'{"status": "degraded", "problems": ["the bag directory is gone"]}'

@@ -378,6 +378,11 @@ def of_server(settings: Settings) -> Iterator[Finding]:
         seen = f"what answers on {at.host} port {at.port} is another program: {error}"
         yield Finding(Level.ERROR, about, seen, "give the server another port: server.port")
         return
+    if status == http.HTTPStatus.UNAUTHORIZED:
+        seen = f"the server on {at.host} port {at.port} takes another token than MEMORY_API_TOKEN"
+        do = "give doctor the token that the server was started with"
+        yield Finding(Level.WARNING, about, seen, do)
+        return
     took = f"in {(time.monotonic() - begun) * 1000:.0f} ms"
     if reply.get("status") == "ok":
         yield Finding(Level.OK, about, f"ok on {at.host} port {at.port}, {took}")
@@ -389,7 +394,7 @@ def of_server(settings: Settings) -> Iterator[Finding]:
 
 
 def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
-    """Status and reply of `/health`.
+    """Status and reply of `/health`; no reply where it refuses the token.
 
     Raises:
         ValueError: the reply is no JSON object.
@@ -400,6 +405,8 @@ def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
     try:
         connection.request("GET", "/health", headers=headers)
         response = connection.getresponse()
+        if response.status == http.HTTPStatus.UNAUTHORIZED and token:
+            return response.status, {}
         reply: JsonValue = json.loads(response.read(_MOST_REPLY))
     finally:
         connection.close()
