@@ -140,6 +140,21 @@ class TestIndexesThatAreWrong:
         found = reader.records(path, ["/chatter"], TimeWindow(100, 102))
         assert [record.log_time for record in found] == [100, 101]
 
+    def test_no_message_is_lost_in_a_chunk_that_is_said_to_end_before_it_begins(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20, start=100), SMALL)
+        at = chunks_of(path)[1].message_start_time
+
+        def state_much_later(body: bytearray) -> None:
+            if struct.unpack_from("<Q", body) == (at,):
+                struct.pack_into("<Q", body, 0, (1 << 64) - 1)
+
+        edit_summary(path, Opcode.CHUNK_INDEX, state_much_later)
+        reader = McapReader()
+        assert reader.summarize(path).count == 20
+        assert times(read(reader, path)) == list(range(100, 120))
+
     def test_a_message_index_that_points_elsewhere_is_an_error(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "a.mcap", chatter(3))
         (chunk,) = chunks_of(path)

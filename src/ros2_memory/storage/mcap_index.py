@@ -9,7 +9,7 @@ messages themselves.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from operator import attrgetter
+from operator import attrgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -200,8 +200,12 @@ def _agrees(stated: Statistics, chunks: Sequence[Chunk], held: Sequence[Chunk]) 
         return False
     if not held:
         return not stated.messages
-    start, end = min([chunk.start for chunk in held]), max([chunk.end for chunk in held])
-    return (start, end) == (stated.start, stated.end) and end < MAX_NS
+    starts, ends = [chunk.start for chunk in held], [chunk.end for chunk in held]
+    start, end = min(starts), max(ends)
+    if (start, end) != (stated.start, stated.end) or end >= MAX_NS:
+        return False
+    # What lies in a chunk that ends before it begins would be in no window.
+    return all(map(le, starts, ends))
 
 
 def totals_of(
