@@ -142,6 +142,16 @@ class TestInfo:
         assert len(told["data_time_range"]["gaps"]) == 1
         assert told["memory_status"]["budget"]["max_gb"] is None
 
+    @pytest.mark.parametrize("there", [True, False])
+    def test_of_a_memory_without_bags_the_exit_code_is_1(
+        self, there: bool, tmp_path: Path, capsys: Capture
+    ) -> None:
+        folder = tmp_path / "none"
+        if there:
+            folder.mkdir()
+        assert cli.main(["info", "--bag-dir", str(folder)]) == 1
+        assert "bags" in capsys.readouterr().out
+
     def test_where_nothing_is_recorded_there_is_no_budget(self, capsys: Capture) -> None:
         assert cli.main(["info"]) == 0
         shown = capsys.readouterr().out

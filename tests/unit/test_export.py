@@ -131,6 +131,17 @@ class TestMcap:
         rest = [row for row in read(tmp_path / "with.mcap") if row[0] != "/tf_static"]
         assert rest == read(tmp_path / "without.mcap")
 
+    def test_that_nothing_but_latched_messages_of_before_was_found_is_told(
+        self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        mount = tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
+        write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [mount, *driven(T0 + 3, 0)])
+        after = str(T0 / NS_PER_S + 5000)
+        words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--start", after, "--latched"]
+        assert cli.main([*words, "--end", str(T0 / NS_PER_S + 6000)]) == 0
+        assert {row[0] for row in read(tmp_path / "out.mcap")} == {"/tf_static"}
+        assert "no message lies in the window" in capsys.readouterr().err
+
     def test_only_the_topics_that_were_asked_for(self, bag_dir: Path, tmp_path: Path) -> None:
         out = tmp_path / "out.mcap"
         assert cli.main(["export", "--mcap", str(out), "--topic", "/chat*", "--last", "20"]) == 0

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -87,7 +87,11 @@ def export(
         note_unseen(view, window)
         with _progress(view, window) as tell:
             held = _held(view, topics, window.start) if latched else []
-            found = _told(chain(held, view.stream(topics, window)), tell)
+            within = view.stream(topics, window)
+            first = list(islice(within, 1))
+            if held and not first:
+                view.note("no message lies in the window: what latched ones held is all there is")
+            found = _told(chain(held, first, within), tell)
             if mcap is not None:
                 done = as_mcap(mcap, found)
             elif parquet is not None:

@@ -101,7 +101,7 @@ def info(
         for name, rows in beside.items():
             if rows:
                 show(console, {name: rows})
-    if all(is_without_answer(reply) for reply in replies.values()):
+    if not memory.index.snapshot().bags:
         raise typer.Exit(NOT_SO)
 
 
