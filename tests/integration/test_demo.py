@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory.demo.questions import QUESTIONS
 from ros2_memory.demo.run import DemoOptions, run_demo
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 PROGRAM = [str(Path(sys.executable).with_name("ros2-memory")), "demo"]
 
@@ -96,6 +96,20 @@ async def test_it_stays_for_other_clients_and_leaves_a_closed_recording(
     _assert_nobody_listens(url)
 
 
+def test_its_server_ends_with_it_where_it_is_killed(scratch: Path) -> None:
+    with subprocess.Popen(
+        [*PROGRAM, "--port", "0", "--duration", "95"],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment(scratch),
+    ) as demo:
+        try:
+            url = _invited(demo)
+        finally:
+            demo.kill()
+    until(lambda: not _listens(url) or None)
+
+
 def test_a_port_in_use_is_named_and_nothing_is_started(scratch: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -144,6 +158,14 @@ def _invited(demo: subprocess.Popen[str]) -> str:
 
 
 def _assert_nobody_listens(url: str) -> None:
-    port = int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])
-    with socket.create_server(("127.0.0.1", port)):
+    with socket.create_server(("127.0.0.1", _port_of(url))):
         pass
+
+
+def _listens(url: str) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", _port_of(url))) == 0
+
+
+def _port_of(url: str) -> int:
+    return int(url.rsplit(":", 1)[1].split("/", maxsplit=1)[0])

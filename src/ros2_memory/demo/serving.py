@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import ConfigError, EpisodicError
+from ros2_memory.recorder.child import LAUNCHER
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -85,8 +86,12 @@ def served(
     with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
         environment = server_environment(os.environ, bag_dir, port, split_duration_s, cache)
         with log_path.open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "ros2_memory.server"],
+            process = subprocess.Popen(  # noqa: S603 - an argv list, and never a shell
+                [
+                    # It ends with this program, also where that is killed.
+                    *(sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid())),
+                    *(sys.executable, "-m", "ros2_memory.server"),
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=None if verbose else log,
                 stderr=None if verbose else log,
