@@ -14,6 +14,7 @@ from ros2_memory.cli.extras import of_extras
 from ros2_memory.cli.findings import Finding, Level
 from ros2_memory.cli.opening import opened
 from ros2_memory.cli.running import AsJson, BagDir, Overrides, Verbose, busy, output, reporting, say
+from ros2_memory.cli.server_finding import of_server
 from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.showing import plain
 from ros2_memory.config import config_dir
@@ -64,7 +65,7 @@ def examined(
         yield from findings.of_recorder(settings, now)
         yield from findings.of_topics(settings, snapshot, now)
         yield from of_extras(settings)
-        yield from findings.of_server(settings)
+        yield from of_server(settings)
 
 
 def _show(console: Console, found: Sequence[Finding]) -> None:

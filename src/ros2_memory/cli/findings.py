@@ -6,11 +6,8 @@ A finding that is not in order says what to do. Nothing here changes anything.
 from __future__ import annotations
 
 import getpass
-import http.client
-import json
 import os
 import shutil
-import time
 from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -18,7 +15,6 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.adapters import GB, build_recorder
-from ros2_memory.api_token import api_token
 from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.errors import EpisodicError
 from ros2_memory.memory import Call
@@ -47,14 +43,6 @@ LATELY_NS: Final = 3600 * NS_PER_S
 """A topic that is not in the newest data of this length is not recorded just now."""
 
 _UNOFFERED: Final = "no publisher has offered it since the recorder started"
-_SERVER_PATIENCE_S: Final = 5.0
-_MOST_REPLY: Final = 1 << 20
-_HERE: Final[Mapping[str, str]] = {
-    "0.0.0.0": "127.0.0.1",  # noqa: S104 - looked up, never bound
-    "::": "::1",
-    "": "127.0.0.1",
-}
-"""Where a server that listens everywhere is reached from its own machine."""
 
 
 class Level(IntEnum):
@@ -357,59 +345,3 @@ def never_heard(selection: TopicSelection, snapshot: Snapshot) -> Mapping[str, l
         for entry in selection.entries
         if not any(TopicSelection((entry,)).matches(topic) for topic in heard)
     }
-
-
-def of_server(settings: Settings) -> Iterator[Finding]:
-    """What the server's `/health` says."""
-    at, about = settings.server, "server"
-    if at.transport == "stdio":
-        seen = "server.transport=stdio: each client starts its own, there is none to ask"
-        yield Finding(Level.OK, about, seen)
-        return
-    begun = time.monotonic()
-    try:
-        status, reply = _health(_HERE.get(at.host, at.host), at.port)
-    except (OSError, http.client.HTTPException) as error:
-        seen = f"nothing answers on {at.host} port {at.port}: {error}"
-        do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
-        yield Finding(Level.ERROR, about, seen, do)
-        return
-    except (ValueError, EpisodicError) as error:
-        seen = f"what answers on {at.host} port {at.port} is another program: {error}"
-        yield Finding(Level.ERROR, about, seen, "give the server another port: server.port")
-        return
-    if status == http.HTTPStatus.UNAUTHORIZED:
-        seen = f"the server on {at.host} port {at.port} takes another token than MEMORY_API_TOKEN"
-        do = "give doctor the token that the server was started with"
-        yield Finding(Level.WARNING, about, seen, do)
-        return
-    took = f"in {(time.monotonic() - begun) * 1000:.0f} ms"
-    if reply.get("status") == "ok":
-        yield Finding(Level.OK, about, f"ok on {at.host} port {at.port}, {took}")
-        return
-    problems = reply.get("problems")
-    named = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
-    seen = f"{reply.get('status', f'HTTP {status}')}: {named or 'it does not say why'}"
-    yield Finding(Level.WARNING, about, seen, "the findings above and its log have the cause")
-
-
-def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
-    """Status and reply of `/health`; no reply where it refuses the token.
-
-    Raises:
-        ValueError: the reply is no JSON object.
-    """
-    token = api_token(os.environ)
-    headers = {"Authorization": f"Bearer {token.get_secret_value()}"} if token else {}
-    connection = http.client.HTTPConnection(host, port, timeout=_SERVER_PATIENCE_S)
-    try:
-        connection.request("GET", "/health", headers=headers)
-        response = connection.getresponse()
-        if response.status == http.HTTPStatus.UNAUTHORIZED and token:
-            return response.status, {}
-        reply: JsonValue = json.loads(response.read(_MOST_REPLY))
-    finally:
-        connection.close()
-    if not isinstance(reply, dict) or "status" not in reply:
-        raise ValueError("it gives no status")
-    return response.status, reply
