@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import os
-import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
@@ -30,7 +29,7 @@ from ros2_memory.recorder.keepsake import Keepsake, write_keepsake
 from ros2_memory.recorder.layout import HANDOVER_FILE, MOMENT_FILE
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import McapLayout, Msg, detections, odom, text, tf, transform, write_mcap
-from tests.keeping import keeper_of
+from tests.keeping import recorder_at_work
 from tests.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
@@ -140,19 +139,8 @@ def write_history(bag_dir: Path) -> Path:
 def recorder_beside(bag_dir: Path, clock: SettableClock) -> Iterator[None]:
     """A recorder's heartbeat, and what it does when a moment is to be kept."""
     write_heartbeat(bag_dir, heartbeat(clock.at))
-    house, over = keeper_of(bag_dir, clock=clock), threading.Event()
-
-    def work() -> None:
-        while not over.wait(0.01):
-            house.keep_moments(bag_dir)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    try:
+    with recorder_at_work(bag_dir, clock):
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def replies(bag_dir: Path) -> dict[str, str]:

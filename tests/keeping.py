@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import threading
 import time
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from ros2_memory.recorder.counting import CountingReader
@@ -17,7 +19,7 @@ from ros2_memory.timebase import NS_PER_S
 from tests.memories import SettableClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from ros2_memory.storage.base import BagReader
@@ -73,6 +75,24 @@ def recording_now(bag_dir: Path, *recordings: str, clock: Clock | None = None) -
         bag_dir,
         Heartbeat(1, now, RecorderState.RECORDING, recordings, now, 0, (), (), None, 2.0),
     )
+
+
+@contextmanager
+def recorder_at_work(bag_dir: Path, clock: Clock) -> Iterator[None]:
+    """A recorder that looks for wishes again and again, as the daemon does."""
+    house, over = keeper_of(bag_dir, clock=clock), threading.Event()
+
+    def work() -> None:
+        while not over.wait(0.01):
+            house.keep_moments(bag_dir)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def files_in(bag_dir: Path) -> list[str]:

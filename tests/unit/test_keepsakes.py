@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -25,11 +23,10 @@ from ros2_memory.replies import Replies
 from ros2_memory.timebase import Deadline
 from ros2_memory.tools import build_tools
 from tests.bags import odom, write_mcap
-from tests.keeping import keeper_of
+from tests.keeping import keeper_of, recorder_at_work
 from tests.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
 S = 10**9
@@ -55,24 +52,6 @@ def beating(bag_dir: Path, state: RecorderState = RecorderState.RECORDING, at: i
     write_heartbeat(bag_dir, Heartbeat(1, at, state, (), at, 0, (), (), None, 2.0))
 
 
-@contextmanager
-def recorder_at_work(bag_dir: Path) -> Iterator[None]:
-    """A recorder that looks for wishes again and again, as the daemon does."""
-    house, over = keeper_of(bag_dir, clock=SettableClock(NOW)), threading.Event()
-
-    def work() -> None:
-        while not over.wait(0.01):
-            house.keep_moments(bag_dir)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
-
-
 def remember(memory: Memory, label: str = "charger found", *, before: float = 30) -> Any:
     return remember_moment(memory, Call(), label, seconds_before=before, seconds_after=0)
 
@@ -95,7 +74,7 @@ def requests(bag_dir: Path) -> list[Path]:
 def test_a_moment_is_kept_by_the_recorder_and_then_listed(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
     beating(tmp_path)
-    with recorder_at_work(tmp_path):
+    with recorder_at_work(tmp_path, SettableClock(NOW)):
         told = remember(memory)
     assert (told.label, told.start, told.end) == ("charger found", T0 + 30 * S, NOW)
     assert (told.bags, told.pending) == (3, True)  # its end is just now
@@ -128,7 +107,7 @@ def test_what_the_recorder_refuses_is_told_with_its_reason(tmp_path: Path) -> No
     memory = remembering(tmp_path)
     beating(tmp_path)
     (tmp_path / MOMENTS_FOLDER).symlink_to(tmp_path)
-    with recorder_at_work(tmp_path):
+    with recorder_at_work(tmp_path, SettableClock(NOW)):
         assert "symbolic link" in refusal(memory)
     reply = Replies(tmp_path, 24_000).error(RefusedError("there is no room"))
     assert json.loads(reply.text) == {"error": "refused", "detail": "there is no room"}
@@ -200,7 +179,7 @@ def test_a_server_that_may_not_write_there_says_where(tmp_path: Path) -> None:
 def test_with_simulated_time_now_is_the_newest_recorded_moment(tmp_path: Path) -> None:
     memory = remembering(tmp_path, replace(RECORDS, now="latest"))
     beating(tmp_path)
-    with recorder_at_work(tmp_path):
+    with recorder_at_work(tmp_path, SettableClock(NOW)):
         told = remember(memory, before=5)
     assert (told.start, told.end) == (T0 + 54 * S, T0 + 59 * S)
     assert told.bags == 1
