@@ -6,6 +6,7 @@ match nothing.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import struct
@@ -44,52 +45,73 @@ _SIDES: Final = {"above": True, "below": False}
 
 @dataclass(frozen=True, slots=True)
 class Contains:
-    """A text inside any string at any depth (not the keys), without regard to case.
+    """Part of a text, or an element of a list.
 
-    Whatever `Equals` finds is contained as well, be it an element of a list or not: an answer that
-    nothing holds true would be wrong where a boolean is.
+    A text is found inside any string at any depth (not in the keys), without regard to case; a
+    boolean wherever one is equal. A number is a whole value, never a part of one, and is looked
+    for only where a field leads (`has_element`): in a whole message every size, level and
+    coordinate would match. Elsewhere its digits are a text like any other.
     """
 
     needle: Scalar
-    _equals: Equals = field(init=False, repr=False)
+    equal: Equals = field(init=False, repr=False)
+    _folded: str | None = field(init=False, repr=False)
+    _boolean: bool | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_equals", Equals(self.needle))
+        meant = _spelled(self.needle) if isinstance(self.needle, str) else self.needle
+        text = _text_of(self.needle)
+        object.__setattr__(self, "equal", Equals(self.needle))
+        object.__setattr__(self, "_folded", None if text is None else text.casefold())
+        object.__setattr__(self, "_boolean", meant if isinstance(meant, bool) else None)
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the needle is a number or spells one."""
+        meant = _spelled(self.needle) if isinstance(self.needle, str) else self.needle
+        return isinstance(meant, int | float) and not isinstance(meant, bool)
 
     def matches(self, value: JsonValue) -> bool:
-        """Whether the value contains the needle."""
-        if not isinstance(self.needle, str):
-            return self._equals.matches(value)
-        folded = self.needle.casefold()
-        return any(
-            folded in leaf.casefold() if isinstance(leaf, str) else self._equals.is_leaf(leaf)
-            for leaf in leaves(value)
-        )
+        """Whether some text of the value contains the needle, or some boolean is equal to it."""
+        for leaf in leaves(value):
+            if isinstance(leaf, str):
+                if self._folded is not None and self._folded in leaf.casefold():
+                    return True
+            elif isinstance(leaf, bool) and leaf is self._boolean:
+                return True
+        return False
+
+    def has_element(self, target: JsonValue) -> bool:
+        """Whether the target of a field is equal to the needle, or is a list with such an element.
+
+        Elements of lists in it count too, what stands in an object does not.
+        """
+        return any(self.equal.is_leaf(each) for each in elements(target))
 
     def may_match(self, evidence: Evidence) -> bool:
         """Whether some value of which this is the evidence may contain the needle."""
-        # What holds a text equal to the needle may hold the needle's, so this asks for both.
-        return self._equals.may_match(evidence)
+        if self._folded is not None and evidence.may_hold_text(self._folded):
+            return True
+        return self._boolean is not None and evidence.may_hold_boolean(self._boolean)
 
 
 @dataclass(frozen=True, slots=True)
 class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
-    A boolean is never a number. A number is equal to itself and to its float32 rounding, which is
-    what a float32 field holds of it. A string is compared to the letter; one that spells a
-    boolean or a number is equal to that, too, since planners put values in quotes.
+    1 and 0 are equal to true and false. A number is equal to itself and to its float32 rounding,
+    which is what a float32 field holds of it. A string is compared to the letter; one that spells
+    a boolean or a number is equal to that, too, since planners put values in quotes.
     """
 
     value: Scalar
-    # Compared too: without them Equals(True) and Equals(1) would be one condition.
-    _boolean: bool | None = field(init=False, repr=False)
-    _numbers: tuple[int | float, ...] = field(init=False, repr=False)
+    _boolean: bool | None = field(init=False, repr=False, compare=False)
+    _numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         meant = _spelled(self.value) if isinstance(self.value, str) else self.value
-        boolean = meant if isinstance(meant, bool) else None
-        numbers = () if meant is None or boolean is not None else (meant, _float32(meant))
+        boolean = bool(meant) if meant is not None and meant in (0, 1) else None
+        numbers = () if meant is None else (meant, _float32(meant))
         object.__setattr__(self, "_boolean", boolean)
         object.__setattr__(self, "_numbers", numbers)
 
@@ -183,7 +205,12 @@ class Condition:
         """Whether the value, or any target of the field in it, meets the test."""
         if self.field is None:
             return self.test.matches(value)
-        return any(self.test.matches(target) for target in at_field(value, self.field))
+        return any(self._meets(target) for target in at_field(value, self.field))
+
+    def _meets(self, target: JsonValue) -> bool:
+        if isinstance(self.test, Contains) and self.test.has_element(target):
+            return True
+        return self.test.matches(target)
 
     def may_match(self, evidence: Evidence) -> bool:
         """Whether some value of which this is the evidence may match; False rules all of them out.
@@ -192,6 +219,8 @@ class Condition:
         """
         if self.field is not None and isinstance(self.test, NearPosition):
             return self.test.may_match_elsewhere(evidence)
+        if self.field is not None and isinstance(self.test, Contains):
+            return self.test.may_match(evidence) or self.test.equal.may_match(evidence)
         return self.test.may_match(evidence)
 
     @property
@@ -360,6 +389,17 @@ def leaves(value: JsonValue) -> Iterator[JsonValue]:
             yield held
 
 
+def elements(value: JsonValue) -> Iterator[JsonValue]:
+    """The value itself or, where it is a list, its elements and those of the lists in it."""
+    waiting = [value]
+    while waiting:
+        held = waiting.pop()
+        if isinstance(held, list):
+            waiting.extend(held)
+        elif not isinstance(held, dict):
+            yield held
+
+
 def _own_positions(value: JsonValue) -> Iterator[Vector3]:
     for held in value if isinstance(value, list) else (value,):
         # Null is a coordinate that was NaN; texts and lists are not coordinates at all.
@@ -388,6 +428,16 @@ def _spelled(text: str) -> bool | int | float | None:
     if _WHOLE.fullmatch(word):
         return int(word)
     return float(word) if _DECIMAL.fullmatch(word) else None
+
+
+def _text_of(needle: Scalar) -> str | None:
+    """The needle as a text: JSON's where it is none; None for a number too long to be one."""
+    if isinstance(needle, str):
+        return needle
+    try:
+        return json.dumps(needle)
+    except ValueError:
+        return None
 
 
 def _float32(number: float) -> float:

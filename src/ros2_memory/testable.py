@@ -7,10 +7,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.conditions import Condition, NearPosition, at_field, positions
+from ros2_memory.conditions import (
+    Condition,
+    Contains,
+    NearPosition,
+    at_field,
+    elements,
+    leaves,
+    positions,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.model import JsonValue
 
@@ -19,7 +27,12 @@ _LISTED_PATHS: Final = 16
 
 def can_be_untestable(condition: Condition) -> bool:
     """Whether there are values of a shape that cannot meet the condition."""
-    return condition.field is not None or isinstance(condition.test, NearPosition)
+    test = condition.test
+    return (
+        condition.field is not None
+        or isinstance(test, NearPosition)
+        or (isinstance(test, Contains) and test.is_number)
+    )
 
 
 def untestable(condition: Condition, value: JsonValue) -> str | None:
@@ -29,8 +42,11 @@ def untestable(condition: Condition, value: JsonValue) -> str | None:
     said of what would stand below it.
     """
     if condition.field is not None:
-        if at_field(value, condition.field) or _open_below(value, condition.field):
+        if _open_below(value, condition.field):
             return None
+        targets = at_field(value, condition.field)
+        if targets:
+            return _numberless(condition, targets)
         told = ", ".join(_paths(value)) or "none"
         return f"the values have no field {condition.field!r}; their fields are: {told}"
     if isinstance(condition.test, NearPosition):
@@ -40,7 +56,23 @@ def untestable(condition: Condition, value: JsonValue) -> str | None:
             "the values carry no position: near_position needs a topic that does, "
             "or a field that leads to an object with x and y"
         )
-    return None
+    return _numberless(condition, [value])
+
+
+def _numberless(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
+    """Why `contains` finds a number in none of these; None where it may, or is asked for a text."""
+    test = condition.test
+    if not isinstance(test, Contains) or not test.is_number:
+        return None
+    if condition.field is not None and any(True for each in targets for _ in elements(each)):
+        return None
+    kinds = {type(leaf) for each in targets for leaf in leaves(each)}
+    if str in kinds or not kinds & {int, float}:
+        return None
+    return (
+        "the values hold numbers and no text, and contains finds a number only as the value of a "
+        "field or as an element of its list: name that in field, or ask with equals"
+    )
 
 
 def _open_below(value: JsonValue, dot_path: str) -> bool:

@@ -182,8 +182,8 @@ _FRAMES = Entry(
     blocking=True,
 )
 _CONDITIONS = (
-    "contains (text anywhere in the message, or what equals finds), equals (boolean, number or "
-    "text), "
+    "contains (part of a text anywhere in the message, or an element of the list that field "
+    "names), equals (boolean, number or text; 1 and 0 are true and false), "
     "above and below (number; field says which), near_position "
     '({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
 )

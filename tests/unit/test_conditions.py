@@ -60,15 +60,56 @@ def test_case_is_folded_in_every_script() -> None:
     assert Contains("ΣΟΦΟΣ").matches(["σοφος"])
 
 
-@pytest.mark.parametrize(("needle", "found"), [(3, True), (7.5, True), (True, True), (8, False)])
-def test_numbers_and_booleans_are_elements_of_a_list(needle: Scalar, found: bool) -> None:
-    assert Contains(needle).matches(SCENE) is found
+@pytest.mark.parametrize("needle", [3, 7.5, 8, "3", "7.5", "0.5", "20"])
+def test_a_number_is_not_contained_where_no_field_is_named(needle: Scalar) -> None:
+    assert not Contains(needle).matches(SCENE)
+    assert not Contains(needle).matches({"level": 20, "bbox": [1, 2, 3, 4], "on": True})
+
+
+@pytest.mark.parametrize(
+    ("needle", "field"),
+    [
+        (3, "ids"),
+        ("3", "ids"),
+        (7.5, "ids"),
+        (True, "ids"),
+        (1, "ids"),
+        (0.5, "detections.score"),
+        ("0.9", "detections.score"),
+        (-1, "detections.point.y"),
+    ],
+)
+def test_a_field_contains_the_number_that_it_is_or_lists(needle: Scalar, field: str) -> None:
+    assert Condition(Contains(needle), field).matches(SCENE)
+
+
+@pytest.mark.parametrize(
+    ("needle", "field"),
+    [(5, "ids"), ("7", "ids"), ("0.", "detections.score"), (0.5, "detections"), (4, "detections")],
+)
+def test_a_field_contains_no_part_of_a_number_and_none_of_an_object(
+    needle: Scalar, field: str
+) -> None:
+    assert not Condition(Contains(needle), field).matches(SCENE)
+
+
+@pytest.mark.parametrize("needle", [20, "20"])
+def test_the_digits_of_a_number_are_found_in_texts(needle: Scalar) -> None:
+    assert Contains(needle).matches({"level": 10, "msg": "retry in 20 s"})
+    assert not Contains(needle).matches({"level": 20, "msg": "retry"})
+
+
+def test_a_number_too_long_to_be_written_is_contained_in_no_text() -> None:
+    assert not Contains(10**5000).matches(["", "1", "0"])
+    assert Condition(Contains(10**5000), "x").matches({"x": [10**5000]})
 
 
 @given(asked_scalars, json_values)
-def test_what_is_equal_is_contained(asked: Scalar, value: JsonValue) -> None:
-    if Equals(asked).matches(value):
-        assert Contains(asked).matches(value)
+def test_what_a_field_is_equal_to_it_contains(asked: Scalar, value: JsonValue) -> None:
+    held: JsonValue = {"x": [asked, value]}
+    assert Condition(Contains(asked), "x").matches(held)
+    if not isinstance(value, dict | list) and Equals(asked).matches(value):
+        assert Condition(Contains(asked), "x").matches({"x": value})
 
 
 @pytest.mark.parametrize("needle", ["true", "True", True])
@@ -77,7 +118,7 @@ def test_a_boolean_alone_is_contained_also_where_it_is_asked_for_in_quotes(needl
     assert not Contains(needle).matches({"data": False})
 
 
-def test_true_is_not_the_element_one() -> None:
+def test_a_number_is_no_boolean_where_no_field_is_named() -> None:
     assert not Contains(True).matches([1, 1.0])
     assert not Contains(1).matches([True])
     assert not Contains(False).matches([0, None])
@@ -111,8 +152,19 @@ def test_a_boolean_is_equal_to_a_leaf_at_any_depth(value: JsonValue) -> None:
     assert Equals(True).matches(value)
 
 
-@given(st.booleans(), st.one_of(st.integers(), st.floats()))
-def test_a_boolean_never_equals_a_number(asked: bool, number: float) -> None:
+@pytest.mark.parametrize(("asked", "held"), [(1, True), (1.0, True), ("1", True), (0, False)])
+def test_one_and_zero_equal_true_and_false_whichever_is_asked_for(
+    asked: Scalar, held: bool
+) -> None:
+    assert Equals(asked).matches({"data": held})
+    assert not Equals(asked).matches({"data": not held})
+    assert Equals(held).matches({"data": int(held)})
+    assert Equals(str(held)).matches({"data": int(held)})
+    assert not Equals(not held).matches({"data": int(held)})
+
+
+@given(st.booleans(), st.one_of(st.integers(), st.floats()).filter(lambda n: n not in (0, 1)))
+def test_a_boolean_equals_no_other_number(asked: bool, number: float) -> None:
     assert not Equals(asked).matches([number])
     assert not Equals(number).matches([asked])
 
@@ -166,7 +218,7 @@ def test_a_quoted_value_is_equal_to_the_same_text_too(asked: str) -> None:
     assert Equals(asked).matches({"data": asked})
 
 
-@pytest.mark.parametrize(("asked", "leaf"), [("1", True), ("nan", math.nan), ("inf", math.inf)])
+@pytest.mark.parametrize(("asked", "leaf"), [("yes", True), ("nan", math.nan), ("inf", math.inf)])
 def test_a_text_that_spells_neither_is_only_a_text(asked: str, leaf: Scalar) -> None:
     assert not Equals(asked).matches(leaf)
 
@@ -176,8 +228,7 @@ def test_thousands_of_digits_are_a_text_or_a_number_but_no_crash() -> None:
     assert at_field([1, 2], "9" * 5000) == []
 
 
-def test_conditions_on_true_and_on_one_are_different_conditions() -> None:
-    assert Equals(True) != Equals(1)
+def test_to_contain_true_and_to_contain_one_are_different_conditions() -> None:
     assert Contains(True) != Contains(1)
 
 

@@ -55,6 +55,10 @@ conditions = st.builds(
 @given(st.lists(values, max_size=4), values, conditions)
 @example([], [{"point": {"x": 10**400, "y": 0.0}}], Condition(Equals(math.inf)))
 @example([], ["STRASSE"], Condition(Contains("straße")))
+@example([], {"x": [True, 2]}, Condition(Contains(1), "x"))
+@example([], {"x": [True, 2]}, Condition(Contains("2"), "x"))
+@example([], {"x": False}, Condition(Equals(0)))
+@example([], {"x": 1.0}, Condition(Equals("true")))
 def test_evidence_never_rules_out_what_matches(
     others: list[JsonValue], value: JsonValue, condition: Condition
 ) -> None:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.errors import EpisodicError
-from ros2_memory.memory import Call, Limits
-from ros2_memory.replies import Replies
+from ros2_memory.memory import Limits
 from ros2_memory.timebase import FixedClock
-from ros2_memory.tools import build_tools
+from tests.asking import asked
 from tests.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
 from tests.mcap_surgery import spoil_chunk
 from tests.memories import memory_of
@@ -21,7 +18,6 @@ from tests.recalled import recalling
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.memory import Memory
 
 S = 10**9
 T0_S = 1_784_023_200
@@ -55,16 +51,6 @@ def tear(path: Path) -> None:
     was = path.stat().st_mtime_ns
     path.write_bytes(b"this was a bag once, and is none any more")
     os.utime(path, ns=(was, was))
-
-
-def asked(memory: Memory, bag_dir: Path, name: str, **given: object) -> Any:
-    tools = {tool.name: tool for tool in build_tools(memory.limits, 25.0)}
-    replies = Replies(bag_dir, 20_000)
-    try:
-        reply = replies.answer(tools[name].question(given)(memory, Call()))
-    except EpisodicError as error:
-        reply = replies.error(error)
-    return json.loads(reply.text)
 
 
 def notes_of(reply: Any) -> list[str]:

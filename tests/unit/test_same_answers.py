@@ -59,7 +59,11 @@ CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
     ("contains", "never"),
     ("contains", "docked"),
     ("contains", 2),
+    ("contains", "1"),
+    ("contains", "true"),
     ("equals", True),
+    ("equals", 1),
+    ("equals", "0"),
     ("equals", 0.4),
     ("equals", "cup"),
     ("equals", 3),
@@ -69,6 +73,8 @@ CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
     ("near_position", {"x": 500.0, "y": 0.0}),
     ("near_position", {"x": 80, "y": 0.5, "z": 1.0}),
 )
+
+FIELDS = ("goal", "detections.label", "detections.bbox", "position", "value", "data", "nowhere")
 
 
 def questions(moments: list[int], draw: Random) -> Iterator[Question]:
@@ -91,7 +97,10 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
         yield f"recap of {span}", partial(_recap, span)
     for topic in TOPICS:
         for kind, wanted in draw.sample(CONDITIONS, 4):
-            for field in (None, draw.choice(["goal", "detections.label", "position", "nowhere"])):
+            for field in (
+                None,
+                draw.choice(["goal", "detections.label", "position", "value", "data", "nowhere"]),
+            ):
                 before = draw.choice([None, None, draw.choice(moments) / 1e9])
                 yield (
                     f"last {topic} {kind} {wanted} {field} {before}",

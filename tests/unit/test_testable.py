@@ -57,6 +57,18 @@ def test_nearness_is_asked_of_values_with_positions_only() -> None:
     assert "no position" in told
 
 
+@pytest.mark.parametrize("wanted", [3, "3", 2.5])
+def test_a_number_is_contained_in_a_text_or_in_what_a_field_names(wanted: JsonValue) -> None:
+    told = refusal(ODOM, "contains", wanted)
+    assert told is not None
+    assert "ask with equals" in told
+    assert refusal(ODOM, "contains", wanted, "position") is not None
+    assert refusal(ODOM, "contains", wanted, "position.x") is None
+    assert refusal(SEEN, "contains", wanted) is None
+    assert refusal({"data": []}, "contains", wanted) is None
+    assert refusal(ODOM, "contains", "cup") is None
+
+
 _values = st.recursive(
     st.none() | st.booleans() | st.integers(0, 3) | st.sampled_from(["cup", "x"]),
     lambda inner: (
@@ -72,6 +84,8 @@ def test_what_matches_is_never_refused(value: JsonValue, field: str) -> None:
     tests: list[tuple[str, JsonValue]] = [
         ("equals", 1),
         ("contains", "cup"),
+        ("contains", "1"),
+        ("contains", 2),
         ("near_position", {"x": 1, "y": 1}),
     ]
     for kind, wanted in tests:

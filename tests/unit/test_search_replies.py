@@ -1,0 +1,126 @@
+"""What a planner reads where it searched: a match, `null`, or what could not be searched."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from tests.asking import asked
+from tests.bags import Msg, boolean, detections, make, stamp, write_mcap
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.model import JsonValue
+
+S = 10**9
+T0_S = 1_784_000_000
+T0 = T0_S * S
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def log(ns: int, level: int, msg: str) -> Msg:
+    body = make(
+        "rcl_interfaces/msg/Log",
+        stamp=stamp(ns),
+        level=level,
+        name="driver",
+        msg=msg,
+        file="driver.cpp",
+        function="spin",
+        line=20,
+    )
+    return Msg("/rosout", "rcl_interfaces/msg/Log", ns, body)
+
+
+def numbers(ns: int, *held: int) -> Msg:
+    layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    body = make("std_msgs/msg/Int32MultiArray", layout=layout, data=np.array(held, dtype=np.int32))
+    return Msg("/numbers", "std_msgs/msg/Int32MultiArray", ns, body)
+
+
+def last(bag_dir: Path, recalls: bool, topic: str, kind: str, value: JsonValue, **more: Any) -> Any:
+    memory = memory_of(bag_dir)
+    if recalls:
+        memory = recalling(memory, bag_dir)
+    return asked(
+        memory, bag_dir, "find_last_match", topic=topic, condition_type=kind, value=value, **more
+    )
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    first = [
+        log(T0, 20, "started"),
+        boolean(T0 + S, True),
+        numbers(T0 + 2 * S, 3, 20),
+        detections(T0 + 3 * S, ["cup"]),
+    ]
+    second = [
+        log(T0 + 10 * S, 30, "retry in 20 s"),
+        boolean(T0 + 11 * S, False),
+        numbers(T0 + 12 * S, 4),
+        detections(T0 + 13 * S, []),
+    ]
+    third = [log(T0 + 20 * S, 20, "done"), boolean(T0 + 21 * S, False), numbers(T0 + 22 * S, 5)]
+    for nth, messages in enumerate([first, second, third]):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages)
+    return tmp_path
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("topic", "kind", "value", "field", "at_s"),
+    [
+        ("/rosout", "contains", "20", None, 10),
+        ("/rosout", "contains", 20, None, 10),
+        ("/rosout", "contains", "20", "msg", 10),
+        ("/rosout", "contains", "20", "level", 20),
+        ("/rosout", "contains", 20, "level", 20),
+        ("/rosout", "contains", "2", "level", None),
+        ("/rosout", "equals", 20, None, 20),
+        ("/vision/scene/scene_objects", "contains", "100", None, None),
+        ("/vision/scene/scene_objects", "contains", 100, "detections.bbox", 3),
+        ("/vision/scene/scene_objects", "contains", "10", "detections.bbox", 3),
+        ("/vision/scene/scene_objects", "contains", "1", "detections.bbox", None),
+        ("/vision/scene/scene_objects", "equals", "100", None, 3),
+        ("/numbers", "contains", 3, "data", 2),
+        ("/numbers", "contains", "20", "data", 2),
+        ("/numbers", "contains", 7, "data", None),
+        ("/bumper", "equals", 1, None, 1),
+        ("/bumper", "equals", "1", None, 1),
+        ("/bumper", "equals", 0, None, 21),
+        ("/bumper", "equals", True, None, 1),
+        ("/bumper", "equals", 2, None, None),
+        ("/bumper", "contains", "true", None, 1),
+        ("/bumper", "contains", True, None, 1),
+        ("/bumper", "contains", 1, "value", 1),
+    ],
+)
+def test_a_number_is_found_as_a_whole_value_and_a_text_by_its_part(
+    bag_dir: Path,
+    recalls: bool,
+    topic: str,
+    kind: str,
+    value: JsonValue,
+    field: str | None,
+    at_s: int | None,
+) -> None:
+    reply = last(bag_dir, recalls, topic, kind, value, field=field)
+    assert reply == (None if at_s is None else reply)
+    assert at_s is None or reply["timestamp"] == T0_S + at_s
+
+
+@each_way
+@pytest.mark.parametrize("value", [5, "5"])
+def test_never_is_not_the_answer_where_only_a_named_field_could_hold_the_number(
+    bag_dir: Path, recalls: bool, value: JsonValue
+) -> None:
+    reply = last(bag_dir, recalls, "/numbers", "contains", value)
+    assert reply["error"] == "invalid_arguments"
+    assert "name that in field, or ask with equals" in reply["detail"]
