@@ -170,8 +170,9 @@ class Visit:
         arrived: log time of its first pose there; None where it was there before what was searched.
         departed: of its last one; None where it is there still.
         duration: between the first and the last that are known.
-        closest_m: how near it came, in the plane.
-        closest_at: when.
+        closest_m: distance (m, in the plane) of the recorded pose that is nearest; the robot may
+            have been nearer between two messages.
+        closest_at: log time of that pose.
         restarts: how often odometry began anew since.
     """
 
@@ -187,7 +188,7 @@ class Visit:
 class Visits:
     """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
 
-    `total` is how many there are; None where the search did not go through all.
+    `total` is how many were found; a note says so where there may be more.
     """
 
     frame_id: str
@@ -196,7 +197,7 @@ class Visits:
     radius_m: float
     visits: tuple[Visit, ...]
     more: bool
-    total: int | None
+    total: int
     now: Ns
     notes: tuple[str, ...] = ()
 

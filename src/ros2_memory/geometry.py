@@ -139,6 +139,19 @@ def distance(a: Vector3, b: Vector3) -> float:
     return math.dist(a, b)
 
 
+def off_segment(
+    point: tuple[float, float], start: tuple[float, float], end: tuple[float, float]
+) -> float:
+    """How far a point of the plane is from a segment; NaN where a coordinate is NaN."""
+    (px, py), (ax, ay) = point, start
+    dx, dy = end[0] - ax, end[1] - ay
+    along = ((px - ax) * dx + (py - ay) * dy) * _scale(dx, dy, 0.0)
+    if math.isnan(along):
+        return math.nan
+    along = min(max(along, 0.0), 1.0)
+    return math.hypot(px - ax - along * dx, py - ay - along * dy)
+
+
 def simplify_to(
     points: Sequence[Vector3], tolerance_m: float, at_most: int
 ) -> tuple[list[int], float]:

@@ -2,27 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.presences import SILENCE_NS
 from ros2_memory.timebase import NS_PER_S, Ns
 
+if TYPE_CHECKING:
+    from ros2_memory.model import TimeWindow
+
 FLICKER_NS: Final[Ns] = 3 * NS_PER_S
 """A robot that is outside for less did not leave."""
+
+
+class Approach(NamedTuple):
+    """A distance (m, in the plane) from the place, and when; the lesser of two is the closer."""
+
+    distance_m: float
+    time: Ns
+
+
+class Unread(NamedTuple):
+    """A time in which every pose is within the radius, and none is closer than the bound."""
+
+    bound: Approach
+    window: TimeWindow
 
 
 @dataclass(slots=True)
 class Stay:
     """A visit that is gone through from its end.
 
-    `left`: before it, so far as it is known, the robot was elsewhere; `begun`: it began here.
+    `closest` is that of the poses read one by one; `unread` are the times of the others. `left`:
+    before it, so far as it is known, the robot was elsewhere; `begun`: it began here.
     """
 
     departed: Ns
     arrived: Ns
-    closest_m: float
-    closest_at: Ns
+    closest: Approach | None = None
+    unread: list[Unread] = field(default_factory=list)
     left: bool = False
     begun: bool = False
 
@@ -39,8 +57,17 @@ class Stays:
         self.all: list[Stay] = []
         self._open: Stay | None = None
 
-    def near(self, first: Ns, last: Ns, closest: tuple[float, Ns]) -> None:
-        """The robot was within the radius from `first` to `last`."""
+    def near(self, approach: Approach, last: Ns | None = None) -> None:
+        """A pose is within the radius; with `last`, every one until then is, at the same place."""
+        stay = self._at(approach.time, approach.time if last is None else last)
+        stay.closest = approach if stay.closest is None else min(approach, stay.closest)
+
+    def near_throughout(self, first: Ns, last: Ns, unread: Unread) -> None:
+        """Every pose from `first` to `last` is within the radius, none long after another."""
+        self._at(first, last).unread.append(unread)
+
+    def _at(self, first: Ns, last: Ns) -> Stay:
+        """The stay that goes on from `first` to `last`."""
         stay = self._open
         if stay is not None:
             allowed = FLICKER_NS if stay.left else SILENCE_NS
@@ -48,12 +75,11 @@ class Stays:
                 self.end()
                 stay = None
         if stay is None:
-            self._open = stay = Stay(last, first, *closest)
+            self._open = stay = Stay(last, first)
             self.all.append(stay)
-        elif closest[0] <= stay.closest_m:
-            stay.closest_m, stay.closest_at = closest
         stay.arrived = first
         stay.left = False
+        return stay
 
     def away(self, at: Ns) -> bool:
         """The robot was elsewhere then; gives whether a stay may still go on further back."""

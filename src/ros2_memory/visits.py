@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from itertools import islice
+from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.absence import moment, require_bags, resolve_topic
@@ -18,27 +18,36 @@ from ros2_memory.candidates import Candidates
 from ros2_memory.conditions import Condition, NearPosition
 from ros2_memory.copies import COPY_HORIZON_NS
 from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
+from ros2_memory.geometry import off_segment
 from ros2_memory.groups import groups_of
 from ros2_memory.history import View
 from ros2_memory.model import TimeWindow
+from ros2_memory.motion import is_place
 from ros2_memory.places import placing
 from ros2_memory.portions import Kept, is_whole
+from ros2_memory.presences import SILENCE_NS
 from ros2_memory.restarts import restarts
-from ros2_memory.stays import Stays
-from ros2_memory.timebase import MAX_NS, MIN_NS, Ns
-from ros2_memory.trajectory import PoseCollector
+from ros2_memory.sights import Sights
+from ros2_memory.stays import Approach, Stays, Unread
+from ros2_memory.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.unseen import note_unseen
-from ros2_memory.ways import POSES, carries_no, leave_out, stops
+from ros2_memory.ways import POSES, add_poses, carries_no, leave_out, stops
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.copies import Found
+    from ros2_memory.groups import Group
     from ros2_memory.memory import Call, Memory
+    from ros2_memory.model import Pose, Vector3
     from ros2_memory.motion import PoseDigest, Stop
     from ros2_memory.places import Placing
     from ros2_memory.stays import Stay
 
+_COUNTING_S: Final = 5.0
+"""For so long visits are counted that are not shown."""
+_ROUNDING_M: Final = 1e-6
+"""What may be lost of a distance between doubles."""
 _MOST_TRIED: Final = 1000
 """The newest poses, of which one must be readable."""
 
@@ -72,20 +81,20 @@ def visits(
     topic = resolve_topic(view, memory.limits.pose_topic)
     place = placing(view, _pose_frame(view, topic), frame_id)
     looking = _Looking(view, topic, place, (x, y, radius))
-    found, more = looking.newest(limit)
     latest, newest = view.snapshot.latest, looking.newest_time
-    epochs = [] if place.is_map or not found else restarts(view, topic, found[-1].arrived)
+    found, total = looking.newest(limit)
+    epochs = [] if place.is_map or not found else _restarts(view, topic, found[-1][0].arrived)
     note_unseen(view, TimeWindow.everything(), nothing=not found)
     told = tuple(
         Visit(
             arrived=stay.arrived if stay.begun else None,
             departed=None if stay.departed == newest else stay.departed,
             duration=stay.departed - stay.arrived,
-            closest_m=stay.closest_m,
-            closest_at=stay.closest_at,
+            closest_m=closest.distance_m,
+            closest_at=closest.time,
             restarts=sum(epoch > stay.departed for epoch in epochs),
         )
-        for stay in found
+        for stay, closest in found
     )
     if any(visit.restarts for visit in told):
         view.note(
@@ -98,11 +107,21 @@ def visits(
         y=y,
         radius_m=radius,
         visits=told,
-        more=more,
-        total=None if more else len(told),
+        more=total > len(told),
+        total=total,
         now=wall if memory.limits.now == "wall" or latest is None else latest,
         notes=view.notes,
     )
+
+
+def _restarts(view: View, topic: str, since: Ns) -> list[Ns]:
+    """When odometry began anew after a moment; not known where the time is over before."""
+    try:
+        return restarts(view, topic, since)
+    except QueryTimeoutError:
+        view.complete = False
+        view.note("the time was over before it was known whether odometry began anew since")
+        return []
 
 
 def _pose_frame(view: View, topic: str) -> str:
@@ -134,6 +153,20 @@ def _frame_of(view: View, found: Found) -> str:
     return pose.frame_id
 
 
+class _Nearest:
+    """Takes poses, and remembers the closest approach; the earliest of equals."""
+
+    def __init__(self, away: Callable[[Vector3], float], approach: Approach | None) -> None:
+        self._away = away
+        self.approach = approach
+
+    def add(self, time: Ns, pose: Pose, _speed_mps: float | None = None, /) -> None:
+        """Takes the next pose."""
+        if is_place(pose.position):
+            here = Approach(self._away(pose.position), time)
+            self.approach = here if self.approach is None else min(here, self.approach)
+
+
 class _Looking:
     """Goes through the poses of a topic from the newest on, but for bags that are ruled out."""
 
@@ -146,14 +179,18 @@ class _Looking:
         self._x, self._y, self._radius = wanted
         self._here = place.in_poses(self._x, self._y)
         self._kept: Kept[PoseDigest] = Kept(view, topic, POSES, TimeWindow.everything())
+        self._counting: Deadline | None = None
 
     @property
     def newest_time(self) -> Ns | None:
         """When the newest pose was recorded."""
         return next((stop.time for stop in self._positions(TimeWindow.everything())), None)
 
-    def newest(self, limit: int) -> tuple[list[Stay], bool]:
-        """The newest visits, and whether there are more."""
+    def newest(self, limit: int) -> tuple[list[tuple[Stay, Approach]], int]:
+        """The newest visits, each with its closest approach, and how many there are in all.
+
+        Where the time is over before all is gone through, there are as many as were found.
+        """
         stays = Stays(limit)
         before = MAX_NS
         try:
@@ -161,16 +198,51 @@ class _Looking:
                 self._pass_over(stays, TimeWindow(part.stop, max(before, part.stop)))
                 self._look(stays, part)
                 before = part.start
-                if stays.enough:
-                    return stays.all[:limit], True
+                if stays.enough and self._counting is None:
+                    self._counting = Deadline.after(_COUNTING_S)
+                self._check_counting()
+            stays.end()
         except QueryTimeoutError:
             if not stays.all:
                 raise
             self._view.complete = False
-            self._view.note(f"the search ran out of time at {moment(before)}")
-            return stays.all[:limit], True
-        stays.end()
-        return stays.all[:limit], len(stays.all) > limit
+            if self._counting is None:
+                self._view.note(f"the search ran out of time at {moment(before)}")
+            self._view.note(f"total counts the visits back to {moment(before)}: there may be more")
+        return [(stay, self._closest(stay)) for stay in stays.all[:limit]], len(stays.all)
+
+    def _check_counting(self) -> None:
+        """Gives up when the time for counting visits that are not shown is over.
+
+        Raises:
+            QueryTimeoutError: it is.
+        """
+        if self._counting is not None and self._counting.expired():
+            raise QueryTimeoutError("counting takes too long")
+
+    def _closest(self, stay: Stay) -> Approach:
+        """The closest of all poses of a visit, the earliest of equals.
+
+        Whole bags within the radius are read only where one of their poses may be closer.
+        """
+        closest = stay.closest
+        sights = Sights(self._view.memory.reader, self._view.memory.extractor)
+        for bound, window in sorted(stay.unread):
+            if closest is not None and closest <= bound:
+                break
+            nearest = _Nearest(self._away, closest)
+            try:
+                add_poses(self._view, nearest, sights, self._view.stream([self._topic], window), [])
+            except QueryTimeoutError:
+                self._view.complete = False
+                self._view.note(
+                    f"closest_m of the visit until {moment(stay.departed)} is not the least: "
+                    "the time was over before all of its poses were read"
+                )
+                return nearest.approach or bound
+            closest = nearest.approach
+        # Where the bags of the visit are gone meanwhile, what is known of them serves.
+        return closest or min(stay.unread).bound
 
     def _parts(self) -> Iterator[TimeWindow]:
         """The times in which the robot may have been near, newest first."""
@@ -198,52 +270,65 @@ class _Looking:
         alone = len(groups) == 1 and is_whole(groups[0], part) and not self._contested(part)
         if alone and self._here is not None:
             known = self._kept.of(groups[0])
-            digest, span = known if known is not None else self._made(part)
-            if span is not None and self._all_near(digest):
-                stays.near(*span, self._closest(digest))
+            if known is not None and self._sum_up(stays, groups[0], *known):
                 return
         self._place.look_at(part)
         for time, position in self._positions(part):
+            self._check_counting()
             off = self._off(time, position)
             if off is not None and off <= self._radius:
-                stays.near(time, time, (off, time))
+                stays.near(Approach(off, time))
             else:
                 stays.away(time)
+
+    def _sum_up(self, stays: Stays, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> bool:
+        """Takes a whole group by the digest of its poses, where that is enough to know."""
+        if digest.invalid or digest.first is None or digest.last is None:
+            return False
+        path = [vertex[1] for vertex in digest.vertices]
+        error_m = digest.error_m + _ROUNDING_M
+        bound_m = self._off_path(path) - error_m
+        if bound_m > self._radius:
+            stays.away(digest.first.time)
+            return True
+        near = all(self._away(position) + error_m <= self._radius for position in path)
+        if not near or not self._unbroken(group, digest, span):
+            return False
+        if digest.error_m == 0 and len({*path}) == 1:
+            # It stood, and all poses are one.
+            stays.near(Approach(self._away(path[0]), digest.first.time), digest.last.time)
+            return True
+        bound = Approach(max(bound_m, 0.0), span[0])
+        stays.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1)))
+        return True
+
+    def _off_path(self, path: Sequence[Vector3]) -> float:
+        """How far (m, in the plane) the place is from a drawn path."""
+        here = self._here or (math.nan, math.nan)
+        # Each vertex by itself too: what is parted may be a single one.
+        pairs = chain(zip(path, path, strict=True), pairwise(path))
+        gaps = [off_segment(here, before[:2], after[:2]) for before, after in pairs]
+        return min(gap for gap in gaps if not math.isnan(gap))
+
+    def _unbroken(self, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> bool:
+        """Whether no two poses of a group that follow each other are so far apart as to part it."""
+        first, last = span
+        if last - first <= SILENCE_NS:
+            return True
+        if len(group.holdings) > 1:
+            return False
+        bag, window = group.holdings[0].bag, TimeWindow(first, last + 1)
+        times = self._view.log_times(bag, self._topic, window)
+        return len(times) == digest.poses and all(
+            after - before <= SILENCE_NS for before, after in pairwise(times)
+        )
 
     def _contested(self, part: TimeWindow) -> bool:
         """Whether another recording may hold the original of a pose in a part."""
         wider = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
         return len({each.bag.recording for each in self._view.holdings([self._topic], wider)}) > 1
 
-    def _made(self, part: TimeWindow) -> tuple[PoseDigest, tuple[Ns, Ns] | None]:
-        """The digest of the poses of a part, as the catalogue would have it."""
-        collector = PoseCollector(self._view.memory.limits.max_plausible_speed_mps)
-        times: list[Ns] = []
-        for found in self._view.stream([self._topic], part):
-            times.append(found.time)
-            try:
-                message = self._view.memory.reader.decode(found.record)
-            except UndecodableError:
-                return collector.digest(), None
-            pose = self._view.memory.extractor.pose(message, found.record.channel.type)
-            if pose is None:
-                return collector.digest(), None
-            collector.add(found.time, pose)
-        return collector.digest(), (times[0], times[-1]) if times else None
-
-    def _all_near(self, digest: PoseDigest) -> bool:
-        """Whether every pose of a digest is within the radius, as its drawn path tells."""
-        if digest.invalid or not digest.poses or digest.jumps:
-            return False
-        return all(
-            self._away(position) + digest.error_m <= self._radius
-            for _, position, _ in digest.vertices
-        )
-
-    def _closest(self, digest: PoseDigest) -> tuple[float, Ns]:
-        return min((self._away(position), time) for time, position, _ in digest.vertices)
-
-    def _away(self, position: tuple[float, float, float]) -> float:
+    def _away(self, position: Vector3) -> float:
         """How far (m, in the plane) a position of the poses' frame is from the place."""
         here = self._here or (math.nan, math.nan)
         return math.dist(position[:2], here)

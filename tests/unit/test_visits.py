@@ -255,6 +255,82 @@ def test_a_visit_whose_search_runs_out_of_time_has_no_arrival(tmp_path: Path) ->
     assert False in outcomes
 
 
+@each_way
+@pytest.mark.parametrize("split_s", [10.0, 40.0])
+def test_a_robot_that_passes_over_a_place_was_no_farther_than_its_nearest_pose(
+    tmp_path: Path, split_s: float, recalls: bool
+) -> None:
+    memory = remembering(tmp_path, line((20, 0.25), x=-2.5), split_s=split_s)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    [visit] = visits(memory, Call(), 0.0, 0.0, radius_m=5.0).visits
+    assert visit.closest_m == pytest.approx(0.0, abs=1e-9)
+    assert visit.closest_at == BEGIN + 10 * S
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    seed=st.integers(0, 2**32),
+    step=st.sampled_from([0.0, 0.002, 0.05, 0.3]),
+    radius=st.sampled_from([0.1, 0.6, 2.0, 8.0]),
+    split_s=st.sampled_from([5.0, 12.0, 60.0]),
+)
+def test_the_closest_approach_is_that_of_the_recorded_poses(
+    seed: int, step: float, radius: float, split_s: float
+) -> None:
+    """Held to every pose there is, whether the catalogue knows the bags or not."""
+    draw = random.Random(seed)
+    poses, x, y, at = [], 0.0, 0.0, BEGIN
+    for _ in range(200):
+        x, y = x + draw.uniform(-step, step), y + draw.uniform(-step, step)
+        poses.append((at, x, y))
+        at += draw.choice([S // 5] * 20 + [2 * S] * 8 + [12 * S])
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        plain = remembering(bag_dir, [odom(t, x, y, 0.0) for t, x, y in poses], split_s=split_s)
+        place = (draw.uniform(-1, 1), draw.uniform(-1, 1))
+        told = visits(plain, Call(), *place, radius_m=radius, limit=100)
+        for visit in told.visits:
+            first = visit.arrived or BEGIN
+            last = visit.departed if visit.departed is not None else poses[-1][0]
+            inside = [(math.dist((px, py), place), t) for t, px, py in poses if first <= t <= last]
+            distance, when = min(inside)
+            assert visit.closest_m == pytest.approx(distance, abs=1e-12)
+            assert visit.closest_at == when
+        assert told.total == len(told.visits)
+        assert visits(recalling(plain, bag_dir), Call(), *place, radius_m=radius, limit=100) == told
+
+
+@each_way
+def test_total_counts_the_visits_that_are_not_shown_too(tmp_path: Path, recalls: bool) -> None:
+    there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
+    memory = remembering(tmp_path, line(*there_and_back))
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0, limit=1)
+    assert len(answer.visits) == 1
+    assert answer.more
+    assert answer.total == 4
+    assert not answer.notes
+
+
+def test_total_is_what_was_counted_where_the_time_is_over(tmp_path: Path) -> None:
+    there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
+    memory = remembering(tmp_path, line(*there_and_back))
+    totals = set()
+    for looks in range(1, 60):
+        call = Call(Deadline.after(looks, iter(range(100_000)).__next__))
+        try:
+            answer = visits(memory, call, 10.0, 0.0, radius_m=1.0, limit=1)
+        except QueryTimeoutError:
+            continue
+        assert answer.total >= len(answer.visits)
+        assert (answer.total < 4) <= any("total counts" in note for note in answer.notes)
+        totals.add(answer.total)
+    assert 4 in totals
+    assert len(totals) > 1
+
+
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
 def test_visits_are_the_same_whatever_the_catalogue_knows(seed: int, part: float) -> None:
