@@ -8,6 +8,7 @@ from ros2_memory import answers
 from ros2_memory.absence import require_bags
 from ros2_memory.history import View, short_name
 from ros2_memory.model import BagState, SetAside, TimeWindow
+from ros2_memory.recorder.listed_splits import absence_told, absent_splits
 from ros2_memory.timebase import Ns, ns_from_unix
 from ros2_memory.unseen import amiss, misdated
 from ros2_memory.wording import counted
@@ -68,6 +69,8 @@ def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
     if snapshot.dating.note:
         view.note(snapshot.dating.note)
     _note_odd_bags(view)
+    for sentence in absence_told(absent_splits(snapshot, memory.index.bag_dir)):
+        view.note(sentence)
     undecodable = undecodable_topics(view)
     return answers.TimeRange(
         earliest=snapshot.dating.earliest,
@@ -93,6 +96,25 @@ def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
         for bag in snapshot.odd(TimeWindow.everything())
         if bag.state is BagState.INCOMPLETE
     )
+
+
+def odd_bags(snapshot: Snapshot) -> list[BagFile]:
+    """The bags of which something is amiss, be it no crash and no clock, in bag order."""
+    bags = snapshot.odd(TimeWindow.everything())
+    return [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
+
+
+def nothing_here(snapshot: Snapshot) -> str:
+    """The sentence on a bag directory of which no bag answers."""
+    if snapshot.active:
+        return "no bag answers yet: the first one is still being written"
+    if snapshot.empty:
+        return (
+            f"no message is recorded here: {counted(snapshot.empty, 'bag holds', 'bags hold')} none"
+        )
+    if snapshot.damaged or snapshot.unread:
+        return "no bag answers"
+    return "no bag is here: nothing is recorded yet, or it is recorded elsewhere"
 
 
 def clock_faults(snapshot: Snapshot) -> tuple[SetAside, ...]:
@@ -154,8 +176,7 @@ def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
 
 def _note_odd_bags(view: View) -> None:
     """Says of the newest bags that are odd, not left open, and no fault of a clock, in what way."""
-    bags = view.snapshot.odd(TimeWindow.everything())
-    odd = [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
+    odd = odd_bags(view.snapshot)
     for bag in odd[-_ODD_BAGS:]:
         view.note(f"{short_name(bag.path)}: {'; '.join(bag.summary.notes)}")
     more = len(odd) - _ODD_BAGS

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.accounts import Budget, Status, Stillness
 from ros2_memory.history import View
+from ros2_memory.overview import nothing_here, odd_bags, undecodable_topics
 from ros2_memory.recorder.heartbeat import RecorderState
+from ros2_memory.recorder.listed_splits import absence_told, absent_splits
 from ros2_memory.timebase import NS_PER_S, Ns
-from ros2_memory.wording import counted
+from ros2_memory.wording import counted, listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -48,7 +50,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         incomplete=snapshot.taken[1],
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot),
-        problems=tuple(problems_of(snapshot, heartbeat, wall)),
+        problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
         notes=view.notes,
     )
 
@@ -71,6 +73,29 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         yield "the recorder has stopped without saying so"
     elif heartbeat.state is RecorderState.PAUSED:
         yield f"the recorder is paused: {heartbeat.last_error or 'it does not say why'}"
+
+
+def lacking_in(view: View) -> Iterator[str]:
+    """What is known to be missing from the answers, in sentences, each with its count.
+
+    Damaged files and a directory that cannot be read are among `problems_of`.
+    """
+    snapshot = view.snapshot
+    if snapshot.problem is None and not snapshot.bags:
+        yield nothing_here(snapshot)
+    if left_open := snapshot.taken[1]:
+        bags = counted(left_open, "bag was", "bags were")
+        yield f"{bags} left open by a crash: what did not reach the disk is lost"
+    if snapshot.unread:
+        files = counted(len(snapshot.unread), "file is not read", "files are not read")
+        yield f"{files}; data_time_range says why"
+    if odd := len(odd_bags(snapshot)):
+        bags = counted(odd, "bag is", "bags are")
+        yield f"{bags} not whole or contradictory; data_time_range says how"
+    yield from absence_told(absent_splits(snapshot, view.memory.index.bag_dir))
+    if undecodable := {each.topic for each in undecodable_topics(view)}:
+        topics = counted(len(undecodable), "topic")
+        yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
 
 
 def _fallen_silent(snapshot: Snapshot) -> Iterator[Stillness]:

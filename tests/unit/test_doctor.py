@@ -170,6 +170,30 @@ def test_damaged_bags_lead_to_recover(robot: Path, capsys: Capture) -> None:
     assert "old_0.mcap (not an MCAP file" in wrong["bags"][0]["seen"]
 
 
+def test_an_empty_directory_is_not_in_order(robot: Path, capsys: Capture) -> None:
+    (robot / "rec" / "rec_0.mcap").unlink()
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert wrong["bags"][0]["seen"].startswith("no bag is here")
+
+
+def test_files_that_metadata_lists_and_are_not_there_are_counted(
+    robot: Path, capsys: Capture
+) -> None:
+    names = "".join(f"  - rec_{n}.mcap\n" for n in range(13))
+    text = f"rosbag2_bagfile_information:\n  version: 4\n  relative_file_paths:\n{names}"
+    metadata = robot / "rec" / "metadata.yaml"
+    metadata.write_text(f"{text}  message_count: 300\n")
+    hour_ago = time.time() - 3600
+    os.utime(metadata, (hour_ago, hour_ago))
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert wrong["bags"][0]["seen"] == (
+        "metadata.yaml of rec lists 12 files that are not there and 250 messages that no file here "
+        "holds"
+    )
+
+
 @pytest.mark.parametrize(
     ("state", "more", "code"),
     [

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
+from mcap.writer import Writer
 
 from ros2_memory.accounts import Stillness
 from ros2_memory.memory import Call
@@ -149,3 +150,105 @@ def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path
     assert told["keeps_days"] == 2.04
     older = replace(memory.limits, kept=replace(budget, max_age_ns=DAY))
     assert shown(replace(memory, limits=older), tmp_path)["budget"]["keeps_days"] == 1.0
+
+
+SOUND = "nothing is known to be missing"
+
+
+class TestWhatIsMissingIsNamedAndCounted:
+    def trust(self, folder: Path, storage: str = "mcap") -> str:
+        trust = shown(memory_of(folder, storage=storage), folder)["trust"]
+        assert isinstance(trust, str)
+        return trust
+
+    def recording(self, folder: Path, *listed: tuple[str, int]) -> None:
+        """Two splits of five messages each, and a metadata.yaml that lists those given."""
+        for split in range(2):
+            messages = [odom(BEGIN + (10 * split + t) * S, 0.0, 0.0) for t in range(5)]
+            write_mcap(folder / f"rec_{split}.mcap", messages)
+        names = "".join(f"  - {name}\n" for name, _ in listed)
+        files = "".join(f"  - path: {name}\n    message_count: {n}\n" for name, n in listed)
+        (folder / "metadata.yaml").write_text(
+            "rosbag2_bagfile_information:\n  version: 9\n"
+            f"  message_count: {sum(n for _, n in listed)}\n"
+            f"  relative_file_paths:\n{names}  files:\n{files}"
+        )
+
+    def test_an_empty_folder(self, tmp_path: Path) -> None:
+        assert self.trust(tmp_path).startswith("no bag is here")
+
+    def test_a_bag_that_a_crash_left_open(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)])
+        path.write_bytes(path.read_bytes()[:-100])
+        assert self.trust(tmp_path).startswith("1 bag was left open by a crash")
+
+    def test_files_that_are_not_read(self, tmp_path: Path) -> None:
+        write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 0.0, 0.0)])
+        for n in range(3):
+            (tmp_path / f"old_{n}.db3").write_bytes(b"SQLite format 3\0")
+        assert self.trust(tmp_path) == "3 files are not read; data_time_range says why"
+
+    def test_a_topic_that_cannot_be_decoded(self, tmp_path: Path) -> None:
+        with (tmp_path / "bag.mcap").open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            schema = writer.register_schema("odd.Odd", "protobuf", b"")
+            channel = writer.register_channel("/odd", "protobuf", schema)
+            writer.add_message(channel, BEGIN, b"", BEGIN)
+            writer.finish()
+        assert self.trust(tmp_path) == "1 topic cannot be decoded: /odd"
+
+    def test_splits_and_messages_that_metadata_lists(self, tmp_path: Path) -> None:
+        there = [("rec_0.mcap", 5), ("rec_1.mcap", 5)]
+        gone = [(f"rec_{n}.mcap", 20) for n in range(2, 14)]
+        self.recording(tmp_path / "rec", *there, *gone)
+        assert self.trust(tmp_path) == (
+            "metadata.yaml of rec lists 12 files that are not there and 240 messages that no file "
+            "here holds"
+        )
+
+    def test_messages_alone(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 255))
+        assert self.trust(tmp_path).endswith("lists 250 messages that no file here holds")
+
+    def test_a_recording_of_which_metadata_alone_is_left(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
+        for each in (tmp_path / "rec").glob("*.mcap"):
+            each.unlink()
+        trust = self.trust(tmp_path)
+        assert "lists 2 files that are not there and 10 messages" in trust
+
+    def test_metadata_that_lists_what_is_there(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
+        assert self.trust(tmp_path) == SOUND
+
+    def test_metadata_that_cannot_be_read_is_not_compared_and_told(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5))
+        (tmp_path / "rec" / "metadata.yaml").write_text("")
+        assert self.trust(tmp_path).startswith("metadata.yaml of rec cannot be read")
+
+    def test_the_oldest_splits_that_retention_deleted_are_not_missing(self, tmp_path: Path) -> None:
+        listed = [(f"rec_{n}.mcap", 5) for n in range(-3, 3)]
+        self.recording(tmp_path / "rec", *listed)
+        assert "lists 4 files" in self.trust(tmp_path)
+        beating(tmp_path, RecorderState.STOPPED, 59)
+        assert "lists 1 file that is not there and 5 messages" in self.trust(tmp_path)
+
+    def test_splits_cut_by_a_handover_hold_fewer_than_listed(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 9), ("rec_1.mcap", 9))
+        (tmp_path / "rec" / "handover.json").write_text("{}")
+        assert self.trust(tmp_path) == SOUND
+
+    def test_a_recording_compressed_by_file(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5))
+        assert self.trust(tmp_path) == SOUND
+
+    def test_it_is_no_longer_told_when_the_file_is_back(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
+        second = tmp_path / "rec" / "rec_1.mcap"
+        content = second.read_bytes()
+        second.unlink()
+        memory = memory_of(tmp_path)
+        assert "lists 1 file" in str(shown(memory, tmp_path)["trust"])
+        second.write_bytes(content)
+        assert shown(memory, tmp_path)["trust"] == SOUND

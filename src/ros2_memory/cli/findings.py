@@ -18,10 +18,11 @@ from ros2_memory.adapters import GB, build_recorder
 from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.errors import EpisodicError
 from ros2_memory.memory import Call
-from ros2_memory.overview import data_time_range
+from ros2_memory.overview import data_time_range, nothing_here, odd_bags
 from ros2_memory.recorder.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.recorder.daemon import Ticking
 from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.recorder.listed_splits import absence_told, absent_splits
 from ros2_memory.recorder.topics import TopicSelection, load_topics
 from ros2_memory.settings import NullRecorderNode
 from ros2_memory.timebase import NS_PER_S, iso_local, unix_from_ns
@@ -186,7 +187,11 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         return
     newest = "" if told.latest is None else f", the newest from {iso_local(told.latest)}"
     answering = counted(told.bags, "bag answers", "bags answer")
-    yield Finding(Level.OK, "bags", f"{answering}{newest}")
+    if told.bags or told.active:
+        yield Finding(Level.OK, "bags", f"{answering}{newest}")
+    else:
+        do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
+        yield Finding(Level.WARNING, "bags", nothing_here(snapshot), do)
     left = (*told.damaged, *told.incomplete)
     if left:
         yield Finding(
@@ -201,6 +206,15 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         do = "storage=rosbag2 reads sqlite and compressed bags, too"
         files = counted(len(told.unread), "file is", "files are")
         yield Finding(Level.WARNING, "bags", f"{files} not read: {names}", do)
+    odd = odd_bags(snapshot)
+    if odd:
+        seen = counted(len(odd), "bag is not whole", "bags are not whole")
+        names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in odd])
+        do = "what is readable of them answers; record or copy them anew for the rest"
+        yield Finding(Level.WARNING, "bags", f"{seen}: {names}", do)
+    for sentence in absence_told(absent_splits(snapshot, memory.index.bag_dir)):
+        do = "copy what is missing from where it was recorded"
+        yield Finding(Level.WARNING, "bags", sentence, do)
     if told.undecodable:
         topics = listed([f"{each.topic} ({each.reason})" for each in told.undecodable])
         number = counted(len(told.undecodable), "topic")

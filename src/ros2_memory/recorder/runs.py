@@ -65,6 +65,13 @@ class Stated(NamedTuple):
         )
 
 
+class Tally(NamedTuple):
+    """How many bags, and how many messages they hold."""
+
+    bags: int
+    messages: int
+
+
 class Run:
     """Some consecutive bags of a timeline; never without any."""
 
@@ -93,6 +100,16 @@ class Run:
     def folders(self) -> frozenset[str]:
         """The folders in which the bags lie."""
         return frozenset([bag.file[: bag.file.rfind("/")] for bag in self.bags])
+
+    @cached_property
+    def tallies(self) -> dict[str, Tally]:
+        """How many bags of the run lie in each folder, and how many messages those hold."""
+        found: dict[str, Tally] = {}
+        for bag in self.bags:
+            folder = bag.file[: bag.file.rfind("/")]
+            bags, messages = found.get(folder, (0, 0))
+            found[folder] = Tally(bags + 1, messages + bag.summary.count)
+        return found
 
     @cached_property
     def courses(self) -> dict[Series, Course]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.model import SetAside
-from ros2_memory.recorder.layout import HANDOVER_FILE
+from ros2_memory.recorder.layout import HANDOVER_FILE, METADATA_FILE
 from ros2_memory.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class Walked:
     the ones that are known no more. `damaged` are directories that cannot be listed and bag names
     that are no files, `links` the symbolic links, neither in any order. With a `problem` the bag
     directory itself is not there, and everything in it is gone; or it cannot be listed at the
-    moment, and everything in it counts as it did.
+    moment, and everything in it counts as it did. `described` are the folders with a metadata.yaml.
     """
 
     looked_at: dict[str, Stamp]
@@ -98,6 +98,7 @@ class Walked:
     damaged: list[SetAside]
     links: list[SetAside]
     problem: str | None = None
+    described: list[str] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -110,6 +111,7 @@ class _Folder:
     links: list[Path] = field(default_factory=list)
     odd: list[SetAside] = field(default_factory=list)
     sidecar_ns: Ns = 0
+    described: bool = False
 
 
 class Tree:
@@ -186,6 +188,8 @@ class Tree:
                 folder = replace(before[path], trusted=False)
             self._folders[path] = folder
             waiting.extend(folder.folders)
+            if folder.described:
+                walked.described.append(path)
             walked.damaged.extend(folder.odd)
             walked.links.extend(
                 SetAside(link, _LINK)
@@ -245,6 +249,8 @@ def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]
             folder.folders.append(entry.path)
     elif entry.name == HANDOVER_FILE:
         _enter_sidecar(folder, entry)
+    elif entry.name == METADATA_FILE:
+        folder.described = True
     elif bag_kind(entry.name):
         if entry.is_file(follow_symlinks=False):
             _enter_file(folder, entry, looked_at)

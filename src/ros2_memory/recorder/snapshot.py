@@ -34,7 +34,8 @@ class Snapshot:
     `bags` too); `damaged` ones cannot be read at all (among them directories that cannot be
     listed); `unread` ones are of a kind that another storage reads, or symbolic links, which are
     not followed. `empty` counts closed bags without a message. `silent_topics` are declared in some
-    bag and heard in none. `problem` says why the bag directory itself could not be read.
+    bag and heard in none. `described` are the folders with a metadata.yaml.
+    `problem` says why the bag directory itself could not be read.
     """
 
     bags: tuple[BagFile, ...] = ()
@@ -45,6 +46,7 @@ class Snapshot:
     silent_topics: frozenset[str] = frozenset()
     scanned_at: Ns = 0
     problem: str | None = None
+    described: tuple[str, ...] = ()
     timeline: Timeline | None = field(default=None, repr=False, compare=False)
 
     @cached_property

@@ -44,6 +44,7 @@ class _Oddities(NamedTuple):
     damaged: tuple[SetAside, ...] = ()
     links: tuple[SetAside, ...] = ()
     problem: str | None = None
+    described: tuple[str, ...] = ()
 
 
 class Survey:
@@ -115,6 +116,7 @@ class Survey:
             silent_topics=frozenset(silent - timeline.types.keys()),
             scanned_at=now,
             problem=odd.problem,
+            described=odd.described,
             timeline=timeline,
         )
 
@@ -209,7 +211,8 @@ class Survey:
 
 
 def _oddities(walked: Walked) -> _Oddities:
-    return _Oddities(_by_path(walked.damaged), _by_path(walked.links), walked.problem)
+    described = tuple(sorted(walked.described))
+    return _Oddities(_by_path(walked.damaged), _by_path(walked.links), walked.problem, described)
 
 
 def _by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
