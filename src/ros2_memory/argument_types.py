@@ -103,7 +103,10 @@ def _testable(value: JsonValue) -> JsonValue:
 
 Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_name)]
 _Duration: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
-_Unix: TypeAlias = Annotated[_Duration, AfterValidator(_reachable)]
+_Unix: TypeAlias = Annotated[
+    float, Field(strict=True, allow_inf_nan=False), AfterValidator(_reachable)
+]
+"""Also before 1970: what reaches back too far is clamped to what is recorded."""
 
 Timestamp: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023200.5])]
 SecondsAgo: TypeAlias = Annotated[

@@ -10,11 +10,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ros2_memory.absence import moment as told
 from ros2_memory.absence import require_bags
-from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.history import View
 from ros2_memory.model import TimeWindow
-from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, Ns, ns_from_unix
+from ros2_memory.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    MIN_NS,
+    START_SLACK_NS,
+    Ns,
+    ns_from_unix,
+)
 
 if TYPE_CHECKING:
     from ros2_memory.memory import Call, Memory
@@ -51,12 +59,27 @@ def open_moment(memory: Memory, call: Call, moment: Moment) -> tuple[View, Ns, N
         at = ns_argument("timestamp", moment.at_s)
         view = View(memory, call, at)
         require_bags(view)
-        return view, at, None
+        return view, _on_the_clock(view, at), None
     ago = ns_argument("seconds_ago", moment.ago_s or 0.0)
     if ago < 0:
         raise InvalidArgumentsError("seconds_ago must be 0 or more: it counts back from now")
     view, now = _relative(memory, call, ago)
-    return view, max(now - ago, MIN_NS), now
+    return view, _on_the_clock(view, MIN_NS if ago == MAX_NS else now - ago), now
+
+
+def _on_the_clock(view: View, at: Ns) -> Ns:
+    """The moment, unless it lies before all that a recorded time can be.
+
+    Raises:
+        NoDataError: it does.
+    """
+    if at > MIN_NS:
+        return at
+    earliest = view.snapshot.earliest
+    begins = "" if earliest is None else f"; the memory begins at {told(earliest)}"
+    raise NoDataError(
+        NoDataReason.OUTSIDE_RANGE, f"no recorded time lies so far back (before 1678){begins}"
+    )
 
 
 def _relative(memory: Memory, call: Call, ago: Ns) -> tuple[View, Ns]:
@@ -82,13 +105,20 @@ def open_span(memory: Memory, call: Call, span: Span) -> tuple[View, TimeWindow]
             raise InvalidArgumentsError("seconds must be more than 0: the length of the window")
         view, now = _relative(memory, call, 0)
         stop = min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
-        return view, TimeWindow(max(now - length, MIN_NS), stop)
+        return view, clamped(view, TimeWindow(max(now - length, MIN_NS), stop))
     if span.start_s is None or span.end_s is None:
         raise InvalidArgumentsError("start and end must both be given, as Unix seconds")
     window = TimeWindow.from_unix(span.start_s, span.end_s)
     view = View(memory, call, window.stop)
     require_bags(view)
-    return view, window
+    return view, clamped(view, window)
+
+
+def clamped(view: View, window: TimeWindow) -> TimeWindow:
+    """The window without what lies before both the epoch and the memory."""
+    earliest = view.snapshot.earliest
+    floor = min(0, 0 if earliest is None else earliest) - START_SLACK_NS
+    return TimeWindow(max(window.start, floor), max(window.stop, floor + 1))
 
 
 def ns_argument(name: str, value_s: float) -> Ns:

@@ -294,8 +294,9 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Foun
     else:
         limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
         tolerance = ns_argument("tolerance_s", limit)
-    oldest = MIN_NS if tolerance is None else at - tolerance - START_SLACK_NS
-    start = max(oldest, MIN_NS)
+    start = MIN_NS if tolerance is None else at - tolerance - START_SLACK_NS
+    if start <= MIN_NS:
+        start, tolerance = MIN_NS, None
     stop = min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
     found = view.newest(topic, TimeWindow(start, stop))
     if found is None:

@@ -73,7 +73,8 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     seen: list[Seen] = []
     throughout: set[str] = set()
     there_still: dict[str, Ns] = {}
-    known_to = min(window.stop, view.snapshot.latest or window.stop)
+    newest = view.snapshot.latest
+    known_to = window.stop if newest is None else min(window.stop, newest)
     for topic, story in _stories(view, window):
         events += [*_flips(topic, story), *map(_error, story.faults)]
         seen.append(story.seen)
@@ -191,7 +192,11 @@ def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -
     `counts` is how many there are of each kind; all of those that may be told are among `events`.
     """
     ranked = sorted(
-        events, key=lambda each: (_KINDS.index(each.kind), each.start - (each.end or each.start))
+        events,
+        key=lambda each: (
+            _KINDS.index(each.kind),
+            0 if each.end is None else each.start - each.end,
+        ),
     )
     told = ranked[:MOST_EVENTS]
     left_out = counts - Counter(each.kind for each in told)

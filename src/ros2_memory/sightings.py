@@ -26,7 +26,7 @@ from ros2_memory.frames import transform_at
 from ros2_memory.geometry import rotate
 from ros2_memory.history import View
 from ros2_memory.model import TimeWindow
-from ros2_memory.moments import Span, ns_argument
+from ros2_memory.moments import Span, clamped, ns_argument
 from ros2_memory.presences import SILENCE_NS
 from ros2_memory.search import Search
 from ros2_memory.things import things_of
@@ -92,9 +92,9 @@ def find_matches(
     wall = memory.clock.now()
     view = View(memory, call, min(_window(span, wall).stop, wall))
     require_bags(view)
-    latest = view.snapshot.latest
+    earliest, latest = view.snapshot.earliest, view.snapshot.latest
     now = wall if memory.limits.now == "wall" or latest is None else latest
-    window = _window(span, now)
+    window = clamped(view, _window(span, now))
     runs = _Runs(limit, oldest_first=oldest_first)
     _gather(view, topic, condition, window, runs)
     searched = TimeWindow(runs.told[-1].first, window.stop) if runs.cut and runs.told else window
@@ -106,8 +106,8 @@ def find_matches(
         found,
         more=runs.cut or runs.count > len(found),
         total=None if runs.cut else runs.count,
-        start=max(window.start, view.snapshot.earliest or window.start),
-        end=min(window.stop, latest or window.stop),
+        start=window.start if earliest is None else max(window.start, earliest),
+        end=window.stop if latest is None else min(window.stop, latest),
         now=now,
         notes=view.notes,
     )
