@@ -29,11 +29,12 @@ def chatter(count: int, size: int = 100, start: int = 0) -> list[Msg]:
     return [text(time, f"{time:0{size}d}") for time in range(start, start + count)]
 
 
-def raw_mcap(path: Path, fill: Callable[[Writer], None], **how: Any) -> Path:
+def raw_mcap(path: Path, fill: Callable[[Writer], None], *, profile: str = "", **how: Any) -> Path:
     """A bag that `fill` writes with the writer itself."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as stream:
         writer = Writer(stream, **how)
-        writer.start(profile="", library="test")
+        writer.start(profile=profile, library="test")
         fill(writer)
         writer.finish()
     return path

@@ -79,6 +79,7 @@ def recover(
     recovery = _Recovery(path, _Bar(stream or sys.stderr, files), say, clock, force=force)
     for file in files:
         recovery.take(file)
+    recovery.correct_metadata()
     for folder in recovery.without_metadata():
         say(f"{folder} has no {METADATA_FILE}: `ros2 bag reindex {folder}` makes one")
     if others:
@@ -113,13 +114,21 @@ class _Recovery:
         if line is not None:
             self._say(f"{name}: {line}")
 
+    def correct_metadata(self) -> None:
+        """Writes metadata.yaml anew where a file of the recording was repaired or removed."""
+        for folder in sorted(self._folders):
+            path = folder / METADATA_FILE
+            try:
+                if self._repairer.correct_metadata(folder):
+                    self._say(f"{path}: written anew, with what the files hold")
+            except BagError as error:
+                self._say(f"{path} NOT CORRECTED: {error.path}: {error.reason}")
+            except (OSError, ValueError) as error:
+                self._say(f"{path} NOT CORRECTED: {error}")
+
     def without_metadata(self) -> list[Path]:
         """Directories with a repaired bag whose recorder never wrote what stands in them."""
-        return [
-            folder
-            for folder in sorted(self._folders)
-            if not (folder / METADATA_FILE).is_file() or not (folder / METADATA_FILE).stat().st_size
-        ]
+        return [folder for folder in sorted(self._folders) if _lacks_metadata(folder)]
 
     def _line(self, file: Path) -> str | None:
         outcome = self.outcome
@@ -137,6 +146,7 @@ class _Recovery:
             return f"NOT REPAIRED: {error.reason}"
         if repaired is None or repaired.rewritten is None:
             outcome.removed += 1
+            self._folders.add(file.parent)
             return "empty, removed"
         outcome.repaired += 1
         outcome.messages += repaired.rewritten.messages
@@ -238,6 +248,11 @@ def _told(repaired: Repaired) -> str:
         f"{counted(rewritten.lost_bytes, 'byte')} lost "
         f"({repaired.was_bytes} bytes before, {repaired.is_bytes} now){notes}"
     )
+
+
+def _lacks_metadata(folder: Path) -> bool:
+    """Whether MCAP files lie in a folder, and no metadata.yaml, or an empty one."""
+    return any(folder.glob(f"*{_MCAP}")) and not _size(folder / METADATA_FILE)
 
 
 def _size(file: Path) -> int:

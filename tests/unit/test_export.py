@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import time
+from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import duckdb
 import pytest
+from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import cli
@@ -20,13 +24,28 @@ from ros2_memory.history import View
 from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.timebase import NS_PER_S
-from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    odom,
+    text,
+    tf,
+    transform,
+    typestore,
+    write_db3,
+    write_mcap,
+)
+from tests.mcap_surgery import raw_mcap
 from tests.memories import memory_of
+from tests.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
+
+    from mcap.writer import Writer as McapFile
 
     from ros2_memory.copies import Found
 
@@ -68,6 +87,35 @@ def read(path: Path) -> list[Row]:
     """Topic, log time and payload of all messages of a file, by plain rosbags."""
     with Reader(path) as reader:
         return [(connection.topic, at, bytes(raw)) for connection, at, raw in reader.messages()]
+
+
+def exported(bag_dir: Path, out: Path, *words: str) -> Path:
+    """The file that an export of the whole folder makes."""
+    asked = ["export", "--mcap", str(out), "--bag-dir", str(bag_dir), "deployment=replay", *words]
+    assert cli.main(asked) == 0
+    return out
+
+
+def profile_of(path: Path) -> str:
+    with path.open("rb") as stream:
+        profile: str = make_reader(stream).get_header().profile
+    return profile
+
+
+def names_of(path: Path) -> dict[str, str]:
+    """The types of topics, by plain mcap."""
+    with path.open("rb") as stream:
+        return {
+            channel.topic: schema.name
+            for schema, channel, _ in make_reader(stream).iter_messages()
+            if schema is not None
+        }
+
+
+def things(writer: McapFile) -> None:
+    schema = writer.register_schema("Thing", "jsonschema", b'{"type": "object"}')
+    channel = writer.register_channel("/thing", "json", schema)
+    writer.add_message(channel, T0, b'{"x": 1}', T0)
 
 
 class TestMcap:
@@ -146,6 +194,101 @@ class TestMcap:
         out = tmp_path / "out.mcap"
         assert cli.main(["export", "--mcap", str(out), "--topic", "/chat*", "--last", "20"]) == 0
         assert {row[0] for row in read(out)} == {"/chatter"}
+
+    @pytest.mark.parametrize("profile", ["", "px4", "ros2"])
+    def test_the_profile_stays(self, tmp_path: Path, profile: str) -> None:
+        folder = tmp_path / "bags"
+        raw_mcap(folder / "rec_0.mcap", things, profile=profile)
+        assert profile_of(exported(folder, tmp_path / "out.mcap")) == profile
+
+    def test_bags_of_two_profiles_have_none_together_and_each_its_own(self, tmp_path: Path) -> None:
+        folder = tmp_path / "bags"
+        raw_mcap(folder / "json_0.mcap", things, profile="")
+        write_mcap(folder / "rec_0.mcap", driven(T0, 0))
+        assert profile_of(exported(folder, tmp_path / "all.mcap")) == ""
+        ours = exported(folder, tmp_path / "ours.mcap", "--topic", "/odom")
+        assert profile_of(ours) == "ros2"
+        assert len(read(ours)) == 100
+
+    def test_types_are_named_as_other_readers_know_them(self, tmp_path: Path) -> None:
+        folder = tmp_path / "bags"
+
+        def fill(writer: McapFile) -> None:
+            old = writer.register_schema("std_msgs/String", "ros2msg", b"string data\n")
+            bare = writer.register_schema("std_msgs/Bool", "", b"")
+            json_schema = writer.register_schema("shop/Thing", "jsonschema", b"{}")
+            for topic, encoding, number, payload in (
+                ("/word", "cdr", old, text(T0, "x").payload),
+                ("/on", "cdr", bare, boolean(T0, data=True).payload),
+                ("/thing", "json", json_schema, b"{}"),
+            ):
+                writer.add_message(
+                    writer.register_channel(topic, encoding, number), T0, payload, T0
+                )
+
+        raw_mcap(folder / "rec_0.mcap", fill, profile="ros2")
+        out = exported(folder, tmp_path / "out.mcap")
+        assert names_of(out) == {
+            "/word": "std_msgs/msg/String",
+            "/on": "std_msgs/msg/Bool",
+            "/thing": "shop/Thing",
+        }
+        ours = exported(folder, tmp_path / "ours.mcap", "--topic", "/word")
+        with Reader(ours) as reader:
+            [(connection, _, raw)] = reader.messages()
+            assert connection.msgtype == "std_msgs/msg/String"
+            message = typestore().deserialize_cdr(raw, connection.msgtype)
+            assert getattr(message, "data", None) == "x"
+
+    @needs_real
+    @pytest.mark.parametrize("name", sorted(path.name for path in REAL.glob("*/")))
+    def test_other_programs_open_what_comes_of_public_robots_bags(
+        self, tmp_path: Path, name: str
+    ) -> None:
+        files = [each for each in sorted((REAL / name).iterdir()) if Rosbag2Reader().reads(each)]
+        for number, file in enumerate(files):
+            # Each by itself: in two recordings a message that is the same counts once.
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            left(Path(shutil.copyfile(file, folder / file.name)))
+            out = tmp_path / f"{number}.mcap"
+            self.require_the_same(folder, out)
+
+    @needs_recorded
+    @pytest.mark.parametrize("name", ["session_mcap", "session_sqlite3", "session_zstd_file"])
+    def test_other_programs_open_what_comes_of_a_recorded_session(
+        self, tmp_path: Path, name: str
+    ) -> None:
+        self.require_the_same(RECORDED / name, tmp_path / "out.mcap")
+
+    def require_the_same(self, folder: Path, out: Path) -> None:
+        """Exports a folder; `mcap`, and where it can `rosbags`, count the same in the file."""
+        reader = Rosbag2Reader()
+        expected: Counter[str] = Counter()
+        profiles: set[str] = set()
+        readable_by_rosbags = True
+        for bag in memory_of(folder, storage="rosbag2").index.refresh().bags:
+            expected.update({each.topic: each.count for each in bag.summary.topics})
+            profiles.add(reader.profile(bag.path))
+            for channel in reader.channels(bag.path):
+                of_ros2 = channel.schema.encoding in {"", "ros2msg", "ros2idl"}
+                readable_by_rosbags &= channel.encoding == "cdr" and of_ros2
+        words = ["export", "--mcap", str(out), "--bag-dir", str(folder), "deployment=replay"]
+        code = cli.main([*words, "storage=rosbag2"])
+        if not expected:
+            assert code != 0
+            assert not out.exists()
+            return
+        with out.open("rb") as stream:
+            plain = make_reader(stream)
+            summary = plain.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            assert summary.statistics.message_count == expected.total()
+            assert Counter(channel.topic for _, channel, _ in plain.iter_messages()) == expected
+        assert {profile_of(out)} == profiles
+        if readable_by_rosbags and profiles == {"ros2"}:
+            assert Counter(topic for topic, _, _ in read(out)) == expected
 
     def test_sqlite_bags_become_mcap(self, tmp_path: Path) -> None:
         left(write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", driven(T0, 0)))

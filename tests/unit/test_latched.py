@@ -192,7 +192,9 @@ class TestTheBagOfCarriedMessages:
         self, tmp_path: Path
     ) -> None:
         class FullDisk(McapWriter):
-            def write(self, path: Path, records: Iterable[Record]) -> None:
+            def write(
+                self, path: Path, records: Iterable[Record], *, profile: str = "ros2"
+            ) -> None:
                 raise BagError(str(path), "it cannot be written: No space left on device")
 
         recording(

@@ -1,15 +1,19 @@
 from __future__ import annotations
 
 import io
+import os
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from ros2_memory import cli
 from ros2_memory.errors import RecorderError
 from ros2_memory.recovery import Outcome, recover
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, odom, write_db3, write_mcap
+from tests.bags import McapLayout, odom, typestore, write_db3, write_mcap
 from tests.keeping import copied, files_in, later, recording_now
 from tests.limits import files_limited_to
 from tests.shared_bags import RECORDED, needs_recorded
@@ -19,6 +23,7 @@ if TYPE_CHECKING:
 
 S = 10**9
 T0 = 1_790_000_000 * S
+ODOMETRY = "nav_msgs/msg/Odometry"
 MESSAGES = [odom(T0 + n * S // 20, n / 20, 0.0) for n in range(100)]
 
 
@@ -51,11 +56,110 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     after = whole.stat()
     assert (after.st_ino, after.st_mtime_ns) == (stat.st_ino, stat.st_mtime_ns)
     assert whole.read_bytes() == content
-    assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "b"]
+    assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "a/metadata.yaml", "b"]
     assert said[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
     assert said[1] == "b/b_0.mcap: empty, removed"
-    assert "ros2 bag reindex" in said[2]
+    assert said[2] == f"{tmp_path / 'a/metadata.yaml'}: written anew, with what the files hold"
     assert said[-1] == str(outcome)
+
+
+class TestMetadata:
+    """Plain rosbags opens what was recovered as a recording, with the right counts."""
+
+    def test_of_a_recording_that_was_killed_is_made(self, tmp_path: Path) -> None:
+        write_mcap(tmp_path / "rec/rec_0.mcap", MESSAGES)
+        cut = left_open(tmp_path / "rec/rec_1.mcap")
+        write_mcap(tmp_path / "rec/.rec_0.mcap.tmp", MESSAGES)
+        recovered(tmp_path)
+        expected = 100 + McapReader().summarize(cut).count
+        assert counted(tmp_path / "rec") == {"/odom": expected}
+
+    def test_that_speaks_of_more_than_there_is_is_corrected(self, tmp_path: Path) -> None:
+        with Writer(tmp_path / "rec", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            store = typestore()
+            odometry = writer.add_connection("/odom", ODOMETRY, typestore=store)
+            writer.add_connection("/quiet", "std_msgs/msg/String", typestore=store)
+            for each in MESSAGES:
+                writer.write(odometry, each.log_time, each.payload)
+            writer.set_custom_data("robot", "seven")
+        cut = left_open(tmp_path / "rec/rec.mcap")
+        os.truncate(cut, cut.stat().st_size - 3000)
+        (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
+        _, said = recovered(tmp_path / "rec")
+        assert any("metadata.yaml: written anew" in line for line in said)
+        held = McapReader().summarize(tmp_path / "rec/rec.mcap")
+        assert 0 < held.count < 100
+        assert counted(tmp_path / "rec") == {"/odom": held.count, "/quiet": 0}
+        assert "robot: seven" in (tmp_path / "rec/metadata.yaml").read_text()
+        with Reader(tmp_path / "rec") as reader:
+            assert (reader.start_time, reader.end_time) == (held.start, held.end + 1)
+
+    def test_is_left_and_that_is_said_while_a_file_is_not_whole(self, tmp_path: Path) -> None:
+        left_open(tmp_path / "rec/rec_0.mcap")
+        (tmp_path / "rec/rec_1.mcap").write_bytes(b"a letter")
+        (tmp_path / "rec/metadata.yaml").write_text("as it was\n")
+        _, said = recovered(tmp_path)
+        assert any(
+            "metadata.yaml NOT CORRECTED: " in line and "rec_1.mcap" in line for line in said
+        )
+        assert (tmp_path / "rec/metadata.yaml").read_text() == "as it was\n"
+
+    @pytest.mark.parametrize(
+        ("text", "reason"),
+        [
+            ("{", "no YAML"),
+            ("rosbag2_bagfile_information: {}", "not of plain MCAP files"),
+            ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "plain MCAP"),
+            (
+                "rosbag2_bagfile_information: {storage_identifier: mcap, version: 4}",
+                "it is of version 4",
+            ),
+        ],
+    )
+    def test_of_another_form_stays(self, tmp_path: Path, text: str, reason: str) -> None:
+        left_open(tmp_path / "rec/rec_0.mcap")
+        (tmp_path / "rec/metadata.yaml").write_text(text)
+        _, said = recovered(tmp_path)
+        assert any("NOT CORRECTED" in line and reason in line for line in said)
+        assert (tmp_path / "rec/metadata.yaml").read_text() == text
+
+    def test_of_files_with_other_names_is_not_made(self, tmp_path: Path) -> None:
+        left_open(tmp_path / "rec/field trip.mcap")
+        _, said = recovered(tmp_path)
+        assert any("ros2 bag reindex" in line for line in said)
+        assert files_in(tmp_path) == ["rec", "rec/field trip.mcap"]
+
+    @needs_recorded
+    @pytest.mark.parametrize("name", ["session_killed", "session_killed_chunk64k", "session_mcap"])
+    def test_of_a_recorded_session(self, tmp_path: Path, name: str) -> None:
+        folder = tmp_path / name
+        copied(RECORDED / name, folder)
+        if name == "session_mcap":
+            last = folder / f"{name}_6.mcap"
+            last.write_bytes(last.read_bytes()[:-2000])
+        outcome, _ = recovered(folder, force=True)
+        assert outcome.failed == 0
+        found = [McapReader().summarize(each) for each in folder.glob("*.mcap")]
+        expected: Counter[str] = Counter()
+        for summary in found:
+            expected.update({each.topic: each.count for each in summary.topics})
+        assert {topic: n for topic, n in counted(folder).items() if n} == expected
+        for each in folder.glob("*.mcap"):
+            with each.open("rb") as stream:
+                plain = make_reader(stream).get_summary()
+                assert plain is not None
+                assert plain.statistics is not None
+                assert plain.statistics.message_count == McapReader().summarize(each).count
+
+
+def counted(recording: Path) -> dict[str, int]:
+    """Messages by topic as plain rosbags states them, each of which it also yields."""
+    with Reader(recording) as reader:
+        stated = {each.topic: each.msgcount for each in reader.connections}
+        read = Counter(connection.topic for connection, _, _ in reader.messages())
+        assert reader.message_count == read.total()
+        assert +Counter(stated) == read
+    return stated
 
 
 def test_a_single_file_is_repaired_whatever_its_name(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """`ros2-memory export`: a time window as an MCAP file, or as rows of Parquet."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Final
@@ -16,6 +16,7 @@ from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.windows import End, Last, Start, window_of
 from ros2_memory.copies import Found
 from ros2_memory.errors import (
+    BagError,
     ConfigError,
     InvalidArgumentsError,
     NoDataError,
@@ -26,7 +27,7 @@ from ros2_memory.globs import matching
 from ros2_memory.history import View
 from ros2_memory.memory import Call, Memory
 from ros2_memory.model import TimeWindow
-from ros2_memory.storage.base import Record
+from ros2_memory.storage.base import ROS2_PROFILE, Record
 from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.timebase import MIN_NS, Ns
 from ros2_memory.unseen import lost_in, note_unseen
@@ -93,7 +94,7 @@ def export(
                 view.note("no message lies in the window: what latched ones held is all there is")
             found = _told(chain(held, first, within), tell)
             if mcap is not None:
-                done = as_mcap(mcap, found)
+                done = as_mcap(mcap, found, _profile(view, topics, window, held))
             elif parquet is not None:
                 done = _as_parquet(parquet, found, memory, robot)
     say(done)
@@ -147,7 +148,21 @@ def _frames(memory: Memory, found: Found) -> set[str]:
     return {edge.child for edge in edges}
 
 
-def as_mcap(path: Path, found: Iterator[Found]) -> str:
+def _profile(view: View, topics: Sequence[str], window: TimeWindow, held: Sequence[Found]) -> str:
+    """The MCAP profile of all the bags that hold the messages; empty where they differ."""
+    chosen = frozenset(topics)
+    within = view.snapshot.overlapping(window)
+    bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.shape.places)}
+    bags.update(found.bag.path for found in held)
+    profiles: set[str] = set()
+    for path in bags:
+        # What cannot be read is reported where its messages are.
+        with suppress(BagError):
+            profiles.add(view.memory.reader.profile(path))
+    return profiles.pop() if len(profiles) == 1 else ""
+
+
+def as_mcap(path: Path, found: Iterator[Found], profile: str = ROS2_PROFILE) -> str:
     """Writes the file, which is there when it is whole; what was done, in a sentence.
 
     Raises:
@@ -171,7 +186,7 @@ def as_mcap(path: Path, found: Iterator[Found]) -> str:
     beside = path.with_name(f".{path.name}.tmp")
     try:
         beside.unlink(missing_ok=True)
-        McapWriter().write(beside, records())
+        McapWriter().write(beside, records(), profile=profile)
         beside.replace(path)
     finally:
         beside.unlink(missing_ok=True)

@@ -77,6 +77,10 @@ class LayeredReader(BagReader):
         """As the reader beneath."""
         return self._reader.channels(self._read_from(path))
 
+    def profile(self, path: Path) -> str:
+        """As the reader beneath."""
+        return self._reader.profile(self._read_from(path))
+
     def undecodable(self, channel: Channel) -> str | None:
         """As the innermost reader."""
         return self._decoder.undecodable(channel)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ros2_memory.errors import BagError, BagVanishedError
+from ros2_memory.recorder.metadata import correct
 from ros2_memory.recorder.removal import repair_name
 from ros2_memory.recorder.sync import flush
 from ros2_memory.storage.base import Closing
@@ -85,6 +86,10 @@ class Repairer:
             raise BagError(
                 str(path), f"it cannot be repaired: {error.strerror or error}"
             ) from error
+
+    def correct_metadata(self, recording: Path) -> bool:
+        """Writes metadata.yaml by what the files hold, as `metadata.correct` does."""
+        return correct(recording, self._reader)
 
     def _rewrite(
         self, path: Path, before: os.stat_result, progress: Callable[[int], None] | None

@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
     from ros2_memory.model import BagSummary, TimeWindow
     from ros2_memory.timebase import Ns
+
+
+ROS2_PROFILE: Final = "ros2"
+"""The profile of every rosbag2 file; other readers of ROS 2 bags refuse every other."""
 
 
 class Closing(StrEnum):
@@ -182,6 +186,16 @@ class BagReader(ABC):
             BagVanishedError: the file is not there.
             BagError: they cannot be read.
         """
+
+    def profile(self, path: Path) -> str:
+        """The profile of the file, as MCAP names it: `ros2`, or what its header holds.
+
+        Raises:
+            BagVanishedError: the file is not there.
+            BagError: it cannot be read.
+        """
+        del path
+        return ROS2_PROFILE
 
     @abstractmethod
     def decode(self, record: Record) -> object:

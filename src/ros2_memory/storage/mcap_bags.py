@@ -18,7 +18,7 @@ from ros2_memory.storage.faults import LostError, UnreachableError, UnreadableEr
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.lru import ByteLru, Shared
 from ros2_memory.storage.mcap_chunk import Column, joined, walk
-from ros2_memory.storage.mcap_file import closing_of, is_finished
+from ros2_memory.storage.mcap_file import closing_of, is_finished, profile_of
 from ros2_memory.storage.mcap_index import (
     McapIndex,
     chunk_columns,
@@ -90,6 +90,11 @@ class McapBags:
         """The channels declared in the file."""
         with OpenFile(path) as file:
             return list(self._index(file).channels.values())
+
+    def profile(self, path: Path) -> str:
+        """The profile that the header of the file holds."""
+        with OpenFile(path) as file:
+            return profile_of(file)
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool

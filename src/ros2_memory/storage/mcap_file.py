@@ -1,16 +1,19 @@
-"""What the two ends of an MCAP file say: that it is one, and that its writer finished it."""
+"""What the two ends of an MCAP file say: that it is one, its profile, that it was finished."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.faults import UnreadableError
-from ros2_memory.storage.mcap_records import MAGIC, MAGIC_SIZE
+from ros2_memory.storage.mcap_records import MAGIC, MAGIC_SIZE, RECORD, Opcode
 from ros2_memory.storage.open_file import EMPTY_FILE
 
 if TYPE_CHECKING:
     from ros2_memory.storage.open_file import OpenFile
+
+_MOST_PROFILE_BYTES: Final = 256
+_LENGTH_BYTES: Final = 4
 
 
 def closing_of(file: OpenFile) -> Closing:
@@ -47,3 +50,22 @@ def require_mcap(file: OpenFile) -> None:
         raise UnreadableError("not an MCAP file: it does not begin as one")
     if file.size < MAGIC_SIZE:
         raise UnreadableError(f"only its first {file.size} bytes had reached the disk")
+
+
+def profile_of(file: OpenFile) -> str:
+    """The profile that the header record holds; empty where there is no header.
+
+    Raises:
+        UnreadableError: it is no MCAP file, or its header is damaged.
+    """
+    require_mcap(file)
+    text_at = MAGIC_SIZE + RECORD.size + _LENGTH_BYTES
+    if file.size < text_at:
+        return ""
+    head = file.read(MAGIC_SIZE, RECORD.size + _LENGTH_BYTES)
+    if head[0] != Opcode.HEADER:
+        return ""
+    length = int.from_bytes(head[RECORD.size :], "little")
+    if length > _MOST_PROFILE_BYTES:
+        raise UnreadableError("damaged: its profile is longer than any can be")
+    return file.read(text_at, length).decode()

@@ -88,6 +88,11 @@ class McapReader(BagReader):
         with reading(path):
             return self._bags.channels(path)
 
+    def profile(self, path: Path) -> str:
+        """The profile in the header of the file."""
+        with reading(path):
+            return self._bags.profile(path)
+
     def undecodable(self, channel: Channel) -> str | None:
         """Why no message of this channel can be decoded, or None."""
         return self._decoding.undecodable(channel)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import os
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
 from mcap.writer import CompressionType, Writer
 
 from ros2_memory.errors import BagError, EpisodicError
+from ros2_memory.storage.base import ROS2_PROFILE
 from ros2_memory.storage.faults import UnreadableError, reading, reason_of
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap_bags import McapBags
 from ros2_memory.storage.mcap_salvage import Salvage, Tally, parsed
 from ros2_memory.storage.open_file import OpenFile
 from ros2_memory.storage.writing import BagWriter, Rewritten
+from ros2_memory.typestore import full_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -26,9 +29,9 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES: Final = 64 << 10
 """Small, since whoever asks for one message has the whole of its chunk unpacked."""
-ROS2_PROFILE: Final = "ros2"
-"""Readers of ROS 2 bags refuse every other."""
 LIBRARY: Final = "ros2-memory"
+_ROS2_ENCODINGS: Final = frozenset(("ros2msg", "ros2idl", ""))
+"""Empty where the recorder found no definition."""
 
 
 class McapWriter(BagWriter):
@@ -41,11 +44,11 @@ class McapWriter(BagWriter):
     def __init__(self, max_chunk_mb: int = MAX_CHUNK_MB) -> None:
         self._max_chunk_mb = max_chunk_mb
 
-    def write(self, path: Path, records: Iterable[Record]) -> None:
+    def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
         """Writes a bag that holds these messages."""
         with _written(path) as stream:
             writer = _writer(stream)
-            writer.start(ROS2_PROFILE, LIBRARY)
+            writer.start(profile, LIBRARY)
             channels = _Channels(writer)
             for record in records:
                 number = channels.number_of(record.channel)
@@ -150,7 +153,7 @@ class _Channels:
         """The channel's number in the file."""
         number = self._channels.get(channel)
         if number is None:
-            schema = channel.schema
+            schema = _exported(channel)
             if schema not in self._schemas:
                 self._schemas[schema] = self._writer.register_schema(
                     schema.name, schema.encoding, schema.text
@@ -160,6 +163,14 @@ class _Channels:
             )
             self._channels[channel] = number
         return number
+
+
+def _exported(channel: Channel) -> Schema:
+    """The schema of a channel; a ROS 2 type is named as rosbag2 and its readers name it."""
+    schema = channel.schema
+    if channel.encoding != "cdr" or schema.encoding not in _ROS2_ENCODINGS:
+        return schema
+    return replace(schema, name=full_name(schema.name))
 
 
 def _writer(stream: IO[bytes]) -> Writer:

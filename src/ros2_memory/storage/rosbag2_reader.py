@@ -37,6 +37,7 @@ class _Room(Protocol):
 
     def summarize(self, path: Path) -> BagSummary: ...
     def channels(self, path: Path) -> Sequence[Channel]: ...
+    def profile(self, path: Path) -> str: ...
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]: ...
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
@@ -122,6 +123,11 @@ class Rosbag2Reader(BagReader):
         """Every channel that is declared in the file."""
         with reading(path), self._opened(path) as opened:
             return opened.room.channels(opened.path)
+
+    def profile(self, path: Path) -> str:
+        """The profile in the header of an MCAP file; `ros2` of a sqlite file."""
+        with reading(path), self._opened(path) as opened:
+            return opened.room.profile(opened.path)
 
     def undecodable(self, channel: Channel) -> str | None:
         """Why no message of this channel can be decoded, or None."""

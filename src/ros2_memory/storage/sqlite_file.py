@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.storage.base import Channel, Closing, Record, Schema
+from ros2_memory.storage.base import ROS2_PROFILE, Channel, Closing, Record, Schema
 from ros2_memory.storage.faults import UnreadableError
 from ros2_memory.storage.limits import (
     MAX_CHANNELS,
@@ -121,6 +121,11 @@ class SqliteBags:
         """The topics declared in the file."""
         with self._opened(path) as (_, topics):
             return list(topics.channels.values())
+
+    def profile(self, path: Path) -> str:
+        """That of ROS 2: no other program writes such files."""
+        with OpenFile(path):
+            return ROS2_PROFILE
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool

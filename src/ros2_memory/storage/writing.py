@@ -10,6 +10,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ros2_memory.storage.base import ROS2_PROFILE
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
@@ -34,11 +36,12 @@ class BagWriter(ABC):
     """Writes closed, indexed bag files."""
 
     @abstractmethod
-    def write(self, path: Path, records: Iterable[Record]) -> None:
+    def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
         """Writes a bag that holds these messages, in the order given, and nothing else.
 
-        Payloads, both times, definitions and the metadata of channels stay as they are. The bag is
-        on the disk when this returns. There must be no file of that name.
+        Payloads, both times, definitions and the metadata of channels stay as they are; ROS 2
+        types are named `package/msg/Name`, as every reader knows them. `profile` is MCAP's. The bag
+        is on the disk when this returns. There must be no file of that name.
 
         Raises:
             BagError: it cannot be written; or what `records` raises.
