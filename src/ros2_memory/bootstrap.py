@@ -61,6 +61,7 @@ def build_memory(settings: Settings) -> Memory:
         split_duration_s=settings.recording.split_duration_s,
         known=partial(catalogue.summaries, bag_dir),
         include_active=settings.reader.include_active,
+        trusts_mtime=not isinstance(settings.recorder, NullRecorderNode),
     )
     recall = Recall(catalogue, bag_dir)
     return Memory(index, reader, extractor, clock, limits_of(settings), recall)

@@ -49,7 +49,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         damaged=len(snapshot.damaged),
         incomplete=snapshot.taken[1],
         unread=len(snapshot.unread),
-        budget=_budget(memory, snapshot),
+        budget=_budget(memory, snapshot, heartbeat, wall),
         problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
         notes=view.notes,
     )
@@ -116,15 +116,18 @@ def _fallen_silent(snapshot: Snapshot) -> Iterator[Stillness]:
             yield Stillness(topic, last, usual)
 
 
-def _budget(memory: Memory, snapshot: Snapshot) -> Budget:
+def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:
     """What the bags take, how fast that grows, and for how long the budget lasts.
 
-    Where nothing is recorded nothing grows, and there is no budget.
+    Growth is only predicted while a live recorder records. Where none is configured there is no
+    budget either.
     """
     kept, latest = memory.limits.kept, snapshot.dating.latest
     used, _ = snapshot.taken
     if kept is None:
         return Budget(used, None, None, None)
+    if heartbeat is None or not _is_recording(heartbeat, wall):
+        return Budget(used, kept.max_total_bytes, None, kept.max_age_ns)
     grown, since = 0, latest
     if latest is not None:
         for bag in reversed(snapshot.bags):
@@ -135,3 +138,7 @@ def _budget(memory: Memory, snapshot: Snapshot) -> Budget:
     span = 0 if latest is None or since is None else latest - since
     per_day = grown * _GROWTH_NS // span if span > 0 else None
     return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns)
+
+
+def _is_recording(heartbeat: Heartbeat, wall: Ns) -> bool:
+    return heartbeat.state is RecorderState.RECORDING and heartbeat.is_live(wall)

@@ -285,13 +285,27 @@ def test_a_fresh_file_without_an_end_is_told_until_when_it_counts_as_being_writt
     robot: Path, capsys: Capture
 ) -> None:
     (robot / "recorder.json").unlink()
-    whole = (robot / "rec" / "rec_0.mcap").read_bytes()
-    (robot / "copy").mkdir()
-    (robot / "copy" / "copy_0.mcap").write_bytes(whole[: len(whole) // 2])
+    path = write_mcap(robot / "copy" / "copy_0.mcap", [odom(time.time_ns(), 0.0, 0.0)])
+    path.write_bytes(path.read_bytes()[:-20])
     code, wrong = examined(capsys, "recorder=none")
     (finding,) = wrong["bags"]
     assert code == 1
     assert "copy/copy_0.mcap has no end and was written lately: until 20" in finding["seen"]
+
+
+@pytest.mark.parametrize(("recorder", "is_active"), [("none", False), ("ros2bag", True)])
+def test_a_copy_of_older_data_is_not_being_written_where_nobody_writes(
+    robot: Path, capsys: Capture, recorder: str, is_active: bool
+) -> None:
+    (robot / "recorder.json").unlink()
+    path = write_mcap(
+        robot / "copy" / "copy_0.mcap", [odom(10**18 + n, 0.0, 0.0) for n in range(9)]
+    )
+    path.write_bytes(path.read_bytes()[:-20])
+    _, wrong = examined(capsys, f"recorder={recorder}")
+    seen = " ".join(each["seen"] for each in wrong["bags"])
+    assert ("counts as still being written" in seen) is is_active
+    assert ("0 damaged and 1 unfinished" in seen) is not is_active
 
 
 def test_a_topic_that_nobody_offers_and_restarts_are_told(robot: Path, capsys: Capture) -> None:

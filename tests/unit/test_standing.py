@@ -47,6 +47,7 @@ class Eye:
         self.reader = PlainReader(*(kinds or (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")))
         self.notes: FileNotes | None = None
         self.verdict: Verdict | None = None
+        self.trusts_mtime = True
         self.scene = Scene(root, NOW, THREE_SPLITS)
 
     def look(
@@ -67,7 +68,7 @@ class Eye:
         else:
             self.notes.look(stamp, now)
         recordings = None if names is None else frozenset(names)
-        self.scene = Scene(self.root, now, THREE_SPLITS, recordings)
+        self.scene = Scene(self.root, now, THREE_SPLITS, recordings, trusts_mtime=self.trusts_mtime)
         self.verdict = judge(self.notes, self.reader, self.scene)
         return self.verdict.standing
 
@@ -391,3 +392,44 @@ def test_metadata_of_any_bytes_is_read_for_the_lines_that_name_bags(tmp_path: Pa
         b"\xff\xfe\n  - rec_0.mcap.zstd\r\n  - path: 'a b.mcap'\nname: /odom\n- x.txt\n"
     )
     assert files_in_metadata(path) == {"rec_0.mcap.zstd", "a b.mcap"}
+
+
+class TestWhereNothingIsRecorded:
+    """A young mtime may be that of a copy."""
+
+    def look(self, path: Path, kind: str, *ages_s: float) -> list[Standing]:
+        eye = Eye(path.parent, kind)
+        eye.trusts_mtime = False
+        return [eye.look(path, age_s=age_s) for age_s in ages_s]
+
+    @pytest.mark.parametrize("old_s", [31, 3600, -3600, 1.8e9])
+    @pytest.mark.parametrize(
+        ("kind", "closed", "standing"),
+        [(".mcap", False, Standing.INCOMPLETE), (".db3", True, Standing.CLOSED)],
+    )
+    def test_a_copy_of_other_times_is_not_being_written(
+        self, tmp_path: Path, old_s: float, kind: str, closed: bool, standing: Standing
+    ) -> None:
+        path = plain(tmp_path / f"bag{kind}", [NOW - round(old_s * S)], closed=closed)
+        assert self.look(path, kind, 0) == [standing]
+
+    @pytest.mark.parametrize(("kind", "closed"), [(".mcap", False), (".db3", True)])
+    def test_the_recording_of_another_program_is(
+        self, tmp_path: Path, kind: str, closed: bool
+    ) -> None:
+        path = plain(tmp_path / f"bag{kind}", [NOW - 3600 * S, NOW - 5 * S], closed=closed)
+        assert self.look(path, kind, 0) == [Standing.ACTIVE]
+
+    def test_so_is_one_without_a_message_yet(self, tmp_path: Path) -> None:
+        (tmp_path / "bag.mcap").touch()
+        assert self.look(tmp_path / "bag.mcap", ".mcap", 0) == [Standing.ACTIVE]
+        begun = plain(tmp_path / "begun.mcap", closed=False)
+        assert self.look(begun, ".mcap", 0) == [Standing.ACTIVE]
+
+    def test_so_is_one_that_was_seen_to_grow(self, tmp_path: Path) -> None:
+        path = plain(tmp_path / "bag.mcap", [1], closed=False)
+        eye = Eye(tmp_path)
+        eye.trusts_mtime = False
+        assert eye.look(path, age_s=0) is Standing.INCOMPLETE
+        grow(path, 2)
+        assert eye.look(path, age_s=0) is Standing.ACTIVE

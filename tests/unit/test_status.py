@@ -143,6 +143,7 @@ def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path
     size = (tmp_path / "bag.mcap").stat().st_size
     budget = RetentionLimits(max_total_bytes=size * 49, max_age_ns=7 * DAY)
     memory = replace(memory, limits=replace(memory.limits, kept=budget))
+    beating(tmp_path, RecorderState.RECORDING, 59)
     answer = memory_status(memory, Call())
     assert (answer.budget.used, answer.budget.per_day) == (size, size * 24)  # all within an hour
     told = shown(memory, tmp_path)["budget"]
@@ -153,6 +154,29 @@ def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path
 
 
 SOUND = "nothing is known to be missing"
+
+
+@pytest.mark.parametrize(
+    ("state", "at"),
+    [
+        (None, 0),
+        (RecorderState.RECORDING, 0),
+        (RecorderState.STOPPED, 59),
+        (RecorderState.PAUSED, 59),
+    ],
+)
+def test_no_growth_is_predicted_of_bags_that_nobody_writes(
+    tmp_path: Path, state: RecorderState | None, at: float
+) -> None:
+    memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
+    budget = RetentionLimits(max_total_bytes=10**9, max_age_ns=7 * DAY)
+    memory = replace(memory, limits=replace(memory.limits, kept=budget))
+    if state is not None:
+        beating(tmp_path, state, at)
+    told = shown(memory, tmp_path)["budget"]
+    assert (told["max_gb"], told["growth_gb_per_day"]) == (1.0, None)
+    assert "full_in_days" not in told
+    assert "keeps_days" not in told
 
 
 class TestWhatIsMissingIsNamedAndCounted:

@@ -53,6 +53,8 @@ class IndexManager:
     closed files that were read earlier: a scan that begins anew does not read them again while they
     look as they did. `include_active`: what is whole of a file that is being written answers, too;
     not where bags are disposed of, repaired or kept, which is for those that are finished.
+    `trusts_mtime`: a file without an end that is young is being written; else it may be a copy, and
+    what is in it decides.
 
     Attributes:
         bag_dir: the bag directory.
@@ -70,7 +72,9 @@ class IndexManager:
         disposal: Disposal | None = None,
         known: Callable[[], Mapping[str, FormerFile]] | None = None,
         include_active: bool = False,
+        trusts_mtime: bool = True,
     ) -> None:
+        self._trusts_mtime = trusts_mtime
         self.bag_dir = bag_dir
         self._known = known
         self._include_active = include_active
@@ -179,7 +183,14 @@ class IndexManager:
         heartbeat = self.heartbeat()
         live = heartbeat is not None and heartbeat.is_live(now)
         named = frozenset(heartbeat.recordings) if heartbeat is not None and live else None
-        return Scene(self.bag_dir, now, self._three_splits, named, self._include_active)
+        return Scene(
+            self.bag_dir,
+            now,
+            self._three_splits,
+            named,
+            self._include_active,
+            self._trusts_mtime,
+        )
 
     def _report(self, before: Snapshot | None, after: Snapshot, change: Change, begun: Ns) -> None:
         removed, added, _ = change

@@ -11,6 +11,12 @@ recorder still writes it or a crash left it:
 A file "grew" when its mtime says so, or when two scans saw it grow. An mtime in the future says
 nothing (the clock was set back), so there only what was seen counts.
 
+Where nothing is recorded (`recorder=none`) an mtime alone is no evidence, since a copy has that of
+its copying: the file is active only where two scans saw it grow, or where its newest message is no
+more than three splits older than its mtime, as in the recording of another program. Where no
+message can be read yet the mtime decides. A recording of simulated times counts as left open by a
+crash until it was seen to grow.
+
 A `.db3` has no closing mark: between two transactions of its recorder it looks finished. One that
 grew within the last three splits is active unless the `metadata.yaml` beside it, which a recorder
 writes last, mentions it, or a live heartbeat names other recordings only. A `.zstd` is written
@@ -82,7 +88,8 @@ class Scene:
     """What one scan knows besides the files themselves.
 
     `open_recordings` are those that a live heartbeat names; None without a live heartbeat.
-    `include_active`: what is whole of a file that is still being written answers.
+    `include_active`: what is whole of a file that is still being written answers. `trusts_mtime`:
+    a young mtime shows that a file is being written, and not only that it was copied.
     """
 
     root: Path
@@ -90,6 +97,7 @@ class Scene:
     three_splits: Ns
     open_recordings: frozenset[str] | None = None
     include_active: bool = False
+    trusts_mtime: bool = True
     _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
 
     def may_be_recorded(self, path: Path) -> bool:
@@ -176,8 +184,11 @@ class FileNotes:
     def grew_lately(self, scene: Scene) -> bool:
         """Whether the file grew within the last three splits."""
         age = scene.now - self.stamp.mtime_ns
-        seen = self.grew_at is not None and scene.now - self.grew_at <= scene.three_splits
-        return seen or -YOUNG_NS < age <= scene.three_splits
+        return self.was_seen_growing(scene) or -YOUNG_NS < age <= scene.three_splits
+
+    def was_seen_growing(self, scene: Scene) -> bool:
+        """Whether two scans saw the file grow, within the last three splits."""
+        return self.grew_at is not None and scene.now - self.grew_at <= scene.three_splits
 
     def must_be_watched(self, verdict: Verdict, scene: Scene) -> bool:
         """Whether the next scan must look at the file though its directory did not change."""
@@ -218,7 +229,7 @@ def judge(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
             # An open MCAP is 0 bytes until its first chunk is full.
             empty = notes.stamp.size == 0
             notes.closing = Closing.OPEN if empty else reader.closing(notes.path)
-        if _is_active(notes, scene):
+        if _is_active(notes, scene) and not _is_copy(notes, reader, scene):
             return _active(notes, reader, scene)
         if notes.summary is None and notes.fault is None:
             notes.summary = reader.summarize(notes.path)
@@ -261,6 +272,26 @@ def _is_active(notes: FileNotes, scene: Scene) -> bool:
         and notes.grew_lately(scene)
         and not scene.is_finished(notes.path)
     )
+
+
+def _is_copy(notes: FileNotes, reader: BagReader, scene: Scene) -> bool:
+    """Whether a file looks as being written for no other reason than when it was copied.
+
+    Raises:
+        BagVanishedError: the file is not there any more.
+    """
+    if scene.trusts_mtime or scene.open_recordings is not None or notes.was_seen_growing(scene):
+        return False
+    if notes.summary is None and notes.stamp.size:
+        try:
+            notes.summary = reader.summarize(notes.path)
+        except BagVanishedError:
+            raise
+        except BagError:
+            return False
+    if notes.summary is None or notes.summary.empty:
+        return False
+    return abs(notes.stamp.mtime_ns - notes.summary.end) > scene.three_splits
 
 
 def _active(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
