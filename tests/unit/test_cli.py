@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -17,6 +18,7 @@ from ros2_memory.cli.asking import complete, parsed
 from ros2_memory.cli.exits import epilog
 from ros2_memory.cli.showing import cell, plain
 from ros2_memory.errors import InvalidArgumentsError
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import odom, text, write_mcap
 
@@ -173,18 +175,32 @@ class TestInfo:
     def test_it_says_until_when_a_fresh_file_without_an_end_counts_as_being_written(
         self, bag_dir: Path, capsys: Capture
     ) -> None:
-        whole = (bag_dir / "rec" / "rec_0.mcap").read_bytes()
-        copy = bag_dir / "copy" / "copy_0.mcap"
-        copy.parent.mkdir()
-        copy.write_bytes(whole[: len(whole) // 2])
+        copy = write_mcap(bag_dir / "copy" / "copy_0.mcap", [odom(time.time_ns(), 0.0, 0.0)])
+        copy.write_bytes(copy.read_bytes()[:-20])
         assert cli.main(["info", "--json"]) == 0
         (row,) = json.loads(capsys.readouterr().out)["counted_as_active"]
         assert row["file"] == "copy/copy_0.mcap"
         assert row["until"] == pytest.approx(copy.stat().st_mtime + 30.0)
 
     def test_where_something_is_it_says_for_how_long_the_budget_lasts(
-        self, capsys: Capture
+        self, bag_dir: Path, capsys: Capture
     ) -> None:
+        now = time.time_ns()
+        write_heartbeat(
+            bag_dir,
+            Heartbeat(
+                pid=os.getpid(),
+                updated=now,
+                state=RecorderState.RECORDING,
+                recordings=("rec",),
+                since=now,
+                bytes_written=0,
+                subscribed=(),
+                silent=(),
+                last_error=None,
+                interval_s=2.0,
+            ),
+        )
         assert cli.main(["info", "deployment=robot", "retention.max_total_gb=2.0"]) == 0
         shown = capsys.readouterr().out
         assert "of 2 GB" in shown
