@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ros2_memory.account_shapes import shown
 from ros2_memory.errors import (
@@ -16,7 +16,7 @@ from ros2_memory.errors import (
     UndecodableError,
 )
 from ros2_memory.fitting import compact, fit
-from ros2_memory.shapes import file_name
+from ros2_memory.shapes import file_name, fit_topics
 from ros2_memory.timebase import unix_rounded_up
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from ros2_memory.fitting import JsonObject
     from ros2_memory.model import JsonValue
     from ros2_memory.shapes import Answer
-
-_HOW_TO_NARROW: Final = "narrow the list with pattern, a glob such as /vision/*"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +53,9 @@ class Replies:
             if from_active:
                 value = {**value, "from_active": True}
             return Reply(fit(value, self.max_chars))
-        text = compact(value)
-        if isinstance(value, list) and len(text) > self.max_chars:
-            # A list has no place for the note that something is missing from it.
-            return Reply(fit({"topics": value, "notes": [_HOW_TO_NARROW]}, self.max_chars))
-        return Reply(text)
+        if isinstance(answer, tuple):
+            return Reply(fit_topics(answer, self.max_chars))
+        return Reply(compact(value))
 
     def error(self, error: EpisodicError) -> Reply:
         """An error of the tree. Having no data is an answer; the others are errors."""

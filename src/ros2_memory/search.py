@@ -12,7 +12,7 @@ from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError, Undecod
 from ros2_memory.model import TimeWindow
 from ros2_memory.testable import can_be_untestable, untestable
 from ros2_memory.timebase import MIN_NS
-from ros2_memory.unseen import note_unseen
+from ros2_memory.unseen import note_unsearched
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -175,5 +175,5 @@ def unsearched(view: View, window: TimeWindow | None = None) -> tuple[str, ...]:
 
     Empty where it was.
     """
-    note_unseen(view, window or TimeWindow.everything(), nothing=True)
+    note_unsearched(view, window or TimeWindow.everything())
     return view.notes

@@ -45,6 +45,8 @@ ZEROS_SHOWN_BELOW_CHARS: Final = 4000
 FINE_PATH_M: Final = 0.05 + 1e-9
 """The deviation that a drawn path is expected to have; a coarser one is worth a note."""
 
+_LONGEST_REST_CHARS: Final = 200
+"""What the row takes that stands for those left out, whatever its numbers."""
 _NEWEST_LISTED: Final = 20
 _MOST_ZEROS_NAMED: Final = 20
 
@@ -62,6 +64,37 @@ def shown(answer: object, _bag_dir: Path) -> JsonValue:
 @shown.register(tuple)
 def _topics(answer: tuple[answers.TopicRow, ...], _bag_dir: Path) -> JsonValue:
     return [_topic_row(row) for row in answer]
+
+
+def fit_topics(rows: Sequence[answers.TopicRow], max_chars: int) -> str:
+    """The list of topics as JSON text of at most `max_chars` characters: always a list of rows.
+
+    Where it would be longer, the busiest topics come first, and the last row stands for all that
+    are left out, with their first and last time and the sum of their counts. `max_chars` must be
+    at least 500.
+    """
+    text = compact([_topic_row(row) for row in rows])
+    if len(text) <= max_chars:
+        return text
+    spare = max_chars - _LONGEST_REST_CHARS
+    told: list[JsonValue] = []
+    rest: list[answers.TopicRow] = []
+    for row in sorted(rows, key=lambda row: -row.count):
+        one = _topic_row(row)
+        size = len(compact(one)) + 1
+        if size <= spare and not rest:
+            told.append(one)
+            spare -= size
+        else:
+            rest.append(row)
+    others = answers.TopicRow(
+        f"({len(rest)} more: use pattern)",
+        "",
+        min(row.first for row in rest),
+        max(row.last for row in rest),
+        sum(row.count for row in rest),
+    )
+    return compact([*told, _topic_row(others)])
 
 
 @shown.register(answers.TimeRange)
@@ -118,16 +151,13 @@ def file_name(path: Path | str, bag_dir: Path) -> str:
 
 
 def _topic_row(row: answers.TopicRow) -> JsonObject:
-    reply: JsonObject = {
+    return {
         "topic": row.topic,
         "type": row.type,
         "first_ts": unix_rounded_up(row.first),
         "last_ts": unix_rounded_up(row.last),
         "count": row.count,
     }
-    if row.undecodable is not None:
-        reply["undecodable"] = row.undecodable
-    return with_notes(reply, row.notes)
 
 
 @shown.register(answers.TopicValue)
@@ -271,7 +301,7 @@ def _value_when(answer: answers.ValueWhen, _bag_dir: Path) -> JsonObject | None:
 
 def _no_match(notes: Sequence[str]) -> JsonObject | None:
     """`null` after a complete search; a search that could not look everywhere says so instead."""
-    return with_notes({"match": None}, notes) if notes else None
+    return with_notes({"timestamp": None, "value": None}, notes) if notes else None
 
 
 @shown.register(answers.TrajectorySummary)

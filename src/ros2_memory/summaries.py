@@ -82,6 +82,11 @@ class Shape:
         return struct.Struct(f"<{3 * len(self.topics)}q")
 
 
+WRONG_STATISTICS: Final = "its own statistics are wrong"
+SUMMARY_NOT_USED: Final = "its summary section is not used"
+MESSAGES_MISSING: Final = "messages may be missing"
+
+
 def set_back_while_written(by: Ns) -> str:
     """The sentence on a bag in the writing of which the clock was set back by so much, or more."""
     return f"the clock was set back by {by / NS_PER_S:.0f} s or more while it was being written"

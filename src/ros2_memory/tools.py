@@ -100,7 +100,8 @@ def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[Variant, ...]:
 _LIST = Entry(
     (Variant("list_recorded_topics", "Recorded topics"),),
     "Every recorded topic. Ask this first when a topic's name is not known. "
-    "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s.",
+    "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; the busiest first where "
+    "they are too many.",
     Listing,
     _list_topics,
 )
@@ -191,7 +192,8 @@ _LAST_MATCH = Entry(
     (Variant("find_last_match", "Last time something held"),),
     "When a condition last held, in all history. "
     f"Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
-    "age_s}}, or null if never ({{match: null, notes}} where not all could be read).",
+    "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
+    "read).",
     Search,
     lambda memory, call, given: queries.find_last_match(
         memory,

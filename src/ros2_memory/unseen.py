@@ -15,10 +15,12 @@ Named are, the first few of each and the others counted:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.reading import short_name
+from ros2_memory.recorder.handover import LOG_CLOCK_NOTE
+from ros2_memory.summaries import MESSAGES_MISSING, SUMMARY_NOT_USED, WRONG_STATISTICS
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS, unix_rounded_up
 from ros2_memory.wording import NAMED, counted, listed, shortened
 
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.clock_faults import ClockFault
     from ros2_memory.recorder.snapshot import Snapshot
     from ros2_memory.timebase import Ns
+
+
+_OF_WHOLE_BAGS: Final = (WRONG_STATISTICS, SUMMARY_NOT_USED, LOG_CLOCK_NOTE)
 
 
 def note_unseen(view: Reading, window: TimeWindow, *, nothing: bool = False) -> None:
@@ -66,6 +71,27 @@ def nothing_after(active: Sequence[SetAside], latest: Ns) -> str:
 
 def _moment(at: Ns) -> str:
     return f"{unix_rounded_up(at):.6f}"
+
+
+def note_unsearched(view: Reading, window: TimeWindow) -> None:
+    """As `note_unseen` of a search without a match, where closed files could not be read.
+
+    Nothing is noted where all of them could be: that one is being written is no reason to doubt
+    it, or a robot that records would never be told that something was not there.
+    """
+    closed = lost_in(view.snapshot, window, nothing=True)
+    if closed or view.notes or any(_may_lack(bag) for bag in view.snapshot.odd(window)):
+        note_unseen(view, window, nothing=True)
+
+
+def _may_lack(bag: BagFile) -> bool:
+    """Whether not all messages of a bag could be read."""
+    return bag.state is BagState.INCOMPLETE or not all(map(_is_whole, bag.summary.notes))
+
+
+def _is_whole(note: str) -> bool:
+    """Whether all messages of a bag were read of which this note says what is odd."""
+    return note.startswith(_OF_WHOLE_BAGS) and not note.endswith(MESSAGES_MISSING)
 
 
 def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> Iterator[str]:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.memory import Limits
+from ros2_memory import queries
+from ros2_memory.memory import Call, Limits
 from ros2_memory.timebase import FixedClock
 from tests.asking import asked
 from tests.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
@@ -152,8 +153,8 @@ def test_never_seen_is_null_only_where_everything_was_searched(tmp_path: Path) -
     assert asked(memory, tmp_path, "find_last_match", **never) is None
     tear(splits[0])
     reply = asked(memory, tmp_path, "find_last_match", **never)
-    assert reply["match"] is None
-    assert reply["notes"]
+    assert (reply.pop("timestamp"), reply.pop("value")) == (None, None)
+    assert [*reply] == ["notes"]
 
 
 def test_the_split_being_written_is_told_where_it_may_hold_newer(tmp_path: Path) -> None:
@@ -184,8 +185,10 @@ def test_a_bag_that_a_crash_left_open_is_told_with_what_is_lost_of_it(tmp_path: 
         "notes"
     ][:1]
     assert told.startswith("1 bag left open by a crash; what is readable is used: rec/rec_2.mcap (")
-    rows = asked(memory, tmp_path, "list_recorded_topics")
-    assert [row["notes"] for row in rows if row["topic"] == "/odom"] == [[told]]
+    [named] = asked(memory, tmp_path, "data_time_range")["incomplete"]
+    assert named["file"] == "rec/rec_2.mcap"
+    rows = queries.list_recorded_topics(memory, Call())
+    assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
 
 
 def test_a_chunk_that_is_lost_of_a_closed_bag_is_told_in_windows_that_touch_the_bag(
@@ -216,10 +219,10 @@ def test_what_does_not_answer_is_listed_with_reasons(tmp_path: Path) -> None:
     assert (undecodable["topic"], undecodable["type"]) == ("/foreign", "nobody_msgs/msg/Unknown")
     assert undecodable["reason"]
     assert all(gap["start"] >= at(0) for gap in told["gaps"])
-    rows = asked(memory, tmp_path, "list_recorded_topics")
-    [odometry] = [row for row in rows if row["topic"] == "/odom"]
-    assert odometry["first_ts"] == 0.0
-    assert odometry["notes"][0].startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
+    rows = queries.list_recorded_topics(memory, Call())
+    [odometry] = [row for row in rows if row.topic == "/odom"]
+    assert odometry.first == 0
+    assert odometry.notes[0].startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
 
 
 def test_what_a_wrong_clock_dated_is_found_by_its_times_and_told_so(tmp_path: Path) -> None:

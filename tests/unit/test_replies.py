@@ -2,10 +2,13 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory import answers
 from ros2_memory.errors import (
@@ -22,7 +25,7 @@ from ros2_memory.model import Pose, Sample, SetAside, Transform, Twist
 from ros2_memory.replies import Replies
 from ros2_memory.shapes import Answer, shown
 from ros2_memory.tf_tree import FrameEdge
-from ros2_memory.timebase import NS_PER_S, ns_from_unix
+from ros2_memory.timebase import NS_PER_S, ns_from_unix, unix_rounded_up
 from ros2_memory.trajectory import Trajectory, Waypoint
 
 BAGS = Path("bags")
@@ -95,7 +98,6 @@ def test_topics_are_a_bare_list() -> None:
             "first_ts": 1784023200.0,
             "last_ts": 1784023200.0,
             "count": 1,
-            "undecodable": "no definition",
         },
     ]
 
@@ -104,12 +106,54 @@ def test_no_topics_are_an_empty_list() -> None:
     assert said(()) == []
 
 
-def test_too_many_topics_become_an_object_that_says_how_to_narrow() -> None:
-    listed = said(tuple(row(number) for number in range(649)))
-    assert listed["topics"][0]["topic"] == "/topic_0000"
-    assert len(listed["topics"]) < 649
-    assert "pattern" in listed["notes"][0]
-    assert f"{len(listed['topics'])} of 649" in listed["notes"][1]
+ROW_KEYS = ["topic", "type", "first_ts", "last_ts", "count"]
+
+
+@given(
+    st.lists(
+        st.tuples(st.text(min_size=1, max_size=900), st.integers(0, 2**63 - 1), st.integers(0, 9)),
+        max_size=60,
+    ),
+    st.integers(500, 3000),
+)
+def test_topics_are_always_a_list_of_rows_of_five_keys_with_the_busiest_first(
+    topics: list[tuple[str, int, int]], max_chars: int
+) -> None:
+    rows = tuple(
+        answers.TopicRow(name, "a/msg/B", T0 + n, T0 + n + extent, count, "why", ("odd",))
+        for n, (name, count, extent) in enumerate(topics)
+    )
+    reply = Replies(BAGS, max_chars).answer(rows)
+    listed = json.loads(reply.text)
+    assert len(reply.text) <= max(max_chars, 2)
+    assert all([*each] == ROW_KEYS for each in listed)
+    assert sum(each["count"] for each in listed) == sum(count for _, count, _ in topics)
+    if len(listed) == len(rows) and not (listed and listed[-1]["type"] == ""):
+        assert [each["count"] for each in listed] == [count for _, count, _ in topics]
+        return
+    *told, rest = listed
+    left_out = sorted(rows, key=lambda row: -row.count)[len(told) :]
+    assert [each["count"] for each in told] == sorted((row.count for row in rows), reverse=True)[
+        : len(told)
+    ]
+    assert (rest["topic"], rest["type"]) == (f"({len(left_out)} more: use pattern)", "")
+    assert rest["first_ts"] == unix_rounded_up(min(row.first for row in left_out))
+    assert rest["last_ts"] == unix_rounded_up(max(row.last for row in left_out))
+
+
+def test_the_busiest_of_649_topics_stands_first_and_the_last_row_counts_the_others() -> None:
+    rows = [row(number) for number in range(649)]
+    rows[600] = replace(rows[600], count=10**6)
+    listed = said(tuple(rows))
+    assert listed[0]["topic"] == "/topic_0600"
+    assert listed[-1] == {
+        "topic": f"({650 - len(listed)} more: use pattern)",
+        "type": "",
+        "first_ts": 1784023200.0,
+        "last_ts": 1784023200.000001,
+        "count": 7 * (650 - len(listed)),
+    }
+    assert 100 < len(listed) < 649
 
 
 def test_a_timestamp_is_rounded_up_so_that_it_finds_its_own_message() -> None:
@@ -273,7 +317,8 @@ def test_a_complete_search_without_a_match_is_null() -> None:
 @pytest.mark.parametrize("kind", [answers.Match, answers.ValueWhen])
 def test_an_incomplete_search_without_a_match_says_what_it_missed(kind: Any) -> None:
     assert said(kind(None, notes=("a.mcap is damaged",))) == {
-        "match": None,
+        "timestamp": None,
+        "value": None,
         "notes": ["a.mcap is damaged"],
     }
 
@@ -379,11 +424,6 @@ def test_no_data_tells_what_could_not_be_read() -> None:
     error = NoDataError(NoDataReason.GAP, "nothing", ("1 bag file could not be read",))
     told = json.loads(REPLIES.error(error).text)
     assert told["notes"] == ["1 bag file could not be read"]
-
-
-def test_a_topic_of_bags_that_are_not_whole_says_so_in_its_row() -> None:
-    row = answers.TopicRow("/odom", "nav_msgs/msg/Odometry", T0, T0, 1, None, ("cut short",))
-    assert said((row,))[0]["notes"] == ["cut short"]
 
 
 def test_what_is_no_answer_is_refused() -> None:

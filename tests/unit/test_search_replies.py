@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from ros2_memory.memory import Limits
 from tests.asking import asked
-from tests.bags import Msg, boolean, detections, make, stamp, write_mcap
-from tests.memories import memory_of
+from tests.bags import McapLayout, Msg, boolean, detections, make, stamp, write_mcap
+from tests.mcap_surgery import spoil_chunk
+from tests.memories import SettableClock, memory_of
 from tests.recalled import recalling
+from tests.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.memory import Memory
     from ros2_memory.model import JsonValue
 
 S = 10**9
@@ -124,3 +129,70 @@ def test_never_is_not_the_answer_where_only_a_named_field_could_hold_the_number(
     reply = last(bag_dir, recalls, "/numbers", "contains", value)
     assert reply["error"] == "invalid_arguments"
     assert "name that in field, or ask with equals" in reply["detail"]
+
+
+def never(memory: Memory, bag_dir: Path, tool: str) -> Any:
+    topic = {
+        "find_last_match": {"topic": "/vision/*"},
+        "get_value_when": {"condition_topic": "/vision/*", "value_topic": "/bumper"},
+    }[tool]
+    condition = {"condition_type": "contains", "value": "scissors"}
+    return asked(memory, bag_dir, tool, **topic, **condition)
+
+
+each_search = pytest.mark.parametrize("tool", ["find_last_match", "get_value_when"])
+
+
+@each_search
+@each_way
+@pytest.mark.parametrize("include_active", [False, True])
+def test_a_robot_that_records_is_answered_null_where_every_closed_bag_was_searched(
+    bag_dir: Path, tool: str, recalls: bool, include_active: bool
+) -> None:
+    active = bag_dir / "rec" / "rec_3.mcap"
+    fresh = [detections(T0 + (30 + n) * S, ["cup"]) for n in range(5)]
+    write_mcap(active, fresh, McapLayout(finish=False))
+    os.utime(active, ns=(T0 + 34 * S,) * 2)
+    memory = memory_of(
+        bag_dir,
+        clock=SettableClock(T0 + 35 * S),
+        limits=Limits(include_active=include_active),
+        include_active=include_active,
+    )
+    assert memory.index.snapshot().active
+    if recalls:
+        memory = recalling(memory, bag_dir)
+    assert never(memory, bag_dir, tool) is None
+
+
+@each_search
+@each_way
+@pytest.mark.parametrize("fault", ["torn", "cut", "spoilt", "undecodable"])
+def test_a_search_that_could_not_read_a_closed_bag_says_which(
+    bag_dir: Path, tool: str, recalls: bool, fault: str
+) -> None:
+    path = bag_dir / "rec" / "rec_1.mcap"
+    if fault == "torn":
+        path.write_bytes(b"this was a bag once, and is none any more")
+    elif fault == "cut":
+        path.write_bytes(path.read_bytes()[:-200])
+    elif fault == "spoilt":
+        spoil_chunk(path, 0)
+    else:
+        body = b"\x00\x01\x00\x00\xff\xff\xff\x7f"
+        kind = "ros2_vision_interfaces/msg/VisionDetectionArray"
+        write_mcap(path, [Msg("/vision/scene/scene_objects", kind, T0 + 10 * S, body)])
+    os.utime(path, ns=(T0 + 20 * S,) * 2)
+    memory = memory_of(bag_dir)
+    reply = never(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool)
+    assert [*reply] == ["timestamp", "value", "notes"]
+    assert (reply["timestamp"], reply["value"]) == (None, None)
+    told = "could not be decoded" if fault == "undecodable" else "rec/rec_1.mcap"
+    assert any(told in note for note in reply["notes"])
+
+
+@needs_real
+def test_wrong_statistics_of_a_file_that_was_read_whole_do_not_make_never_uncertain() -> None:
+    bag_dir = REAL / "rosbag2_time0_mcap"
+    given = {"topic": "*", "condition_type": "equals", "value": "never recorded"}
+    assert asked(memory_of(bag_dir), bag_dir, "find_last_match", **given) is None

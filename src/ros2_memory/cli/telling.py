@@ -21,8 +21,9 @@ from ros2_memory.cli.running import (
 )
 from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.showing import cell, show
-from ros2_memory.memory import Memory
+from ros2_memory.memory import Call, Memory
 from ros2_memory.model import JsonValue, TimeWindow
+from ros2_memory.overview import list_recorded_topics
 from ros2_memory.recorder.snapshot import Snapshot
 from ros2_memory.timebase import NS_PER_S, unix_from_ns
 
@@ -48,7 +49,15 @@ def topics(
         reply: JsonValue = json.loads(text)
         snapshot = memory.index.snapshot()
     rows = [each for each in reply if isinstance(each, dict)] if isinstance(reply, list) else []
-    shown = [{**row, "rate_hz": usual_rate(snapshot, str(row["topic"]))} for row in rows]
+    remarks = _remarks(memory) if rows else {}
+    shown = [
+        {
+            **row,
+            **remarks.get((str(row["topic"]), str(row["type"])), {}),
+            "rate_hz": usual_rate(snapshot, str(row["topic"])),
+        }
+        for row in rows
+    ]
     if as_json:
         say(json.dumps(shown) if rows else text)
     elif rows:
@@ -59,6 +68,18 @@ def topics(
         say(f"nothing is recorded in {settings.recording.bag_dir}")
     if not rows:
         raise typer.Exit(NOT_SO)
+
+
+def _remarks(memory: Memory) -> dict[tuple[str, str], dict[str, JsonValue]]:
+    """By topic and type what is odd of them; planners read it in `data_time_range`."""
+    remarks: dict[tuple[str, str], dict[str, JsonValue]] = {}
+    for row in list_recorded_topics(memory, Call()):
+        of_row = remarks.setdefault((row.topic, row.type), {})
+        if row.undecodable is not None:
+            of_row["undecodable"] = row.undecodable
+        if row.notes:
+            of_row["notes"] = [*row.notes]
+    return remarks
 
 
 def usual_rate(snapshot: Snapshot, topic: str) -> float | None:

@@ -26,7 +26,12 @@ from ros2_memory.storage.mcap_chunk import (
 )
 from ros2_memory.storage.mcap_records import RECORD, Statistics
 from ros2_memory.storage.mcap_summary import Chunk, DoubtError, read_summary
-from ros2_memory.summaries import OUT_OF_ORDER_NS
+from ros2_memory.summaries import (
+    MESSAGES_MISSING,
+    OUT_OF_ORDER_NS,
+    SUMMARY_NOT_USED,
+    WRONG_STATISTICS,
+)
 from ros2_memory.timebase import MAX_NS, unix_from_ns
 
 if TYPE_CHECKING:
@@ -171,7 +176,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
     except (DoubtError, OSError):
         raise
     except Exception as error:
-        raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
+        raise DoubtError(f"{SUMMARY_NOT_USED} ({reason_of(error)})") from error
 
 
 def _index_from_summary(file: OpenFile) -> McapIndex:
@@ -326,11 +331,11 @@ def disagreements(stated: Statistics, totals: Mapping[int, Total]) -> tuple[str,
     if stated.counts == counts and claimed == (count, first, last):
         return ()
     note = (
-        f"its own statistics are wrong: they state {stated.messages} messages from"
+        f"{WRONG_STATISTICS}: they state {stated.messages} messages from"
         f" {_seconds(stated.start)} to {_seconds(stated.end)}; it holds {count} from"
         f" {_seconds(first)} to {_seconds(last)}"
     )
-    return (note,)
+    return (f"{note}; {MESSAGES_MISSING}" if stated.messages > count else note,)
 
 
 def _seconds(moment: Ns) -> str:
