@@ -12,6 +12,7 @@ from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.retention import RetentionLimits
+from ros2_memory.recorder.time_sync import TimeSync
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -30,6 +31,18 @@ PLENTY = 10**15
 HOUR = 3600 * NS_PER_S
 
 
+class FakeTimeSync(TimeSync):
+    """Reports what it is told, and counts how often it is asked."""
+
+    def __init__(self, *, synchronised: bool = True) -> None:
+        self.synchronised = synchronised
+        self.asked = 0
+
+    def is_synchronised(self) -> bool:
+        self.asked += 1
+        return self.synchronised
+
+
 def keeper_of(
     bag_dir: Path,
     *,
@@ -42,14 +55,16 @@ def keeper_of(
     moments_bytes: int = PLENTY,
     monotonic: Callable[[], float] = time.monotonic,
     measure_free: Callable[[Path], int] = lambda _: PLENTY,
+    time_sync: TimeSync | None = None,
 ) -> Housekeeping:
-    """A housekeeper. Unless a clock is given it is an hour later: nothing is being written."""
+    """A housekeeper whose clock is right, and an hour later unless one is given."""
     return Housekeeping(
         bag_dir,
         CountingReader(reader or McapReader()),
         writer or McapWriter(),
         clock or later(),
         RetentionLimits(max_bytes, round(max_age_h * HOUR)),
+        time_sync=time_sync or FakeTimeSync(),
         split_duration_s=10.0,
         moments_bytes=moments_bytes,
         static_topics=("/tf_static",),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping
+from collections.abc import Collection, MutableMapping
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ class Housekeeping:
         self.making = False
         self.moments_kept = 0
         self.failed: dict[str, str] = {}
+        self.recorded: list[tuple[tuple[str, ...], int, float]] = []
+        self.held: str | None = None
 
     def repair(self, bag_dir: Path) -> None:
         self.asked.append("repair")
@@ -52,6 +54,14 @@ class Housekeeping:
 
     def keep_moments(self, bag_dir: Path) -> None:
         self.moments_kept += 1
+
+    def note_recorded(
+        self, recordings: Collection[str], bytes_written: int, monotonic_s: float
+    ) -> None:
+        self.recorded.append((tuple(recordings), bytes_written, monotonic_s))
+
+    def age_held(self) -> str | None:
+        return self.held
 
     def faults(self) -> dict[str, str]:
         return self.failed

@@ -152,6 +152,7 @@ def _of_recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
         "heartbeat_age_s": _seconds(now - heartbeat.updated),
         "restarts": heartbeat.restarts,
         "last_error": None if error is None else _short(error),
+        "age_held": None if heartbeat.age_held is None else _short(heartbeat.age_held),
     }
     for kind, topics, most in (
         ("silent", heartbeat.silent, _MOST_TOPICS),

@@ -51,7 +51,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot, heartbeat, wall),
         problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
-        notes=view.notes,
+        notes=(*view.notes, *_age_held(heartbeat, wall)),
     )
 
 
@@ -96,6 +96,12 @@ def lacking_in(view: View) -> Iterator[str]:
     if undecodable := {each.topic for each in undecodable_topics(view)}:
         topics = counted(len(undecodable), "topic")
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
+
+
+def _age_held(heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
+    """What a live recorder keeps longer than it should, for want of a clock that is right."""
+    if heartbeat is not None and heartbeat.age_held is not None and heartbeat.is_live(wall):
+        yield heartbeat.age_held
 
 
 def _fallen_silent(snapshot: Snapshot) -> Iterator[Stillness]:

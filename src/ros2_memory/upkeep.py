@@ -8,6 +8,7 @@ from ros2_memory.adapters import GB, retention_limits
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
 from ros2_memory.recorder.repair import Repairer
+from ros2_memory.recorder.time_sync import SystemTimeSync
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.timebase import WallClock
@@ -36,6 +37,7 @@ def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> H
             McapWriter(settings.reader.max_chunk_mb),
             WallClock(),
             limits,
+            time_sync=SystemTimeSync(),
             split_duration_s=settings.recording.split_duration_s,
             moments_bytes=moments_bytes(settings),
             static_topics=settings.data.tf_static_topics,

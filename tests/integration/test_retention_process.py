@@ -23,6 +23,7 @@ from ros2_memory import queries
 from ros2_memory.errors import NoDataError
 from ros2_memory.memory import Call, Limits
 from ros2_memory.moments import Moment, Span
+from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.layout import is_carried
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import NS_PER_S, WallClock
@@ -30,10 +31,11 @@ from tests.bags import McapLayout, odom, write_mcap
 from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving
 from tests.keeping import keeper_of, size_of
+from tests.live_recorder import answer
 from tests.memories import memory_of
 from tests.questions import ask_everything, write_run
 from tests.split_writer import DOCK
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -217,6 +219,41 @@ def test_the_daemon_repairs_what_a_crash_left_and_keeps_its_budget(site: Site) -
     left = {path.name for path in (site.bag_dir / "rec_20260101T000000Z").glob("*.mcap")}
     assert left == {f"{number}.mcap" for number in range(10 - len(left), 10)}
     assert 0 < len(left) < 10
+
+
+def age_held(bag_dir: Path) -> str | None:
+    heartbeat = read_heartbeat(bag_dir).heartbeat
+    assert heartbeat is not None
+    return heartbeat.age_held
+
+
+def test_a_clock_that_stepped_forward_deletes_nothing_before_it_is_synchronised(site: Site) -> None:
+    """As the recorder finds it after a step of 150 h: its bags of a week look older than that."""
+    site.synchronised.write_text("no\n")
+    now = WallClock().now()
+    kept = [
+        write_mcap(
+            site.bag_dir / f"rec_20260101T{n:06}Z" / "0.mcap",
+            [odom(now - (149 + 2 * n) * 3600 * NS_PER_S + each, 1.0, 2.0) for each in range(20)],
+        )
+        for n in range(1, 20)
+    ]
+    daemon = site.run("retention.max_age_h=168")
+    (held,) = daemon.wait_for("age_held")
+    assert held["bags"] == 10
+    until(lambda: age_held(site.bag_dir) == held["reason"])
+    with serving(site.bag_dir, site.folder / "server") as served:
+        assert answer(served, "memory_status")["notes"] == [held["reason"]]
+        assert json.loads(served.get("/health")[1])["recorder"]["age_held"] == held["reason"]
+    assert all(path.exists() for path in kept)
+    recorded = {path.name for path in daemon.recordings()} - {path.parent.name for path in kept}
+    assert max(recorded) in (site.bag_dir / ".episodic/recorded.jsonl").read_text()
+
+    site.synchronised.write_text("yes\n")
+    daemon.wait_for("age_no_longer_held")
+    assert [path.exists() for path in kept] == [True] * 9 + [False] * 10
+    until(lambda: age_held(site.bag_dir) is None)
+    assert daemon.stop() == 0
 
 
 def state(folder: Path) -> dict[str, tuple[object, ...]]:

@@ -124,7 +124,16 @@ async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
         "silent_topics": ["/b"],
         "missing_topics": ["/c"],
         "last_error": None,
+        "age_held": None,
     }
+
+
+async def test_age_that_is_held_is_shown_and_degrades_nothing(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), age_held="2 bags stay"))
+    told = await Health(memory_at(tmp_path, seconds=3), "1")()
+    assert told["status"] == "ok"
+    assert isinstance(told["recorder"], dict)
+    assert told["recorder"]["age_held"] == "2 bags stay"
 
 
 @pytest.mark.parametrize(

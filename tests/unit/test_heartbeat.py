@@ -50,13 +50,15 @@ beats = st.builds(
     interval_s=st.floats(0.001, 3600),
     restarts=st.integers(0, 2**63 - 1),
     missing=st.lists(st.text()).map(tuple),
+    age_held=st.none() | st.text(),
 )
 
 
 def test_that_of_an_older_recorder_is_read(tmp_path: Path) -> None:
-    write_heartbeat(tmp_path, replace(BEAT, restarts=3, missing=("/gone",)))
+    write_heartbeat(tmp_path, replace(BEAT, restarts=3, missing=("/gone",), age_held="2 bags"))
     content = json.loads((tmp_path / HEARTBEAT_FILE).read_text())
     assert (content.pop("restarts"), content.pop("missing")) == (3, ["/gone"])
+    assert content.pop("age_held") == "2 bags"
     (tmp_path / HEARTBEAT_FILE).write_text(json.dumps(content))
     assert read_heartbeat(tmp_path) == (BEAT, None)
 
@@ -137,7 +139,7 @@ def test_a_directory_or_a_pipe_of_that_name_does_not_stall_the_reader(tmp_path: 
         assert read.reason
 
 
-@pytest.mark.parametrize("key", sorted({*BEAT.__slots__} - {"restarts", "missing"}))
+@pytest.mark.parametrize("key", sorted({*BEAT.__slots__} - {"restarts", "missing", "age_held"}))
 def test_a_missing_key_is_named(tmp_path: Path, key: str) -> None:
     assert key in (_reason_without(tmp_path, key) or "")
 

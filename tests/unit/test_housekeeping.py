@@ -16,12 +16,13 @@ from ros2_memory.model import TimeWindow
 from ros2_memory.moments import Span
 from ros2_memory.recorder.housekeeping import InBackground
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.recorder.ports import Housekeeper
+from ros2_memory.recorder.ports import Housekeeper, NoHousekeeping
 from ros2_memory.recorder.removal import Inode, remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.bags import McapLayout, odom, write_db3, write_mcap
 from tests.keeping import (
     PLENTY,
+    FakeTimeSync,
     files_in,
     keeper_of,
     later,
@@ -107,6 +108,42 @@ class TestRetention:
         os.utime(young, ns=(T0, T0))
         keeper_of(tmp_path, max_age_h=2).apply(tmp_path)
         assert (old.exists(), young.exists()) == (False, True)
+
+    def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
+        self, tmp_path: Path
+    ) -> None:
+        old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "b/b_0.mcap", 3 * 3600)
+        clock = FakeTimeSync(synchronised=False)
+        keeper = keeper_of(tmp_path, max_age_h=2, time_sync=clock)
+        with structlog.testing.capture_logs() as captured:
+            keeper.apply(tmp_path)
+            keeper.apply(tmp_path)
+            assert (old.exists(), clock.asked) == (True, 2)
+            [held] = events(captured, "age_held")
+            assert (held["bags"], held["reason"]) == (1, keeper.age_held())
+            assert "1 bag is older than 2 h" in held["reason"]
+            clock.synchronised = True
+            keeper.apply(tmp_path)
+        assert (old.exists(), young.exists(), keeper.age_held()) == (False, True, None)
+        assert len(events(captured, "age_no_longer_held")) == 1
+        keeper.apply(tmp_path)
+        assert clock.asked == 3
+
+    def test_what_was_recorded_longer_ago_than_the_limit_goes_by_the_monotonic_clock(
+        self, tmp_path: Path
+    ) -> None:
+        old = bag(tmp_path / "a/a_0.mcap", 0)
+        keeper = keeper_of(tmp_path, max_age_h=0.1, time_sync=FakeTimeSync(synchronised=False))
+        keeper.apply(tmp_path)
+        for second in range(400):
+            keeper.note_recorded(["b"], second, float(second))
+            if second == 350:
+                bag(tmp_path / "b/b_0.mcap", 30)
+                keeper.apply(tmp_path)
+                assert old.exists()
+        keeper.apply(tmp_path)
+        assert files_in(tmp_path / "b") == ["b_0.mcap"]
+        assert not old.exists()
 
     def test_it_is_told_once_for_each_pass_what_was_deleted(self, tmp_path: Path) -> None:
         recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
@@ -367,22 +404,12 @@ class TestInTheBackground:
         ids=["of the disk", "of this program"],
     )
     def test_a_failure_is_reported(self, tmp_path: Path, error: Exception, told: str) -> None:
-        class Failing:
+        class Failing(NoHousekeeping):
             mended = False
-
-            def repair(self, bag_dir: Path) -> None: ...
-            def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None: ...
-            def making_room(self) -> bool:
-                return False
 
             def apply(self, bag_dir: Path) -> None:
                 if not self.mended:
                     raise error
-
-            def keep_moments(self, bag_dir: Path) -> None: ...
-
-            def faults(self) -> dict[str, str]:
-                return {}
 
         failing = Failing()
         keeper = InBackground(failing)

@@ -54,7 +54,7 @@ def stock(
     other_bytes: int = 0,
     free_bytes: int | None = None,
 ) -> Stock:
-    return Stock(bags, now, sidecars or {}, other_bytes, free_bytes)
+    return Stock(bags, now, sidecars or {}, other_bytes, free_bytes, synchronised=True)
 
 
 def names(bags: Iterable[StoredBag]) -> list[str]:
@@ -244,6 +244,10 @@ def stocks(draw: st.DrawFn) -> Stock:
         sidecars=draw(st.dictionaries(st.sampled_from("ABC"), st.integers(0, 20))),
         other_bytes=draw(st.integers(0, 50)),
         free_bytes=draw(st.none() | st.integers(0, 100)),
+        recorded_since=draw(
+            st.dictionaries(st.sampled_from("ABC"), st.integers(0, 200).map(lambda h: h * HOUR))
+        ),
+        synchronised=draw(st.booleans()),
     )
 
 

@@ -66,6 +66,16 @@ def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
     assert told["fell_silent"] == []
 
 
+def test_age_that_is_held_is_told_while_the_recorder_lives(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    beating(tmp_path, RecorderState.RECORDING, 59, age_held="72 bags stay")
+    told = shown(memory, tmp_path)
+    assert told["notes"] == ["72 bags stay"]
+    assert told["trust"] == "nothing is known to be missing"
+    beating(tmp_path, RecorderState.STOPPED, -100, age_held="72 bags stay")
+    assert "notes" not in shown(memory, tmp_path)
+
+
 @pytest.mark.parametrize(
     ("now", "told"), [("wall", ("recording", False)), ("latest", (None, False))]
 )

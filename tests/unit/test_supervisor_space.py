@@ -14,6 +14,26 @@ from tests.supervision import Housekeeping, assert_each_counts_once, events
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
 
+class TestRecordedTime:
+    def test_the_house_is_told_what_is_recorded_and_what_it_holds_stands_in_the_heartbeat(
+        self, tmp_path: Path
+    ) -> None:
+        housekeeping = Housekeeping()
+        world = World(tmp_path, housekeeper=housekeeping)
+        world.supervisor.start()
+        world.run(20)
+        names, written, at_s = housekeeping.recorded[-1]
+        assert [*names] == world.heartbeat()["recordings"]
+        assert (written > 0, at_s) == (True, max(each[2] for each in housekeeping.recorded))
+        assert world.heartbeat()["age_held"] is None
+        housekeeping.held = "2 bags stay"
+        world.run(1)
+        assert world.heartbeat()["age_held"] == "2 bags stay"
+        world.free = 900
+        world.run(3)
+        assert housekeeping.recorded[-1][0] == ()
+
+
 class TestSpace:
     def world(self, tmp_path: Path) -> tuple[World, Housekeeping]:
         housekeeping = Housekeeping()

@@ -282,6 +282,9 @@ def _troubles(heartbeat: Heartbeat) -> Iterator[Finding]:
         )
         seen = f"subscribed and never heard: {listed(heartbeat.silent)}"
         yield Finding(Level.WARNING, "recorder", seen, do)
+    if heartbeat.age_held:
+        do = "have the clock synchronised: timedatectl set-ntp true, or chrony; the budget holds"
+        yield Finding(Level.WARNING, "recorder", heartbeat.age_held, do)
     if heartbeat.last_error:
         seen = f"its last error: {heartbeat.last_error}"
         if heartbeat.restarts:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.errors import EpisodicError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Collection
     from pathlib import Path
 
     from ros2_memory.recorder.journal import Journal
@@ -57,6 +57,12 @@ class Chores:
     def keep_moments(self) -> None:
         """Has kept what somebody asks to keep."""
         self._do("keep_moments", partial(self._housekeeper.keep_moments, self._bag_dir))
+
+    def note_recorded(
+        self, recordings: Collection[str], bytes_written: int, monotonic_s: float
+    ) -> None:
+        """Has counted the time for which recordings are written."""
+        self._housekeeper.note_recorded(recordings, bytes_written, monotonic_s)
 
     def tell(self) -> None:
         """Reports what could not be done where nobody waited for it."""

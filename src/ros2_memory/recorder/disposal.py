@@ -17,8 +17,9 @@ import structlog
 
 from ros2_memory.errors import EpisodicError
 from ros2_memory.recorder.inventory import Inventory
+from ros2_memory.recorder.recorded_time import relative_recording
 from ros2_memory.recorder.removal import Inode, remove_bag, remove_emptied
-from ros2_memory.recorder.retention import weighed
+from ros2_memory.recorder.retention import ages, weighed
 from ros2_memory.recorder.scan import other_form
 
 if TYPE_CHECKING:
@@ -26,8 +27,10 @@ if TYPE_CHECKING:
 
     from ros2_memory.recorder.inventory import Known
     from ros2_memory.recorder.latched import Carrier
-    from ros2_memory.recorder.retention import RetentionLimits, StoredBag
+    from ros2_memory.recorder.recorded_time import RecordedTime
+    from ros2_memory.recorder.retention import RetentionLimits, Stock, StoredBag
     from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.recorder.time_sync import TimeSync
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass: some tenths of a second. The next pass goes on."""
@@ -41,7 +44,8 @@ class Disposed:
 
     `total_bytes` is what the budget counts afterwards, and `fits` whether the limits are kept.
     `carried` is how many latched messages are carried, where their bag was written anew; `failed`
-    is how many bags could not be deleted.
+    is how many bags could not be deleted. `held` is how many are too old by their dates and stay,
+    since the clock is not known to be right.
     """
 
     bags: int = 0
@@ -51,6 +55,7 @@ class Disposed:
     failed: int = 0
     total_bytes: int = 0
     fits: bool = True
+    held: int = 0
 
 
 @dataclass(slots=True)
@@ -58,10 +63,11 @@ class _Pass:
     """One pass under way: bags that were deleted (`kept` of them in moments), and those that stay.
 
     Of these some are `waiting`: they could be deleted, and should be some moments later. When it is
-    `urgent` nothing is waited for.
+    `urgent` nothing is waited for. `synchronised`: whether the system clock is; None until asked.
     """
 
     urgent: bool
+    synchronised: bool | None = None
     waiting: set[str] = field(default_factory=set)
     done: Disposed = field(default_factory=Disposed)
     gone: set[str] = field(default_factory=set)
@@ -82,6 +88,8 @@ class Disposal:
         bag_dir: the bag directory.
         limits: how much is kept.
         carrier: carries latched messages on.
+        recorded: how long was recorded after each recording.
+        time_sync: knows whether the system clock is synchronised.
         static_topics: topics that are latched whatever their publishers say.
         grace_s: how long latched messages are carried before the bag goes that they stood in.
         monotonic: a clock that never steps, in seconds.
@@ -93,6 +101,8 @@ class Disposal:
         limits: RetentionLimits,
         carrier: Carrier,
         *,
+        recorded: RecordedTime,
+        time_sync: TimeSync,
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
         monotonic: Callable[[], float] = time.monotonic,
@@ -100,6 +110,8 @@ class Disposal:
         self._bag_dir = bag_dir
         self._limits = limits
         self._carrier = carrier
+        self._recorded = recorded
+        self._time_sync = time_sync
         self._inventory = Inventory(bag_dir, static_topics)
         self._grace_s = grace_s
         self._monotonic = monotonic
@@ -134,6 +146,7 @@ class Disposal:
             stock = self._inventory.stock(known, gone=under_way.gone, staying=under_way.staying)
             if free_bytes is not None:
                 stock = replace(stock, free_bytes=free_bytes())
+            stock = self._with_clocks(stock, limits, under_way)
             found = weighed(stock, limits)
             under_way.done.total_bytes, under_way.done.fits = found.total_bytes, found.fits
             doomed = found.doomed[: MOST_AT_ONCE - len(under_way.gone)]
@@ -146,6 +159,21 @@ class Disposal:
                 under_way.hurry()
         self._tidy(known, under_way)
         return under_way.done
+
+    def _with_clocks(self, stock: Stock, limits: RetentionLimits, under_way: _Pass) -> Stock:
+        """The stock, and what the clocks say of it."""
+        names = {
+            bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in stock.bags
+        }
+        since = self._recorded.since(names.values())
+        stock = replace(stock, recorded_since={path: since[name] for path, name in names.items()})
+        old = ages(stock, limits)
+        # A program has to be started to know, so only where it matters.
+        if old.by_dates != old.by_recording and under_way.synchronised is None:
+            under_way.synchronised = self._time_sync.is_synchronised()
+        synchronised = bool(under_way.synchronised)
+        under_way.done.held = len(old.held(synchronised=synchronised))
+        return replace(stock, synchronised=synchronised)
 
     def _dispose(
         self,

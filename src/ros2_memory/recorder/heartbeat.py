@@ -53,7 +53,8 @@ class Heartbeat:
     topics subscribed to, `silent` those among them that have brought no message; `bytes_written`
     counts all recordings since the recorder started, `restarts` how often it had to start
     `ros2 bag record` anew. `missing` are the topics that are to be recorded, by name, and that no
-    publisher has offered since then.
+    publisher has offered since then. `age_held` says which bags stay although they are too old by
+    their dates, since the clock is not known to be right; None where there are none.
     """
 
     pid: int
@@ -68,6 +69,7 @@ class Heartbeat:
     interval_s: float
     restarts: int = 0
     missing: tuple[str, ...] = ()
+    age_held: str | None = None
 
     def is_live(self, now: Ns) -> bool:
         """Whether the recorder that wrote this is likely to be there still.
@@ -163,6 +165,7 @@ def _parsed(text: str) -> Heartbeat:
         # Those of an older recorder do not have them.
         restarts=_int(fields, "restarts", least=0) if "restarts" in fields else 0,
         missing=_strings(fields, "missing") if "missing" in fields else (),
+        age_held=_text_or_null(fields, "age_held") if "age_held" in fields else None,
     )
 
 

@@ -25,9 +25,11 @@ from ros2_memory.recorder.keeper import Keeper
 from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.latched import Carrier
 from ros2_memory.recorder.layout import METADATA_FILE
+from ros2_memory.recorder.recorded_time import RecordedTime
 from ros2_memory.recorder.removal import left_by_repair, remove_emptied
 from ros2_memory.recorder.repair import Repairer, open_files
-from ros2_memory.timebase import ms_from_ns, ns_from_unix
+from ros2_memory.timebase import NS_PER_S, ms_from_ns, ns_from_unix
+from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.repair import Repaired
     from ros2_memory.recorder.retention import RetentionLimits
     from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.recorder.time_sync import TimeSync
     from ros2_memory.storage.base import BagReader
     from ros2_memory.storage.writing import BagWriter
     from ros2_memory.timebase import Clock
@@ -59,6 +62,7 @@ class Housekeeping:
         writer: writes those that are repaired, and the one of carried messages.
         clock: the wall clock.
         limits: how much is kept.
+        time_sync: knows whether the system clock is synchronised.
         split_duration_s: how long the recorder writes one file.
         moments_bytes: how much of it moments may take that were asked to be kept.
         static_topics: topics that are latched whatever their publishers say.
@@ -75,6 +79,7 @@ class Housekeeping:
         clock: Clock,
         limits: RetentionLimits,
         *,
+        time_sync: TimeSync,
         split_duration_s: float,
         moments_bytes: int = 0,
         static_topics: Collection[str] = (),
@@ -82,10 +87,13 @@ class Housekeeping:
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._recorded = RecordedTime(bag_dir)
         disposal = Disposal(
             bag_dir,
             limits,
             Carrier(bag_dir, reader, writer, static_topics),
+            recorded=self._recorded,
+            time_sync=time_sync,
             static_topics=static_topics,
             grace_s=grace_s,
             monotonic=monotonic,
@@ -102,6 +110,8 @@ class Housekeeping:
         self._repairer = Repairer(reader, writer)
         self._names = KeptNames(bag_dir)
         self._clock = clock
+        self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
+        self._held = 0
         self._patience = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._measure_free = measure_free
         self._tried: set[tuple[Path, int, int]] = set()
@@ -132,6 +142,7 @@ class Housekeeping:
             free_bytes=lambda: self._measure_free(bag_dir), min_free_bytes=free_bytes_wanted
         )
         self._report(done, begun, free_bytes_wanted=free_bytes_wanted)
+        self._tell_held(done)
 
     def making_room(self) -> bool:
         """Never: it is made when `make_room` returns."""
@@ -144,6 +155,7 @@ class Housekeeping:
         done = self._index.apply_retention()
         self._report(done, begun)
         self._tell_shortage(done)
+        self._tell_held(done)
         if self._repair_left(bag_dir, self._index.snapshot()):
             self._index.refresh()
 
@@ -158,6 +170,24 @@ class Housekeeping:
         if self._keeper.has_work():
             with self._index.undisturbed() as snapshot:
                 self._keeper.keep(snapshot)
+
+    def note_recorded(
+        self, recordings: Collection[str], bytes_written: int, monotonic_s: float
+    ) -> None:
+        """Counts the time for which these recordings are being written."""
+        self._recorded.note(recordings, bytes_written, monotonic_s)
+
+    def age_held(self) -> str | None:
+        """Which bags the last pass kept although their dates make them too old, and why."""
+        if not self._held:
+            return None
+        bags = counted(self._held, "bag is", "bags are")
+        limit = f"{self._max_age_h:g} h"
+        return (
+            f"{bags} older than {limit} (retention.max_age_h) by the dates, and kept: the clock is "
+            "not known to be right. They go when it is synchronised with a time server "
+            f"(timedatectl shows that), or when {limit} have been recorded after them"
+        )
 
     def faults(self) -> Mapping[str, str]:
         """None: what fails is raised."""
@@ -271,6 +301,14 @@ class Housekeeping:
             **values,
         )
 
+    def _tell_held(self, done: Disposed) -> None:
+        """Says once that age is held, and once that it no longer is."""
+        before, self._held = self._held, done.held
+        if self._held and not before:
+            _log.warning("age_held", bags=self._held, reason=self.age_held())
+        elif before and not self._held:
+            _log.info("age_no_longer_held")
+
     def _tell_shortage(self, done: Disposed) -> None:
         """Says once that the budget cannot be held."""
         if not done.fits and not self._short:
@@ -314,6 +352,16 @@ class InBackground:
     def keep_moments(self, bag_dir: Path) -> None:
         """Begins to keep what is asked for, unless that is still under way."""
         self._begin("keep_moments", lambda: self._housekeeper.keep_moments(bag_dir))
+
+    def note_recorded(
+        self, recordings: Collection[str], bytes_written: int, monotonic_s: float
+    ) -> None:
+        """Counts the time for which these recordings are being written."""
+        self._housekeeper.note_recorded(recordings, bytes_written, monotonic_s)
+
+    def age_held(self) -> str | None:
+        """Which bags age should delete by their dates, and does not, and why."""
+        return self._housekeeper.age_held()
 
     def faults(self) -> Mapping[str, str]:
         """By task why it failed the last time; what has since been done is not among them."""

@@ -15,6 +15,7 @@
         20261120T043012Z-charging/         one moment
           moment.json                      what it is called, and when it was
           rec_20261120T043000Z/            hard links, under the names that the bags have above
+      .episodic/recorded.jsonl     how long was recorded when each recording ended (`recorded_time`)
       .episodic/requests/          what the query server asks of the recorder (see `mailbox`)
 
 The two YAML files stand beside the recordings, since a recording's own directory must not exist
@@ -45,7 +46,9 @@ CARRY_FOLDER: Final = "latched"
 CARRY_FILE: Final = "carried.mcap"
 MOMENTS_FOLDER: Final = "moments"
 MOMENT_FILE: Final = "moment.json"
-REQUESTS_FOLDER: Final = ".episodic/requests"
+OWN_FOLDER: Final = ".episodic"
+RECORDED_FILE: Final = "recorded.jsonl"
+REQUESTS_FOLDER: Final = f"{OWN_FOLDER}/requests"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """What may be deleted from the bag directory itself, besides bags: it is written anew."""

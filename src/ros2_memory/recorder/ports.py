@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
     from pathlib import Path
 
 
@@ -55,6 +55,22 @@ class Housekeeper(Protocol):
     def keep_moments(self, bag_dir: Path) -> None:
         """Keeps from deletion what somebody asks to keep. Called about once a second."""
 
+    def note_recorded(
+        self, recordings: Collection[str], bytes_written: int, monotonic_s: float
+    ) -> None:
+        """Counts the time for which recordings are written: their age where clocks are wrong.
+
+        Called some times a second, with none while nothing is recorded.
+
+        Args:
+            recordings: the directories being written, relative to the bag directory.
+            bytes_written: how much all recordings wrote since the recorder started.
+            monotonic_s: the monotonic clock, in seconds.
+        """
+
+    def age_held(self) -> str | None:
+        """Which bags are too old by their dates and stay, and why; None where there are none."""
+
     def faults(self) -> Mapping[str, str]:
         """By task, such as `apply`, why it failed the last time, where it went on unseen."""
 
@@ -77,6 +93,15 @@ class NoHousekeeping:
 
     def keep_moments(self, bag_dir: Path) -> None:
         """Does nothing."""
+
+    def note_recorded(
+        self, recordings: Collection[str], bytes_written: int, monotonic_s: float
+    ) -> None:
+        """Does nothing."""
+
+    def age_held(self) -> str | None:
+        """None."""
+        return None
 
     def faults(self) -> Mapping[str, str]:
         """None."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Pulse:
     """Writes `recorder.json`; `interval_s` is how often it is asked to.
 
-    `expected` gives the topics that are to be recorded by name.
+    `expected` gives the topics that are to be recorded by name, `age_held` which bags age leaves.
     """
 
     def __init__(
@@ -30,13 +30,16 @@ class Pulse:
         interval_s: float,
         clock: Clock,
         journal: Journal,
+        *,
         expected: Callable[[], Sequence[str]] = tuple,
+        age_held: Callable[[], str | None] = lambda: None,
     ) -> None:
         self._bag_dir = bag_dir
         self._interval_s = interval_s
         self._clock = clock
         self._journal = journal
         self._expected = expected
+        self._age_held = age_held
         self._offered = set[str]()
         self._state = RecorderState.STOPPED
         self._since = clock.now()
@@ -82,6 +85,7 @@ class Pulse:
             interval_s=self._interval_s,
             restarts=crew.restarts,
             missing=self._missing(crew),
+            age_held=self._age_held(),
         )
 
     def _missing(self, crew: Crew) -> tuple[str, ...]:

@@ -1,7 +1,11 @@
 """Which bags are deleted: those too old, then the oldest beyond the budget. Pure decisions.
 
-Age counts from the newest recorded data, not from the wall clock: a robot that was switched off
-does not erase itself when it wakes. Clocks step, so not every date is believed:
+Age deletes only by a clock that is known to be right. Where the system clock is synchronised that
+is the one of the dates; else it is the monotonic clock: a bag is too old when more than
+`max_age_ns` has been recorded after it. What the dates alone call too old is held.
+
+By dates, age counts from the newest recorded data, not from the wall clock: a robot that was
+switched off does not erase itself when it wakes. Clocks step, so not every date is believed:
 
 - A bag dated in the future, before there was ROS 2, or longer than any recording is not dated: it
   ages no others, and is itself as old as its file.
@@ -80,7 +84,9 @@ class Stock:
     `sidecars` says, for each recording that goes with its last bag, how many bytes go with it.
     `other_bytes` is what nothing here may delete: open bags, and what is not worth deleting.
     `kept` are the files of moments, which nothing here deletes; bags may be other names of them.
-    `free_bytes` is what the disk has left; None where that is not to count.
+    `free_bytes` is what the disk has left; None where that is not to count. `recorded_since` is by
+    recording how long was recorded after it, by the monotonic clock (none where it is missing), and
+    `synchronised` whether the system clock is.
     """
 
     bags: Sequence[StoredBag]
@@ -89,6 +95,23 @@ class Stock:
     other_bytes: int = 0
     free_bytes: int | None = None
     kept: Sequence[StoredFile] = ()
+    recorded_since: Mapping[str, Ns] = field(default_factory=dict)
+    synchronised: bool = False
+
+
+class Ages(NamedTuple):
+    """The bags that are too old by their dates, and by the time that was recorded after them."""
+
+    by_dates: frozenset[str]
+    by_recording: frozenset[str]
+
+    def too_old(self, *, synchronised: bool) -> frozenset[str]:
+        """Those that age deletes."""
+        return self.by_dates if synchronised else self.by_recording
+
+    def held(self, *, synchronised: bool) -> frozenset[str]:
+        """Those that would go if the clock were known to be right."""
+        return self.by_dates - self.too_old(synchronised=synchronised)
 
 
 class Weighed(NamedTuple):
@@ -108,12 +131,17 @@ def expired(stock: Stock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
     return weighed(stock, limits).doomed
 
 
+def ages(stock: Stock, limits: RetentionLimits) -> Ages:
+    """The bags that are too old by either clock."""
+    return _ages(stock, _eras(stock, limits), limits.max_age_ns)
+
+
 def weighed(stock: Stock, limits: RetentionLimits) -> Weighed:
     """The bags to delete, and what came of weighing them."""
     plan = _Plan(stock)
     total = plan.total
     eras = _eras(stock, limits)
-    aged = _aged(stock.bags, eras, limits.max_age_ns)
+    aged = _ages(stock, eras, limits.max_age_ns).too_old(synchronised=stock.synchronised)
     if not aged and plan.fits(limits):
         return Weighed((), total, fits=True)
     order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)
@@ -206,8 +234,15 @@ def _eras(stock: Stock, limits: RetentionLimits) -> list[_Era]:
     return eras
 
 
+def _ages(stock: Stock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
+    old = {name for name, since in stock.recorded_since.items() if since > max_age_ns}
+    by_recording = (bag.path for bag in stock.bags if bag.recording in old) if old else ()
+    by_dates = _aged(stock.bags, eras, max_age_ns)
+    return Ages(frozenset(by_dates), frozenset(by_recording))
+
+
 def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
-    """The bags that are too old for the newest of their era.
+    """The bags that are too old for the newest of their era, if all dates are right.
 
     One that is not dated is of the present era if it was written in it, else of none.
     """

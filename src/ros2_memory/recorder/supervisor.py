@@ -89,7 +89,14 @@ class Supervisor:
         self._away = False
         self._journal = Journal()
         self._chores = Chores(orders.bag_dir, housekeeper, self._journal, monotonic())
-        self._pulse = Pulse(orders.bag_dir, orders.heartbeat_s, clock, self._journal, expected)
+        self._pulse = Pulse(
+            orders.bag_dir,
+            orders.heartbeat_s,
+            clock,
+            self._journal,
+            expected=expected,
+            age_held=housekeeper.age_held,
+        )
         self._crew = Crew(
             orders.bag_dir,
             start_child,
@@ -171,6 +178,7 @@ class Supervisor:
             "rotation": self._mind_rotation,
             "restart": self._mind_restart,
             "reap": self._crew.reap,
+            "recorded": self._note_recorded,
             "house": self._keep_house,
             "moments": self._keep_moments,
         }
@@ -329,6 +337,10 @@ class Supervisor:
         self._chores.tell()
         if not self._away:
             self._chores.keep_house(now.monotonic_s)
+
+    def _note_recorded(self, now: Moment) -> None:
+        names = () if self._away else tuple(each.name for each in self._crew.sessions if each.ready)
+        self._chores.note_recorded(names, self._crew.bytes_written, now.monotonic_s)
 
     def _keep_moments(self, now: Moment) -> None:
         if not self._away and self._is_due("moments", MOMENTS_S, now):

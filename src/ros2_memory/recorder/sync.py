@@ -5,6 +5,7 @@ A file is on the disk when it was flushed itself, and its name when its director
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from contextlib import suppress
@@ -18,6 +19,9 @@ MAX_SMALL_FILE: Final = 1 << 20
 
 # Never through a symbolic link: what is written or read lies in the bag directory itself.
 _ANEW: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
+_AT_THE_END: Final = (
+    os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
+)
 _AS_IT_IS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
 
 
@@ -53,6 +57,39 @@ def write_all_durably(texts: Mapping[Path, str]) -> None:
             with suppress(OSError):
                 beside.unlink(missing_ok=True)
         raise
+
+
+def append_durably(target: Path, text: str) -> None:
+    """Adds text to a regular file, which is made where there is none; on the disk on return.
+
+    Raises:
+        OSError: it cannot be written; a part of the text may have been.
+    """
+    descriptor = os.open(target, _AT_THE_END, 0o666)
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file", str(target))
+        data = memoryview(text.encode())
+        while data:
+            data = data[os.write(descriptor, data) :]
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    if not status.st_size:
+        flush(target.parent)
+
+
+def own_folder(folder: Path) -> None:
+    """Makes a folder of this program where there is none, and none above it.
+
+    Raises:
+        OSError: it cannot be made, or a symbolic link stands there, which is not followed.
+    """
+    folder.mkdir(exist_ok=True)
+    if folder.is_symlink():
+        reason = f"{folder.name} is a symbolic link, which is not followed"
+        raise OSError(errno.ELOOP, reason, str(folder))
 
 
 def open_plain(path: Path | str) -> BinaryIO:
