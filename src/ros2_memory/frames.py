@@ -17,7 +17,9 @@ from ros2_memory.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
+from ros2_memory.geometry import alike
 from ros2_memory.model import StampedTransform, TimeWindow
+from ros2_memory.sessions import Sessions
 from ros2_memory.tf_tree import (
     TF_CACHE_NS,
     FrameEdge,
@@ -30,11 +32,13 @@ from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, NS_PER_M
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
 
-    from ros2_memory.copies import Found
+    from ros2_memory.copies import Found, Holding
     from ros2_memory.history import View
     from ros2_memory.model import BagFile
     from ros2_memory.recorder.runs import Run
+    from ros2_memory.sessions import Session
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment dynamic transforms are read; the last is as far as tf2 remembers."""
@@ -54,51 +58,135 @@ class FoundTransform(NamedTuple):
     reach: Ns = TF_CACHE_NS
 
 
-def transform_at(view: View, parent: str, child: str, at: Ns) -> FoundTransform:
+def transform_at(
+    view: View, parent: str, child: str, at: Ns, recording: Path | None = None
+) -> FoundTransform:
     """The pose of `child` in `parent` at a moment, by tf2's rules.
+
+    Of a message of a `recording` it is told by the transforms of that recording's session; else by
+    those of the session that was recorded then. Where several were, and differ, a note says so.
 
     Raises:
         NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,
             or nothing brackets the moment on one of the edges between them.
     """
     limits = view.memory.limits
-    recorded = _recorded(view, (*limits.tf_topics, *limits.tf_static_topics))
-    if not recorded:
+    if not _recorded(view, (*limits.tf_topics, *limits.tf_static_topics)):
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
-    static = _static_at(view, at)
-    for half_width in _HALF_WIDTHS:
-        dynamic = list(_transforms(view, limits.tf_topics, _around(at, half_width), static=False))
+    sessions = sessions_of(view)
+    holding = sessions.at(at) if recording is None else [sessions.lending_to(recording, at)]
+    answers: list[tuple[Session, FoundTransform]] = []
+    failure: NoDataError | None = None
+    for session in holding or [frozenset()]:
         try:
-            found = _lookup(static, dynamic, limits.tf_clock, (parent, child), at)
+            answers.append((session, _transform_in(view, session, (parent, child), at)))
+        except NoDataError as error:
+            failure = failure or error
+    if not answers and failure is not None:
+        raise failure
+    session, found = answers[0]
+    if not all(_alike(found, other) for _, other in answers):
+        name = min(session).rpartition("/")[2]
+        view.note(
+            f"{len(answers)} sessions that were recorded then hold different transforms; "
+            f"this is that of {name}"
+        )
+    return found
+
+
+def _alike(one: FoundTransform, other: FoundTransform) -> bool:
+    return alike(one.lookup.transform, other.lookup.transform)
+
+
+def _transform_in(view: View, among: Session, frames: tuple[str, str], at: Ns) -> FoundTransform:
+    """As `transform_at`, by the transforms of one session."""
+    limits = view.memory.limits
+    static = _static_at(view, at, among)
+    for half_width in _HALF_WIDTHS:
+        window = _around(at, half_width)
+        dynamic = list(_transforms(view, limits.tf_topics, window, among, static=False))
+        try:
+            found = _lookup(static, dynamic, limits.tf_clock, frames, at)
             return found._replace(reach=half_width)
         except NoDataError as error:
             failure = error
     if limits.tf_clock == "stamp":
-        dynamic = list(_stamped_near(view, at))
+        dynamic = list(_stamped_near(view, at, among))
         try:
-            return _lookup(static, dynamic, "stamp", (parent, child), at)
+            return _lookup(static, dynamic, "stamp", frames, at)
         except NoDataError as error:
             raise _of_stamps(error, at, nothing_near=not dynamic) from error
-    raise _explained(view, failure, (parent, child), at, nothing_near=not dynamic) from failure
+    raise _explained(view, failure, frames, at, among, nothing_near=not dynamic) from failure
 
 
-def graph_over(view: View, window: TimeWindow) -> FrameGraph:
-    """The transforms with which any moment of a window can be looked up."""
-    limits = view.memory.limits
+def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTransform]:
+    """The moving transforms of a session with which any moment of a window can be looked up."""
     wider = TimeWindow(
         max(window.start - TF_CACHE_NS, MIN_NS), min(window.stop + TF_CACHE_NS, MAX_NS)
     )
-    dynamic = list(_transforms(view, limits.tf_topics, wider, static=False))
-    clock: TfClock = "log" if limits.tf_clock == "log" else "stamp"
-    if limits.tf_clock == "auto":
-        clock = agreeing_clock(dynamic)
-    return FrameGraph([*_static_at(view, window.stop - 1), *dynamic], clock)
+    return list(_transforms(view, view.memory.limits.tf_topics, wider, among, static=False))
 
 
-def statics(view: View) -> list[StampedTransform]:
-    """Every static transform that was ever recorded, in order."""
+def graph_of(
+    view: View, static: Sequence[StampedTransform], moving: Sequence[StampedTransform]
+) -> FrameGraph:
+    """The transforms as a graph, in the clock that is configured."""
+    clock: TfClock = "log" if view.memory.limits.tf_clock == "log" else "stamp"
+    if view.memory.limits.tf_clock == "auto":
+        clock = agreeing_clock(moving)
+    return FrameGraph([*static, *moving], clock)
+
+
+def statics(view: View, among: Session) -> list[StampedTransform]:
+    """Every static transform of a session, in order."""
     topics = view.memory.limits.tf_static_topics
-    return list(_transforms(view, topics, TimeWindow.everything(), static=True))
+    return list(_transforms(view, topics, TimeWindow.everything(), among, static=True))
+
+
+def holding_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
+    """For each child frame its newest static transform at a moment, of these in order.
+
+    A static transform holds at all times of its session, so one that was only received later holds
+    too, the first of them.
+    """
+    holding: dict[str, StampedTransform] = {}
+    for each in static:
+        child = each.child.lstrip("/")
+        if child not in holding or each.log_time <= at + AT_OR_BEFORE_SLACK_NS:
+            holding[child] = each
+    return list(holding.values())
+
+
+def sessions_of(view: View) -> Sessions:
+    """The sessions of a view, worked out once."""
+    if view.sessions is None:
+        limits = view.memory.limits
+        view.sessions = Sessions(
+            view,
+            limits.tf_topics,
+            limits.tf_static_topics,
+            lambda topics, among: {
+                child for _, child in _pairs(view, topics, static=True, among=among)
+            },
+        )
+    return view.sessions
+
+
+def own_holdings(
+    view: View, topic: str, window: TimeWindow, recording: Path
+) -> list[Holding] | None:
+    """What the session of a recording holds of a topic in a window; None where it never has any."""
+    sessions = sessions_of(view)
+    own = sessions.of(recording)
+    if not any(sessions.folder(each) in own for each in view.snapshot.recordings(topic)):
+        return None
+    return _holdings(view, (topic,), window, own)
+
+
+def children_moving(view: View, among: Session) -> set[str]:
+    """The child frames of a session's moving transforms."""
+    pairs = _pairs(view, view.memory.limits.tf_topics, static=False, among=among)
+    return {child.lstrip("/") for _, child in pairs}
 
 
 def edges(view: View) -> tuple[FrameEdge, ...]:
@@ -116,32 +204,38 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
 
 
 def _pairs(
-    view: View, topics: Iterable[str], *, static: bool, window: TimeWindow | None = None
+    view: View,
+    topics: Iterable[str],
+    *,
+    static: bool,
+    window: TimeWindow | None = None,
+    among: Session | None = None,
 ) -> set[tuple[str, str]]:
     """The pairs of these topics: of which the catalogue says none, their bags are read.
 
-    With a window, those of the bags that have something of a topic in it.
+    With a window, those of the bags that have something of a topic in it; `among` a session, of its
+    bags.
     """
     pairs: set[tuple[str, str]] = set()
     recorded = _recorded(view, topics)
     unknown: list[tuple[Ns, Ns]] = []
     for topic in recorded:
         for run in view.snapshot.runs:
-            known, spans = _known_pairs(view, run, topic, window or TimeWindow.everything())
+            known, spans = _known_pairs(view, run, topic, window or TimeWindow.everything(), among)
             pairs |= known
             unknown += spans
     for span in united(unknown):
-        for found in view.stream(recorded, TimeWindow(*span)):
-            pairs.update((each.parent, each.child) for each in _decoded(view, found, static=static))
+        for each in _transforms(view, recorded, TimeWindow(*span), among, static=static):
+            pairs.add((each.parent, each.child))
     return pairs
 
 
 def _known_pairs(
-    view: View, run: Run, topic: str, window: TimeWindow
+    view: View, run: Run, topic: str, window: TimeWindow, among: Session | None
 ) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
     """The pairs that the catalogue has of a run of bags, and the time of bags it has none of."""
     notes = view.recalled(run) if topic in run.spans else None
-    if notes is not None and window.covers(*run.spans[topic]):
+    if notes is not None and among is None and window.covers(*run.spans[topic]):
         every = notes.pairs(topic)
         if every is not None:
             return set(every), []
@@ -150,7 +244,7 @@ def _known_pairs(
     known: set[tuple[str, str]] = set()
     rest: list[tuple[Ns, Ns]] = []
     for bag, first, last in run.extents(topic):
-        if window.overlaps(first, last):
+        if window.overlaps(first, last) and _is_among(view, bag, among):
             edge = edges.get(numbers.get(bag.file, 0))
             if edge is None:
                 rest.append((first, last + 1))
@@ -174,7 +268,13 @@ def _lookup(
 
 
 def _explained(
-    view: View, failure: NoDataError, frames: tuple[str, str], at: Ns, *, nothing_near: bool
+    view: View,
+    failure: NoDataError,
+    frames: tuple[str, str],
+    at: Ns,
+    among: Session,
+    *,
+    nothing_near: bool,
 ) -> NoDataError:
     """The failure of a lookup in its neighbourhood, said of the whole memory.
 
@@ -186,7 +286,7 @@ def _explained(
     if failure.reason in _OF_ALL_TIMES:
         then = _of_then(failure, at)
         unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
-        if not (unknown and connected(view, frames, _around(at, _LONGER_NS))):
+        if not (unknown and connected(view, frames, _around(at, _LONGER_NS), among)):
             return then
         told = f"{then.detail}; within {seconds(_LONGER_NS)} the two were connected: ask about then"
         return NoDataError(between(view, _around(at, TF_CACHE_NS)), told)
@@ -203,15 +303,20 @@ def _explained(
     return NoDataError(reason, failure.detail)
 
 
-def connected(view: View, frames: tuple[str, str], window: TimeWindow | None = None) -> bool:
+def connected(
+    view: View,
+    frames: tuple[str, str],
+    window: TimeWindow | None = None,
+    among: Session | None = None,
+) -> bool:
     """Whether transforms recorded in a window, and static ones, lead from one frame to the other.
 
     Not known where the time for the answer is over before.
     """
     limits = view.memory.limits
     try:
-        pairs = _pairs(view, limits.tf_topics, static=False, window=window)
-        pairs |= _pairs(view, limits.tf_static_topics, static=True)
+        pairs = _pairs(view, limits.tf_topics, static=False, window=window, among=among)
+        pairs |= _pairs(view, limits.tf_static_topics, static=True, among=among)
     except QueryTimeoutError:
         return False
     origin, target = (name.lstrip("/") for name in frames)
@@ -245,27 +350,19 @@ def _of_then(failure: NoDataError, at: Ns) -> NoDataError:
     )
 
 
-def _static_at(view: View, at: Ns) -> list[StampedTransform]:
-    """For each child frame its newest static transform at the moment.
-
-    A static transform holds at all times, so one that was only received later holds too.
-    """
-    holding: dict[str, StampedTransform] = {}
-    topics = view.memory.limits.tf_static_topics
-    for each in _transforms(view, topics, TimeWindow.everything(), static=True):
-        if each.child not in holding or each.log_time <= at + AT_OR_BEFORE_SLACK_NS:
-            holding[each.child] = each
-    return list(holding.values())
+def _static_at(view: View, at: Ns, among: Session) -> list[StampedTransform]:
+    """The static transforms of a session that hold at a moment."""
+    return holding_at(statics(view, among), at)
 
 
-def _stamped_near(view: View, at: Ns) -> Iterator[StampedTransform]:
+def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransform]:
     """The dynamic transforms stamped around a moment, wherever in log time they were recorded.
 
     A bag is read where the stamps of its first and last message reach as far as the moment.
     """
     topics = _recorded(view, view.memory.limits.tf_topics)
     everything = TimeWindow.everything()
-    for held in view.holdings(topics, everything):
+    for held in _holdings(view, topics, everything, among):
         ends = _stamps_at_ends(view, held.bag, topics)
         if ends and min(ends) - TF_CACHE_NS <= at <= max(ends) + TF_CACHE_NS:
             for found in view.used(view.read(held.bag, topics, everything)):
@@ -304,12 +401,34 @@ def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
 
 
 def _transforms(
-    view: View, topics: Iterable[str], window: TimeWindow, *, static: bool
+    view: View, topics: Iterable[str], window: TimeWindow, among: Session | None, *, static: bool
 ) -> Iterator[StampedTransform]:
+    """The transforms in a window, in order; of a session the copies in its recordings too."""
     recorded = _recorded(view, topics)
-    if recorded:
-        for found in view.stream(recorded, window):
-            yield from _decoded(view, found, static=static)
+    if not recorded:
+        return
+    if among is None:
+        found = view.stream(recorded, window)
+    else:
+        # A latched message that was received again counts in the recording that received it, too.
+        holdings = _holdings(view, recorded, window, among)
+        found = view.used(view.merged(holdings, recorded, window, newest_first=False))
+    for each in found:
+        yield from _decoded(view, each, static=static)
+
+
+def _holdings(
+    view: View, topics: Sequence[str], window: TimeWindow, among: Session
+) -> list[Holding]:
+    held = view.holdings(topics, window)
+    sessions = sessions_of(view)
+    recordings = {each.bag.recording for each in held}
+    chosen = {each for each in recordings if sessions.folder(each) in among}
+    return [each for each in held if each.bag.recording in chosen]
+
+
+def _is_among(view: View, bag: BagFile, among: Session | None) -> bool:
+    return among is None or sessions_of(view).folder(bag.recording) in among
 
 
 def _decoded(view: View, found: Found, *, static: bool) -> tuple[StampedTransform, ...]:

@@ -34,6 +34,8 @@ _SCANS_PER_POINT: Final = 64
 _MANY_POINTS: Final = 48
 """From so many on, looking through points as arrays is faster than one by one."""
 
+_SAME_M: Final = 1e-6
+
 
 def normalised(q: Quaternion) -> Quaternion | None:
     """The unit quaternion of the same rotation; None for a zero, NaN or infinite one."""
@@ -110,6 +112,13 @@ def invert(t: Transform) -> Transform:
     back = conjugate(t.rotation)
     x, y, z = rotate(back, t.translation)
     return Transform((-x, -y, -z), back)
+
+
+def alike(one: Transform, other: Transform) -> bool:
+    """Whether two transforms differ by less than a micrometre, and by hardly an angle."""
+    apart = compose(invert(one), other)
+    off = distance(apart.translation, (0.0, 0.0, 0.0))
+    return off < _SAME_M and abs(apart.rotation[3]) > 1 - _SAME_M
 
 
 def slerp(a: Quaternion, b: Quaternion, ratio: float) -> Quaternion:

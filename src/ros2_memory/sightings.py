@@ -22,7 +22,7 @@ from ros2_memory.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.frames import transform_at
+from ros2_memory.frames import own_holdings, transform_at
 from ros2_memory.geometry import rotate
 from ros2_memory.history import View
 from ros2_memory.model import TimeWindow
@@ -286,7 +286,7 @@ def _any_between(view: View, topic: str, gap: TimeWindow) -> bool:
 
 def _told(view: View, condition: Condition, run: _Run, pose_topic: str) -> Sighting:
     """A row with where the robot was at its newest message, and where the thing was."""
-    robot = _robot(view, pose_topic, run.newest.time)
+    robot = _robot(view, pose_topic, run.newest)
     return Sighting(
         topic=run.newest.record.channel.topic,
         first=run.first,
@@ -298,9 +298,16 @@ def _told(view: View, condition: Condition, run: _Run, pose_topic: str) -> Sight
     )
 
 
-def _robot(view: View, topic: str, at: Ns) -> Pose | None:
-    """Where the robot was: its newest pose at or before then that can be read."""
-    found = view.newest(topic, TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1))
+def _robot(view: View, topic: str, seen: Found) -> Pose | None:
+    """Where the robot was: its newest pose at or before then that can be read.
+
+    Where the sighting's own session has poses, it is one of these.
+    """
+    window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
+    own = own_holdings(view, topic, window, seen.bag.recording)
+    found = view.newest(topic, window)
+    if own is not None and (found is None or found.bag not in {held.bag for held in own}):
+        found = next(view.stream([topic], window, newest_first=True, among=own), None)
     if found is None:
         return None
     try:
@@ -324,7 +331,9 @@ def _spot(view: View, condition: Condition, found: Found, robot: Pose | None) ->
         if target == thing.frame_id:
             return Spot(thing.label, thing.place, target)
         try:
-            found_transform = transform_at(view, target, thing.frame_id, found.time)
+            found_transform = transform_at(
+                view, target, thing.frame_id, found.time, found.bag.recording
+            )
         except NoDataError:
             continue
         pose = found_transform.lookup.transform

@@ -23,10 +23,14 @@ class Approach(NamedTuple):
 
 
 class Unread(NamedTuple):
-    """A time in which every pose is within the radius, and none is closer than the bound."""
+    """A time in which every pose is within the radius, and none is closer than the bound.
+
+    `here` is where the place is (m) in the frame of these poses.
+    """
 
     bound: Approach
     window: TimeWindow
+    here: tuple[float, float]
 
 
 @dataclass(slots=True)

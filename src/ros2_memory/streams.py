@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import BagFile
     from ros2_memory.recorder.runs import Run
+    from ros2_memory.sessions import Sessions
     from ros2_memory.timebase import Ns
 
 RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
@@ -45,10 +46,15 @@ _FEW_SOUGHT: Final = 8
 
 
 class Streams(Reading):
-    """One call's sight of all bags together."""
+    """One call's sight of all bags together.
+
+    Attributes:
+        sessions: which recordings belong together, once that is asked (see `frames`).
+    """
 
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
         super().__init__(memory, call, reach)
+        self.sessions: Sessions | None = None
         self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
         self._sought: Counter[str] = Counter()
 

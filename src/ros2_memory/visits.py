@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from itertools import chain, islice, pairwise
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.absence import moment, require_bags, resolve_topic
@@ -34,9 +35,10 @@ from ros2_memory.unseen import note_unseen
 from ros2_memory.ways import POSES, add_poses, carries_no, leave_out, stops
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
 
-    from ros2_memory.copies import Found
+    from ros2_memory.copies import Found, Holding
     from ros2_memory.groups import Group
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import Pose, Vector3
@@ -79,7 +81,7 @@ def visits(
     view = View(memory, call, wall)
     require_bags(view)
     topic = resolve_topic(view, memory.limits.pose_topic)
-    place = placing(view, _pose_frame(view, topic), frame_id)
+    place = placing(view, _pose_frame(view, topic), topic, frame_id)
     looking = _Looking(view, topic, place, (x, y, radius))
     latest, newest = view.snapshot.latest, looking.newest_time
     found, total = looking.newest(limit)
@@ -156,15 +158,15 @@ def _frame_of(view: View, found: Found) -> str:
 class _Nearest:
     """Takes poses, and remembers the closest approach; the earliest of equals."""
 
-    def __init__(self, away: Callable[[Vector3], float], approach: Approach | None) -> None:
-        self._away = away
+    def __init__(self, here: tuple[float, float], approach: Approach | None) -> None:
+        self._here = here
         self.approach = approach
 
     def add(self, time: Ns, pose: Pose, _speed_mps: float | None = None, /) -> None:
         """Takes the next pose."""
         if is_place(pose.position):
-            here = Approach(self._away(pose.position), time)
-            self.approach = here if self.approach is None else min(here, self.approach)
+            near = Approach(_away(pose.position, self._here), time)
+            self.approach = near if self.approach is None else min(near, self.approach)
 
 
 class _Looking:
@@ -177,7 +179,7 @@ class _Looking:
         self._topic = topic
         self._place = place
         self._x, self._y, self._radius = wanted
-        self._here = place.in_poses(self._x, self._y)
+        self._one = place.is_one(topic)
         self._kept: Kept[PoseDigest] = Kept(view, topic, POSES, TimeWindow.everything())
         self._counting: Deadline | None = None
 
@@ -227,10 +229,10 @@ class _Looking:
         """
         closest = stay.closest
         sights = Sights(self._view.memory.reader, self._view.memory.extractor)
-        for bound, window in sorted(stay.unread):
+        for bound, window, here in sorted(stay.unread, key=attrgetter("bound")):
             if closest is not None and closest <= bound:
                 break
-            nearest = _Nearest(self._away, closest)
+            nearest = _Nearest(here, closest)
             try:
                 add_poses(self._view, nearest, sights, self._view.stream([self._topic], window), [])
             except QueryTimeoutError:
@@ -242,7 +244,7 @@ class _Looking:
                 return nearest.approach or bound
             closest = nearest.approach
         # Where the bags of the visit are gone meanwhile, what is known of them serves.
-        return closest or min(stay.unread).bound
+        return closest or min(each.bound for each in stay.unread)
 
     def _parts(self) -> Iterator[TimeWindow]:
         """The times in which the robot may have been near, newest first."""
@@ -250,10 +252,12 @@ class _Looking:
             # What ends a visit may be a copy of a pose in a bag that is ruled out.
             yield TimeWindow.everything()
             return
-        if self._here is None:  # the place is another one in every bag: none is ruled out
+        holdings = self._view.holdings([self._topic], TimeWindow.everything())
+        here = self._here_in(holdings[0]) if self._one and holdings else None
+        if here is None:  # the place is another one in some bags: none is ruled out
             near = Condition(NearPosition(0.0, 0.0, None, math.inf))
         else:
-            near = Condition(NearPosition(*self._here, None, self._radius))
+            near = Condition(NearPosition(*here, None, self._radius))
         for stretch in Candidates(self._view, (self._topic,), near, MAX_NS).stretches():
             yield stretch.window
 
@@ -268,47 +272,47 @@ class _Looking:
     def _look(self, stays: Stays, part: TimeWindow) -> None:
         groups = groups_of(self._view, self._topic, part)
         alone = len(groups) == 1 and is_whole(groups[0], part) and not self._contested(part)
-        if alone and self._here is not None:
+        here = self._here_in(groups[0].holdings[0]) if alone else None
+        if here is not None:
             known = self._kept.of(groups[0])
-            if known is not None and self._sum_up(stays, groups[0], *known):
+            if known is not None and self._sum_up(stays, groups[0], *known, here):
                 return
         self._place.look_at(part)
-        for time, position in self._positions(part):
+        for recording, time, position in self._positions_in(part):
             self._check_counting()
-            off = self._off(time, position)
+            off = self._off(recording, time, position)
             if off is not None and off <= self._radius:
                 stays.near(Approach(off, time))
             else:
                 stays.away(time)
 
-    def _sum_up(self, stays: Stays, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> bool:
+    def _sum_up(
+        self,
+        stays: Stays,
+        group: Group,
+        digest: PoseDigest,
+        span: tuple[Ns, Ns],
+        here: tuple[float, float],
+    ) -> bool:
         """Takes a whole group by the digest of its poses, where that is enough to know."""
         if digest.invalid or digest.first is None or digest.last is None:
             return False
         path = [vertex[1] for vertex in digest.vertices]
         error_m = digest.error_m + _ROUNDING_M
-        bound_m = self._off_path(path) - error_m
+        bound_m = _off_path(path, here) - error_m
         if bound_m > self._radius:
             stays.away(digest.first.time)
             return True
-        near = all(self._away(position) + error_m <= self._radius for position in path)
+        near = all(_away(position, here) + error_m <= self._radius for position in path)
         if not near or not self._unbroken(group, digest, span):
             return False
         if digest.error_m == 0 and len({*path}) == 1:
             # It stood, and all poses are one.
-            stays.near(Approach(self._away(path[0]), digest.first.time), digest.last.time)
+            stays.near(Approach(_away(path[0], here), digest.first.time), digest.last.time)
             return True
         bound = Approach(max(bound_m, 0.0), span[0])
-        stays.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1)))
+        stays.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1), here))
         return True
-
-    def _off_path(self, path: Sequence[Vector3]) -> float:
-        """How far (m, in the plane) the place is from a drawn path."""
-        here = self._here or (math.nan, math.nan)
-        # Each vertex by itself too: what is parted may be a single one.
-        pairs = chain(zip(path, path, strict=True), pairwise(path))
-        gaps = [off_segment(here, before[:2], after[:2]) for before, after in pairs]
-        return min(gap for gap in gaps if not math.isnan(gap))
 
     def _unbroken(self, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> bool:
         """Whether no two poses of a group that follow each other are so far apart as to part it."""
@@ -328,17 +332,43 @@ class _Looking:
         wider = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
         return len({each.bag.recording for each in self._view.holdings([self._topic], wider)}) > 1
 
-    def _away(self, position: Vector3) -> float:
-        """How far (m, in the plane) a position of the poses' frame is from the place."""
-        here = self._here or (math.nan, math.nan)
-        return math.dist(position[:2], here)
+    def _here_in(self, held: Holding) -> tuple[float, float] | None:
+        """Where the place is in the poses' frame of a bag; None where that is not one place."""
+        return self._place.in_poses(held.bag.recording, held.first, self._x, self._y)
 
-    def _off(self, time: Ns, position: tuple[float, float, float]) -> float | None:
-        if self._here is not None:
-            return self._away(position)
-        there = self._place.of(time, position)
-        return None if there is None else math.dist(there[:2], (self._x, self._y))
+    def _off(self, recording: Path, time: Ns, position: Vector3) -> float | None:
+        here = self._place.in_poses(recording, time, self._x, self._y)
+        if here is not None:
+            return _away(position, here)
+        there = self._place.of(recording, time, position)
+        return None if there is None else _away(there, (self._x, self._y))
+
+    def _positions_in(self, part: TimeWindow) -> Iterator[tuple[Path, Ns, Vector3]]:
+        """As `_positions`, each with its recording."""
+        messages = self._view.stream([self._topic], part, newest_first=True)
+        at: list[Path] = []
+
+        def noted() -> Iterator[Found]:
+            for found in messages:
+                at[:] = [found.bag.recording]
+                yield found
+
+        for stop in stops(self._view, noted()):
+            yield at[0], *stop
 
     def _positions(self, part: TimeWindow) -> Iterator[Stop]:
         """The positions of a part that are places, newest first."""
         return stops(self._view, self._view.stream([self._topic], part, newest_first=True))
+
+
+def _away(position: Vector3, here: tuple[float, float]) -> float:
+    """How far (m, in the plane) a position is from a place of the same frame."""
+    return math.dist(position[:2], here)
+
+
+def _off_path(path: Sequence[Vector3], here: tuple[float, float]) -> float:
+    """How far (m, in the plane) a place is from a drawn path of the same frame."""
+    # Each vertex by itself too: what is parted may be a single one.
+    pairs = chain(zip(path, path, strict=True), pairwise(path))
+    gaps = [off_segment(here, before[:2], after[:2]) for before, after in pairs]
+    return min(gap for gap in gaps if not math.isnan(gap))

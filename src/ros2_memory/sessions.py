@@ -1,0 +1,193 @@
+"""Which recordings hold what one robot said of itself in one go.
+
+A transform holds in the session in which it was published: another robot, or the same one after it
+was started anew, has its own. A session is a recording and those that it is joined with by
+handovers; the bag of carried messages belongs to every session of our recorder.
+
+Recordings of one time complete each other where one has moving transforms alone and the other
+static ones alone, of other frames, or where one has none at all and one session beside it has some:
+so records whoever starts two recorders for one robot.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING, Final, TypeAlias
+from weakref import WeakKeyDictionary
+
+from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.handover import read_handover
+from ros2_memory.recorder.inventory import is_own_recording
+from ros2_memory.recorder.kept_names import KeptNames
+from ros2_memory.recorder.layout import CARRY_FOLDER
+from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.reading import Reading
+    from ros2_memory.recorder.timeline import Timeline
+
+Session: TypeAlias = frozenset[str]
+"""The folders of the recordings, as they are called where they were recorded."""
+
+_AROUND_NS: Final[Ns] = 10 * NS_PER_S
+"""A recording goes on at a moment where it has a bag so near: tf2 remembers no longer."""
+_JOINED: Final[WeakKeyDictionary[Timeline, Mapping[str, Session]]] = WeakKeyDictionary()
+"""What the sidecars of a timeline's recordings join; a new bag makes a new timeline."""
+
+
+class Sessions:
+    """The sessions of a view that hold transforms.
+
+    Args:
+        view: one call's sight of the memory.
+        moving: the topics of moving transforms.
+        static: those of static ones.
+        children: the child frames that a session has on some topics.
+    """
+
+    def __init__(
+        self,
+        view: Reading,
+        moving: Sequence[str],
+        static: Sequence[str],
+        children: Callable[[Sequence[str], Session], set[str]],
+    ) -> None:
+        self._view = view
+        self._topics = {"moving": tuple(moving), "static": tuple(static)}
+        self._children = children
+        self._names = KeptNames(view.memory.index.bag_dir)
+        root = str(view.memory.index.bag_dir).rstrip("/")
+        self._carried = f"{root}/{CARRY_FOLDER}"
+        self._spans: dict[str, dict[str, tuple[Ns, Ns]]] = {
+            kind: self._spans_of(topics) for kind, topics in self._topics.items()
+        }
+        self._joined = self._chains()
+        self._lending: dict[tuple[str, Ns], Session] = {}
+
+    def folder(self, recording: Path) -> str:
+        """Where a recording lies, or lay when it was recorded, if a moment keeps it."""
+        return self._names.recorded_as(str(recording))
+
+    def of(self, recording: Path) -> Session:
+        """The session of a recording."""
+        return self._of(self.folder(recording))
+
+    def lending_to(self, recording: Path, at: Ns) -> Session:
+        """Whose transforms hold for a message of a recording; empty where no session's do."""
+        key = (self.folder(recording), at // _AROUND_NS)
+        if key not in self._lending:
+            self._lending[key] = self._completed(self._of(key[0]), at)
+        return self._lending[key]
+
+    def at(self, moment: Ns) -> list[Session]:
+        """The sessions whose transforms may hold at a moment.
+
+        Those that were being recorded then; where nothing was, all, the nearest in time first.
+        """
+        around = self._around(moment)
+        if around:
+            holding = (each for each in around if self._kinds(each))
+            return [*dict.fromkeys(self._completed(each, moment) for each in holding)]
+        spans = [span for by_folder in self._spans.values() for span in by_folder.items()]
+        near = sorted(spans, key=lambda each: (_off(each[1], moment), each[0]))
+        return [*dict.fromkeys(self._of(folder) for folder, _ in near)]
+
+    def _completed(self, own: Session, at: Ns) -> Session:
+        """A session with the one beside it that has what it lacks; empty where it has nothing."""
+        kinds = self._kinds(own)
+        if len(kinds) == len(self._topics):
+            return own
+        beside = [each for each in self._around(at) if each != own and self._kinds(each)]
+        if kinds:
+            partners = [each for each in beside if self._complement(own, each)]
+        else:
+            partners = [*dict.fromkeys(self._completed(each, at) for each in beside)]
+        if len(partners) == 1:
+            return own | partners[0]
+        return own if kinds else frozenset()
+
+    def _complement(self, one: Session, other: Session) -> bool:
+        """Whether one has moving transforms alone, the other static ones alone, of other frames."""
+        if self._kinds(one) & self._kinds(other):
+            return False
+        every = [topic for topics in self._topics.values() for topic in topics]
+        return not self._children(every, one) & self._children(every, other)
+
+    def _kinds(self, session: Session) -> frozenset[str]:
+        """Which kinds of transforms a session holds; those that are carried count as its own."""
+        return frozenset(kind for kind, spans in self._spans.items() if session & spans.keys())
+
+    def _around(self, moment: Ns) -> list[Session]:
+        """The sessions that were being recorded at a moment."""
+        start, stop = max(moment - _AROUND_NS, MIN_NS), min(moment + _AROUND_NS + 1, MAX_NS)
+        bags = self._view.snapshot.overlapping(TimeWindow(start, stop))
+        folders = dict.fromkeys(self.folder(bag.recording) for bag in bags)
+        folders.pop(self._carried, None)
+        return [*dict.fromkeys(self._of(folder) for folder in sorted(folders))]
+
+    def _of(self, folder: str) -> Session:
+        return self._joined.get(folder) or self._with_carried(frozenset({folder}))
+
+    def _with_carried(self, folders: Session) -> Session:
+        ours = len(folders) > 1 or any(
+            is_own_recording(each.rpartition("/")[2]) for each in folders
+        )
+        return folders | {self._carried} if ours else folders
+
+    def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
+        spans: dict[str, tuple[Ns, Ns]] = {}
+        for topic in topics:
+            for recording, (first, last) in self._view.snapshot.recordings(topic).items():
+                folder = self.folder(recording)
+                known = spans.get(folder, (first, last))
+                spans[folder] = min(first, known[0]), max(last, known[1])
+        return spans
+
+    def _chains(self) -> Mapping[str, Session]:
+        """By folder, the recordings that hold transforms and are joined by handovers."""
+        timeline = self._view.snapshot.timeline
+        known = None if timeline is None else _JOINED.get(timeline)
+        if known is None:
+            every = [topic for topics in self._topics.values() for topic in topics]
+            recordings = [self._view.snapshot.recordings(topic) for topic in every]
+            paths = {self.folder(path): path for some in recordings for path in some}
+            chains = _joined(paths) if len(paths) > 1 else {}
+            known = {folder: self._with_carried(chain) for folder, chain in chains.items()}
+            if timeline is not None:
+                _JOINED[timeline] = known
+        return known
+
+
+def _joined(paths: Mapping[str, Path]) -> dict[str, Session]:
+    """By folder, all that are joined with it, of recordings by their folders."""
+    beside: defaultdict[str, set[str]] = defaultdict(set)
+    for folder, path in paths.items():
+        for name in _neighbours(path):
+            other = f"{folder.rpartition('/')[0]}/{name}"
+            beside[folder].add(other)
+            beside[other].add(folder)
+    joined: dict[str, Session] = {}
+    for folder in paths:
+        if folder in joined:
+            continue
+        chain, waiting = {folder}, [folder]
+        while waiting:
+            fresh = beside[waiting.pop()] - chain
+            chain |= fresh
+            waiting += fresh
+        joined.update(dict.fromkeys(chain, frozenset(chain)))
+    return joined
+
+
+def _off(span: tuple[Ns, Ns], moment: Ns) -> Ns:
+    """How far a moment is from a span of time."""
+    return max(span[0] - moment, moment - span[1], 0)
+
+
+def _neighbours(recording: Path) -> tuple[str, ...]:
+    """The names of the recordings before and after one that are joined with it by a handover."""
+    handover = read_handover(recording).handover
+    return tuple(filter(None, (handover.previous, handover.next)))

@@ -1,0 +1,199 @@
+"""Whose transforms hold: those of the time, of both topics, and of the recording that is asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.errors import NoDataError
+from ros2_memory.memory import Call
+from ros2_memory.moments import Moment
+from ros2_memory.queries import transform
+from ros2_memory.recorder.handover import Handover, write_handover
+from ros2_memory.sightings import find_matches
+from ros2_memory.timebase import unix_from_ns
+from ros2_memory.visits import visits
+from tests.bags import Msg, detections, odom, tf, write_mcap
+from tests.bags import transform as stamped
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.memory import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+DAY = 86_400 * S
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def static(at: int, parent: str, child: str, x: float) -> Msg:
+    return tf(at, stamped(at, parent, child, (x, 0.0, 0.0)), topic="/tf_static")
+
+
+def moving(begin: int, seconds: int, parent: str, child: str, x: float, mps: float) -> list[Msg]:
+    ticks = [begin + nth * S // 5 for nth in range(seconds * 5 + 1)]
+    return [
+        tf(at, stamped(at, parent, child, (x + mps * (at - begin) / S, 0.0, 0.0))) for at in ticks
+    ]
+
+
+def drive(begin: int, seconds: int, mps: float = 0.5) -> list[Msg]:
+    """Odometry along x from 0."""
+    ticks = [begin + nth * S // 5 for nth in range(seconds * 5 + 1)]
+    return [odom(at, mps * (at - begin) / S, 0.0, 0.0) for at in ticks]
+
+
+def record(folder: Path, messages: list[Msg], split_s: int = 10) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    by_split: dict[int, list[Msg]] = {}
+    begin = min(each.log_time for each in messages)
+    for each in sorted(messages, key=lambda message: message.log_time):
+        by_split.setdefault((each.log_time - begin) // (split_s * S), []).append(each)
+    for nth, some in by_split.items():
+        write_mcap(folder / f"{folder.name}_{nth}.mcap", some)
+
+
+def remembered(root: Path, *, recalls: bool) -> Memory:
+    memory = memory_of(root)
+    return recalling(replace(memory), root) if recalls else memory
+
+
+def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:
+    """Arrivals in whole seconds after BEGIN, newest first."""
+    found = visits(memory, Call(), x, 0.0, radius_m=radius)
+    assert found.frame_id == "map"
+    return [round(((each.arrived or 0) - BEGIN) / S, 1) for each in found.visits]
+
+
+def two_robots(root: Path, static_at: int, moving_at: int) -> None:
+    """One whose map is 100 m off its odometry for ever; and one that slips in its odometry."""
+    record(root / "nav2", [static(static_at, "map", "odom", 100.0), *drive(static_at, 20, 0.4)])
+    record(root / "boat", [*moving(moving_at, 20, "map", "odom", 5.0, -0.5), *drive(moving_at, 20)])
+
+
+@each_way
+@pytest.mark.parametrize("nav2_days", [-3, 3, 0])
+def test_a_place_in_the_map_is_one_by_the_transforms_of_the_own_recording(
+    tmp_path: Path, nav2_days: int, recalls: bool
+) -> None:
+    """The boat stands at 5 m of its map throughout; the other robot drives from 100 m to 110."""
+    apart = nav2_days * DAY
+    two_robots(tmp_path, BEGIN + apart, BEGIN)
+    memory = remembered(tmp_path, recalls=recalls)
+    assert arrivals(memory, 5.0) == [0.0]
+    assert arrivals(memory, 103.0) == [round(apart / S + 6.8, 1)]
+    assert visits(memory, Call(), 3.0, 0.0, radius_m=0.3).visits == ()
+    assert visits(memory, Call(), 105.0, 0.0, radius_m=0.3).total == 1
+
+
+@each_way
+def test_another_robots_static_transform_places_nothing(tmp_path: Path, recalls: bool) -> None:
+    """A boat that knows no map was nowhere in it, whoever else has one."""
+    record(tmp_path / "nav2", [static(BEGIN - DAY, "map", "odom", 100.0), *drive(BEGIN - DAY, 20)])
+    record(
+        tmp_path / "boat", [*moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5), *drive(BEGIN, 20)]
+    )
+    memory = remembered(tmp_path, recalls=recalls)
+    assert arrivals(memory, 103.0) == [round(-DAY / S + 5.4, 1)]
+    with pytest.raises(NoDataError):
+        transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 5 * S)))
+
+
+def asked(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> float:
+    found = transform(memory, Call(), parent, child, Moment(unix_from_ns(at)))
+    return round(found.transform.translation[0], 3)
+
+
+@each_way
+def test_a_transform_is_that_of_the_time_that_is_asked(tmp_path: Path, recalls: bool) -> None:
+    two_robots(tmp_path, BEGIN + DAY, BEGIN)
+    memory = remembered(tmp_path, recalls=recalls)
+    assert asked(memory, BEGIN + 4 * S) == 3.0
+    assert asked(memory, BEGIN + DAY + 4 * S) == 100.0
+
+
+@each_way
+def test_two_robots_of_one_time_are_not_mixed_and_a_note_says_whose_it_is(
+    tmp_path: Path, recalls: bool
+) -> None:
+    two_robots(tmp_path, BEGIN, BEGIN)
+    memory = remembered(tmp_path, recalls=recalls)
+    found = transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 4 * S)))
+    assert found.transform.translation[0] == pytest.approx(3.0)
+    assert [note for note in found.notes if "2 sessions" in note and "boat" in note]
+
+
+@each_way
+def test_a_static_transform_that_changes_holds_from_then_on(tmp_path: Path, recalls: bool) -> None:
+    """Also inside one bag: the robot is placed anew while it stands."""
+    poses = [odom(BEGIN + nth * S // 5, 0.0, 0.0, 0.0) for nth in range(100)]
+    changed = [static(BEGIN, "map", "odom", 0.0), static(BEGIN + 8 * S, "map", "odom", 50.0)]
+    record(tmp_path / "one", [*changed, *poses], split_s=60)
+    memory = remembered(tmp_path, recalls=recalls)
+    there, later = (visits(memory, Call(), x, 0.0, radius_m=1.0).visits for x in (0.0, 50.0))
+    assert [((each.arrived or 0) - BEGIN, (each.departed or 0) - BEGIN) for each in there] == [
+        (0, 39 * S // 5)
+    ]
+    assert [((each.arrived or 0) - BEGIN, each.departed) for each in later] == [(8 * S, None)]
+
+
+@each_way
+def test_recordings_joined_by_a_handover_share_their_transforms(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """A publisher that has gone is not heard by the recording that took over."""
+    first, second = tmp_path / "rec_20260714T000000Z", tmp_path / "rec_20260714T010000Z"
+    record(first, [static(BEGIN, "map", "odom", 7.0), *drive(BEGIN, 20)])
+    record(second, [static(BEGIN + 21 * S, "base_link", "laser", 1.0), *drive(BEGIN + 21 * S, 20)])
+    memory = remembered(tmp_path, recalls=recalls)
+    with pytest.raises(NoDataError):
+        asked(memory, BEGIN + 33 * S)
+    write_handover(first, Handover(next=second.name))
+    write_handover(second, Handover(previous=first.name))
+    memory = remembered(tmp_path, recalls=recalls)
+    assert asked(memory, BEGIN + 33 * S) == 7.0
+    assert arrivals(memory, 12.0) == [pytest.approx(30.6, abs=0.3), pytest.approx(9.6, abs=0.3)]
+
+
+@each_way
+def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls: bool) -> None:
+    """One records what moves, one what is static, one neither."""
+    record(tmp_path / "fixed", [static(BEGIN, "map", "odom", 7.0)])
+    record(tmp_path / "moving", moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5))
+    record(tmp_path / "sensors", drive(BEGIN, 20))
+    memory = remembered(tmp_path, recalls=recalls)
+    assert asked(memory, BEGIN + 4 * S, "map", "base_link") == 9.0
+    assert arrivals(memory, 9.0) == [pytest.approx(3.4, abs=0.21)]
+
+
+@each_way
+def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Two robots of one time: the sighting is of the one that stands, though the other is newer."""
+    record(
+        tmp_path / "nav2",
+        [
+            static(BEGIN, "map", "odom", 100.0),
+            *moving(BEGIN, 20, "odom", "base_link", 2.0, 0.0),
+            *[odom(BEGIN + nth * S, 2.0, 0.0, 0.0) for nth in range(20)],
+            detections(BEGIN + 4 * S + S // 2, ["scissors"]),
+        ],
+    )
+    boat = moving(BEGIN, 20, "map", "odom", 5.0, -0.5)
+    boat += moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5)
+    record(tmp_path / "boat", [*boat, *drive(BEGIN, 20)])
+    memory = remembered(tmp_path, recalls=recalls)
+    topic = detections(BEGIN, []).topic
+    [found] = find_matches(memory, Call(), topic, "contains", "scissors").sightings
+    assert found.thing is not None
+    assert found.thing.frame_id == "map"
+    assert found.thing.position[0] == pytest.approx(103.0)
+    assert found.robot is not None
+    assert found.robot.position[0] == pytest.approx(2.0)
