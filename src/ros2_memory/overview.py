@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory import answers
 from ros2_memory.absence import require_bags
-from ros2_memory.history import View, short_name
+from ros2_memory.history import View
 from ros2_memory.model import BagState, SetAside, TimeWindow
 from ros2_memory.recorder.listed_splits import absence_told, absent_splits
 from ros2_memory.timebase import Ns, ns_from_unix
-from ros2_memory.unseen import amiss, misdated
+from ros2_memory.unseen import amiss, by_remark, misdated
 from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
@@ -176,12 +176,9 @@ def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
 
 def _note_odd_bags(view: View) -> None:
     """Says of the newest bags that are odd, not left open, and no fault of a clock, in what way."""
-    odd = odd_bags(view.snapshot)
-    for bag in odd[-_ODD_BAGS:]:
-        view.note(f"{short_name(bag.path)}: {'; '.join(bag.summary.notes)}")
-    more = len(odd) - _ODD_BAGS
-    if more > 0:
-        view.note(f"{counted(more, 'older bag is', 'older bags are')} odd too")
+    odd = [(bag, "; ".join(bag.summary.notes)) for bag in odd_bags(view.snapshot)]
+    for sentence in by_remark(odd, _ODD_BAGS):
+        view.note(sentence)
 
 
 def _gaps(view: View) -> tuple[answers.Gap, ...]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.copies import Found
 from ros2_memory.errors import BagError, BagVanishedError, QueryTimeoutError
 from ros2_memory.model import BagState, TimeWindow
-from ros2_memory.timebase import MIN_NS
+from ros2_memory.timebase import MAX_NS, MIN_NS
+from ros2_memory.wording import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -22,6 +23,18 @@ if TYPE_CHECKING:
     from ros2_memory.timebase import Ns
 
 _CHECK_EVERY: Final = 256
+_DELETED: Final = Reason(
+    "was deleted before it could be read", "bag", many="were deleted before they could be read"
+)
+_NOT_WHOLE: Final = Reason("could not be read whole", "bag")
+_NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
+
+
+class _Thing(NamedTuple):
+    """What is wrong with one thing, and the last log time at which it is."""
+
+    detail: str
+    last: Ns
 
 
 class Reading:
@@ -33,20 +46,42 @@ class Reading:
         with call.stages.timed("index"):
             self.snapshot = memory.index.snapshot(reach)
         self._as_of: int | None = None
-        self._notes: dict[str, None] = {}
-        self._lacking: dict[str, Ns] = {}
+        self._notes: dict[str | Reason, None] = {}
+        self._things: dict[Reason, dict[str, _Thing]] = {}
         self.complete = True
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was skipped so far, each thing once."""
+        """What was skipped so far: each thing once, and one sentence for each reason."""
         # In which order bags are found damaged depends on what the catalogue knows.
-        lacking = iter(sorted(each for each in self._notes if each in self._lacking))
-        return tuple(next(lacking) if each in self._lacking else each for each in self._notes)
+        sentences = iter(sorted(map(self._sentence, filter(self._things.get, self._things))))
+        return tuple(
+            each if isinstance(each, str) else next(sentences)
+            for each in self._notes
+            if isinstance(each, str) or self._things[each]
+        )
+
+    def _sentence(self, reason: Reason) -> str:
+        return reason.sentence({name: each.detail for name, each in self._things[reason].items()})
 
     def note(self, sentence: str) -> None:
         """Adds a sentence for the reply."""
         self._notes.setdefault(sentence)
+
+    def note_thing(self, reason: Reason, name: str, detail: str = "", last: Ns = MAX_NS) -> None:
+        """Adds a thing to the sentence on a reason.
+
+        `last`: no part of it lies after this log time.
+        """
+        self._notes.setdefault(reason)
+        things = self._things.setdefault(reason, {})
+        known = things.get(name)
+        if known is None or known.last < last:
+            things[name] = _Thing(detail, last)
+
+    def noted_things(self) -> frozenset[tuple[Reason, str]]:
+        """The things that sentences are on so far."""
+        return frozenset((reason, name) for reason, held in self._things.items() for name in held)
 
     def check_deadline(self) -> None:
         """Gives up when the call's time is over.
@@ -119,28 +154,28 @@ class Reading:
     def skip(self, bag: BagFile, error: BagError, since: Ns = MIN_NS) -> None:
         """Notes that a bag, or some of it, is not part of the answer, be it since a moment."""
         self.complete = False
-        name = short_name(bag.path)
-        if isinstance(error, BagVanishedError):
-            sentence = f"{name} was deleted before it could be read"
-        elif error.lost is not None:
-            sentence = f"{name} could not be read whole: {error.reason}"
-        else:
-            sentence = f"{name} could not be read to its end: {error.reason}"
         last = bag.end if error.lost is None else error.lost[1]
         if last < since:
             return
-        self._lacking[sentence] = max(last, self._lacking.get(sentence, last))
-        self.note(sentence)
+        name = short_name(bag.path)
+        if isinstance(error, BagVanishedError):
+            self.note_thing(_DELETED, name, last=last)
+        else:
+            reason = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE
+            self.note_thing(reason, name, error.reason, last)
 
-    def unsay_before(self, moment: Ns, said: Collection[str] = ()) -> None:
+    def unsay_before(self, moment: Ns, said: Collection[tuple[Reason, str]] = frozenset()) -> None:
         """Takes back the notes on what could not be read where all of it lies before a moment.
 
         For a question that did not need it: how far back is read besides what is asked for depends
-        on what the catalogue knows. What was `said` before stands.
+        on what the catalogue knows. What was `said` before (`noted_things`) stands.
         """
-        for sentence, last in self._lacking.items():
-            if last < moment and sentence not in said:
-                self._notes.pop(sentence, None)
+        for reason, things in self._things.items():
+            self._things[reason] = {
+                name: each
+                for name, each in things.items()
+                if each.last >= moment or (reason, name) in said
+            }
 
     def read(
         self,

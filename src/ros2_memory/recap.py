@@ -21,7 +21,7 @@ from ros2_memory.tales import rests_in, story_in
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, ns_from_unix
 from ros2_memory.unseen import note_edges, note_unseen
 from ros2_memory.ways import way_driven
-from ros2_memory.wording import counted
+from ros2_memory.wording import Reason, counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -40,6 +40,7 @@ MOST_EVENTS: Final = 25
 SHORTEST_STOP_NS: Final[Ns] = 3 * NS_PER_S
 """A robot that stands for less is turning round, or minding its step."""
 
+_UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
 _KINDS: Final = ("gap", "error", "stop", "flip", "thing")
 """Kinds of events, the one that matters most first."""
 _PLURALS: Final = {
@@ -83,7 +84,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
             there_still |= dict.fromkeys(story.seen.labels_of(last=story.last), story.last)
         if story.undecodable:
             messages = counted(story.undecodable, "message")
-            view.note(f"{messages} of {topic} could not be decoded: what they say is not told")
+            view.note_thing(_UNDECODED, f"{messages} of {topic}")
         if story.left_out:
             view.note(f"{topic} changes too often to tell each: {story.left_out} more")
     things = united(seen).without(throughout)

@@ -13,6 +13,7 @@ from ros2_memory.model import TimeWindow
 from ros2_memory.testable import can_be_untestable, untestable
 from ros2_memory.timebase import MIN_NS
 from ros2_memory.unseen import note_unsearched
+from ros2_memory.wording import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -59,7 +60,7 @@ class Search:
     def newest(self, until: Ns) -> Found | None:
         """The newest match before a moment, as `last_match` gives it."""
         candidates = self.candidates(until)
-        said = self._view.notes
+        said = self._view.noted_things()
         try:
             for stretch in candidates.stretches():
                 for found in self._messages(stretch):
@@ -133,8 +134,8 @@ class Search:
         ]
         return self._view.stream(stretch.topics, window, newest_first=True, among=among)
 
-    def matches(self, found: Found) -> bool:
-        """Whether a message meets the condition; one that cannot be decoded does not."""
+    def matches(self, found: Found) -> bool | None:
+        """Whether a message meets the condition; None where it cannot be decoded."""
         begin = time.perf_counter_ns()
         channel = found.record.channel
         memory = self._view.memory
@@ -147,7 +148,7 @@ class Search:
             # One that was raised keeps all that was on the way, the message with it.
             alone = UndecodableError(error.topic, error.type_name, error.reason)
             self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
-            return False
+            return None
         finally:
             self._view.call.stages.add("extract", time.perf_counter_ns() - begin)
 
@@ -157,9 +158,8 @@ class Search:
             if newest < since:
                 continue
             self._view.complete = False
-            self._view.note(
-                f"messages of {topic} ({type_name}) could not be decoded: {error.reason}"
-            )
+            reason = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
+            self._view.note_thing(reason, f"{topic} ({type_name})")
 
     def _out_of_time(self, back_to: Ns) -> QueryTimeoutError:
         budget_s = self._view.call.deadline.budget_s

@@ -2,7 +2,7 @@
 
 A sighting is message after message of one topic that meets a condition. It is over with a message
 of that topic that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector
-may speak only of what it sees.
+may speak only of what it sees. A message that cannot be decoded is neither a match nor an end.
 """
 
 from __future__ import annotations
@@ -55,10 +55,18 @@ NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
 
 @dataclass(slots=True)
 class _Run:
-    """Matches in a row, the newest first; `begun`: it is known what is before them."""
+    """Matches in a row, the newest first.
+
+    Attributes:
+        newest: the last match.
+        first: log time of the first match so far.
+        reach: log time of the first message so far, be it one that cannot be decoded.
+        begun: it is known what is before them.
+    """
 
     newest: Found
     first: Ns
+    reach: Ns
     messages: int = 1
     begun: bool = False
 
@@ -155,8 +163,11 @@ def _gather(
             for found in view.stream(bearing, part, newest_first=True):
                 before = found.time
                 runs.end_silent(found.time)
-                if search.matches(found):
+                matches = search.matches(found)
+                if matches:
                     runs.add(found)
+                elif matches is None:
+                    runs.pass_by(found)
                 else:
                     runs.end(found.record.channel.topic)
                 if runs.enough:
@@ -213,19 +224,27 @@ class _Runs:
         topic = found.record.channel.topic
         run = self._open.get(topic)
         if run is None:
-            self._open[topic] = run = _Run(found, found.time)
+            self._open[topic] = run = _Run(found, found.time, found.time)
             self._kept.append(run)
             self.count += 1
         else:
-            run.first = found.time
+            run.first = run.reach = found.time
             run.messages += 1
+            self._open.move_to_end(topic)
+
+    def pass_by(self, found: Found) -> None:
+        """Takes a message that cannot be decoded: it is no match, and ends no row."""
+        topic = found.record.channel.topic
+        run = self._open.get(topic)
+        if run is not None:
+            run.reach = found.time
             self._open.move_to_end(topic)
 
     def end_silent(self, until: Ns) -> None:
         """Ends the rows in which no message from before a moment can be."""
         while self._open:
             run = next(iter(self._open.values()))
-            if run.first - until <= SILENCE_NS:
+            if run.reach - until <= SILENCE_NS:
                 return
             self.end(run.newest.record.channel.topic)
 

@@ -165,11 +165,21 @@ def _left_open(bags: Sequence[BagFile]) -> Iterator[str]:
 
 
 def _odd(bags: Sequence[BagFile]) -> Iterator[str]:
-    for bag in bags[-NAMED:]:
-        yield f"{short_name(bag.path)}: {shortened('; '.join(bag.summary.remarks))}"
-    if len(bags) > NAMED:
-        more = counted(len(bags) - NAMED, "older bag is", "older bags are")
-        yield f"{more} odd too"
+    yield from by_remark([(bag, "; ".join(bag.summary.remarks)) for bag in bags], NAMED)
+
+
+def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
+    """One sentence for each remark that bags have in common, those of the newest bags alone."""
+    names: dict[str, list[str]] = {}
+    for bag, remark in reversed(bags):
+        names.setdefault(shortened(remark), []).append(short_name(bag.path))
+    told = [*names.items()][:most]
+    for remark, [name, *others] in reversed(told):
+        subject = f"{len(others) + 1} bags ({listed([name, *others])})" if others else name
+        yield f"{subject}: {remark}"
+    more = len(bags) - sum(len(each) for _, each in told)
+    if more:
+        yield f"{counted(more, 'older bag is', 'older bags are')} odd too"
 
 
 def amiss(bags: Sequence[BagFile]) -> Iterator[str]:

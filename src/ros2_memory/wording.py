@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 NAMED: Final = 3
 """How many things a sentence names before it counts the rest."""
@@ -23,6 +24,32 @@ def listed(names: Sequence[str], count: int | None = None) -> str:
     more = (len(names) if count is None else count) - min(len(names), NAMED)
     shown = ", ".join(shortened(name) for name in names[:NAMED])
     return f"{shown} and {more} more" if more > 0 else shown
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """What is wrong with several things, for one sentence on all of them.
+
+    Attributes:
+        what: the sentence after its subject; `many` where that differs for several.
+        noun: what the things are; `plural` where that is not `noun` with an s.
+        of: what stands before the noun or the name, such as "messages of ".
+    """
+
+    what: str
+    noun: str
+    plural: str | None = None
+    of: str = ""
+    many: str | None = None
+
+    def sentence(self, things: Mapping[str, str]) -> str:
+        """The sentence on these things; each has a detail of its own, or an empty one."""
+        [name, detail], *others = sorted(things.items())
+        if not others:
+            return f"{self.of}{name} {self.what}" + (f": {detail}" if detail else "")
+        named = [f"{each} ({why})" if why else each for each, why in sorted(things.items())]
+        subject = f"{self.of}{counted(len(things), self.noun, self.plural)}"
+        return f"{subject} {self.many or self.what}: {listed(named)}"
 
 
 def shortened(text: str) -> str:

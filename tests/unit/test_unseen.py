@@ -116,8 +116,17 @@ def test_a_closed_bag_that_contradicts_itself_is_told() -> None:
     odd = [split(number, notes=("its own statistics are wrong",)) for number in range(5)]
     snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 5) == ["rec/rec_0.mcap: its own statistics are wrong"]
-    assert told(snapshot, 0, 60)[-2:] == [
-        "rec/rec_4.mcap: its own statistics are wrong",
+    named = "rec/rec_4.mcap, rec/rec_3.mcap, rec/rec_2.mcap and 2 more"
+    assert told(snapshot, 0, 60) == [f"5 bags ({named}): its own statistics are wrong"]
+
+
+def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_told() -> None:
+    odd = [split(number, notes=(f"way {number}",)) for number in range(5)]
+    snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 60) == [
+        "rec/rec_2.mcap: way 2",
+        "rec/rec_3.mcap: way 3",
+        "rec/rec_4.mcap: way 4",
         "2 older bags are odd too",
     ]
 
