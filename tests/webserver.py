@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import uvicorn
 
-from ros2_memory.connections import BoundedConnection
+from ros2_memory.connections import ACCEPTED_AT_ONCE, BoundedConnection
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ async def listening(
     config = uvicorn.Config(
         app,
         http=BoundedConnection,
+        backlog=ACCEPTED_AT_ONCE,
         lifespan=lifespan,
         ws="none",
         log_config=None,

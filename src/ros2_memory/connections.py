@@ -2,14 +2,22 @@
 
 Uvicorn waits for the rest of a request for as long as the client likes, and for a client to read
 its reply likewise. A few hundred clients that do neither would take all file descriptors.
+
+A connection is a stranger's until a request on it was admitted: it showed the token, or where there
+is none it passed the `Guard`. Strangers have a small pool of their own, in which the oldest makes
+room for the next: however many there are, whoever shows the token is served.
 """
 
 from __future__ import annotations
 
 import socket
-from typing import TYPE_CHECKING, Final, Literal
+from contextlib import suppress
+from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from ros2_memory.gate import is_admitted
+from ros2_memory.logs import Refusals, get_logger
 
 if TYPE_CHECKING:
     import asyncio
@@ -24,6 +32,12 @@ KEPT_BYTES: Final = 128 << 10
 """Of what was sent and is not acknowledged: several replies of usual length."""
 LINGER_S: Final = 1.0
 MOST_CONNECTIONS: Final = 256
+MOST_STRANGERS: Final = 64
+ACCEPTED_AT_ONCE: Final = 16
+"""In one turn of the event loop, three of which pass before a new connection is read from: so none
+is put out before what it sent at once was looked at."""
+
+log = get_logger(__name__)
 
 _Phase = Literal["head", "body", "reply"]
 
@@ -33,12 +47,24 @@ class BoundedConnection(H11Protocol):
 
     A request that does not come to its end is answered with 408, a connection too many with 503;
     a reply that is not read ends the connection, which ends the call or the event stream with it.
+    The oldest stranger too many is put out without a word.
     """
+
+    _refusals: ClassVar[Refusals] = Refusals()
 
     _phase: _Phase = "reply"
     _deadline: asyncio.TimerHandle | None = None
     _unread: asyncio.TimerHandle | None = None
     _is_refused = False
+    _is_admitted = False
+    _made_s = 0.0
+
+    @property
+    def is_stranger(self) -> bool:
+        """Whether no request on it was admitted so far."""
+        if not self._is_admitted and self._has_begun():
+            self._is_admitted = is_admitted(self.scope)
+        return not self._is_admitted
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         """A client has connected."""
@@ -46,10 +72,32 @@ class BoundedConnection(H11Protocol):
         # Zero: any unsent byte counts as unread, and none is kept for long.
         transport.set_write_buffer_limits(high=0)
         _bound_the_system(transport)
-        if len(self.connections) > MOST_CONNECTIONS:
+        self._made_s = self.loop.time()
+        strangers = self._strangers()
+        if len(self.connections) - len(strangers) >= MOST_CONNECTIONS:
+            self._log_refused("too many connections")
             self._refuse(503, "Service Unavailable", "Too many connections; close some.\n")
             return
+        if len(strangers) > MOST_STRANGERS:
+            min(strangers, key=lambda each: each._made_s)._put_out()
         self._watch()
+
+    def _strangers(self) -> list[BoundedConnection]:
+        return [
+            each
+            for each in self.connections
+            if isinstance(each, BoundedConnection) and each.is_stranger and not each._is_refused
+        ]
+
+    def _log_refused(self, reason: str) -> None:
+        if refused := self._refusals.count(reason):
+            log.warning("connection_refused", reason=reason, refused=refused)
+
+    def _put_out(self) -> None:
+        """Ends it at once, without a word: it has had its time."""
+        self._log_refused("a stranger made room for another")
+        self._is_refused = True
+        self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """It is over."""
@@ -66,6 +114,7 @@ class BoundedConnection(H11Protocol):
 
     def on_response_complete(self) -> None:
         """The reply is on its way; another request may follow."""
+        self._is_admitted = not self.is_stranger
         super().on_response_complete()
         self._watch()
 
@@ -114,7 +163,17 @@ class BoundedConnection(H11Protocol):
             # Answered before it was read, and there is no answer to what is left.
             self.transport.abort()
         else:
+            self._log_refused("no request within its time")
             self._refuse(408, "Request Timeout", "The request did not come to its end in time.\n")
+
+    def send_400_response(self, msg: str) -> None:
+        """What came is no HTTP."""
+        self._log_refused("no HTTP")
+        if self._has_begun() and self.cycle.response_started:
+            self._is_refused = True
+            self.transport.abort()
+        else:
+            self._refuse(400, "Bad Request", f"{msg}\n")
 
     def _refuse(self, status: int, reason: str, sentence: str) -> None:
         """Answers outside of the protocol's state, which need not allow for an answer, and ends.
@@ -130,7 +189,10 @@ class BoundedConnection(H11Protocol):
             f"HTTP/1.1 {status} {reason}\r\ncontent-type: text/plain; charset=utf-8\r\n"
             f"content-length: {len(sentence)}\r\nconnection: close\r\n\r\n{sentence}".encode()
         )
-        self.transport.write_eof()
+        # Later it would be tried on a peer that may be gone by then, which raises.
+        if not self.transport.get_write_buffer_size():
+            with suppress(OSError):
+                self.transport.write_eof()
         self.loop.call_later(LINGER_S, self.transport.abort)
 
 

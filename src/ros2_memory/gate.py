@@ -18,13 +18,16 @@ from starlette.responses import PlainTextResponse
 from ros2_memory.logs import get_logger
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 HEALTH_PATH: Final = "/health"
 ADMITTED: Final = "ros2_memory.admitted"
 """In the scope of a request to `/health`: whether it showed the token."""
+
+_SHOWN: Final = "ros2_memory.shown"
+"""In the state of a request, which its connection sees: it was admitted."""
 
 TOLD_EVERY_S: Final = 60.0
 """Refusals are logged this often at most: whoever guesses must not fill the disk with it."""
@@ -35,6 +38,17 @@ _WRONG: Final = "The token is not the one of this server.\n"
 
 
 log = get_logger(__name__)
+
+
+def admit(scope: Scope) -> None:
+    """Notes for the connection that one of its requests was admitted."""
+    scope.setdefault("state", {})[_SHOWN] = True
+
+
+def is_admitted(scope: Mapping[str, object]) -> bool:
+    """Whether a request was admitted."""
+    state = scope.get("state")
+    return isinstance(state, dict) and state.get(_SHOWN) is True
 
 
 class TokenGate:
@@ -61,6 +75,7 @@ class TokenGate:
             return
         shown = [value for name, value in scope["headers"] if name == b"authorization"]
         if len(shown) == 1 and self._is_right(shown[0]):
+            admit(scope)
             await self._app({**scope, ADMITTED: True}, receive, send)
         elif not shown and scope["path"] == HEALTH_PATH:
             await self._app({**scope, ADMITTED: False}, receive, send)

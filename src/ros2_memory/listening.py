@@ -8,7 +8,8 @@ import socket
 from dataclasses import dataclass
 from typing import Final
 
-_BACKLOG: Final = 128
+BACKLOG: Final = 128
+"""Connections that wait to be taken in."""
 
 
 class CannotListenError(Exception):
@@ -58,7 +59,7 @@ def bound(address: Address) -> socket.socket:
     """
     try:
         listening = socket.create_server(
-            (address.ip, address.port), family=address.family, backlog=_BACKLOG
+            (address.ip, address.port), family=address.family, backlog=BACKLOG
         )
     except OSError as error:
         raise CannotListenError(_why_not(address.host, address.port, error)) from error

@@ -9,16 +9,27 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 from structlog.stdlib import ProcessorFormatter
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from structlog.typing import FilteringBoundLogger, Processor
 
 _TALKATIVE: Final = "mcp.server.streamable_http"
 """Says at the end of each request that a session ends, where there are no sessions."""
+
+EVERY_S: Final = 10.0
+"""How often at most one kind of refusal is logged, and one sentence of a library that clients can
+have it say: nobody who may not ask can fill the disk by being refused."""
+
+_LIBRARIES: Final = ("asyncio", "mcp", "starlette", "uvicorn")
+_ALIKE_CHARS: Final = 32
+_MOST_KINDS: Final = 256
 
 
 def configure_logging(
@@ -61,6 +72,7 @@ def configure_logging(
             processors=[ProcessorFormatter.remove_processors_meta, *render],
         )
     )
+    handler.addFilter(_NowAndThen())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     least = logging.WARNING if level == "info" else logging.NOTSET
     logging.getLogger(_TALKATIVE).setLevel(least)
@@ -74,3 +86,54 @@ def get_logger(name: str) -> FilteringBoundLogger:
     """
     logger: FilteringBoundLogger = structlog.get_logger(name)
     return logger
+
+
+class Refusals:
+    """Counts what was refused, so that each kind is logged now and then; kinds are few and fixed.
+
+    Args:
+        monotonic: a clock that never steps, in seconds.
+    """
+
+    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._monotonic = monotonic
+        self._counts: dict[str, int] = {}
+        self._silent_until: dict[str, float] = {}
+
+    def count(self, reason: str) -> int:
+        """Counts one; returns how many since this kind was logged, or 0 until it is due again."""
+        self._counts[reason] = self._counts.get(reason, 0) + 1
+        now = self._monotonic()
+        if now < self._silent_until.get(reason, now):
+            return 0
+        self._silent_until[reason] = now + EVERY_S
+        return self._counts.pop(reason)
+
+
+class _NowAndThen(logging.Filter):
+    """Lets warnings and errors of network libraries pass now and then, each kind for itself.
+
+    What is alike begins with the same words. The next that passes says how many were `suppressed`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._suppressed: dict[tuple[str, str], int] = {}
+        self._silent_until: dict[tuple[str, str], float] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a record passes."""
+        if record.levelno < logging.WARNING or record.name.partition(".")[0] not in _LIBRARIES:
+            return True
+        kind = (record.name, str(record.msg)[:_ALIKE_CHARS])
+        now = time.monotonic()
+        if now < self._silent_until.get(kind, now):
+            self._suppressed[kind] = self._suppressed.get(kind, 0) + 1
+            return False
+        if len(self._silent_until) >= _MOST_KINDS:
+            self._silent_until.clear()
+            self._suppressed.clear()
+        self._silent_until[kind] = now + EVERY_S
+        if suppressed := self._suppressed.pop(kind, 0):
+            record.suppressed = suppressed
+        return True

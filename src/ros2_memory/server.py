@@ -24,12 +24,12 @@ from ros2_memory.bootstrap import (
     build_telemetry,
 )
 from ros2_memory.config import exit_on_config_error, load_settings
-from ros2_memory.connections import BoundedConnection
+from ros2_memory.connections import ACCEPTED_AT_ONCE, BoundedConnection
 from ros2_memory.endpoint import build_server
 from ros2_memory.filling import keep_filled
 from ros2_memory.health import Health, keep_fresh
 from ros2_memory.http import STREAM_PATH, web_app
-from ros2_memory.listening import CannotListenError, bound, resolved
+from ros2_memory.listening import BACKLOG, CannotListenError, bound, resolved
 from ros2_memory.logs import configure_logging, get_logger
 from ros2_memory.recorder.notify import READY, STOPPING, ServiceManager
 from ros2_memory.release import package_version
@@ -201,6 +201,7 @@ def _serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
     config = uvicorn.Config(
         app,
         http=BoundedConnection,
+        backlog=ACCEPTED_AT_ONCE,
         lifespan="on",
         ws="none",
         log_config=None,
@@ -224,6 +225,8 @@ class _Listener(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         for each in sockets or []:
+            # More may wait for their turn than are taken in at once.
+            each.listen(BACKLOG)
             host, port = each.getsockname()[:2]
             shown = f"[{host}]" if ":" in host else host
             log.info("listening", url=f"http://{shown}:{port}{STREAM_PATH}", host=host, port=port)

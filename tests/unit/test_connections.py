@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import socket
-from contextlib import asynccontextmanager
+import struct
+import threading
+from collections import deque
+from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from structlog.testing import capture_logs
 
 from ros2_memory import connections
+from ros2_memory.gate import admit
+from ros2_memory.logs import Refusals
+from tests.unit.test_http import GOOD, MCP_HEADERS, SHOWN, app, call_tool
 from tests.webserver import BOUND_S, listening
 
 if TYPE_CHECKING:
@@ -37,6 +45,8 @@ class App:
             self.under_way -= 1
 
     async def _answer(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["path"] != "/stranger":
+            admit(scope)
         more = scope["method"] == "POST" and scope["path"] != "/early"
         while more:
             message = await receive()
@@ -190,6 +200,10 @@ async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
     monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
     async with serving() as served:
         open_ones = [await served.connect() for _ in range(3)]
+        for reader, writer in open_ones:
+            writer.write(GET)
+            async with asyncio.timeout(BOUND_S):
+                await reader.readuntil(b"ok")
         told = await served.reply()
         assert told.startswith(b"HTTP/1.1 503 Service Unavailable\r\n")
         assert told.endswith(b"Too many connections; close some.\n")
@@ -236,3 +250,119 @@ async def test_the_system_keeps_little_and_gives_up_a_peer_that_vanished() -> No
         kept = connected.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
         assert kept <= 2 * connections.KEPT_BYTES
         writer.close()
+
+
+async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connections, "MOST_STRANGERS", 3)
+    async with serving() as served:
+        known, to_known = await served.connect()
+        to_known.write(GET)
+        async with asyncio.timeout(BOUND_S):
+            await known.readuntil(b"ok")
+        with ExitStack() as stack:
+            strangers = []
+            for _ in range(6):
+                place = ("127.0.0.1", served.port)
+                strangers.append(stack.enter_context(socket.create_connection(place, BOUND_S)))
+                strangers[-1].sendall(b"G")
+                async with asyncio.timeout(BOUND_S):
+                    while len(served.server.server_state.connections) < min(len(strangers), 3) + 1:
+                        await asyncio.sleep(0.001)
+            for each in strangers[:3]:
+                with suppress(ConnectionResetError):
+                    assert await asyncio.to_thread(each.recv, 1) == b""
+            for each in strangers[3:]:
+                each.sendall(GET[1:])
+                assert b" 200 " in await asyncio.to_thread(each.recv, 1000)
+        to_known.write(GET)
+        async with asyncio.timeout(BOUND_S):
+            assert b" 200 " in await known.readuntil(b"ok")
+        to_known.close()
+
+
+async def test_a_request_that_was_not_admitted_leaves_a_stranger() -> None:
+    async with serving() as served:
+        reader, writer = await served.connect()
+        for path, stranger in ((b"/stranger", True), (b"/", False), (b"/stranger", False)):
+            writer.write(b"GET " + path + b" HTTP/1.1\r\nhost: a\r\n\r\n")
+            async with asyncio.timeout(BOUND_S):
+                await reader.readuntil(b"ok")
+            [connection] = served.server.server_state.connections
+            assert isinstance(connection, connections.BoundedConnection)
+            assert connection.is_stranger is stranger
+        writer.close()
+
+
+def flood(port: int, stop: threading.Event) -> int:
+    """Opens connections, sends one byte on each, and leaves it at that; how many it opened."""
+    opened = 0
+    kept: deque[socket.socket] = deque()
+    while not stop.is_set():
+        with suppress(OSError):
+            kept.append(socket.create_connection(("127.0.0.1", port), timeout=BOUND_S))
+            opened += 1
+            kept[-1].sendall(b"P")
+        if len(kept) > 300:
+            kept.popleft().close()
+    for each in kept:
+        each.close()
+    return opened
+
+
+async def test_strangers_do_not_lock_out_whoever_shows_the_token() -> None:
+    web = app(api_token=GOOD)
+    body = json.dumps(call_tool("ask"))
+    headers = {"host": "127.0.0.1", "connection": "close", "content-type": "application/json"}
+    headers |= MCP_HEADERS | SHOWN | {"content-length": str(len(body))}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+    request = f"POST /mcp HTTP/1.1\r\n{lines}\r\n{body}".encode()
+    statuses, stop = [], threading.Event()
+    async with listening(web, lifespan="on") as server:
+        port = server.servers[0].sockets[0].getsockname()[1]
+        with ExitStack() as silent:
+            for _ in range(257):
+                each = silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+                each.sendall(b"P")
+                await asyncio.sleep(0)
+            flooding = asyncio.create_task(asyncio.to_thread(flood, port, stop))
+            try:
+                for _ in range(50):
+                    # Each over a connection of its own.
+                    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                    writer.write(request)
+                    async with asyncio.timeout(BOUND_S):
+                        statuses.append((await reader.readline()).split()[1])
+                        await reader.read()
+                    writer.close()
+            finally:
+                stop.set()
+                opened = await flooding
+    assert opened
+    assert statuses == [b"200"] * 50
+
+
+@pytest.mark.usefixtures("hurried")
+async def test_peers_that_are_gone_fill_no_log(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections.BoundedConnection, "_refusals", Refusals())
+    garbage = (b"", b"P", HALF, b"\x16\x03\x01", POST, GET + b"\x00" * 99, b"GET / HTTP/9\r\n\r\n")
+    chunked = b"POST /early HTTP/1.1\r\nhost: a\r\ntransfer-encoding: chunked\r\n\r\nzz\r\n"
+    with capture_logs() as logged:
+        async with serving() as served:
+            for sent in (*garbage, chunked) * 12:
+                with socket.create_connection(("127.0.0.1", served.port)) as client:
+                    # Closing then resets, so nothing can be sent any more.
+                    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                    client.sendall(sent)
+                    await asyncio.sleep(0)
+            await served.gone()
+            for sent in (*garbage, chunked) * 12:
+                await served.reply(sent)
+            await served.gone()
+    assert {each["event"] for each in logged} == {"connection_refused"}
+    assert len(logged) == len({each["reason"] for each in logged})
+    tracebacks = [each for each in caplog.records if each.exc_info]
+    assert tracebacks == []

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import logging
 import warnings
+from collections import Counter
 from datetime import UTC, datetime
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 import structlog
 from mcp.server import streamable_http as transport
 
+from ros2_memory import logs
 from ros2_memory.logs import configure_logging, get_logger
 from ros2_memory.withheld import withheld_warnings, withhold_warnings
 
@@ -175,3 +178,34 @@ def test_withheld_warnings_are_counted_by_event_and_errors_are_shown(
     assert withheld_warnings() == {"bag_damaged": 2, "theirs": 1}
     assert withheld_warnings() == {}
     assert [each["event"] for each in events(capsys)] == ["not_deleted"]
+
+
+def test_what_a_library_repeats_is_logged_now_and_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(logs, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    configure_logging("info", "json")
+    for second in range(25):
+        now[0] = float(second)
+        for logger in ("uvicorn.error", "asyncio", "mcp.server.sse"):
+            logging.getLogger(logger).warning("Invalid HTTP request received.")
+        logging.getLogger("asyncio").error("Fatal error: protocol.data_received() call %d", second)
+        get_logger("ros2_memory.test").warning("ours")
+    told = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    counts = Counter(each["logger"] for each in told)
+    ours = {"ros2_memory.test": 25}
+    assert counts == {"uvicorn.error": 3, "asyncio": 6, "mcp.server.sse": 3, **ours}
+    seen = [each.get("suppressed") for each in told if each["logger"] == "uvicorn.error"]
+    assert seen == [None, 9, 9]
+
+
+def test_refusals_are_counted_between_what_is_logged() -> None:
+    now = [0.0]
+    refusals = logs.Refusals(lambda: now[0])
+    counts = []
+    for second in range(25):
+        now[0] = float(second)
+        counts.append(refusals.count("a"))
+    assert [each for each in counts if each] == [1, 10, 10]
+    assert refusals.count("b") == 1
