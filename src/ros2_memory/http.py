@@ -16,9 +16,10 @@ from starlette.datastructures import Headers
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from ros2_memory.gate import ADMITTED, HEALTH_PATH, TokenGate
+from ros2_memory.gate import ADMITTED, HEALTH_PATH, TokenGate, admit
 from ros2_memory.intake import Intake
-from ros2_memory.page import Page
+from ros2_memory.logs import Refusals, get_logger
+from ros2_memory.page import PAGE_PATH, Page
 from ros2_memory.session_names import SessionNames
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from ros2_memory.fitting import JsonObject
     from ros2_memory.telemetry import Exposition
 
+log = get_logger(__name__)
+
 Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 
 STREAM_PATH: Final = "/sse"
@@ -42,6 +45,8 @@ THREADS: Final = 4
 """For what nobody asked, such as a look at the bags. One that was needed once stays a while."""
 
 _LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+_SAME_SITE: Final = frozenset({"same-origin", "none"})
+"""Of Sec-Fetch-Site: a page of this server, or no page at all."""
 _ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - only compared with
 
 
@@ -95,7 +100,7 @@ def web_app(
         # It holds no data, and a browser cannot show a token before it has a page to ask for it.
         # Where others can reach the server, the token comes first nevertheless.
         app = Page(app)
-    return WebApp(Guard(app, host))
+    return WebApp(Guard(app, host, admits=api_token is None))
 
 
 def _showing(
@@ -192,16 +197,24 @@ class _Exchange:
 
 
 class Guard:
-    """Refuses requests that a web page could have forged, by their Host and Origin headers.
+    """Refuses requests that a web page could have forged: by Host, Origin and Sec-Fetch-Site.
 
     A page of another site reaches a server on this machine or network by having its own name
     resolve to the server's address (DNS rebinding): then Host carries that name. So Host must be a
-    name that is known to be this server's, or a bare address, which cannot be rebound. Origin,
-    which only browsers send, must be the same as Host, or a page on the loopback address.
+    name that is known to be this server's, or a bare address, which cannot be rebound.
+
+    A browser names the page that sends a request in Origin, which must be this server's own: other
+    ports of this machine serve other programs' pages. Where it sends none it still says in
+    Sec-Fetch-Site (W3C Fetch Metadata) whether another site is behind a request. A person may
+    follow a link from anywhere to the page itself, of which the other site sees nothing.
+
+    `admits`: whoever passes is admitted, since no token is asked for.
     """
 
-    def __init__(self, app: ASGIApp, host: str) -> None:
+    def __init__(self, app: ASGIApp, host: str, *, admits: bool = False) -> None:
         self._app = app
+        self._admits = admits
+        self._refusals = Refusals()
         self._names = _LOOPBACK | {host.lower()} - _ANY_ADDRESS
         self._reachable = host.lower() not in _LOOPBACK
         if self._reachable:
@@ -211,23 +224,47 @@ class Guard:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """ASGI."""
         if scope["type"] == "http":
-            headers = Headers(scope=scope)
-            refusal = self._refusal(headers.get("host", ""), headers.get("origin"))
+            refusal = self._refusal(scope)
             if refusal is not None:
                 await refusal(scope, receive, send)
                 return
+            if self._admits:
+                admit(scope)
         await self._app(scope, receive, send)
 
-    def _refusal(self, host: str, origin: str | None) -> PlainTextResponse | None:
+    def _refusal(self, scope: Scope) -> PlainTextResponse | None:
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
         name = _host_name(f"//{host}")
         if name not in self._names and not (self._reachable and _is_address(name)):
+            self._log_refused("the host name of another site")
             return PlainTextResponse(
                 "Host is not a name of this server; use its address instead.\n", status_code=421
             )
-        same = (f"http://{host}".lower(), f"https://{host}".lower())
-        if origin is None or origin.lower() in same or _host_name(origin) in _LOOPBACK:
-            return None
-        return PlainTextResponse("Origin is another site.\n", status_code=403)
+        same = {f"http://{host}".lower(), f"https://{host}".lower()}
+        if any(origin.lower() not in same for origin in headers.getlist("origin")):
+            self._log_refused("the origin of another site")
+            return PlainTextResponse("Origin is another site.\n", status_code=403)
+        if not _SAME_SITE.issuperset(headers.getlist("sec-fetch-site")) and not _is_visit(
+            scope, headers
+        ):
+            self._log_refused("a request from another site")
+            return PlainTextResponse("Sec-Fetch-Site is another site.\n", status_code=403)
+        return None
+
+    def _log_refused(self, reason: str) -> None:
+        if refused := self._refusals.count(reason):
+            log.warning("request_refused", reason=reason, refused=refused)
+
+
+def _is_visit(scope: Scope, headers: Headers) -> bool:
+    """Whether a person has a browser open the page."""
+    return (
+        scope["method"] == "GET"
+        and scope["path"] == PAGE_PATH
+        and headers.getlist("sec-fetch-mode") == ["navigate"]
+        and headers.getlist("sec-fetch-dest") == ["document"]
+    )
 
 
 def _host_name(url: str) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import anyio
 import httpx2
 import pytest
+from structlog.testing import capture_logs
 
 from ros2_memory import answers
 from ros2_memory.dispatch import Dispatcher
@@ -202,10 +203,77 @@ async def test_a_loopback_server_does_not_answer_to_other_addresses() -> None:
     assert response.status_code == 421
 
 
-async def test_a_page_on_this_machine_may_ask() -> None:
-    async with client(app(EVERYWHERE), "http://192.168.7.20:9203") as http:
-        response = await http.get("/health", headers={"origin": "http://localhost:6274"})
-    assert response.status_code == 200
+PATHS = ["/", "/health", "/sse", "/mcp", "/messages/"]
+VISIT = {"sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "javascript://localhost",
+        "http://localhost:6274",
+        "http://127.0.0.1",
+        "http://127.0.0.1:9204",
+        "http://[::1]:9203",
+        "ftp://127.0.0.1:9203",
+        "http://127.0.0.1:9203/",
+        "http://user@127.0.0.1:9203",
+        "http://127.0.0.1:9203 http://evil.example",
+        "127.0.0.1:9203",
+        "file://",
+    ],
+)
+async def test_other_ports_and_malformed_origins_are_other_sites(path: str, origin: str) -> None:
+    async with client(app()) as http:
+        assert (await http.get(path, headers={"origin": origin})).status_code == 403
+        both = [("origin", HOME), ("origin", origin)]
+        assert (await http.get(path, headers=both)).status_code == 403
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "", "other", "none, cross-site"])
+@pytest.mark.parametrize("method", ["GET", "POST", "HEAD", "OPTIONS"])
+async def test_requests_that_another_site_is_behind_are_refused(
+    path: str, site: str, method: str
+) -> None:
+    async with client(app()) as http:
+        for more in ({}, {"sec-fetch-mode": "no-cors"}, {**VISIT, "sec-fetch-dest": "iframe"}):
+            headers = {"sec-fetch-site": site, **more}
+            assert (await http.request(method, path, headers=headers)).status_code == 403
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "none", "same-origin"])
+async def test_a_person_may_follow_a_link_to_the_page_and_to_nothing_else(site: str) -> None:
+    async with client(app()) as http:
+        response = await http.get("/", headers={"sec-fetch-site": site, **VISIT})
+        assert response.status_code == 200
+        if site in {"cross-site", "same-site"}:
+            for path in PATHS[1:]:
+                other = await http.get(path, headers={"sec-fetch-site": site, **VISIT})
+                assert other.status_code == 403
+            posted = await http.post("/", headers={"sec-fetch-site": site, **VISIT})
+            assert posted.status_code == 403
+
+
+@pytest.mark.parametrize("site", ["none", "same-origin"])
+async def test_what_the_page_itself_and_a_person_ask_is_answered(site: str) -> None:
+    async with client(app()) as http:
+        headers = {"sec-fetch-site": site, "origin": HOME}
+        assert (await http.get("/health", headers=headers)).status_code == 200
+
+
+async def test_refusals_of_other_sites_are_counted_and_logged_now_and_then() -> None:
+    with capture_logs() as logged:
+        async with client(app()) as http:
+            for _ in range(50):
+                await http.get("/health", headers={"origin": "http://evil.example"})
+                await http.get("/health", headers={"sec-fetch-site": "cross-site"})
+    told = [(each["event"], each["reason"], each["refused"]) for each in logged]
+    assert told == [
+        ("request_refused", "the origin of another site", 1),
+        ("request_refused", "a request from another site", 1),
+    ]
 
 
 class Connection:
