@@ -30,6 +30,7 @@ from ros2_memory.logs import get_logger
 from ros2_memory.memory import Call
 from ros2_memory.telemetry import SILENT, UNKNOWN_TOOL, Answered
 from ros2_memory.timebase import Deadline, unix_from_ns
+from ros2_memory.volume import too_much_of
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
@@ -171,7 +172,7 @@ class Dispatcher:
     ) -> tuple[str, Reply]:
         try:
             tool = _named(name, asked)
-            question = tool.question(given)
+            question = _asked(tool, given)
         except InvalidArgumentsError as error:
             return error.code, self._replies.error(error)
         waits = _Waits()
@@ -232,6 +233,12 @@ def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
     near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
     hint = f"do you mean {' or '.join(near)}?" if near else f"there are: {', '.join(tools)}"
     raise InvalidArgumentsError(f"there is no tool {glimpse(name)}; {hint}")
+
+
+def _asked(tool: Tool, given: Mapping[str, object]) -> Question:
+    if too_much := too_much_of(given):
+        raise InvalidArgumentsError(too_much)
+    return tool.question(given)
 
 
 class _Waits:

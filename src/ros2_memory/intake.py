@@ -1,6 +1,7 @@
 """What of a request is taken in, and for how long its answer is worth the work.
 
-Bodies are read whole, and bounded one by one and all together, before anything looks at them. A
+Bodies are read whole, and bounded one by one and all together, in size, number of values and depth,
+before anything looks at them. A
 call whose client leaves is ended, and so is taking in more questions from a client that does not
 read the answers it has.
 """
@@ -17,12 +18,14 @@ import anyio
 from starlette.datastructures import Headers, QueryParams
 from starlette.responses import PlainTextResponse
 
+from ros2_memory.volume import too_much_in
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-MOST_BODY_BYTES: Final = 4 << 20
+MOST_BODY_BYTES: Final = 1 << 20
 MOST_HELD_BYTES: Final = 32 << 20
 """Of all bodies at once."""
 MOST_UNREAD: Final = 64
@@ -87,7 +90,8 @@ class Intake:
                 return PlainTextResponse(_TOO_LARGE, status_code=413)
             if self._held > MOST_HELD_BYTES:
                 return PlainTextResponse(_TOO_MUCH, status_code=503, headers={"retry-after": "1"})
-        return None
+        reason = too_much_in(exchange.body)
+        return None if reason is None else PlainTextResponse(reason, status_code=413)
 
     def _unread(self, scope: Scope) -> PlainTextResponse | None:
         """The refusal of a message whose sender has not read what it was sent."""
@@ -163,6 +167,11 @@ class _Exchange:
             more = message.get("more_body", False)
             yield message.get("body", b"")
         self._body = bytes(body)
+
+    @property
+    def body(self) -> bytes:
+        """What was read; empty where the client left before its end."""
+        return self._body or b""
 
     async def run(self, app: ASGIApp) -> None:
         """Runs the application, for as long as the client waits for its answer.

@@ -149,7 +149,7 @@ def _client(context: object) -> Hashable:
     request = context.request_context.request if isinstance(context, Context) else None
     if not isinstance(request, Request):
         return None
-    # It was parsed, and would be kept for as long as the call waits: up to 4 MiB for each.
+    # It was parsed, and would be kept for as long as the call waits: up to 1 MiB for each.
     request._body = b""
     session = request.query_params.get("session_id")
     if session is not None and request.url.path.startswith(MESSAGES_PATH):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 
 from ros2_memory.dispatch import Dispatcher
 from ros2_memory.replies import Replies
+from ros2_memory.signatures import Signature
 from ros2_memory.tools import build_tools
 from tests.hostile import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested
 from tests.memories import memory_of
@@ -80,9 +82,27 @@ def test_every_argument_stands_every_hostile_value(
 
 
 def test_a_thousand_unknown_arguments_are_told_in_few_words(dispatcher: Dispatcher) -> None:
-    told = held(asked(dispatcher, "list_frames", {f"x{n}": n for n in range(100_000)}))
+    told = held(asked(dispatcher, "list_frames", {f"x{n}": n for n in range(1000)}))
     assert told["error"] == "invalid_arguments"
-    assert "99995 more" in told["detail"]
+    assert "995 more" in told["detail"]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {f"x{n}": n for n in range(1_000_000)},
+        {"topic": [0] * 1_000_000},
+        {"topic": {"a": [[[0] * 4000] * 4]}},
+        {"topic": nested(DEEP)},
+    ],
+)
+def test_too_many_arguments_are_told_before_any_is_looked_at(
+    dispatcher: Dispatcher, given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Signature, "read", lambda *_: pytest.fail("it was looked at"))
+    told = held(asked(dispatcher, "find_last_match", given))
+    assert told["error"] == "invalid_arguments"
+    assert re.search(r"^(topic|more than) .*(values|levels|arguments)", told["detail"])
 
 
 @pytest.mark.parametrize("name", ["x" * MEGABYTE, "\ud800", "", "\x00", "get_position_at\x00"])
