@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ros2_memory import directories
 from ros2_memory.adapters import build_reader, retention_limits
 from ros2_memory.catalogue import FILE, FOLDER, Catalogue
 from ros2_memory.config import load_message_schemas
@@ -90,7 +91,7 @@ def way_of_reading(settings: Settings, schemas: Mapping[str, Mapping[str, str]])
     definitions = [
         (str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns)
         for folder in settings.storage.custom_msg_paths
-        for path in sorted(Path(folder).rglob("*.msg"))
+        for path in sorted(directories.files_below(Path(folder), ".msg"))
     ]
     depends_on = (
         package_version(),

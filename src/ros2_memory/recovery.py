@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory import directories
 from ros2_memory.errors import BagError, BagVanishedError, RecorderError
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.kept_names import KeptNames
@@ -222,8 +223,15 @@ def _files(path: Path, clock: Clock) -> tuple[list[Path], int]:
     """The MCAP files to look at, and how many bags of other kinds lie there.
 
     Raises:
-        RecorderError: there is nothing of that name, or it cannot be listed.
+        RecorderError: there is nothing of that name, it lies behind a symbolic link, or it cannot
+            be listed.
     """
+    link = directories.link_in(path)
+    if link is not None:
+        raise RecorderError(
+            f"{path}: {link} is a symbolic link, and nothing behind one is repaired; "
+            f"give the path itself: {path.resolve()}"
+        )
     if path.is_file():
         return [path], 0
     if not path.is_dir():

@@ -22,6 +22,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from ros2_memory import directories
 from ros2_memory.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -305,7 +306,7 @@ def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
             " package, with msg/*.msg in it"
         )
     try:
-        files = sorted(file for file in folder.resolve().rglob("*.msg") if file.is_file())
+        files = sorted(directories.files_below(folder.resolve(), ".msg"))
         files = [file for file in files if file.parent.name == "msg"]
         if not files:
             raise ConfigError(f"reader.custom_msg_paths: {folder} holds no msg/*.msg file")

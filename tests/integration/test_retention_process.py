@@ -35,6 +35,7 @@ from tests.live_recorder import answer
 from tests.memories import memory_of
 from tests.questions import ask_everything, write_run
 from tests.split_writer import DOCK
+from tests.unit.test_deep_directories import DEEP, within
 from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
@@ -254,6 +255,19 @@ def test_a_clock_that_stepped_forward_deletes_nothing_before_it_is_synchronised(
     assert [path.exists() for path in kept] == [True] * 9 + [False] * 10
     until(lambda: age_held(site.bag_dir) is None)
     assert daemon.stop() == 0
+
+
+def test_folders_nested_without_end_are_cleared_and_it_records(site: Site) -> None:
+    bag = write_mcap(site.folder / "a.mcap", [odom(NS_PER_S, 1.0, 2.0)])
+    site.bag_dir.mkdir()
+    with within(site.bag_dir, DEEP, "d") as inner:
+        os.link(bag, "deep.mcap", dst_dir_fd=inner)
+    daemon = site.run("recording.clear_on_startup=true")
+    (cleared,) = daemon.wait_for("bags_cleared")
+    assert (cleared["files"], daemon.events("not_cleared")) == (1, [])
+    assert daemon.stop() == 0
+    # pytest would recurse.
+    subprocess.run(["rm", "-rf", str(site.bag_dir / "d")], check=True)
 
 
 def state(folder: Path) -> dict[str, tuple[object, ...]]:

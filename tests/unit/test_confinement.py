@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from ros2_memory import directories
 from ros2_memory.bootstrap import build_filler, build_memory
 from ros2_memory.catalogue_file import open_file
 from ros2_memory.config import load_settings
@@ -29,11 +30,12 @@ from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.handover import read_handover
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.lock import BagDirLock
+from ros2_memory.recorder.mailbox import Mailbox, Slot
 from ros2_memory.recorder.scan import Tree
 from ros2_memory.recorder.settle import settle_all
 from ros2_memory.recorder.standing import files_in_metadata
 from ros2_memory.recorder.sync import write_durably
-from ros2_memory.recorder.wipe import clear_bags
+from ros2_memory.recorder.wipe import clear_bags, remove_if_empty
 from ros2_memory.recovery import recover
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.mcap_writer import McapWriter
@@ -43,6 +45,7 @@ from ros2_memory.timebase import NS_PER_S
 from ros2_memory.tools import build_tools
 from ros2_memory.upkeep import build_repairer
 from tests.bags import boolean, text, write_db3, write_mcap
+from tests.keeping import keeper_of
 from tests.questions import ANSWERED, T0, T0_S, write_run
 
 if TYPE_CHECKING:
@@ -277,6 +280,66 @@ class TestDeletions:
         before = contents(outside)
         lines: list[str] = []
         recover(bags, lines.append, force=True)
+        assert contents(outside) == before
+
+    def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
+        self, bags: Path, outside: Path
+    ) -> None:
+        cut = outside / "rec_0.mcap"
+        cut.write_bytes(cut.read_bytes()[:-100])
+        (outside / "rec_9.mcap").touch()
+        (bags / "linked").symlink_to(outside)
+        before = contents(outside)
+        for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
+            with pytest.raises(RecorderError, match="symbolic link") as refused:
+                recover(path, lambda _: None, force=True)
+            assert str(path.resolve()) in str(refused.value)
+            if path.suffix:
+                with pytest.raises(BagError, match="behind a symbolic link"):
+                    build_repairer().repair(path)
+        assert contents(outside) == before
+
+    def test_a_repair_leaves_a_directory_that_a_link_replaced_since(
+        self, bags: Path, outside: Path
+    ) -> None:
+        (outside / "run_0.mcap").write_bytes(b"")
+        (outside / ".run_0.mcap.repair").write_bytes(b"kept")
+        before = contents(outside)
+        house = keeper_of(bags)
+        shutil.rmtree(bags / "run")
+        (bags / "run").symlink_to(outside)
+        assert not house._repair(bags / "run/run_0.mcap")
+        house._repair_recording(bags, bags / "run")
+        assert not remove_if_empty(bags / "run")
+        assert contents(outside) == before
+
+    def test_no_metadata_is_corrected_behind_a_link(self, bags: Path, outside: Path) -> None:
+        before = contents(outside)
+        (bags / "linked").symlink_to(outside)
+        with pytest.raises(OSError, match="symbolic link"):
+            build_repairer().correct_metadata(bags / "linked")
+        assert contents(outside) == before
+
+    def test_nothing_is_asked_for_or_answered_behind_a_link(
+        self, bags: Path, outside: Path
+    ) -> None:
+        (outside / "requests").mkdir()
+        (outside / "requests" / f"{'0' * 32}.json").write_text("{}")
+        before = contents(outside)
+        (bags / ".episodic").symlink_to(outside)
+        with pytest.raises(OSError, match="symbolic link"):
+            Slot(bags, "label", 0, 1, 2).post()
+        mailbox = Mailbox(bags)
+        mailbox.open()
+        assert not mailbox.has_mail()
+        assert contents(outside) == before
+
+    def test_no_bag_of_a_moment_is_linked_behind_a_link(self, bags: Path, outside: Path) -> None:
+        before = contents(outside)
+        (bags / "moments").mkdir()
+        (bags / "moments/a").symlink_to(outside)
+        with pytest.raises(OSError, match="symbolic link"):
+            directories.make(bags, bags / "moments/a/rec_0")
         assert contents(outside) == before
 
     def test_a_repair_of_a_link_by_name_is_refused(self, bags: Path, outside: Path) -> None:

@@ -14,6 +14,7 @@ from difflib import get_close_matches
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory import directories
 from ros2_memory.adapters import GB, build_recorder
 from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.errors import EpisodicError
@@ -152,11 +153,12 @@ def _room(settings: Settings, bag_dir: Path) -> Iterator[Finding]:
 def _size(folder: Path) -> int:
     """The bytes of all files below a folder, as far as they can be seen; two names count once."""
     sizes: dict[tuple[int, int], int] = {}
-    for parent, _, names in os.walk(folder):
-        for name in names:
+    for _, entries in directories.walk(folder):
+        for entry in entries:
             with suppress(OSError):
-                status = os.lstat(os.path.join(parent, name))  # noqa: PTH118 - many files
-                sizes[status.st_dev, status.st_ino] = status.st_size
+                if not entry.is_dir(follow_symlinks=False):
+                    status = entry.stat(follow_symlinks=False)
+                    sizes[status.st_dev, status.st_ino] = status.st_size
     return sum(sizes.values())
 
 

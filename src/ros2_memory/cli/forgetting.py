@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from ros2_memory import directories
 from ros2_memory.adapters import build_reader
 from ros2_memory.catalogue import BagKey
 from ros2_memory.cli.opening import opened
@@ -321,7 +322,9 @@ class _Removal:
                 if bag.recording == recording
             }
             try:
-                if take_out(recording, gone):
+                with directories.opened(self.bag_dir, recording):
+                    lists = take_out(recording, gone)
+                if lists:
                     said.append(f"{name} lists what is left")
             except (OSError, ValueError) as error:
                 said.append(

@@ -57,6 +57,7 @@ class _Part:
         self.path = path
         self.beside = path.with_name(f".{path.name}.tmp")
         self.rows: list[Row] = []
+        self.beside.unlink(missing_ok=True)  # or a link there would be written through
         self._writer = pq.ParquetWriter(self.beside, SCHEMA, compression="zstd")
 
     def flush(self) -> None:

@@ -87,6 +87,8 @@ def put_in_order(
         _log.warning("bags_cleared", files=wiped.files, bytes=wiped.bytes)
         for fault in wiped.faults:
             _log.error("not_cleared", reason=fault)
+        if wiped.more:
+            _log.error("not_cleared", reason=f"{wiped.more} more cannot be deleted")
     _prepare(bag_dir, reader, housekeeper)
 
 

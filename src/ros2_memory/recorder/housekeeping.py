@@ -7,6 +7,7 @@ found unfinished later on, when nothing writes it, is repaired then.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from contextlib import suppress
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from ros2_memory import directories
 from ros2_memory.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.model import BagState
 from ros2_memory.recorder.disk import free_bytes
@@ -107,7 +109,7 @@ class Housekeeping:
             disposal=disposal,
         )
         self._keeper = Keeper(bag_dir, moments_bytes, clock)
-        self._repairer = Repairer(reader, writer)
+        self._repairer = Repairer(reader, writer, bag_dir)
         self._names = KeptNames(bag_dir)
         self._clock = clock
         self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
@@ -208,11 +210,13 @@ class Housekeeping:
 
     def _repair_recording(self, bag_dir: Path, directory: Path) -> None:
         try:
-            for path in sorted(directory.iterdir()):
-                if left_by_repair(path.name) and not path.is_symlink():
-                    path.unlink()
-                elif path.suffix == _MCAP:
-                    self._repair(path)
+            with directories.opened(bag_dir, directory) as opened:
+                names = sorted(os.listdir(opened))  # noqa: PTH208 - a descriptor has no path
+                for name in filter(left_by_repair, names):
+                    os.unlink(name, dir_fd=opened)
+            for name in names:
+                if name.endswith(_MCAP) and not left_by_repair(name):
+                    self._repair(directory / name)
             # A recording of nothing but empty splits.
             remove_emptied(bag_dir, directory)
         except OSError as error:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from ros2_memory import directories
 from ros2_memory.recorder.keepsake import (
     MOST_MOMENTS,
     Held,
@@ -109,7 +109,7 @@ class Keeper:
         moments = moments_of(self._bag_dir)
         if moments.is_symlink():
             return
-        for root, _, _ in os.walk(moments):
+        for root, _ in directories.walk(moments):
             recording = self._names.recorded_as(root)
             try:
                 if recording != root:
@@ -163,7 +163,7 @@ class Keeper:
             if keepsake != Keepsake.of(wish):
                 write_keepsake(folder, keepsake)
         except OSError:
-            shutil.rmtree(folder, ignore_errors=True)
+            directories.remove(folder)
             raise
         flush(folder.parent)
         return Held(folder, keepsake, files)
@@ -229,6 +229,7 @@ class Keeper:
                     continue
                 name = os.path.relpath(self._names.recorded_as(bag.file), self._bag_dir)
                 target = folder / name
+                directories.make(self._bag_dir, target.parent)
                 if not _link_bag(bag.path, target, inode):
                     missing[f"{name} has gone, or another file of that name is kept"] = None
                     continue
@@ -275,7 +276,6 @@ def _link_bag(bag: Path, target: Path, inode: int) -> bool:
     Raises:
         OSError: the link cannot be made.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(bag, target, follow_symlinks=False)
     except FileNotFoundError:

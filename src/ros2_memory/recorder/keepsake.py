@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory import directories
 from ros2_memory.recorder.layout import MOMENT_FILE, MOMENTS_FOLDER
 from ros2_memory.recorder.scan import bag_kind
 from ros2_memory.recorder.sync import read_small_file, write_durably
@@ -215,9 +216,10 @@ def _moment(fields: Mapping[object, object], key: str) -> Ns:
 def _files_in(folder: Path) -> dict[int, int]:
     """The bags below a moment's folder, by inode, with their sizes."""
     files: dict[int, int] = {}
-    for path in folder.rglob("*"):
-        if bag_kind(path.name) and not path.name.startswith("."):
-            with suppress(FileNotFoundError):
-                status = path.lstat()
-                files[status.st_ino] = status.st_size
+    for _, entries in directories.walk(folder):
+        for entry in entries:
+            if bag_kind(entry.name) and not entry.name.startswith("."):
+                with suppress(FileNotFoundError):
+                    status = entry.stat(follow_symlinks=False)
+                    files[status.st_ino] = status.st_size
     return files

@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
+from ros2_memory import directories
 from ros2_memory.recorder.keepsake import FORMAT, Wish, json_object, wish_from
 from ros2_memory.recorder.layout import REQUESTS_FOLDER
-from ros2_memory.recorder.sync import read_small_file
+from ros2_memory.recorder.sync import own_folder, read_small_file
 from ros2_memory.timebase import NS_PER_S
 
 if TYPE_CHECKING:
@@ -101,6 +102,7 @@ class Mailbox:
     """The recorder's side. Not for several threads at once."""
 
     def __init__(self, bag_dir: Path) -> None:
+        self._bag_dir = bag_dir
         self._folder = requests_of(bag_dir)
         self._foreign = 0
         self._ignored: set[str] = set()
@@ -113,7 +115,8 @@ class Mailbox:
     def has_mail(self) -> bool:
         """Whether there are wishes."""
         try:
-            names = [path.name for path in self._folder.iterdir()]
+            with directories.opened(self._bag_dir, self._folder) as opened:
+                names = os.listdir(opened)  # noqa: PTH208 - a descriptor has no path
         except OSError:
             return False
         return any(name.endswith((".json", ".taken")) and self._counts(name) for name in names)
@@ -194,8 +197,8 @@ def requests_of(bag_dir: Path) -> Path:
 
 def _make(folder: Path) -> None:
     """Makes the folder, and none above the bag directory: that may be on a disk that is away."""
-    folder.parent.mkdir(exist_ok=True)
-    folder.mkdir(exist_ok=True)
+    own_folder(folder.parent)
+    own_folder(folder)
 
 
 def _put(target: Path, content: Mapping[str, object]) -> None:

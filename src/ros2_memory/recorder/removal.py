@@ -9,14 +9,14 @@ from __future__ import annotations
 import os
 import re
 import stat
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory import directories
 from ros2_memory.recorder.layout import RECORDING_FILES
 from ros2_memory.recorder.scan import bag_kind
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
 REPAIR_SUFFIX: Final = ".repair"
@@ -60,7 +60,7 @@ def remove_bag(root: Path, path: Path, inode: Inode) -> int:
         FileNotFoundError: it is not there any more.
         OSError: it cannot be deleted, or is not the file that was looked at.
     """
-    with _directory(root, path.parent) as directory:
+    with directories.opened(root, path.parent) as directory:
         status = os.stat(path.name, dir_fd=directory, follow_symlinks=False)
         if not stat.S_ISREG(status.st_mode) or (status.st_dev, status.st_ino) != inode:
             raise OSError(f"{path} is not the file that was looked at")
@@ -83,7 +83,7 @@ def remove_emptied(root: Path, recording: Path) -> int:
         return 0
     removed = 0
     try:
-        with _directory(root, recording) as directory:
+        with directories.opened(root, recording) as directory:
             with os.scandir(directory) as listing:
                 entries = list(listing)
             if any(bag_kind(entry.name) for entry in entries):
@@ -94,7 +94,7 @@ def remove_emptied(root: Path, recording: Path) -> int:
                     removed += 1
             if len(entries) > removed:
                 return removed
-        with _directory(root, recording.parent) as above:
+        with directories.opened(root, recording.parent) as above:
             os.rmdir(recording.name, dir_fd=above)
     except FileNotFoundError:
         pass
@@ -118,18 +118,3 @@ def _companions(directory: int, bag: str) -> list[str]:
         names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False)]
     found = ((name, _COMPANION.fullmatch(name)) for name in names)
     return [name for name, match in found if match and match["bag"] == bag]
-
-
-@contextmanager
-def _directory(root: Path, path: Path) -> Iterator[int]:
-    """A descriptor of a directory that is the root or below it, found without following a link."""
-    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-    descriptor = os.open(root, flags)
-    try:
-        for name in path.relative_to(root).parts:
-            inner = os.open(name, flags | os.O_NOFOLLOW, dir_fd=descriptor)
-            os.close(descriptor)
-            descriptor = inner
-        yield descriptor
-    finally:
-        os.close(descriptor)

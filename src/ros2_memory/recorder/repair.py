@@ -11,10 +11,11 @@ import os
 import shutil
 import stat
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ros2_memory import directories
 from ros2_memory.errors import BagError, BagVanishedError
 from ros2_memory.recorder.metadata import correct
 from ros2_memory.recorder.removal import repair_name
@@ -43,11 +44,15 @@ class Repaired:
 
 
 class Repairer:
-    """Repairs MCAP files in place. Whoever calls knows that nobody writes them any more."""
+    """Repairs MCAP files in place. Whoever calls knows that nobody writes them any more.
 
-    def __init__(self, reader: BagReader, writer: BagWriter) -> None:
+    What is repaired lies below `root`, and is not reached through a symbolic link there.
+    """
+
+    def __init__(self, reader: BagReader, writer: BagWriter, root: Path = Path("/")) -> None:
         self._reader = reader
         self._writer = writer
+        self._root = root
 
     def is_whole(self, path: Path) -> bool:
         """Whether the writer of a file finished it, so that there is nothing to repair.
@@ -72,24 +77,38 @@ class Repairer:
             BagError: it cannot be repaired, and is as it was.
         """
         try:
-            before = _status(path)
-            if not before.st_size:
-                path.unlink()
-                flush(path.parent)
-                return Repaired(path, 0)
-            if self._reader.closing(path) is Closing.CLOSED:
-                return None
-            return self._rewrite(path, before, progress)
+            with directories.opened(self._root, path.parent.absolute()) as folder:
+                # The directory itself, whatever takes its name meanwhile.
+                here = Path(f"/proc/self/fd/{folder}", path.name)
+                repaired = self._repair(here, path, progress)
+        except BagVanishedError as error:
+            raise BagVanishedError(str(path), error.reason) from error
+        except BagError as error:
+            raise BagError(str(path), error.reason) from error
         except FileNotFoundError as error:
             raise BagVanishedError(str(path), "the file is not there any more") from error
         except OSError as error:
             raise BagError(
                 str(path), f"it cannot be repaired: {error.strerror or error}"
             ) from error
+        return None if repaired is None else replace(repaired, path=path)
 
     def correct_metadata(self, recording: Path) -> bool:
         """Writes metadata.yaml by what the files hold, as `metadata.correct` does."""
-        return correct(recording, self._reader)
+        with directories.opened(self._root, recording.absolute()):
+            return correct(recording, self._reader)
+
+    def _repair(
+        self, here: Path, path: Path, progress: Callable[[int], None] | None
+    ) -> Repaired | None:
+        before = _status(here)
+        if not before.st_size:
+            here.unlink()
+            flush(here.parent)
+            return Repaired(path, 0)
+        if self._reader.closing(path) is Closing.CLOSED:
+            return None
+        return self._rewrite(here, before, progress)
 
     def _rewrite(
         self, path: Path, before: os.stat_result, progress: Callable[[int], None] | None

@@ -7,6 +7,7 @@ another file system that is mounted below is left alone.
 
 from __future__ import annotations
 
+import errno
 import os
 import pwd
 from contextlib import contextmanager, suppress
@@ -28,16 +29,22 @@ from ros2_memory.recorder.scan import bag_kind
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+MOST_FAULTS: Final = 100
+
 _SQLITE_COMPANIONS: Final = (".db3-wal", ".db3-shm", ".db3-journal")
 
 
 @dataclass(slots=True)
 class Wiped:
-    """What was deleted, and a sentence for each thing that could not be."""
+    """What was deleted, and a sentence for each of the first things that could not be.
+
+    `more` is how many could not be besides.
+    """
 
     files: int = 0
     bytes: int = 0
     faults: list[str] = field(default_factory=list)
+    more: int = 0
 
 
 def clear_bags(bag_dir: Path) -> Wiped:
@@ -50,8 +57,7 @@ def clear_bags(bag_dir: Path) -> Wiped:
     root = bag_dir.resolve()
     wiped = Wiped()
     try:
-        with _opened(root) as opened:
-            _clear(root, opened, os.fstat(opened).st_dev, wiped, root)
+        _Clearing(root, wiped).run()
     except FileNotFoundError:
         pass
     except OSError as error:
@@ -83,12 +89,13 @@ def remove_if_empty(recording: Path) -> bool:
     A recorder that dies as soon as it starts would leave one with every attempt.
     """
     try:
-        with os.scandir(recording) as listing:
-            entries = list(listing)
-        if not all(_is_nothing(entry) for entry in entries):
-            return False
-        for entry in entries:
-            Path(entry.path).unlink()
+        with _opened(recording) as opened:
+            with os.scandir(opened) as listing:
+                entries = list(listing)
+            if not all(_is_nothing(entry) for entry in entries):
+                return False
+            for entry in entries:
+                os.unlink(entry.name, dir_fd=opened)
         recording.rmdir()
     except OSError:
         return False
@@ -104,43 +111,132 @@ def _is_nothing(entry: os.DirEntry[str]) -> bool:
     )
 
 
-def _clear(path: Path, opened: int, device: int, wiped: Wiped, root: Path) -> bool:
-    """Deletes the bags below an open directory; whether there were any in it, or moments.
+@dataclass(slots=True)
+class _Folder:
+    """A directory that is being cleared, and the ones in it that still are to be."""
 
-    Names are looked up in the open directory: whatever takes the place of its path meanwhile is
-    not touched. A directory below goes too if nothing else is in it.
+    name: str
+    inode: tuple[int, int]
+    had_bags: bool
+    waiting: list[str]
+
+
+class _Clearing:
+    """Deletes the bags below one directory, however deep they lie.
+
+    One directory is open at a time, and names are looked up in it: whatever takes the place of its
+    path meanwhile is not touched. The way up is `..`, if that is the directory it was come from.
     """
-    with os.scandir(opened) as listing:
-        entries = list(listing)
-    moments = root / MOMENTS_FOLDER
-    had_bags = moments in {path, path.parent} or any(_is_bag(entry) for entry in entries)
-    beside = _beside_bags(path, root, had_bags=had_bags)
-    for entry in entries:
-        below = path / entry.name
+
+    def __init__(self, root: Path, wiped: Wiped) -> None:
+        self._root = root
+        self._wiped = wiped
+        self._open = -1
+        self._way: list[_Folder] = []
+
+    def run(self) -> None:
+        """Clears it.
+
+        Raises:
+            OSError: the directory itself cannot be listed.
+        """
+        self._open = _open(self._root)
         try:
-            if _is_directory(entry, device):
-                with _opened(entry.name, opened) as inner:
-                    emptied = _clear(below, inner, device, wiped, root)
-                if emptied:
-                    with suppress(OSError):
-                        os.rmdir(entry.name, dir_fd=opened)
-            elif _is_bag(entry) or (entry.name in beside and entry.is_file(follow_symlinks=False)):
-                size = entry.stat(follow_symlinks=False).st_size
-                os.unlink(entry.name, dir_fd=opened)
-                wiped.files += 1
-                wiped.bytes += size
+            self._device = os.fstat(self._open).st_dev
+            self._enter("")
+            while self._way:
+                waiting = self._way[-1].waiting
+                if waiting:
+                    self._descend(waiting.pop())
+                else:
+                    self._leave()
+        finally:
+            os.close(self._open)
+
+    def _descend(self, name: str) -> None:
+        """Goes down into a directory, where it can, and clears what lies in it."""
+        above = self._open
+        try:
+            self._open = _open(name, above)
         except FileNotFoundError:
-            continue
+            return
         except OSError as error:
-            wiped.faults.append(f"{below} cannot be deleted: {error.strerror}")
-    return had_bags
+            self._fault(name, error)
+            return
+        try:
+            self._enter(name)
+        except OSError as error:
+            os.close(self._open)
+            self._open = above
+            self._fault(name, error)
+        else:
+            os.close(above)
+
+    def _enter(self, name: str) -> None:
+        """Deletes the bags in the open directory, and what goes with them."""
+        with os.scandir(self._open) as listing:
+            entries = list(listing)
+        status = os.fstat(self._open)
+        level = len(self._way)
+        moments = level in {1, 2} and (name if level == 1 else self._way[1].name) == MOMENTS_FOLDER
+        had_bags = moments or any(_is_bag(entry) for entry in entries)
+        names = RECORDING_FILES if had_bags else frozenset()
+        if level == 0:
+            names |= OWN_FILES
+        elif level == 2 and moments:
+            names |= {MOMENT_FILE}
+        folder = _Folder(name, (status.st_dev, status.st_ino), had_bags, [])
+        self._way.append(folder)
+        for entry in entries:
+            try:
+                if _is_directory(entry, self._device):
+                    folder.waiting.append(entry.name)
+                elif _is_bag(entry) or (
+                    entry.name in names and entry.is_file(follow_symlinks=False)
+                ):
+                    size = entry.stat(follow_symlinks=False).st_size
+                    os.unlink(entry.name, dir_fd=self._open)
+                    self._wiped.files += 1
+                    self._wiped.bytes += size
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                self._fault(entry.name, error)
+
+    def _leave(self) -> None:
+        """Goes up again, and deletes the directory where it had bags and nothing is left in it."""
+        left = self._way.pop()
+        if not self._way:
+            return
+        above = _open("..", self._open)
+        os.close(self._open)
+        self._open = above
+        status = os.fstat(above)
+        if (status.st_dev, status.st_ino) != self._way[-1].inode:
+            moved = OSError(errno.EBUSY, "it was moved away while it was cleared")
+            self._fault(left.name, moved)
+            self._way.clear()
+        elif left.had_bags:
+            with suppress(OSError):
+                os.rmdir(left.name, dir_fd=above)
+
+    def _fault(self, name: str, error: OSError) -> None:
+        path = self._root.joinpath(*(each.name for each in self._way if each.name), name)
+        if len(self._wiped.faults) < MOST_FAULTS:
+            self._wiped.faults.append(f"{path} cannot be deleted: {error.strerror}")
+        else:
+            self._wiped.more += 1
+
+
+def _open(path: Path | str, within: int | None = None) -> int:
+    """A descriptor of a directory that stands there itself and not through a link."""
+    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
+    return os.open(path, flags, dir_fd=within)
 
 
 @contextmanager
-def _opened(path: Path | str, within: int | None = None) -> Iterator[int]:
-    """A descriptor of a directory that stands there itself and not through a link."""
-    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
-    descriptor = os.open(path, flags, dir_fd=within)
+def _opened(path: Path) -> Iterator[int]:
+    descriptor = _open(path)
     try:
         yield descriptor
     finally:
@@ -156,11 +252,3 @@ def _is_directory(entry: os.DirEntry[str], device: int) -> bool:
 def _is_bag(entry: os.DirEntry[str]) -> bool:
     named = bag_kind(entry.name) or entry.name.endswith(_SQLITE_COMPANIONS)
     return bool(named) and entry.is_file(follow_symlinks=False)
-
-
-def _beside_bags(path: Path, root: Path, *, had_bags: bool) -> frozenset[str]:
-    """The files of a directory that go with its bags."""
-    names = RECORDING_FILES if had_bags else frozenset()
-    if path == root:
-        return names | OWN_FILES
-    return names | {MOMENT_FILE} if path.parent == root / MOMENTS_FOLDER else names
