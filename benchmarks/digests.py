@@ -13,7 +13,14 @@ from benchmarks.report import Figure
 from ros2_memory.bootstrap import build_filler
 from ros2_memory.digest import Digester
 from ros2_memory.indexing import fill
-from ros2_memory.rests import SLOT_NS
+from ros2_memory.standstills import (
+    BLOCK_NS,
+    ChainDigest,
+    packed_blocks,
+    packed_poses,
+    unpacked_blocks,
+    unpacked_poses,
+)
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
@@ -21,8 +28,8 @@ if TYPE_CHECKING:
     from ros2_memory.memory import Memory
     from ros2_memory.model import BagSummary
     from ros2_memory.motion import PoseDigest, Stop
-    from ros2_memory.rests import RestDigest, Slot
     from ros2_memory.settings import Settings
+    from ros2_memory.standstills import StandstillDigest, TimedPosition
     from ros2_memory.stories import Story
     from ros2_memory.topic_digest import TopicDigest
 
@@ -79,26 +86,41 @@ def _moved_topic(topic: TopicDigest, by: int) -> TopicDigest:
             for each in kept
         )
     poses = None if topic.poses is None else _moved_poses(topic.poses, by)
-    rests = None if topic.rests is None else _moved_rests(topic.rests, by)
+    standstills = None if topic.standstills is None else _moved_standstills(topic.standstills, by)
     story = None if topic.story is None else _moved_story(topic.story, by)
-    return replace(topic, poses=poses, rests=rests, story=story, edges=edges, kept=kept)
+    return replace(topic, poses=poses, standstills=standstills, story=story, edges=edges, kept=kept)
 
 
-def _moved_rests(rests: RestDigest, by: int) -> RestDigest:
-    def later(slot: Slot) -> Slot:
-        first = slot.first._replace(time=slot.first.time + by)
-        number = slot.number + by // SLOT_NS
-        return slot._replace(number=number, first=first, last=slot.last + by)
+def _moved_standstills(digest: StandstillDigest, by: int) -> StandstillDigest:
+    def later(moment: int | None) -> int | None:
+        return None if moment is None else moment + by
 
     return replace(
-        rests,
-        head=later(rests.head),
-        second=None if rests.second is None else rests.second._replace(time=rests.second.time + by),
-        rests=tuple(
-            each._replace(start=each.start + by, end=each.end + by) for each in rests.rests
+        digest,
+        head=packed_poses(_later(unpacked_poses(digest.head), by)),
+        head_until=digest.head_until + by,
+        tail=packed_poses(_later(unpacked_poses(digest.tail), by)),
+        tail_since=digest.tail_since + by,
+        chains=tuple(
+            ChainDigest(
+                later(each.start),
+                later(each.end),
+                packed_blocks(
+                    block._replace(
+                        number=block.number + by // BLOCK_NS,
+                        first=block.first + by,
+                        last=block.last + by,
+                    )
+                    for block in unpacked_blocks(each.blocks)
+                ),
+            )
+            for each in digest.chains
         ),
-        tail=None if rests.tail is None else later(rests.tail),
     )
+
+
+def _later(poses: list[TimedPosition], by: int) -> list[TimedPosition]:
+    return [pose._replace(time=pose.time + by) for pose in poses]
 
 
 def _moved_story(story: Story, by: int) -> Story:

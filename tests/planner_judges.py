@@ -38,6 +38,8 @@ ASKED_AT_S: Final = STARTED_S + ASKED_AFTER_S
 
 PLACE_M: Final = 0.05
 SECOND: Final = 1.0
+STOP_S: Final = 0.2
+"""The robot comes to a stop so slowly that where it stands begins within this time."""
 SAME_S: Final = 2e-3
 
 OBJECTS: Final = "/vision/*/scene_objects"
@@ -94,13 +96,16 @@ def _near(place: Planar | tuple[float, float], radius: float) -> Callable[[float
 
 
 def _stands(t: float) -> bool:
-    return abs(robot.twist(t)[0]) < 0.05
+    return abs(robot.twist(t)[0]) < 0.005
 
 
-def _stops(asked: Asked, since_s: float, least_s: float = 4.0) -> list[list[Message]]:
-    """Where the robot stood for so long and more; whether it stopped for 3 s is told to 1 s."""
-    rows = _rows(asked, ODOM, _stands, since_s)
-    return [row for row in rows if row[-1].log_time - row[0].log_time >= least_s * NS_PER_S]
+def _stops(asked: Asked, since_s: float, least_s: float = 3.0) -> list[list[Message]]:
+    """Where the robot stood for so long and more, as far as it is since then."""
+    rows = _rows(asked, ODOM, _stands)
+    since = ns_from_unix(since_s)
+    long = (row for row in rows if row[-1].log_time - row[0].log_time >= least_s * NS_PER_S)
+    inside = ([each for each in row if each.log_time >= since] for row in long)
+    return [row for row in inside if len(row) > 1]
 
 
 def _t(moment_s: float) -> float:
@@ -234,11 +239,9 @@ def way_of_recap(last_s: float) -> Judge:
         near("distance", number(reply, "distance_m"), way, PLACE_M)
         fastest = max(abs(robot.twist(message.t)[0]) for message in driven)
         near("top speed", number(reply, "max_speed"), fastest, 2e-3)
-        certain = _stops(asked, ASKED_AT_S - last_s)
-        stood = sum(row[-1].log_time - row[0].log_time for row in certain) / 1e9
-        doubtful = len(_stops(asked, ASKED_AT_S - last_s, 2.0)) - len(certain)
-        room = SECOND * len(certain) + 4 * SECOND * doubtful
-        near("stood", number(reply, "stood_s"), stood + room / 2, room / 2 + SECOND)
+        stops = _stops(asked, ASKED_AT_S - last_s)
+        stood = sum(row[-1].log_time - row[0].log_time for row in stops) / 1e9
+        near("stood", number(reply, "stood_s"), stood, 2 * STOP_S * len(stops))
 
     return judge
 
@@ -249,14 +252,10 @@ def stopped(last_s: float) -> Judge:
     def judge(replies: Replies, asked: Asked) -> None:
         told = _of_kind(replies[-1], "stood at")
         same("number of stops", number(replies[-1], "counts", "stops"), len(told))
-        since = ASKED_AT_S - last_s
-        certain = _stops(asked, since)
-        possible = _stops(asked, since, 2.0)
-        if not len(certain) <= len(told) <= len(possible):
-            same("stops", len(told), len(certain))
-        for event in told:
-            began = number(event, "timestamp")
-            _stop(event, min(possible, key=lambda row: abs(_unix(row[0]) - began)))
+        stops = _stops(asked, ASKED_AT_S - last_s)
+        same("stops", len(told), len(stops))
+        for event, row in zip(told, stops, strict=True):
+            _stop(event, row)
 
     return judge
 
@@ -266,10 +265,10 @@ def _stop(event: JsonValue, row: Sequence[Message]) -> None:
     middle = robot.pose(row[len(row) // 2].t)
     near("x", float(x), middle.x, PLACE_M)
     near("y", float(y), middle.y, PLACE_M)
-    near("time", number(event, "timestamp"), unix_from_ns(row[0].log_time), SECOND)
-    near("how long ago", number(event, "ago_s"), _ago(row[0].log_time), SECOND)
+    near("time", number(event, "timestamp"), unix_from_ns(row[0].log_time), STOP_S)
+    near("how long ago", number(event, "ago_s"), _ago(row[0].log_time), STOP_S + 0.05)
     stood = (row[-1].log_time - row[0].log_time) / 1e9
-    near("how long", number(event, "duration_s"), stood, 2 * SECOND)
+    near("how long", number(event, "duration_s"), stood, 2 * STOP_S)
 
 
 def _of_kind(reply: JsonValue, begins: str) -> list[JsonValue]:

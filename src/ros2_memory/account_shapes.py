@@ -66,6 +66,7 @@ def _recap(answer: accounts.Recap, _bag_dir: Path) -> JsonObject:
         "distance_m": None if answer.distance_m is None else rounded(answer.distance_m, 3),
         "max_speed": None if answer.max_speed is None else rounded(answer.max_speed, 3),
         "stood_s": None if answer.stood is None else seconds(answer.stood),
+        "shortest_stop_s": seconds(answer.shortest_stop),
         "frame_id": answer.frame_id or None,
         "events": [_event(each, answer.now) for each in answer.events],
     }
@@ -82,7 +83,7 @@ def _event(event: accounts.Event, now: Ns) -> JsonObject:
         "text": event.text,
     }
     if event.end is not None:
-        shown_event["duration_s"] = round(seconds(event.end - event.start), 1)
+        shown_event["duration_s"] = round(seconds(event.end - event.start), 3)
     if event.goes_on:
         shown_event["goes_on"] = True
     return shown_event

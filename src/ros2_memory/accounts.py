@@ -85,7 +85,10 @@ class Recap:
         now: what ages count from.
         distance_m: the way driven; None, as what follows, where no pose tells.
         max_speed: in m/s.
-        stood: how long the robot stood in all.
+        stood: how long the robot stood in all, in standstills that last `shortest_stop` or longer.
+            One that goes on outside of the window counts as far as it is inside, so the times of
+            windows that follow each other add up.
+        shortest_stop: what stands for less is no standstill.
         frame_id: of the places in texts.
         events: what happened, in order of time.
         throughout: things that were in view all the time.
@@ -98,6 +101,7 @@ class Recap:
     distance_m: float | None
     max_speed: float | None
     stood: Ns | None
+    shortest_stop: Ns
     frame_id: str | None
     events: tuple[Event, ...]
     throughout: tuple[str, ...]

@@ -30,7 +30,7 @@ from ros2_memory.catalogue_sql import (
 from ros2_memory.former import former_files
 from ros2_memory.packing import (
     unpacked_poses,
-    unpacked_rests,
+    unpacked_standstills,
     unpacked_story,
 )
 from ros2_memory.storage.base import Channel, Record, Schema
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from ros2_memory.model import BagFile
     from ros2_memory.motion import PoseDigest
     from ros2_memory.recorder.standing import FormerFile
-    from ros2_memory.rests import RestDigest
+    from ros2_memory.standstills import StandstillDigest
     from ros2_memory.stories import Story
     from ros2_memory.timebase import Ns
 
@@ -192,13 +192,13 @@ class Catalogue:
 
         return self._read(ask, {})
 
-    def rests(self, topic: str, numbers: Sequence[int]) -> dict[int, RestDigest]:
+    def standstills(self, topic: str, numbers: Sequence[int]) -> dict[int, StandstillDigest]:
         """Where the poses of the topic in the entries stand still; not where some have no pose."""
 
-        def ask(base: sqlite3.Connection) -> dict[int, RestDigest]:
+        def ask(base: sqlite3.Connection) -> dict[int, StandstillDigest]:
             first, here = self._base.first, self._base.here(numbers)
             rows = tale_rows(base, "rests", topic, here)
-            return {first + number: unpacked_rests(packed) for number, packed in rows}
+            return {first + number: unpacked_standstills(packed) for number, packed in rows}
 
         return self._read(ask, {})
 

@@ -11,7 +11,7 @@ import json
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.evidence import OPEN, Box, Evidence
-from ros2_memory.packing import packed_poses, packed_rests, packed_story, shape_text
+from ros2_memory.packing import packed_poses, packed_standstills, packed_story, shape_text
 from ros2_memory.stories import Story
 
 if TYPE_CHECKING:
@@ -131,14 +131,14 @@ def _put_tale(base: sqlite3.Connection, bag: int, topic: TopicDigest, summary: B
     story = b"" if topic.story is None else packed_story(topic.story)
     spans = [(each.first, each.last) for each in summary.of(topic.topic)]
     quiet = Story(min(first for first, _ in spans), max(last for _, last in spans))
-    if topic.rests is None and topic.story == quiet:
+    if topic.standstills is None and topic.story == quiet:
         return
     base.execute(
         f"INSERT INTO tales VALUES ({TOPIC}, ?, ?, ?)",
         (
             topic.topic,
             bag,
-            None if topic.rests is None else packed_rests(topic.rests),
+            None if topic.standstills is None else packed_standstills(topic.standstills),
             None if topic.story == quiet else story,
         ),
     )

@@ -107,6 +107,10 @@ class TimeWindow:
         start = max(self.start, other.start)
         return TimeWindow(start, max(start, min(self.stop, other.stop)))
 
+    def widened(self, by: Ns) -> TimeWindow:
+        """So much more on both sides."""
+        return TimeWindow(max(self.start - by, MIN_NS), min(self.stop + by, MAX_NS))
+
     @property
     def empty(self) -> bool:
         """Whether no moment lies inside."""

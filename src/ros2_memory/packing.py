@@ -8,13 +8,14 @@ from __future__ import annotations
 import json
 import math
 import struct
+import zlib
 from functools import lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.motion import PoseDigest, Stop
 from ros2_memory.presences import Seen
-from ros2_memory.rests import Box3, Rest, RestDigest, Slot
+from ros2_memory.standstills import ChainDigest, StandstillDigest
 from ros2_memory.stories import Fault, Flip, Known, Story
 from ros2_memory.summaries import BagSummary, Heading, shared_shape
 
@@ -25,9 +26,6 @@ if TYPE_CHECKING:
 
 _HEAD: Final = struct.Struct("<qqqqddB??qdddqdddqdddqddd")
 _VERTEX: Final = struct.Struct("<qdddd")
-_REST_HEAD: Final = struct.Struct("<BBqddd")
-_SLOT: Final = struct.Struct("<qqdddqdddddd")
-_REST: Final = struct.Struct("<qqdddddd")
 _STORY: Final = struct.Struct("<qqqqI")
 _NOWHERE: Final = Stop(0, (math.nan, math.nan, math.nan))
 
@@ -70,61 +68,36 @@ def unpacked_poses(packed: bytes) -> PoseDigest:
         raise ValueError(f"not a digest of poses: {error}") from error
 
 
-def packed_rests(rests: RestDigest) -> bytes:
-    """A digest of rests as bytes."""
-    ends = [each for each in (rests.head, rests.tail) if each is not None]
-    flags = rests.from_second | rests.to_tail << 1
-    second = _NOWHERE if rests.second is None else rests.second
-    return b"".join(
-        (
-            _REST_HEAD.pack(flags, len(ends), second.time, *second.position),
-            *(
-                _SLOT.pack(
-                    each.number,
-                    each.first.time,
-                    *each.first.position,
-                    each.last,
-                    *each.box.low,
-                    *each.box.high,
-                )
-                for each in ends
-            ),
-            *(
-                _REST.pack(each.start, each.end, *each.box.low, *each.box.high)
-                for each in rests.rests
-            ),
-        )
-    )
+def packed_standstills(digest: StandstillDigest) -> bytes:
+    """A digest of standstills as bytes."""
+    chains = [[each.start, each.end, len(each.blocks)] for each in digest.chains]
+    head, tail = digest.head, digest.tail
+    sizes = json.dumps([len(head), digest.head_until, len(tail), digest.tail_since, chains])
+    parts = (sizes.encode(), b"\n", head, tail, *(each.blocks for each in digest.chains))
+    return zlib.compress(b"".join(parts))
 
 
-def unpacked_rests(packed: bytes) -> RestDigest:
+def unpacked_standstills(packed: bytes) -> StandstillDigest:
     """The digest that these bytes are of.
 
     Raises:
         ValueError: they are of none.
     """
     try:
-        flags, ends, *second = _REST_HEAD.unpack_from(packed)
-        slots = [
-            _slot(_SLOT.unpack_from(packed, _REST_HEAD.size + nth * _SLOT.size))
-            for nth in range(ends)
-        ]
-        body = packed[_REST_HEAD.size + ends * _SLOT.size :]
-        rests = [
-            Rest(start, end, Box3((a, b, c), (d, e, f)))
-            for start, end, a, b, c, d, e, f in _REST.iter_unpack(body)
-        ]
-        head, tail = slots[0], slots[1] if ends > 1 else None
-    except (struct.error, IndexError) as error:
-        raise ValueError(f"not a digest of rests: {error}") from error
-    time, x, y, z = second
-    known = Stop(time, (x, y, z)) if tail is not None else None
-    return RestDigest(head, known, tuple(rests), bool(flags & 1), bool(flags & 2), tail)
-
-
-def _slot(numbers: tuple[int | float, ...]) -> Slot:
-    number, time, x, y, z, last, a, b, c, d, e, f = numbers
-    return Slot(int(number), Stop(int(time), (x, y, z)), int(last), Box3((a, b, c), (d, e, f)))
+        sizes, _, body = zlib.decompress(packed).partition(b"\n")
+        head, head_until, tail, tail_since, chains = json.loads(sizes)
+        at = head + tail
+        unpacked = []
+        for start, end, size in chains:
+            unpacked.append(ChainDigest(start, end, body[at : at + size]))
+            at += size
+    except (TypeError, zlib.error) as error:
+        raise ValueError(f"not a digest of standstills: {error}") from error
+    if at != len(body):
+        raise ValueError("not a digest of standstills: some of it is missing")
+    return StandstillDigest(
+        body[:head], head_until, body[head : head + tail], tail_since, tuple(unpacked)
+    )
 
 
 def packed_story(story: Story) -> bytes:

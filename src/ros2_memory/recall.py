@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ros2_memory.model import BagFile
     from ros2_memory.motion import PoseDigest
     from ros2_memory.recorder.runs import Run
-    from ros2_memory.rests import RestDigest
+    from ros2_memory.standstills import StandstillDigest
     from ros2_memory.storage.base import Record
     from ros2_memory.stories import Story
     from ros2_memory.topic_digest import EdgeDigest
@@ -96,9 +96,9 @@ class RunNotes:
         """For each of these entries that has it the digest of its poses."""
         return self._catalogue.poses(topic, among)
 
-    def rests(self, topic: str, among: Sequence[int]) -> Mapping[int, RestDigest]:
+    def standstills(self, topic: str, among: Sequence[int]) -> Mapping[int, StandstillDigest]:
         """For each of these entries that has it where its poses stand still."""
-        return self._catalogue.rests(topic, among)
+        return self._catalogue.standstills(topic, among)
 
     def stories(self, topic: str, among: Sequence[int]) -> Mapping[int, Story | None]:
         """For each of these entries what the messages of the topic say, as the catalogue has it."""

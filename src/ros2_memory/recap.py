@@ -16,9 +16,10 @@ from ros2_memory.accounts import Event, Recap
 from ros2_memory.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.moments import open_span
 from ros2_memory.presences import SILENCE_NS, united
+from ros2_memory.standstills import SHORTEST_NS
 from ros2_memory.stories import tells
-from ros2_memory.tales import rests_in, story_in
-from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, ns_from_unix
+from ros2_memory.tales import standstills_in, story_in
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS, ns_from_unix
 from ros2_memory.unseen import note_edges, note_unseen
 from ros2_memory.ways import way_driven
 from ros2_memory.wording import Reason, counted
@@ -31,14 +32,12 @@ if TYPE_CHECKING:
     from ros2_memory.model import TimeWindow
     from ros2_memory.moments import Span
     from ros2_memory.presences import Presence, Seen
-    from ros2_memory.rests import Rest
+    from ros2_memory.standstills import Standstill
     from ros2_memory.stories import Fault, Story
     from ros2_memory.timebase import Ns
     from ros2_memory.ways import Way
 
 MOST_EVENTS: Final = 25
-SHORTEST_STOP_NS: Final[Ns] = 3 * NS_PER_S
-"""A robot that stands for less is turning round, or minding its step."""
 
 _UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
 _KINDS: Final = ("gap", "error", "stop", "flip", "thing")
@@ -57,7 +56,7 @@ class _Drive:
     """How the robot moved; `frame_id` is that of its poses."""
 
     way: Way
-    rests: tuple[Rest, ...]
+    standstills: tuple[Standstill, ...]
 
 
 def recap(memory: Memory, call: Call, span: Span) -> Recap:
@@ -107,7 +106,8 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         now=memory.clock.now() if memory.limits.now == "wall" or latest is None else latest,
         distance_m=None if trajectory is None else trajectory.distance_m,
         max_speed=None if trajectory is None else trajectory.max_speed,
-        stood=None if drive is None else sum(rest.end - rest.start for rest in drive.rests),
+        stood=None if drive is None else sum(each.end - each.start for each in drive.standstills),
+        shortest_stop=SHORTEST_NS,
         frame_id=None if drive is None else drive.way.frames[0],
         events=tuple(told),
         throughout=tuple(sorted(throughout)),
@@ -124,11 +124,11 @@ def _drive(view: View, window: TimeWindow) -> _Drive | None:
         if way is None:
             view.note(f"{topic} has no poses in this time: nothing is known of the way")
             return None
-        rests = rests_in(view, topic, window)
+        standstills = standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
         view.note(f"nothing is known of the way: {error}")
         return None
-    return _Drive(way, tuple(rest for rest in rests if rest.end - rest.start >= SHORTEST_STOP_NS))
+    return _Drive(way, standstills)
 
 
 def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, Story]]:
@@ -140,10 +140,10 @@ def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, Story]]:
 
 
 def _stops(drive: _Drive) -> Iterator[Event]:
-    for rest in drive.rests:
-        x, y, _ = rest.box.centre
+    for start, end, box in drive.standstills:
+        x, y, _ = box.centre
         text = f"stood at x {x:z.2f}, y {y:z.2f}"
-        yield Event("stop", rest.start, rest.end, text, goes_on=rest.end >= drive.way.last)
+        yield Event("stop", start, end, text, goes_on=end >= drive.way.last)
 
 
 def _flips(topic: str, story: Story) -> Iterator[Event]:

@@ -9,11 +9,22 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import UndecodableError
 from ros2_memory.motion import is_place
-from ros2_memory.packing import packed_rests, packed_story, unpacked_rests, unpacked_story
+from ros2_memory.packing import (
+    packed_standstills,
+    packed_story,
+    unpacked_standstills,
+    unpacked_story,
+)
 from ros2_memory.portions import Kept, Kind, is_whole
-from ros2_memory.rests import RestBuilder, RestCollector, RestDigest
 from ros2_memory.sights import Sights
+from ros2_memory.standstills import (
+    CONTEXT_NS,
+    StandstillBuilder,
+    StandstillCollector,
+    StandstillDigest,
+)
 from ros2_memory.stories import MOST_TOLD, QUIET, Story, StoryBuilder, state_of
+from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS
 from ros2_memory.ways import add_poses
 
 if TYPE_CHECKING:
@@ -22,14 +33,14 @@ if TYPE_CHECKING:
     from ros2_memory.copies import Found
     from ros2_memory.history import View
     from ros2_memory.model import Pose, TimeWindow
-    from ros2_memory.rests import Rest
+    from ros2_memory.standstills import Standstill
     from ros2_memory.timebase import Ns
 
-_RESTS: Final = Kind(
-    "rests",
-    ask=lambda notes, topic, among: notes.rests(topic, among),
-    packed=lambda digest: packed_rests(digest).hex(),
-    unpacked=lambda text: unpacked_rests(bytes.fromhex(text)),
+_STANDSTILLS: Final = Kind(
+    "standstills",
+    ask=lambda notes, topic, among: notes.standstills(topic, among),
+    packed=lambda digest: packed_standstills(digest).hex(),
+    unpacked=lambda text: unpacked_standstills(bytes.fromhex(text)),
 )
 _STORIES: Final = Kind(
     "story",
@@ -42,7 +53,7 @@ _STORIES: Final = Kind(
 class _Standing:
     """Takes poses for what only asks where they are."""
 
-    def __init__(self, to: RestBuilder | RestCollector) -> None:
+    def __init__(self, to: StandstillBuilder | StandstillCollector) -> None:
         self._to = to
 
     def add(self, time: Ns, pose: Pose, _speed_mps: float | None = None) -> None:
@@ -51,14 +62,19 @@ class _Standing:
             self._to.add(time, pose.position)
 
 
-def rests_in(view: View, topic: str, window: TimeWindow) -> tuple[Rest, ...]:
-    """Where the poses of a topic stand still in a window, in order.
+def standstills_in(view: View, topic: str, window: TimeWindow) -> tuple[Standstill, ...]:
+    """Return where the poses of a topic stand still, in order, as far as it is in a window.
+
+    Poses outside of the window count too: a standstill that goes on beyond an end of the window
+    ends there, however little of it is inside. So those of windows that follow each other add up.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
     """
-    builder = RestBuilder()
-    kept: Kept[RestDigest] = Kept(view, topic, _RESTS, window)
+    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
+    window = window.widened(CONTEXT_NS)
+    builder = StandstillBuilder()
+    kept: Kept[StandstillDigest] = Kept(view, topic, _STANDSTILLS, window)
     sights = Sights(view.memory.reader, view.memory.extractor)
     for group in view.groups(topic, window):
         failures: list[UndecodableError] = []
@@ -67,14 +83,18 @@ def rests_in(view: View, topic: str, window: TimeWindow) -> tuple[Rest, ...]:
         elif (known := kept.of(group)) is not None:
             builder.join(known[0])
         else:
-            collector = RestCollector()
+            collector = StandstillCollector()
             span = add_poses(view, _Standing(collector), sights, group.once(), failures)
             digest = collector.digest()
             if digest is not None:
                 builder.join(digest)
                 if span is not None and not failures:
                     kept.keep(group, digest, span)
-    return builder.rests()
+    return tuple(
+        each._replace(start=max(each.start, start), end=min(each.end, end))
+        for each in builder.standstills()
+        if each.start < end and each.end > start
+    )
 
 
 def story_in(view: View, topic: str, window: TimeWindow) -> Story | None:

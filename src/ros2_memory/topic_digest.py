@@ -11,7 +11,7 @@ from ros2_memory.errors import UndecodableError
 from ros2_memory.evidence_collector import EvidenceCollector
 from ros2_memory.motion import is_place
 from ros2_memory.mould import mould_of
-from ros2_memory.rests import RestCollector
+from ros2_memory.standstills import StandstillCollector
 from ros2_memory.stories import MOST_TOLD, StoryBuilder, state_of
 from ros2_memory.trajectory import PoseCollector
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ros2_memory.model import Pose, StampedTransform
     from ros2_memory.motion import PoseDigest
     from ros2_memory.mould import Mould
-    from ros2_memory.rests import RestDigest
+    from ros2_memory.standstills import StandstillDigest
     from ros2_memory.storage.base import BagReader, Record
     from ros2_memory.stories import State, Story
     from ros2_memory.timebase import Ns
@@ -62,7 +62,7 @@ class TopicDigest:
         topic: its name.
         evidence: what rules conditions out.
         poses: what its poses amount to; None where some message carries none.
-        rests: where they stand still; None where `poses` is None or has no valid one.
+        standstills: where they stand still; None where `poses` is None or has no valid one.
         story: what its messages say; None where there is none.
         edges: its frame edges; None where some message could not be decoded, or they are too many.
         kept: all its messages in order, where they are few; else None.
@@ -72,7 +72,7 @@ class TopicDigest:
     topic: str
     evidence: Evidence
     poses: PoseDigest | None
-    rests: RestDigest | None
+    standstills: StandstillDigest | None
     story: Story | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
@@ -115,7 +115,7 @@ class TopicCollector:
         self._latched = latched
         self._evidence = EvidenceCollector()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
-        self._rests = RestCollector()
+        self._standstills = StandstillCollector()
         self._story = StoryBuilder()
         self._pairs: set[tuple[str, str]] | None = set()
         self._ends: tuple[Record, Record] | None = None
@@ -146,7 +146,7 @@ class TopicCollector:
             topic=self._topic,
             evidence=self._evidence.evidence(),
             poses=None if self._poses is None else self._poses.digest(),
-            rests=None if self._poses is None else self._rests.digest(),
+            standstills=None if self._poses is None else self._standstills.digest(),
             story=self._story.story(MOST_TOLD),
             edges=self._edges(),
             kept=tuple(self._kept) if self._kept is not None and few else None,
@@ -207,7 +207,7 @@ class TopicCollector:
         elif self._poses is not None:
             self._poses.add(record.log_time, seen.pose, seen.speed_mps)
             if is_place(seen.pose.position):
-                self._rests.add(record.log_time, seen.pose.position)
+                self._standstills.add(record.log_time, seen.pose.position)
 
     def _flush(self) -> None:
         """Takes the waiting messages: those of one mould together, the others one by one."""

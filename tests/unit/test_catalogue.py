@@ -87,7 +87,7 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
             held.evidence.booleans,
         )
         assert again.poses(held.topic, [number]).get(number) == held.poses
-        assert again.rests(held.topic, [number]).get(number) == held.rests
+        assert again.standstills(held.topic, [number]).get(number) == held.standstills
         assert again.stories(held.topic, [number]) == {
             number: QUIET if held.story is not None and held.story.says_nothing else held.story
         }
@@ -95,9 +95,9 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
         assert again.kept(held.topic, [number]).get(number) == held.kept
     assert topic(DIGEST, "/odom").poses is not None
     assert topic(DIGEST, "/tf_static").kept is not None
-    rests, story = topic(DIGEST, "/odom").rests, topic(DIGEST, "/bumper").story
-    assert rests is not None
-    assert len(rests.rests) == 1
+    standstills, story = topic(DIGEST, "/odom").standstills, topic(DIGEST, "/bumper").story
+    assert standstills is not None
+    assert standstills.head
     assert story is not None
     assert len(story.flips) == 1
 
@@ -129,7 +129,9 @@ def test_what_is_told_of_topics_comes_back_from_a_file_that_took_another_ones_pl
     [number] = catalogue.find([KEY])
     assert former is not None
     assert number is not None
-    assert catalogue.rests("/odom", [former, number]) == {number: topic(DIGEST, "/odom").rests}
+    assert catalogue.standstills("/odom", [former, number]) == {
+        number: topic(DIGEST, "/odom").standstills
+    }
     story = topic(DIGEST, "/bumper").story
     assert catalogue.stories("/bumper", [former, number]) == {number: story}
 
