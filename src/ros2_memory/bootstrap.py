@@ -158,7 +158,7 @@ def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
     if settings.server.traces:
         with _optional("server.traces"):
             from ros2_memory.observability import traces  # noqa: PLC0415 - an extra
-        observers.append(traces.traces_from_environment())
+        observers.append(traces.traces_from_environment(arguments=settings.logging.arguments))
     return Telemetry(tuple(observers), exposition)
 
 
@@ -192,4 +192,5 @@ def build_dispatcher(
         call_timeout_s=served.call_timeout_s,
         readable=readable_tools(memory.limits),
         telemetry=telemetry,
+        log_arguments=settings.logging.arguments,
     )

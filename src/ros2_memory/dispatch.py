@@ -60,7 +60,8 @@ log = get_logger(__name__)
 class Dispatcher:
     """Answers tool calls from one memory, a bounded number at a time.
 
-    `readable`: what no tool call reaches, but a resource that is read.
+    `readable`: what no tool call reaches, but a resource that is read. `log_arguments`: whether log
+    events show what a caller wrote, cut short.
 
     Attributes:
         tools: what a call can name, in the order of their declaration.
@@ -75,6 +76,7 @@ class Dispatcher:
         call_timeout_s: float,
         readable: Sequence[Tool] = (),
         telemetry: Telemetry = SILENT,
+        log_arguments: bool = True,
     ) -> None:
         self.tools = (*tools,)
         self._memory = memory
@@ -83,6 +85,7 @@ class Dispatcher:
         self._replies = replies
         self._call_timeout_s = call_timeout_s
         self._telemetry = telemetry
+        self._log_arguments = log_arguments
         self.quick = Lane("quick", QUICK_AT_ONCE)
         self.blocking = Lane("blocking", BLOCKING_AT_ONCE)
         self._stopping = threading.Event()
@@ -138,15 +141,18 @@ class Dispatcher:
                     correlation_id,
                     call.stages.as_ms(),
                 )
-                self._tell(done, name if known else glimpse(name), given)
+                self._tell(done, name, given)
         return reply
 
     def _tell(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
         """Of a call that is over: the log, and whoever observes."""
-        log.info(
+        tool, _log = done.tool, log
+        if self._log_arguments:
+            tool = name if tool != UNKNOWN_TOOL else glimpse(name)
+            _log = log.bind(arguments=glimpse(given, _LOGGED_CHARS))
+        _log.info(
             "tool_call",
-            tool=name,
-            arguments=glimpse(given, _LOGGED_CHARS),
+            tool=tool,
             outcome=done.outcome,
             duration_ms=round(done.duration_s * 1000, 3),
             stages_ms=done.stages_ms,

@@ -18,24 +18,34 @@ from structlog.stdlib import ProcessorFormatter
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from structlog.typing import FilteringBoundLogger, Processor
+    from structlog.typing import EventDict, FilteringBoundLogger, Processor
 
 _TALKATIVE: Final = "mcp.server.streamable_http"
 """Says at the end of each request that a session ends, where there are no sessions."""
+
+LONGEST: Final = 8000
+"""Characters of any text of a log event, be it a traceback or what a library repeats."""
 
 EVERY_S: Final = 10.0
 """How often at most one kind of refusal is logged, and one sentence of a library that clients can
 have it say: nobody who may not ask can fill the disk by being refused."""
 
+_LIBRARY: Final = "mcp"
 _LIBRARIES: Final = ("asyncio", "mcp", "starlette", "uvicorn")
 _ALIKE_CHARS: Final = 32
 _MOST_KINDS: Final = 256
 
 
 def configure_logging(
-    level: Literal["debug", "info", "warning", "error"], layout: Literal["json", "pretty"]
+    level: Literal["debug", "info", "warning", "error"],
+    layout: Literal["json", "pretty"],
+    *,
+    arguments: bool = True,
 ) -> None:
     """Sends every event of at least `level` to stderr, with a UTC timestamp.
+
+    Without `arguments` the MCP library, which shows whole messages at `debug`, logs warnings alone,
+    and without what clients sent. Nothing that is logged is longer than `LONGEST` characters.
 
     `json` is for machines; `pretty` is for people, and coloured on a terminal. Call it before a
     server is built: the MCP SDK configures logging itself where nobody has.
@@ -48,14 +58,15 @@ def configure_logging(
         structlog.processors.StackInfoRenderer(),
     ]
     render: list[Processor] = (
-        [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+        [structlog.processors.format_exc_info, _cut, structlog.processors.JSONRenderer()]
         if layout == "json"
         else [
+            _cut,
             structlog.dev.ConsoleRenderer(
                 colors=sys.stderr.isatty(),
                 # The default one prints local variables, which may hold what logs must not.
                 exception_formatter=structlog.dev.plain_traceback,
-            )
+            ),
         ]
     )
     structlog.configure(
@@ -76,6 +87,9 @@ def configure_logging(
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     least = logging.WARNING if level == "info" else logging.NOTSET
     logging.getLogger(_TALKATIVE).setLevel(least)
+    logging.getLogger(_LIBRARY).setLevel(logging.NOTSET if arguments else logging.WARNING)
+    if not arguments:
+        handler.addFilter(_without_arguments)
     logging.captureWarnings(capture=True)
 
 
@@ -86,6 +100,23 @@ def get_logger(name: str) -> FilteringBoundLogger:
     """
     logger: FilteringBoundLogger = structlog.get_logger(name)
     return logger
+
+
+def _cut(_logger: object, _method: str, event: EventDict) -> EventDict:
+    """Cuts texts that are too long; a traceback keeps its end, which says what was raised."""
+    for name, value in event.items():
+        if isinstance(value, str) and len(value) > LONGEST:
+            is_traceback = name == "exception"
+            event[name] = f"...{value[-LONGEST:]}" if is_traceback else f"{value[:LONGEST]}..."
+    return event
+
+
+def _without_arguments(record: logging.LogRecord) -> bool:
+    """Takes out of a library's record what a client may have sent: its parameters and traceback."""
+    if record.name.partition(".")[0] == _LIBRARY:
+        record.msg, record.args = str(record.msg)[:_ALIKE_CHARS], ()
+        record.exc_info = record.exc_text = None
+    return True
 
 
 class Refusals:

@@ -82,7 +82,9 @@ def _run(overrides: Sequence[str]) -> None:
     """
     with exit_on_config_error(PROGRAM):
         settings = load_settings(overrides)
-        configure_logging(settings.logging.level, settings.logging.format)
+        configure_logging(
+            settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
+        )
         front = None if settings.server.transport == "stdio" else _front(settings.server)
         memory = build_memory(settings)
         telemetry = build_telemetry(settings, memory)

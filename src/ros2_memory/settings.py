@@ -155,6 +155,7 @@ class LoggingSettings:
 
     level: Literal["debug", "info", "warning", "error"]
     format: Literal["json", "pretty"]
+    arguments: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

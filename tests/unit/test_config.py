@@ -71,7 +71,7 @@ class TestDefaults:
                 "metrics": False,
                 "traces": False,
             },
-            "logging": {"level": "info", "format": "json"},
+            "logging": {"level": "info", "format": "json", "arguments": True},
             "storage": {
                 "target": MCAP,
                 "custom_msg_paths": (),

@@ -206,6 +206,19 @@ async def test_each_call_is_logged_once_with_its_outcome_and_times(log: LogCaptu
     assert len({entry["correlation_id"] for entry in log.entries}) == 3
 
 
+async def test_arguments_are_left_out_of_the_log_where_they_are_not_wanted(log: LogCapture) -> None:
+    tools = [tool("ask", lambda _: value(1))]
+    replies = Replies(Path("bags"), 24_000)
+    silent = Dispatcher(NOBODY, tools, replies, call_timeout_s=25, log_arguments=False)
+    await silent.answer("ask", {"s3cret": "s3cret"})
+    await silent.answer("s3cret", {"s3cret": "s3cret"})
+    assert [(each["event"], each["tool"]) for each in log.entries] == [
+        ("tool_call", "ask"),
+        ("tool_call", "unknown"),
+    ]
+    assert "s3cret" not in str(log.entries)
+
+
 async def test_a_query_that_takes_too_long_gives_up_by_itself() -> None:
     async with Client(served(tool("slow", until_given_up), timeout_s=1.0)) as client:
         result = await client.call_tool("slow", {})

@@ -209,3 +209,30 @@ def test_refusals_are_counted_between_what_is_logged() -> None:
         counts.append(refusals.count("a"))
     assert [each for each in counts if each] == [1, 10, 10]
     assert refusals.count("b") == 1
+
+
+def test_nothing_that_is_logged_is_endless(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("debug", "json")
+    long = "x" * 1_000_000
+    logging.getLogger("mcp.server.sse").debug(f"Received JSON: {long}")
+    get_logger("ros2_memory.test").info("ours", reason=long)
+    fault = ValueError(f"{long}the end")
+    get_logger("ros2_memory.test").error("failed", exc_info=fault)
+    told = events(capsys)
+    assert len(told) == 3
+    assert all(len(json.dumps(each)) < 2 * logs.LONGEST for each in told)
+    assert told[2]["exception"].endswith("the end")
+
+
+@pytest.mark.parametrize("level", ["debug", "info"])
+def test_without_arguments_the_library_shows_nothing_of_a_message(
+    level: Literal["debug", "info"], capsys: pytest.CaptureFixture[str]
+) -> None:
+    configure_logging(level, "json", arguments=False)
+    theirs = logging.getLogger("mcp.server.sse")
+    theirs.debug("Received JSON: %s", "s3cret")
+    theirs.warning("Rejecting message for session %s: credential does not match", "s3cret")
+    theirs.error("Failed to parse message", exc_info=ValueError("s3cret"))
+    told = events(capsys)
+    assert [each["level"] for each in told] == ["warning", "error"]
+    assert "s3cret" not in str(told)

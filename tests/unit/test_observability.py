@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
-from mcp import Client
+from mcp import Client, MCPError
 
 from ros2_memory import answers
 from ros2_memory.dispatch import Dispatcher
@@ -128,13 +128,16 @@ class TestMetrics:
 
 
 @pytest.fixture
-def spans(monkeypatch: pytest.MonkeyPatch) -> Iterator[InMemorySpanExporter]:
+def spans(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[InMemorySpanExporter]:
     """Spans of the MCP library, and of a server that `traced` builds.
 
     The provider of a process can be set once, so the library is given one here instead.
     """
     exporter = InMemorySpanExporter()
-    provider = provider_to(SimpleSpanProcessor(exporter))
+    arguments = getattr(request, "param", True)
+    provider = provider_to(SimpleSpanProcessor(exporter), arguments=arguments)
     monkeypatch.setattr("mcp.shared._otel._tracer", provider.get_tracer("mcp-python-sdk"))
     monkeypatch.setattr(trace, "get_tracer_provider", lambda: provider)
     yield exporter
@@ -211,6 +214,34 @@ class TestTraces:
         assert attributes["gen_ai.tool.name"] == UNKNOWN_TOOL
         assert max(len(str(each)) for each in attributes.values()) <= LONGEST
 
+    async def test_whatever_a_client_sends_spans_stay_small(
+        self, spans: InMemorySpanExporter
+    ) -> None:
+        long = "x" * 100_000
+        async with Client(traced()) as client:
+            await client.call_tool(long, {long: long})
+            for ask in (client.get_prompt, client.read_resource):
+                with pytest.raises(MCPError):
+                    await ask(f"file:///{long}")
+        assert len(spans.get_finished_spans()) >= 3
+        for each in spans.get_finished_spans():
+            assert len(each.to_json()) < 4000
+
+    @pytest.mark.parametrize("spans", [False], indirect=True)
+    async def test_without_arguments_nothing_that_a_client_chose_is_in_a_span(
+        self, spans: InMemorySpanExporter
+    ) -> None:
+        async with Client(traced()) as client:
+            await client.call_tool("full", {"s3cret": "s3cret"})
+            await client.call_tool("s3cret", {"s3cret": "s3cret"})
+            for ask in (client.get_prompt, client.read_resource):
+                with pytest.raises(MCPError):
+                    await ask("file:///s3cret")
+        served = [each for each in spans.get_finished_spans() if each.kind is trace.SpanKind.SERVER]
+        assert "s3cret" not in "".join(each.to_json() for each in served)
+        names = {each.name for each in served}
+        assert {"tools/call full", "tools/call unknown", "prompts/get", "resources/read"} <= names
+
     async def test_a_call_that_did_not_come_over_mcp_gets_a_span_of_its_length(
         self, spans: InMemorySpanExporter
     ) -> None:
@@ -258,7 +289,7 @@ class TestTraces:
     ) -> None:
         monkeypatch.setenv("OTEL_SPAN_EVENT_COUNT_LIMIT", "many")
         with pytest.raises(ConfigError, match=r"server\.traces: .* OTEL_SPAN_EVENT_COUNT_LIMIT"):
-            traces_from_environment()
+            traces_from_environment(arguments=True)
 
     def test_stopping_does_not_wait_for_an_exporter_that_hangs(self) -> None:
         freed = threading.Event()

@@ -49,7 +49,9 @@ def _for_people(settings: Settings, *, verbose: bool) -> None:
 def _beside(settings: Settings, server: int) -> None:
     if not die_with(server):
         raise typer.Exit(CANNOT_RUN)
-    configure_logging(settings.logging.level, settings.logging.format)
+    configure_logging(
+        settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
+    )
     filler = build_filler(settings, build_memory(settings))
     step_back()
     fill(filler, None, orphaned())

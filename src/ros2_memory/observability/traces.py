@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from opentelemetry import trace
 from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
 from opentelemetry.sdk.resources import SERVICE_NAME, Resource
-from opentelemetry.sdk.trace import SpanLimits, SpanProcessor, TracerProvider
+from opentelemetry.sdk.trace import ReadableSpan, SpanLimits, SpanProcessor, TracerProvider
 from opentelemetry.sdk.trace.export import BatchSpanProcessor
 from opentelemetry.trace import SpanKind, Status, StatusCode
 
@@ -71,18 +71,66 @@ class Traces(Observer):
         ending.join(_ENDS_WITHIN_S)
 
 
-class ShortNames(SpanProcessor):
-    """Shortens the names of spans: a client may call a tool whatever it likes."""
+class Bounded(SpanProcessor):
+    """Passes spans on whose names and sentences are of bounded length, as their attributes are.
+
+    A client may call a tool or a method whatever it likes, and the MCP library repeats that in the
+    name and the status of a span.
+
+    Args:
+        processor: what they are passed on to.
+        arguments: whether texts that a client chose may be shown, cut short.
+    """
+
+    def __init__(self, processor: SpanProcessor, *, arguments: bool) -> None:
+        self._processor = processor
+        self._arguments = arguments
 
     def on_start(self, span: Span, parent_context: Context | None = None) -> None:
-        """Before anything is kept of it."""
-        del parent_context
-        if len(span.name) > LONGEST:
-            span.update_name(f"{span.name[: LONGEST - 3]}...")
+        """Passes it on."""
+        self._processor.on_start(span, parent_context)
+
+    def on_end(self, span: ReadableSpan) -> None:
+        """Passes on what may be shown of it."""
+        attributes = dict(span.attributes or {})
+        name, description, events = span.name, span.status.description, span.events
+        if not self._arguments:
+            attributes.pop("gen_ai.prompt.name", None)
+            tool = attributes.get("gen_ai.tool.name")
+            name = str(attributes.get("mcp.method.name", name)) + (f" {tool}" if tool else "")
+            description, events = None, ()
+        self._processor.on_end(
+            ReadableSpan(
+                name=name if len(name) <= LONGEST else f"{name[: LONGEST - 3]}...",
+                context=span.context,
+                parent=span.parent,
+                resource=span.resource,
+                attributes=attributes,
+                events=events,
+                links=span.links,
+                kind=span.kind,
+                status=Status(
+                    span.status.status_code, None if description is None else description[:LONGEST]
+                ),
+                start_time=span.start_time,
+                end_time=span.end_time,
+                instrumentation_scope=span.instrumentation_scope,
+            )
+        )
+
+    def shutdown(self) -> None:
+        """Passes it on."""
+        self._processor.shutdown()
+
+    def force_flush(self, timeout_millis: int = 30000) -> bool:
+        """Passes it on."""
+        return self._processor.force_flush(timeout_millis)
 
 
-def provider_to(processor: SpanProcessor) -> TracerProvider:
+def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerProvider:
     """A provider whose spans are of bounded size; sampler and resource are the environment's.
+
+    `arguments`: whether texts that a client chose, such as a tool's name, may be in them.
 
     It is named `ros2-memory-server` unless `OTEL_SERVICE_NAME` or `OTEL_RESOURCE_ATTRIBUTES` name
     it.
@@ -92,13 +140,14 @@ def provider_to(processor: SpanProcessor) -> TracerProvider:
         resource = resource.merge(Resource({SERVICE_NAME: SERVICE}))
     limits = SpanLimits(max_attribute_length=LONGEST, max_span_attribute_length=LONGEST)
     provider = TracerProvider(resource=resource, span_limits=limits, shutdown_on_exit=False)
-    provider.add_span_processor(ShortNames())
-    provider.add_span_processor(processor)
+    provider.add_span_processor(Bounded(processor, arguments=arguments))
     return provider
 
 
-def traces_from_environment() -> Traces:
+def traces_from_environment(*, arguments: bool) -> Traces:
     """Sets the provider of this process, to which the MCP library's spans go too.
+
+    `arguments` is as for `provider_to`.
 
     Where spans are sent to, and how, is said by the standard `OTEL_*` variables.
 
@@ -106,7 +155,7 @@ def traces_from_environment() -> Traces:
         ConfigError: one of them holds what cannot be used.
     """
     try:
-        provider = provider_to(BatchSpanProcessor(OTLPSpanExporter()))
+        provider = provider_to(BatchSpanProcessor(OTLPSpanExporter()), arguments=arguments)
     except ValueError as error:
         raise ConfigError(
             f"server.traces: an OTEL_* variable of the environment cannot be used: {error}"
