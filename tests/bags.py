@@ -39,11 +39,28 @@ TRANSIENT_LOCAL: Final = _QOS.format(durability="transient_local")
 VOLATILE: Final = _QOS.format(durability="volatile")
 
 
+OTHER_ROBOTS: Final = {
+    "turtlesim/msg/Pose": (
+        "float32 x\nfloat32 y\nfloat32 theta\nfloat32 linear_velocity\nfloat32 angular_velocity\n"
+    ),
+    "px4_msgs/msg/VehicleOdometry": (
+        "uint64 timestamp\nuint64 timestamp_sample\nuint8 pose_frame\nfloat32[3] position\n"
+        "float32[4] q\nuint8 velocity_frame\nfloat32[3] velocity\nfloat32[3] angular_velocity\n"
+        "float32[3] position_variance\nfloat32[3] orientation_variance\n"
+        "float32[3] velocity_variance\nuint8 reset_counter\nint8 quality\n"
+    ),
+    "px4_msgs/msg/VehicleLocalPosition": (
+        "uint64 timestamp\nbool xy_valid\nfloat32 x\nfloat32 y\nfloat32 z\nfloat32 heading\n"
+    ),
+}
+"""Types that carry a pose in ways of their own (of the last some of its fields)."""
+
+
 @cache
 def typestore() -> Typestore:
-    """Jazzy's standard types and `ros2_vision_interfaces`."""
+    """Jazzy's standard types, `ros2_vision_interfaces`, and `OTHER_ROBOTS`."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in VISION_DEFINITIONS.items():
+    for name, text in {**VISION_DEFINITIONS, **OTHER_ROBOTS}.items():
         store.register(get_types_from_msg(text, name))
     return store
 

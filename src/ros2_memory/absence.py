@@ -19,7 +19,7 @@ from ros2_memory.timebase import (
     unix_rounded_up,
 )
 from ros2_memory.unseen import may_be_written, note_unseen
-from ros2_memory.wording import counted
+from ros2_memory.wording import counted, listed
 
 if TYPE_CHECKING:
     from ros2_memory.history import View
@@ -51,6 +51,51 @@ def resolve_topic(view: View, name: str) -> str:
         if candidate in topics:
             return candidate
     raise not_recorded(view, name)
+
+
+def resolve_pose_topic(view: View, name: str | None = None, what: str = "position") -> str:
+    """The recorded topic that a question about the robot's motion means.
+
+    Args:
+        view: what is recorded.
+        name: the topic that was asked for; None for `data.pose_topic`.
+        what: "position" or "velocity".
+
+    Raises:
+        NoDataError: as `resolve_topic`; where the configured topic is not recorded the sentence
+            names those that carry poses.
+    """
+    if name is not None:
+        return resolve_topic(view, name)
+    configured = view.memory.limits.pose_topic
+    try:
+        return resolve_topic(view, configured)
+    except NoDataError as error:
+        those = topics_with(view, what) or topics_with(view, "geodetic")
+        if error.reason is not NoDataReason.TOPIC_NOT_RECORDED or not those:
+            raise
+        what = {"position": "poses", "velocity": "velocities"}[what]
+        which = those[0].partition(" ")[0] if len(those) == 1 else "to one of them"
+        told = (
+            f"no topic {configured} is recorded, which data.pose_topic names; {what} are on "
+            f"{listed(those)}: set data.pose_topic{'=' if len(those) == 1 else ' '}{which}, "
+            "or give topic where the tool takes it"
+        )
+        raise NoDataError(error.reason, told, error.notes) from error
+
+
+def topics_with(view: View, what: str) -> list[str]:
+    """The recorded topics of types that carry a `position`, `velocity` or `geodetic` place.
+
+    Each with its type behind it. What types that are not in the schema map carry is not known.
+    """
+    kinds_of = view.memory.extractor.kinds_of
+    return [
+        f"{topic} ({type_name})"
+        for topic in view.snapshot.topics()
+        for type_name in sorted(view.snapshot.types_of(topic))
+        if what in kinds_of(type_name)
+    ]
 
 
 def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
@@ -102,7 +147,7 @@ def not_recorded(view: View, name: str) -> NoDataError:
         told = f"{name} is declared in the bags, but not one message of it was recorded"
     else:
         told = f"no topic {name} is recorded"
-    close = get_close_matches(name, snapshot.topics(), n=5, cutoff=0.5)
+    close = get_close_matches(name, snapshot.topics(), n=5, cutoff=0.6)
     if not close:
         stem = name.rstrip("/").rpartition("/")[2].strip("*")
         close = [topic for topic in snapshot.topics() if stem and stem in topic][:5]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ros2_memory.model import Pose, Sample, SetAside, Transform, Twist
+    from ros2_memory.model import Geodetic, Pose, Sample, SetAside, Transform, Twist
     from ros2_memory.tf_tree import FrameEdge
     from ros2_memory.timebase import Ns
     from ros2_memory.trajectory import Trajectory
@@ -105,13 +105,17 @@ class TopicRange:
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Where the robot was, in the pose's own frame."""
+    """Where the robot was, in the pose's own frame.
+
+    `geodetic` is set for a satellite receiver, and the pose's coordinates are NaN then.
+    """
 
     topic: str
     time: Ns
     pose: Pose
     notes: tuple[str, ...] = ()
     age: Ns | None = None
+    geodetic: Geodetic | None = None
 
 
 @dataclass(frozen=True, slots=True)

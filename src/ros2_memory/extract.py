@@ -1,27 +1,44 @@
 """Messages into plain values, by a map of dot-paths for each message type.
 
 The schema map (`config/message_schemas.yaml`) names, for a type, the fields that a reply shows
-and the path at which each stands in the message. The names `position` and `orientation`,
-`linear_velocity` and `angular_velocity` also tell where a pose and a twist are. Types that are not
-in the map are shown with all their fields.
+and the path at which each stands in the message. Some names have a meaning. A pose is read from
+`position` and `orientation`, from `translation` and `rotation`, or from `x`, `y`, `z` and a heading
+in radians (`theta`, `yaw` or `heading`); a twist from `linear_velocity` and `angular_velocity`; a
+place on the Earth in degrees from `latitude`, `longitude` and `altitude`; `pose_frame` and
+`velocity_frame` are PX4's numbers of frames. Types that are not in the map are shown with all
+their fields.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.messages import ABSENT, Route, Segments, descend, names_of, parse_path
-from ros2_memory.model import JsonValue, Pose, StampedTransform, Transform, Twist
+from ros2_memory.model import Geodetic, JsonValue, Pose, StampedTransform, Transform, Twist
 from ros2_memory.rendering import MAX_SQUEEZE, Exact, Rendering, Shown
-from ros2_memory.views import Kind, kind_of, nanoseconds, rotation, view, xyz, xyzw
+from ros2_memory.views import (
+    Kind,
+    Metric,
+    euler,
+    kind_of,
+    nanoseconds,
+    rotation,
+    unit,
+    view,
+    xyz,
+    xyzw,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from ros2_memory.model import Vector3
+    from ros2_memory.model import Quaternion, Vector3
     from ros2_memory.timebase import Ns
 
 MAX_SHOWN_CHARS: Final = 20_000
@@ -40,12 +57,54 @@ class Extracted:
 
 
 @dataclass(frozen=True, slots=True)
+class _Point:
+    """A pose as a point and a rotation; `arrays`: they may be arrays, as PX4 writes them."""
+
+    position: Route
+    orientation: Route
+    arrays: bool = False
+
+    def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
+        node = self.position.of(message)
+        where = xyz(node)
+        if where is None and self.arrays:
+            where = _triple(node)
+        if where is None:
+            return None
+        turned = self.orientation.of(message)
+        turn = rotation(turned)
+        return where, _px4_rotation(turned) if turn is None and self.arrays else turn
+
+
+@dataclass(frozen=True, slots=True)
+class _Planar:
+    """A pose as x, y, perhaps z (m; 0 without one) and a heading (rad) in fields of their own."""
+
+    x: Route
+    y: Route
+    z: Route
+    heading: Route
+
+    def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
+        x, y = _number(self.x.of(message)), _number(self.y.of(message))
+        if x is None or y is None:
+            return None
+        z, heading = _number(self.z.of(message)), _number(self.heading.of(message))
+        if heading is None or not math.isfinite(heading):
+            return (x, y, z or 0.0), None
+        return (x, y, z or 0.0), (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
+
+
+@dataclass(frozen=True, slots=True)
 class _Plan:
-    """What the schema map says of one type, compiled. Pairs of routes are tried in order."""
+    """What the schema map says of one type, compiled. Poses and twists are tried in order."""
 
     fields: tuple[tuple[str, Segments], ...]
-    poses: tuple[tuple[Route, Route], ...]
+    poses: tuple[_Point | _Planar, ...]
     twists: tuple[tuple[Route, Route], ...]
+    geodetic: tuple[Route, Route, Route] | None = None
+    pose_frame: Route | None = None
+    velocity_frame: Route | None = None
 
     def path(self, name: str) -> Segments | None:
         """The path of a field."""
@@ -56,10 +115,11 @@ def _pair(*segments: str, of: tuple[str, str]) -> tuple[Route, Route]:
     return Route(*segments, of[0]), Route(*segments, of[1])
 
 
+_HEADINGS: Final = ("theta", "yaw", "heading")
 _UNMAPPED: Final = _Plan(
     fields=(),
     poses=tuple(
-        _pair(*prefix, of=("position", "orientation"))
+        _Point(*_pair(*prefix, of=("position", "orientation")))
         for prefix in (("pose", "pose"), ("pose",), ())
     ),
     twists=tuple(
@@ -72,6 +132,10 @@ _STAMP: Final = Route("header", "stamp")
 _TRANSFORMS: Final = Route("transforms")
 _TRANSLATION: Final = Route("transform", "translation")
 _ROTATION: Final = Route("transform", "rotation")
+_POINTS: Final = frozenset({"position", "linear_velocity", "angular_velocity"})
+_POSE_FRAMES: Final = {1: "NED", 2: "FRD"}
+_VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 3: "body FRD"}
+"""The constants of px4_msgs/msg/VehicleOdometry."""
 
 
 class SchemaExtractor:
@@ -143,15 +207,40 @@ class SchemaExtractor:
     def pose(self, message: object, type_name: str) -> Pose | None:
         """The pose that a message carries, in its header's frame; None where it carries none.
 
-        By the schema map's `position` and `orientation`; for a type that is not in the map, by a
-        point at `pose.pose.position`, `pose.position` or `position`. Coordinates are as they
-        stand, NaN included.
+        By the schema map's names; for a type that is not in the map, by a point at
+        `pose.pose.position`, `pose.position` or `position`, or by `x`, `y` and a heading.
+        Coordinates are as they stand, NaN included.
         """
-        for position, orientation in self._plan(type_name).poses:
-            where = xyz(position.of(message))
-            if where is not None:
-                return Pose(where, rotation(orientation.of(message)), _text(_FRAME.of(message)))
-        return None
+        plan = self._plan(type_name)
+        for route in plan.poses:
+            found = route.of(message)
+            if found is not None:
+                frame = _text(_FRAME.of(message)) or _frame(plan.pose_frame, message, _POSE_FRAMES)
+                return Pose(*found, frame)
+        return _headed(message) if plan is _UNMAPPED else None
+
+    def geodetic(self, message: object, type_name: str) -> Geodetic | None:
+        """The place on the Earth that a message carries; None where it carries none."""
+        routes = self._plan(type_name).geodetic
+        if routes is None:
+            return None
+        latitude, longitude, altitude = (_number(route.of(message)) for route in routes)
+        if latitude is None or longitude is None:
+            return None
+        above = math.nan if altitude is None else altitude
+        return Geodetic(latitude, longitude, above, _text(_FRAME.of(message)))
+
+    def kinds_of(self, type_name: str) -> frozenset[str]:
+        """What messages of a mapped type carry: `position`, `velocity`, `geodetic`."""
+        plan = self._plan(type_name)
+        if plan is _UNMAPPED:
+            return frozenset()
+        has = {
+            "position": any(not _is_bare(route) for route in plan.poses),
+            "velocity": bool(plan.twists),
+            "geodetic": plan.geodetic is not None,
+        }
+        return frozenset(kind for kind, carried in has.items() if carried)
 
     def twist(self, message: object, type_name: str) -> Twist | None:
         """The velocity that a message carries; None where it carries none.
@@ -160,11 +249,16 @@ class SchemaExtractor:
         map, by vectors at `twist.twist` or `twist`. It is expressed in the child frame where the
         message names one (nav_msgs/Odometry), otherwise in the header's frame.
         """
-        for linear, angular in self._plan(type_name).twists:
-            along, about = xyz(linear.of(message)), xyz(angular.of(message))
+        plan = self._plan(type_name)
+        for linear, angular in plan.twists:
+            ahead, turning = linear.of(message), angular.of(message)
+            along, about = xyz(ahead), xyz(turning)
+            if along is None and plan is not _UNMAPPED:
+                along, about = _velocity(ahead, 0), _velocity(turning, 2)
             if along is not None and about is not None:
                 frame = _text(_CHILD_FRAME.of(message)) or _text(_FRAME.of(message))
-                return Twist(along, about, frame)
+                numbered = _frame(plan.velocity_frame, message, _VELOCITY_FRAMES)
+                return Twist(along, about, frame or numbered)
         return None
 
     def frame(self, message: object) -> str:
@@ -197,7 +291,7 @@ class SchemaExtractor:
 
     def _whole(self, rendering: Rendering, message: object, type_name: str) -> JsonValue:
         plan = self._plan(type_name)
-        nodes = [(name, _at(message, path)) for name, path in plan.fields]
+        nodes = [(name, _meant(name, _at(message, path))) for name, path in plan.fields]
         absent = [name for name, node in nodes if node is ABSENT]
         for name in absent:
             rendering.say("absent", name, f"{name}: this message has no such field")
@@ -218,7 +312,7 @@ class SchemaExtractor:
         segments = tuple(path.split("."))
         mapped = plan.path(segments[0])
         if mapped is not None:
-            found = descend(_at(message, mapped), segments[1:], view)
+            found = descend(_meant(segments[0], _at(message, mapped)), segments[1:], view)
         else:
             found = ABSENT if plan.fields else descend(message, segments, view)
         return _plain(_at(message, segments)) if found is ABSENT else found
@@ -236,17 +330,104 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> _Plan:
         paths[name] = segments
     return _Plan(
         fields=tuple(paths.items()),
-        poses=_routes(paths, "position", "orientation", optional=True),
-        twists=_routes(paths, "linear_velocity", "angular_velocity", optional=False),
+        poses=_poses(paths),
+        twists=((_route(paths, "linear_velocity"), _route(paths, "angular_velocity")),)
+        if paths.keys() >= {"linear_velocity", "angular_velocity"}
+        else (),
+        geodetic=(
+            _route(paths, "latitude"),
+            _route(paths, "longitude"),
+            _route(paths, "altitude"),
+        )
+        if paths.keys() >= {"latitude", "longitude"}
+        else None,
+        pose_frame=_route(paths, "pose_frame") if "pose_frame" in paths else None,
+        velocity_frame=_route(paths, "velocity_frame") if "velocity_frame" in paths else None,
     )
 
 
-def _routes(
-    paths: Mapping[str, Segments], first: str, second: str, *, optional: bool
-) -> tuple[tuple[Route, Route], ...]:
-    if first not in paths or (second not in paths and not optional):
-        return ()
-    return ((Route(*paths[first]), Route(*paths[second]) if second in paths else _NOWHERE),)
+def _poses(paths: Mapping[str, Segments]) -> tuple[_Point | _Planar, ...]:
+    if "position" in paths:
+        return (_Point(_route(paths, "position"), _route(paths, "orientation"), arrays=True),)
+    if paths.keys() >= {"translation", "rotation"}:
+        return (_Point(_route(paths, "translation"), _route(paths, "rotation")),)
+    if paths.keys() >= {"x", "y"}:
+        heading = next((name for name in _HEADINGS if name in paths), "heading")
+        return (_Planar(*(_route(paths, name) for name in ("x", "y", "z", heading))),)
+    return ()
+
+
+def _route(paths: Mapping[str, Segments], name: str) -> Route:
+    return Route(*paths[name]) if name in paths else _NOWHERE
+
+
+def _is_bare(route: _Point | _Planar) -> bool:
+    """Whether it leads to a point without an orientation, such as one that somebody clicked."""
+    return isinstance(route, _Point) and route.orientation is _NOWHERE
+
+
+def _headed(message: object) -> Pose | None:
+    """The pose of a message that has x, y and a heading in radians as fields of its own."""
+    names = names_of(message) if not isinstance(message, list) else ()
+    heading = next((name for name in _HEADINGS if name in names), None)
+    if heading is None:
+        return None
+    found = _Planar(Route("x"), Route("y"), Route("z"), Route(heading)).of(message)
+    return None if found is None else Pose(*found, _text(_FRAME.of(message)))
+
+
+def _number(node: object) -> float | None:
+    if isinstance(node, bool) or not isinstance(node, int | float | np.number):
+        return None
+    try:
+        return float(node)
+    except (OverflowError, TypeError):
+        return None
+
+
+def _numbers(node: object, count: int) -> list[float] | None:
+    """The numbers of an array of so many."""
+    if not isinstance(node, list | np.ndarray) or len(node) != count:
+        return None
+    numbers = [_number(part) for part in node]
+    return [part for part in numbers if part is not None] if None not in numbers else None
+
+
+def _triple(node: object) -> Vector3 | None:
+    numbers = _numbers(node, 3)
+    return None if numbers is None else (numbers[0], numbers[1], numbers[2])
+
+
+def _px4_rotation(node: object) -> Quaternion | None:
+    """The unit quaternion of an array in PX4's order: w, x, y, z."""
+    numbers = _numbers(node, 4)
+    return None if numbers is None else unit((numbers[1], numbers[2], numbers[3], numbers[0]))
+
+
+def _velocity(node: object, axis: int) -> Vector3 | None:
+    """A velocity as an array, or as one number: along or about this axis."""
+    one = _number(node)
+    if one is None:
+        return _triple(node)
+    return (one, 0.0, 0.0) if axis == 0 else (0.0, 0.0, one)
+
+
+def _frame(route: Route | None, message: object, named: Mapping[int, str]) -> str:
+    number = None if route is None else _number(route.of(message))
+    return "" if number is None else named.get(int(number), "")
+
+
+def _meant(name: str, node: object) -> object:
+    """What stands under a name of the schema map: an array as the point or rotation that it is."""
+    if not isinstance(node, np.ndarray):
+        return node
+    if name in _POINTS:
+        point = _triple(node)
+        return node if point is None else dict(zip("xyz", map(Metric, point), strict=True))
+    if name == "orientation" and len(node) == 4:
+        turn = _px4_rotation(node)
+        return None if turn is None else euler(dict(zip("xyzw", turn, strict=True)))
+    return node
 
 
 def _at(message: object, path: Segments) -> object:

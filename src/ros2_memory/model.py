@@ -203,6 +203,16 @@ class Pose:
 
 
 @dataclass(frozen=True, slots=True)
+class Geodetic:
+    """A place on the Earth (WGS 84): degrees north and east, metres above the ellipsoid or NaN."""
+
+    latitude: float
+    longitude: float
+    altitude: float
+    frame_id: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Twist:
     """Linear (m/s) and angular (rad/s) velocity expressed in `frame_id` (empty: not said)."""
 

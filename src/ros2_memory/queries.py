@@ -20,6 +20,7 @@ from ros2_memory.absence import (
     nothing_at,
     nothing_between,
     require_bags,
+    resolve_pose_topic,
     resolve_topic,
     seconds,
 )
@@ -31,7 +32,7 @@ from ros2_memory.errors import (
 )
 from ros2_memory.extremes import MOST_MESSAGES, TOO_MANY, extremes_of
 from ros2_memory.history import View
-from ros2_memory.model import Sample, TimeWindow
+from ros2_memory.model import Pose, Sample, TimeWindow
 from ros2_memory.moments import Moment, Span, ns_argument, open_moment, open_span
 from ros2_memory.overview import data_time_range, list_recorded_topics
 from ros2_memory.recorder.clock_faults import FUTURE_NS
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.copies import Found
     from ros2_memory.memory import Call, Memory
-    from ros2_memory.model import JsonValue, Pose, Twist
+    from ros2_memory.model import JsonValue
 
 __all__ = [
     "data_time_range",
@@ -130,13 +131,25 @@ def position(
     topic: str | None = None,
     tolerance_s: float | None = None,
 ) -> answers.Position:
-    """Where the robot was: the newest pose at or before a moment, within the tolerance."""
+    """Where the robot was: the newest pose at or before a moment, within the tolerance.
+
+    A topic of a satellite receiver gives degrees.
+    """
     view, at, now = open_moment(memory, call, moment)
-    name = resolve_topic(view, topic or memory.limits.pose_topic)
+    name = resolve_pose_topic(view, topic)
     found = _found_at(view, name, at, tolerance_s)
-    pose = _pose(view, found)
+    message, type_name = decoded(view, found), found.record.channel.type
+    pose = memory.extractor.pose(message, type_name)
     if pose is None:
-        raise InvalidArgumentsError(carries_no("position", found))
+        place = memory.extractor.geodetic(message, type_name)
+        if place is None:
+            raise InvalidArgumentsError(carries_no(view, "position", found))
+        if not (math.isfinite(place.latitude) and math.isfinite(place.longitude)):
+            view.note("the recorded position is not a number")
+        nowhere = Pose((math.nan,) * 3, None, place.frame_id)
+        return answers.Position(
+            name, found.time, nowhere, view.notes, _age(found, now), geodetic=place
+        )
     if not all(map(math.isfinite, pose.position)):
         view.note("the recorded position is not a number")
     if pose.orientation is None:
@@ -154,11 +167,11 @@ def velocity(
 ) -> answers.Velocity:
     """How fast the robot moved: the newest twist at or before a moment, within the tolerance."""
     view, at, now = open_moment(memory, call, moment)
-    name = resolve_topic(view, topic or memory.limits.pose_topic)
+    name = resolve_pose_topic(view, topic, "velocity")
     found = _found_at(view, name, at, tolerance_s)
-    twist = _twist(view, found)
+    twist = memory.extractor.twist(decoded(view, found), found.record.channel.type)
     if twist is None:
-        raise InvalidArgumentsError(carries_no("velocity", found))
+        raise InvalidArgumentsError(carries_no(view, "velocity", found))
     return answers.Velocity(name, found.time, twist, view.notes, _age(found, now))
 
 
@@ -262,7 +275,7 @@ def trajectory_summary(
 ) -> answers.TrajectorySummary:
     """The way driven in a window, from one pose topic in log-time order."""
     view, window = open_span(memory, call, span)
-    name = resolve_topic(view, topic or memory.limits.pose_topic)
+    name = resolve_pose_topic(view, topic)
     way = way_driven(view, name, window)
     if way is None:
         raise nothing_between(view, (name,), window)
@@ -346,14 +359,6 @@ def _samples(
     for detail, count in failures.items():
         view.note(f"{count} samples left out: {detail}")
     return tuple(samples), list(types)
-
-
-def _pose(view: View, found: Found) -> Pose | None:
-    return view.memory.extractor.pose(decoded(view, found), found.record.channel.type)
-
-
-def _twist(view: View, found: Found) -> Twist | None:
-    return view.memory.extractor.twist(decoded(view, found), found.record.channel.type)
 
 
 def _age(found: Found, now: Ns | None) -> Ns | None:

@@ -11,7 +11,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.absence import resolve_topic
+from ros2_memory.absence import resolve_pose_topic
 from ros2_memory.accounts import Event, Recap
 from ros2_memory.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.moments import open_span
@@ -119,7 +119,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
 def _drive(view: View, window: TimeWindow) -> _Drive | None:
     """How the robot moved; None, with a note, where that is not known."""
     try:
-        topic = resolve_topic(view, view.memory.limits.pose_topic)
+        topic = resolve_pose_topic(view)
         way = way_driven(view, topic, window)
         if way is None:
             view.note(f"{topic} has no poses in this time: nothing is known of the way")

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.fitting import JsonObject
-    from ros2_memory.model import JsonValue, Quaternion, SetAside
+    from ros2_memory.model import Geodetic, JsonValue, Quaternion, SetAside
     from ros2_memory.trajectory import Trajectory
 
 Answer: TypeAlias = (
@@ -219,11 +219,20 @@ def _position(answer: answers.Position, _bag_dir: Path) -> JsonObject:
     reply: JsonObject = {
         **metres(pose.position),
         "yaw_deg": degrees(None if unit is None else yaw(unit)),
+        **({} if answer.geodetic is None else _geodetic(answer.geodetic)),
         "timestamp": unix_rounded_up(answer.time),
         "topic": answer.topic,
         "frame_id": pose.frame_id or None,
     }
     return _finished(reply, answer.age, answer.notes)
+
+
+def _geodetic(place: Geodetic) -> JsonObject:
+    return {
+        "latitude": rounded(place.latitude, 8),
+        "longitude": rounded(place.longitude, 8),
+        "altitude": rounded(place.altitude, 4),
+    }
 
 
 @shown.register(answers.Velocity)

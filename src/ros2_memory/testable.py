@@ -52,11 +52,20 @@ def untestable(condition: Condition, value: JsonValue) -> str | None:
     if isinstance(condition.test, NearPosition):
         if any(True for _ in positions(value)) or _has_open_end(value):
             return None
-        return (
-            "the values carry no position: near_position needs a topic that does, "
-            "or a field that leads to an object with x and y"
-        )
+        return _placeless(value)
     return _numberless(condition, [value])
+
+
+def _placeless(value: JsonValue) -> str:
+    if isinstance(value, dict) and value.keys() >= {"latitude", "longitude"}:
+        return (
+            "the values give latitude and longitude in degrees, and near_position compares metres: "
+            "ask with above or below on field latitude or longitude"
+        )
+    return (
+        "the values carry no position: near_position needs a topic that does, "
+        "or a field that leads to an object with x and y"
+    )
 
 
 def _numberless(condition: Condition, targets: Sequence[JsonValue]) -> str | None:

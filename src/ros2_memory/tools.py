@@ -149,7 +149,8 @@ _TOPIC_OVER = Entry(
 _POSITION = Entry(
     _at_and_ago("position", "Robot position"),
     "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
-    "(counter-clockwise from x), timestamp, topic, frame_id}}.",
+    "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, longitude "
+    "and altitude instead of x, y, z, which are null.",
     MotionAt,
     lambda memory, call, given: queries.position(
         memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s

@@ -13,7 +13,7 @@ from itertools import chain, islice, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.absence import moment, require_bags, resolve_topic
+from ros2_memory.absence import moment, require_bags, resolve_pose_topic
 from ros2_memory.accounts import Visit, Visits
 from ros2_memory.candidates import Candidates
 from ros2_memory.conditions import Condition, NearPosition
@@ -80,7 +80,7 @@ def visits(
     wall = memory.clock.now()
     view = View(memory, call, wall)
     require_bags(view)
-    topic = resolve_topic(view, memory.limits.pose_topic)
+    topic = resolve_pose_topic(view)
     place = placing(view, _pose_frame(view, topic), topic, frame_id)
     looking = _Looking(view, topic, place, (x, y, radius))
     latest, newest = view.snapshot.latest, looking.newest_time
@@ -151,7 +151,7 @@ def _frame_of(view: View, found: Found) -> str:
     message = view.memory.reader.decode(found.record)
     pose = view.memory.extractor.pose(message, found.record.channel.type)
     if pose is None:
-        raise InvalidArgumentsError(carries_no("position", found))
+        raise InvalidArgumentsError(carries_no(view, "position", found))
     return pose.frame_id
 
 

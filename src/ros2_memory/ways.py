@@ -9,13 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
-from ros2_memory.absence import undecodable
+from ros2_memory.absence import topics_with, undecodable
 from ros2_memory.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.motion import Stop, is_place
 from ros2_memory.packing import packed_poses, unpacked_poses
 from ros2_memory.portions import Kept, Kind, is_whole
 from ros2_memory.sights import Sights
 from ros2_memory.trajectory import PoseCollector, TrajectoryBuilder
+from ros2_memory.wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -121,7 +122,7 @@ def add_poses(
                 failures.append(sight)
                 continue
             if sight.pose is None:
-                raise InvalidArgumentsError(carries_no("position", found))
+                raise InvalidArgumentsError(carries_no(view, "position", found))
             to.add(found.time, sight.pose, sight.speed_mps)
             first = found.time if first is None else first
             last = found.time
@@ -177,10 +178,14 @@ def decoded(view: View, found: Found) -> object:
         raise undecodable(error.topic, error.type_name, error) from error
 
 
-def carries_no(what: str, found: Found) -> str:
+def carries_no(view: View, what: str, found: Found) -> str:
     """The sentence for a topic that is asked for what its type does not have."""
     channel = found.record.channel
+    has = f"carries no {what}"
+    if "geodetic" in view.memory.extractor.kinds_of(channel.type):
+        has = f"carries latitude and longitude in degrees, and no {what} in metres"
+    those = topics_with(view, what)
+    hint = f"such as {listed(those)}" if those else "such as one of type nav_msgs/msg/Odometry"
     return (
-        f"topic: {channel.topic} is a {channel.type}, which carries no {what}; "
-        "give a topic that does, such as one of type nav_msgs/msg/Odometry"
+        f"topic: {channel.topic} is a {channel.type}, which {has}; give a topic that does, {hint}"
     )

@@ -54,7 +54,7 @@ def topic_of(messages: list[Msg]) -> TopicDigest:
         ("contains", "red cup"),
         ("equals", "mug"),
         ("equals", 7),
-        ("equals", True),
+        ("contains", True),
         ("near_position", {"x": 9.0, "y": 9.0}),
         ("near_position", {"x": 1.0, "y": 0.0, "z": 3.0}),
     ],

@@ -1,0 +1,258 @@
+"""Positions come from whatever carries one, and refusals name what does."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from ros2_memory.memory import Limits
+from tests.asking import asked
+from tests.bags import (
+    Msg,
+    boolean,
+    header,
+    make,
+    odom,
+    point,
+    quaternion,
+    text,
+    transform,
+    write_mcap,
+)
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+T0_S = 1_784_000_000
+T0 = T0_S * S
+YAW = math.radians(30)
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def pose_stamped(ns: int, x: float, y: float, topic: str = "/pose") -> Msg:
+    pose = make("geometry_msgs/msg/Pose", position=point(x, y), orientation=quaternion(YAW))
+    body = make("geometry_msgs/msg/PoseStamped", header=header(ns, "map"), pose=pose)
+    return Msg(topic, "geometry_msgs/msg/PoseStamped", ns, body)
+
+
+def with_covariance(ns: int, x: float, y: float) -> Msg:
+    pose = make("geometry_msgs/msg/Pose", position=point(x, y), orientation=quaternion(YAW))
+    spread = make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+    body = make(
+        "geometry_msgs/msg/PoseWithCovarianceStamped", header=header(ns, "map"), pose=spread
+    )
+    return Msg("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", ns, body)
+
+
+def turtle(ns: int, x: float, y: float) -> Msg:
+    body = make(
+        "turtlesim/msg/Pose", x=x, y=y, theta=YAW, linear_velocity=0.5, angular_velocity=-0.25
+    )
+    return Msg("/turtle1/pose", "turtlesim/msg/Pose", ns, body)
+
+
+def vehicle(ns: int, x: float, y: float) -> Msg:
+    def triple(*parts: float) -> Any:
+        return np.array(parts, dtype=np.float32)
+
+    body = make(
+        "px4_msgs/msg/VehicleOdometry",
+        timestamp=ns // 1000,
+        timestamp_sample=ns // 1000,
+        pose_frame=1,
+        position=triple(x, y, -2.0),
+        q=triple(math.cos(YAW / 2), 0.0, 0.0, math.sin(YAW / 2)),
+        velocity_frame=3,
+        velocity=triple(0.5, 0.0, 0.0),
+        angular_velocity=triple(0.0, 0.0, -0.25),
+        position_variance=triple(0.0, 0.0, 0.0),
+        orientation_variance=triple(0.0, 0.0, 0.0),
+        velocity_variance=triple(0.0, 0.0, 0.0),
+        reset_counter=0,
+        quality=100,
+    )
+    return Msg("/fmu/out/vehicle_odometry", "px4_msgs/msg/VehicleOdometry", ns, body)
+
+
+def local(ns: int, x: float, y: float) -> Msg:
+    body = make(
+        "px4_msgs/msg/VehicleLocalPosition",
+        timestamp=ns // 1000,
+        xy_valid=True,
+        x=x,
+        y=y,
+        z=-2.0,
+        heading=YAW,
+    )
+    kind = "px4_msgs/msg/VehicleLocalPosition"
+    return Msg("/fmu/out/vehicle_local_position", kind, ns, body)
+
+
+def tracked(ns: int, x: float, y: float) -> Msg:
+    body = transform(ns, "world", "robot", (x, y, 0.0), YAW)
+    return Msg("/vicon/robot", "geometry_msgs/msg/TransformStamped", ns, body)
+
+
+def fix(ns: int, north: float, east: float) -> Msg:
+    status = make("sensor_msgs/msg/NavSatStatus", status=0, service=1)
+    body = make(
+        "sensor_msgs/msg/NavSatFix",
+        header=header(ns, "gps"),
+        status=status,
+        latitude=48.1234567 + north,
+        longitude=11.7654321 + east,
+        altitude=519.5,
+        position_covariance=np.zeros(9),
+        position_covariance_type=0,
+    )
+    return Msg("/fix", "sensor_msgs/msg/NavSatFix", ns, body)
+
+
+CARRIERS = {
+    "/pose": (pose_stamped, "map", 0.0),
+    "/amcl_pose": (with_covariance, "map", 0.0),
+    "/turtle1/pose": (turtle, None, 0.0),
+    "/fmu/out/vehicle_odometry": (vehicle, "NED", -2.0),
+    "/fmu/out/vehicle_local_position": (local, None, -2.0),
+    "/vicon/robot": (tracked, "world", 0.0),
+}
+
+
+def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
+    memory = memory_of(bag_dir, limits=Limits(**given.pop("limits", {})))
+    return asked(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool, **given)
+
+
+def driven(topic: str) -> list[Msg]:
+    """60 s at 0.5 m/s, ten times a second, to the side."""
+    made = CARRIERS[topic][0]
+    return [made(T0 + n * S // 10, 1.0 + n * 0.05, 2.0) for n in range(601)]
+
+
+@each_way
+@pytest.mark.parametrize("topic", CARRIERS)
+def test_whatever_carries_a_position_answers_where_and_how_far(
+    tmp_path: Path, recalls: bool, topic: str
+) -> None:
+    messages = driven(topic)
+    for split in range(3):
+        path = tmp_path / "rec" / f"rec_{split}.mcap"
+        write_mcap(path, messages[201 * split : 201 * split + 201])
+    _, frame, z = CARRIERS[topic]
+    here = ask(tmp_path, recalls, "get_position_at", topic=topic, timestamp=T0_S + 10)
+    assert (here["x"], here["y"], here["z"]) == pytest.approx((6.0, 2.0, z), abs=1e-4)
+    assert here["yaw_deg"] == pytest.approx(30.0, abs=0.01)
+    assert here["frame_id"] == frame
+    assert "latitude" not in here
+    way = ask(tmp_path, recalls, "trajectory_summary", topic=topic, start=T0_S, end=T0_S + 60)
+    assert way["distance_m"] == pytest.approx(30.0, rel=0.002)
+    near = ask(
+        tmp_path,
+        recalls,
+        "find_last_match",
+        topic=topic,
+        condition_type="near_position",
+        value={"x": 6.0, "y": 2.0},
+    )
+    assert near["timestamp"] == pytest.approx(T0_S + 11, abs=0.11)
+    visits = ask(
+        tmp_path, recalls, "visits", x=6.0, y=2.0, radius_m=0.5, limits={"pose_topic": topic}
+    )
+    assert visits["total"] == 1
+
+
+@each_way
+@pytest.mark.parametrize("topic", ["/turtle1/pose", "/fmu/out/vehicle_odometry"])
+def test_whatever_carries_a_velocity_answers_how_fast(
+    tmp_path: Path, recalls: bool, topic: str
+) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", driven(topic))
+    told = ask(tmp_path, recalls, "get_velocity_at", topic=topic, timestamp=T0_S + 10)
+    assert told["linear"] == {"x": 0.5, "y": 0.0, "z": 0.0}
+    assert told["angular"] == {"x": 0.0, "y": 0.0, "z": -0.25}
+    assert told["frame_id"] == ("body FRD" if "vehicle" in topic else None)
+
+
+def test_fields_of_a_vehicles_odometry_read_as_a_point_and_angles(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [vehicle(T0, 1.0, 2.0)])
+    given = {"topic": "/fmu/out/vehicle_odometry", "timestamp": T0_S}
+    value = ask(tmp_path, False, "get_topic_at_time", **given)["value"]
+    assert value["position"] == {"x": 1.0, "y": 2.0, "z": -2.0}
+    assert value["orientation"]["yaw_deg"] == pytest.approx(30.0, abs=0.01)
+    part = ask(tmp_path, False, "get_topic_at_time", **given, fields=["position.x", "q"])["value"]
+    assert part["position.x"] == 1.0
+    assert len(part["q"]) == 4
+
+
+@each_way
+def test_a_satellite_fix_is_told_in_degrees(tmp_path: Path, recalls: bool) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(9)])
+    assert ask(tmp_path, recalls, "get_position_at", topic="/fix", timestamp=T0_S + 2) == {
+        "x": None,
+        "y": None,
+        "z": None,
+        "yaw_deg": None,
+        "latitude": 48.1234767,
+        "longitude": 11.7654321,
+        "altitude": 519.5,
+        "timestamp": T0_S + 2.0,
+        "topic": "/fix",
+        "frame_id": "gps",
+    }
+    way = {"topic": "/fix", "start": T0_S, "end": T0_S + 9}
+    refused = ask(tmp_path, recalls, "trajectory_summary", **way)
+    assert "latitude and longitude in degrees, and no position in metres" in refused["detail"]
+    near = {"topic": "/fix", "condition_type": "near_position", "value": {"x": 48.12, "y": 11.77}}
+    refused = ask(tmp_path, recalls, "find_last_match", **near)
+    assert "degrees" in refused["detail"]
+    unknown = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 2)
+    assert "poses are on /fix (sensor_msgs/msg/NavSatFix)" in unknown["detail"]
+
+
+ABOUT_POSES: list[tuple[str, dict[str, Any]]] = [
+    ("get_position_at", {"timestamp": T0_S + 1}),
+    ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),
+    ("visits", {"x": 0.0, "y": 0.0}),
+]
+
+
+@each_way
+@pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
+def test_where_the_pose_topic_is_not_recorded_the_one_with_poses_is_named(
+    tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
+) -> None:
+    others = [text(T0, "up", "/rosout"), boolean(T0, True)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*others, pose_stamped(T0 + S, 1.0, 2.0, "/pose")])
+    told = ask(tmp_path, recalls, tool, **given)
+    assert (told["error"], told["reason"]) == ("no_data", "topic_not_recorded")
+    assert "no topic /odom is recorded, which data.pose_topic names" in told["detail"]
+    assert "poses are on /pose (geometry_msgs/msg/PoseStamped)" in told["detail"]
+    assert "set data.pose_topic=/pose" in told["detail"]
+    assert "/rosout" not in told["detail"]
+
+
+def test_recap_names_the_topic_with_poses(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [pose_stamped(T0, 1.0, 2.0, "/pose")])
+    told = ask(tmp_path, False, "recap", start=T0_S, end=T0_S + 1)
+    assert any("set data.pose_topic=/pose" in note for note in told["notes"])
+
+
+def test_of_several_topics_with_poses_each_is_named(tmp_path: Path) -> None:
+    messages = [pose_stamped(T0, 1.0, 2.0, name) for name in ("/a", "/b")]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    told = ask(tmp_path, False, "get_position_at", timestamp=T0_S)
+    assert "set data.pose_topic to one of them" in told["detail"]
+
+
+def test_a_topic_without_a_position_is_refused_with_those_that_have_one(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [odom(T0, 1.0, 2.0), boolean(T0, True)])
+    told = ask(tmp_path, False, "get_position_at", topic="/bumper", timestamp=T0_S)
+    assert told["error"] == "invalid_arguments"
+    assert "carries no position; give a topic that does, such as /odom" in told["detail"]
