@@ -56,20 +56,42 @@ def spoil_chunk(path: Path, number: int) -> None:
     path.write_bytes(data)
 
 
+def change_index(path: Path, chunk: ChunkIndex, at: int, value: int, nth: int = 0) -> None:
+    """Overwrites a number of the first message index of a chunk.
+
+    `at` is 0 for a log time and 8 for a place, `nth` of which message.
+    """
+    data = bytearray(path.read_bytes())
+    index_at = min(chunk.message_index_offsets.values())
+    struct.pack_into("<Q", data, index_at + 15 + 16 * nth + at, value)
+    path.write_bytes(data)
+
+
 def edit_summary(path: Path, opcode: Opcode, edit: Callable[[bytearray], None]) -> None:
     """Changes the bodies of the summary's records of one kind, checksum kept right."""
+
+    def edited(found: int, body: bytes) -> bytes:
+        changed = bytearray(body)
+        if found == opcode:
+            edit(changed)
+        return bytes(changed)
+
+    rewrite_summary(path, edited)
+
+
+def rewrite_summary(path: Path, change: Callable[[int, bytes], bytes | None]) -> None:
+    """Writes the bodies of the summary's records anew, None for none, checksum kept right."""
     data = path.read_bytes()
     footer_at = len(data) - 8 - FOOTER.size
     kind, length, start, offsets, _ = FOOTER.unpack_from(data, footer_at)
-    section = bytearray(data[start:footer_at])
-    position = 0
-    while position < len(section):
-        found, size = RECORD.unpack_from(section, position)
+    section = bytearray()
+    position = start
+    while position < footer_at:
+        opcode, size = RECORD.unpack_from(data, position)
         position += RECORD.size
-        if found == opcode:
-            body = section[position : position + size]
-            edit(body)
-            section[position : position + size] = body
+        body = change(opcode, data[position : position + size])
+        if body is not None:
+            section += RECORD.pack(opcode, len(body)) + body
         position += size
     footer = FOOTER.pack(kind, length, start, offsets, 0)[:-4]
     crc = zlib.crc32(footer, zlib.crc32(section))

@@ -8,6 +8,7 @@
     |-- BusyError                 busy               it was not even begun: others were before it
     |-- BagError                  bag_unreadable     a file that cannot be read at all
     |   |-- BagVanishedError      bag_unreadable     it is gone (retention, unmount)
+    |   |-- BagContradictionError bag_unreadable     its indexes lie; read without them
     |   `-- BagUnreachableError   bag_unreadable     the disk or the machine fails, not the file
     |-- UndecodableError          undecodable        a message whose bytes mean nothing to us
     |-- RefusedError              refused            something that is not done, and why
@@ -105,6 +106,13 @@ class BagError(EpisodicError):
 
 class BagVanishedError(BagError):
     """The bag file is not there any more."""
+
+
+class BagContradictionError(BagError):
+    """A bag file whose indexes contradict its messages, which are read without the indexes.
+
+    `lost` is the span that was asked about: reading goes on behind it, and nothing of it is lost.
+    """
 
 
 class BagUnreachableError(BagError):

@@ -6,7 +6,12 @@ import time
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.copies import Found
-from ros2_memory.errors import BagError, BagVanishedError, QueryTimeoutError
+from ros2_memory.errors import (
+    BagContradictionError,
+    BagError,
+    BagVanishedError,
+    QueryTimeoutError,
+)
 from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.timebase import MAX_NS, MIN_NS
 from ros2_memory.wording import Reason
@@ -26,6 +31,7 @@ _CHECK_EVERY: Final = 256
 _DELETED: Final = Reason(
     "was deleted before it could be read", "bag", many="were deleted before they could be read"
 )
+_CONTRADICTS_ITSELF: Final = Reason("contradicts itself", "bag", many="contradict themselves")
 _NOT_WHOLE: Final = Reason("could not be read whole", "bag")
 _NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
 
@@ -153,13 +159,15 @@ class Reading:
 
     def skip(self, bag: BagFile, error: BagError, since: Ns = MIN_NS) -> None:
         """Notes that a bag, or some of it, is not part of the answer, be it since a moment."""
-        self.complete = False
+        self.complete &= isinstance(error, BagContradictionError)
         last = bag.end if error.lost is None else error.lost[1]
         if last < since:
             return
         name = short_name(bag.path)
         if isinstance(error, BagVanishedError):
             self.note_thing(_DELETED, name, last=last)
+        elif isinstance(error, BagContradictionError):
+            self.note_thing(_CONTRADICTS_ITSELF, name, error.reason, last)
         else:
             reason = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE
             self.note_thing(reason, name, error.reason, last)

@@ -1,7 +1,12 @@
-"""A damaged chunk costs its own messages, and is told where these were looked for."""
+"""A damaged chunk costs its own messages, and is told where these were looked for.
+
+A damaged index costs none, and is told too.
+"""
 
 from __future__ import annotations
 
+import json
+import struct
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,7 +22,8 @@ from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.bags import McapLayout, Msg, text, write_mcap
+from tests.asking import asked as asked_tool
+from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
 from tests.memories import memory_of
 from tests.recalled import recalling
@@ -31,6 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 S = 10**9
+T0 = 1_700_000_000 * S
 LATCHED = McapLayout(chunk_size=1, latched=frozenset({"/dock"}))
 EVERYTHING = TimeWindow.everything()
 
@@ -182,3 +189,64 @@ def test_damaged_bags_are_told_in_one_order_whichever_was_found_first(tmp_path: 
     assert told[0] == told[1]
     [told_once] = told[0]
     assert told_once.startswith("2 bags could not be read whole: a/a_0.mcap (")
+
+
+class TestAnIndexThatContradictsItsMessages:
+    """One bit of a message index is another: nothing that is asked for is missed or moved."""
+
+    def driven(self, bag_dir: Path) -> Path:
+        """Ten seconds at 1 m/s; one message is indexed as if it lay 0.2 s later."""
+        moving = [
+            each
+            for n in range(100)
+            for at in [T0 + n * S // 10]
+            for each in (
+                odom(at, n / 10, 0.0),
+                tf(at, transform(at, "odom", "base", (n / 10, 0.0, 0.0))),
+            )
+        ]
+        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", moving, McapLayout(chunk_size=8000))
+        self.right = path.read_bytes()
+        chunk = chunks_of(path)[2]
+        for offset in chunk.message_index_offsets.values():
+            data = bytearray(path.read_bytes())
+            at = offset + 15 + 16 * 5
+            (time,) = struct.unpack_from("<Q", data, at)
+            self.at = time
+            struct.pack_into("<Q", data, at, time + S // 5)
+            path.write_bytes(data)
+        return path
+
+    def test_where_the_robot_was_is_what_its_messages_say(self, tmp_path: Path) -> None:
+        self.driven(tmp_path)
+        true = (self.at - T0) / S
+        for storage in ("mcap", "rosbag2"):
+            memory = memory_of(tmp_path, storage=storage)
+            at_s = self.at / S
+            told = asked_tool(memory, tmp_path, "get_position_at", topic="/odom", timestamp=at_s)
+            assert told["x"] == pytest.approx(true, abs=1e-6)
+            assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+            frames = {"parent": "odom", "child": "base"}
+            told = asked_tool(memory, tmp_path, "get_transform_at", timestamp=at_s, **frames)
+            assert told["translation"]["x"] == pytest.approx(true, abs=1e-6)
+            told = asked_tool(
+                memory, tmp_path, "get_topic_in_range", topic="/odom", start=at_s, end=at_s + 0.15
+            )
+            assert [sample["timestamp"] for sample in told["samples"]] == [
+                pytest.approx(at_s + n / 10, abs=1e-5) for n in range(2)
+            ]
+
+    def test_a_search_finds_what_it_finds_in_the_same_bag_with_a_right_index(
+        self, tmp_path: Path
+    ) -> None:
+        self.driven(tmp_path / "wrong")
+        whole = self.driven(tmp_path / "right")
+        whole.write_bytes(self.right)
+        near = json.dumps({"x": (self.at - T0) / S, "y": 0.0})
+        asks = {"topic": "/odom", "condition_type": "near_position", "value": near}
+        wrong, right = (
+            asked_tool(memory_of(tmp_path / name), tmp_path / name, "find_matches", **asks)
+            for name in ("wrong", "right")
+        )
+        assert any("contradicts itself" in note for note in wrong.pop("notes"))
+        assert wrong == right

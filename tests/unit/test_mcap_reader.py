@@ -10,7 +10,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from ros2_memory.errors import BagError, ConfigError, UndecodableError
+from ros2_memory.errors import BagContradictionError, BagError, ConfigError, UndecodableError
 from ros2_memory.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
@@ -18,16 +18,21 @@ from tests.mcap_surgery import (
     FOOTER,
     RECORD,
     SMALL,
+    change_index,
     chatter,
     chunks_of,
     edit_summary,
     one_chunk,
     raw_mcap,
+    rewrite_summary,
     spoil_chunk,
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
+
+    from mcap.records import ChunkIndex
 
     from ros2_memory.storage.base import Record
 
@@ -37,6 +42,10 @@ STRING = "std_msgs/msg/String"
 
 def read(reader: McapReader, path: Path, *topics: str, **how: Any) -> list[Record]:
     return list(reader.records(path, topics or ("/chatter",), EVERYTHING, **how))
+
+
+def from_bytes(number: bytes) -> int:
+    return int.from_bytes(number, "little")
 
 
 def times(records: list[Record]) -> list[int]:
@@ -104,6 +113,23 @@ class TestReadingOnlyWhatIsWanted:
         assert times(read(reader, path)) == times(read(reader, path)) == list(range(20))
 
 
+def read_on(
+    reader: McapReader, path: Path, *, newest_first: bool = False
+) -> tuple[list[int], list[str]]:
+    """The log times of all messages, and what is said of contradictions on the way."""
+    told: list[str] = []
+    found: list[int] = []
+    records = reader.records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
+    while True:
+        try:
+            for each in records:
+                found.append(each.log_time)  # noqa: PERF401 - what came before an error counts
+        except BagContradictionError as error:
+            told.append(error.reason)
+        else:
+            return found, told
+
+
 class TestIndexesThatAreWrong:
     def test_a_damaged_summary_is_replaced_by_the_messages(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
@@ -155,15 +181,128 @@ class TestIndexesThatAreWrong:
         assert reader.summarize(path).count == 20
         assert times(read(reader, path)) == list(range(100, 120))
 
-    def test_a_message_index_that_points_elsewhere_is_an_error(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(3))
+    @pytest.mark.parametrize(
+        ("at", "value"),
+        [
+            pytest.param(0, 1, id="another time"),
+            pytest.param(8, 7, id="another place"),
+            pytest.param(8, 1 << 40, id="a place outside"),
+            pytest.param(8, (1 << 64) - 60, id="a place before"),
+        ],
+    )
+    def test_a_message_index_that_is_wrong_costs_no_message_and_is_named(
+        self, tmp_path: Path, at: int, value: int
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(12), SMALL)
+        wrong = chunks_of(path)[1]
+        first = wrong.message_start_time
+        change_index(path, wrong, at, first + value if at == 0 else value)
+        reason = "damaged: a message is not where its index says; its messages were read without"
+        for newest_first in (False, True):
+            found, told = read_on(McapReader(), path, newest_first=newest_first)
+            assert found == sorted(range(12), reverse=newest_first)
+            assert told == [f"{reason} its indexes"]
+        reader = McapReader()
+        with pytest.raises(BagContradictionError):
+            next(reader.records(path, ["/chatter"], TimeWindow(first, first + 1)))
+        # From now on it is known, and named in every answer.
+        with pytest.raises(BagError):
+            reader.newest(path, "/chatter", EVERYTHING)
+        found, told = read_on(reader, path)
+        assert found == [*range(12)]
+        assert len(told) == 1
+        assert any("without its indexes" in note for note in reader.summarize(path).notes)
+
+    def test_what_a_wrong_message_index_says_is_in_no_summary_and_no_log_times(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", [*chatter(9), boolean(9, True)])
         (chunk,) = chunks_of(path)
-        data = bytearray(path.read_bytes())
+        change_index(path, chunk, 0, 1)
+        assert McapReader().summarize(path).of("/chatter")[0].first == 0
+        assert McapReader().log_times(path, "/chatter", TimeWindow(0, 2)) == [0, 1]
+        whole = write_mcap(tmp_path / "b.mcap", [*chatter(9), boolean(9, True)])
+        assert McapReader().summarize(whole).notes == ()
+
+    def test_an_index_that_names_a_message_twice_is_not_believed(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", [text(5, f"{n:0100d}") for n in range(4)])
+        (chunk,) = chunks_of(path)
         (index_at,) = chunk.message_index_offsets.values()
-        struct.pack_into("<Q", data, index_at + 15 + 8, 7)
+        data = bytearray(path.read_bytes())
+        data[index_at + 15 : index_at + 31] = data[index_at + 31 : index_at + 47]
         path.write_bytes(data)
-        with pytest.raises(BagError, match="a message is not where its index says"):
-            read(McapReader(), path)
+        found, told = read_on(McapReader(), path)
+        assert found == [5] * 4
+        assert len(told) == 1
+
+    @pytest.mark.parametrize(
+        ("at", "value"),
+        [
+            pytest.param(0, lambda chunk: chunk.message_start_time + 1, id="a later start"),
+            pytest.param(8, lambda chunk: chunk.message_end_time - 1, id="an earlier end"),
+            pytest.param(16, lambda _: 8, id="no chunk"),
+            pytest.param(16, None, id="another chunk"),
+            pytest.param(24, lambda chunk: chunk.chunk_length - 1, id="another length"),
+        ],
+    )
+    def test_a_chunk_index_that_does_not_agree_with_its_chunk_is_named(
+        self, tmp_path: Path, at: int, value: Callable[[ChunkIndex], int] | None
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        _, second, _, other, *_ = chunks_of(path)
+        stated = other.chunk_start_offset if value is None else value(second)
+
+        def of_the_second(body: bytearray) -> None:
+            if struct.unpack_from("<Q", body, 16) == (second.chunk_start_offset,):
+                struct.pack_into("<Q", body, at, stated)
+
+        edit_summary(path, Opcode.CHUNK_INDEX, of_the_second)
+        reader = McapReader()
+        summary = reader.summarize(path)
+        assert summary.count == 20
+        assert any("its chunk indexes do not " in note for note in summary.notes)
+        for start in range(20):
+            found = reader.records(path, ["/chatter"], TimeWindow(start, start + 3))
+            assert [each.log_time for each in found] == [*range(start, min(start + 3, 20))]
+
+    def test_a_channel_that_a_chunk_index_lacks_is_not_lost(self, tmp_path: Path) -> None:
+        both = [*chatter(12), *(boolean(time, True) for time in range(12))]
+        path = write_mcap(tmp_path / "a.mcap", both)
+
+        def without_the_first_channel(opcode: int, body: bytes) -> bytes:
+            if opcode != Opcode.CHUNK_INDEX:
+                return body
+            size = from_bytes(body[32:36])
+            return body[:32] + struct.pack("<I", size - 10) + body[46:]
+
+        rewrite_summary(path, without_the_first_channel)
+        reader = McapReader()
+        assert reader.summarize(path).count == 24
+        assert times(read(reader, path)) == times(read(reader, path, "/bumper")) == [*range(12)]
+        [note] = reader.summarize(path).notes
+        assert note == "its message indexes do not hold what its statistics state"
+
+    def test_a_chunk_that_neither_indexes_nor_statistics_know_is_not_lost(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        hidden = chunks_of(path)[2]
+        left = 20 - (hidden.message_end_time - hidden.message_start_time + 1)
+
+        def without_it(opcode: int, body: bytes) -> bytes | None:
+            if opcode == Opcode.CHUNK_INDEX:
+                return None if from_bytes(body[16:24]) == hidden.chunk_start_offset else body
+            if opcode == Opcode.STATISTICS:
+                chunks = struct.pack("<I", from_bytes(body[22:26]) - 1)
+                count = struct.pack("<Q", left)
+                return count + body[8:22] + chunks + body[26:-8] + count
+            return body
+
+        rewrite_summary(path, without_it)
+        reader = McapReader()
+        assert reader.summarize(path).count == 20
+        assert times(read(reader, path)) == [*range(20)]
+        assert any("all of its chunks" in note for note in reader.summarize(path).notes)
 
     def test_messages_outside_chunks_are_not_lost_beside_chunks(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "a.mcap", chatter(6), SMALL)

@@ -66,8 +66,10 @@ class Channel:
     @property
     def bytes_held(self) -> int:
         """About how much memory its texts take."""
-        offered = sum([len(name) + len(text) for name, text in self.metadata])
-        return len(self.topic) + len(self.schema.name) + len(self.schema.text) + offered
+        held = len(self.topic) + len(self.schema.name) + len(self.schema.text)
+        for name, text in self.metadata:
+            held += len(name) + len(text)
+        return held
 
 
 class Record(NamedTuple):

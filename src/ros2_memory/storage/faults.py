@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from ros2_memory.errors import (
+    BagContradictionError,
     BagError,
     BagUnreachableError,
     BagVanishedError,
@@ -60,12 +61,19 @@ class LostError(UnreadableError):
         self.last = last
 
 
+class ContradictionError(LostError):
+    """Indexes that contradict the messages: these are read without them, from `first` to `last`."""
+
+
 def whole(path: Path, item: T | LostError) -> T:
     """The item itself.
 
     Raises:
+        BagContradictionError: it says that the indexes of `path` are not believed.
         BagError: it stands for messages of `path` that are lost.
     """
+    if isinstance(item, ContradictionError):
+        raise BagContradictionError(str(path), str(item), (item.first, item.last))
     if isinstance(item, LostError):
         raise BagError(str(path), str(item), (item.first, item.last))
     return item

@@ -7,23 +7,35 @@ file's own indexes are missing or wrong (see `mcap_index`).
 
 from __future__ import annotations
 
+import struct
+from bisect import bisect_left
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from mcap.opcode import Opcode
 
+from ros2_memory.model import TimeWindow
 from ros2_memory.storage.base import Channel, Closing, Record
-from ros2_memory.storage.faults import LostError, UnreachableError, UnreadableError, damage
+from ros2_memory.storage.faults import (
+    ContradictionError,
+    LostError,
+    UnreachableError,
+    UnreadableError,
+    damage,
+    reason_of,
+)
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.lru import ByteLru, Shared
-from ros2_memory.storage.mcap_chunk import Column, joined, walk
+from ros2_memory.storage.mcap_chunk import NOT_THERE, Column, joined, walk
 from ros2_memory.storage.mcap_file import closing_of, is_finished, profile_of
 from ros2_memory.storage.mcap_index import (
     McapIndex,
+    channels_bytes,
     chunk_columns,
     chunk_data,
     index_from_summary,
+    proven_columns,
 )
 from ros2_memory.storage.mcap_records import MESSAGE, RECORD
 from ros2_memory.storage.mcap_scan import index_by_scan
@@ -38,12 +50,26 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import BagSummary, TimeWindow
+    from ros2_memory.model import BagSummary
     from ros2_memory.storage.open_file import FileKey
     from ros2_memory.timebase import Ns
 
 
 _LARGE_BYTES: Final = 8 << 20
+_PROVEN_BYTES: Final = 32 << 20
+"""Chunks that take more, together, are not read only to hold their message indexes against them."""
+
+
+class _ContradictedError(UnreadableError):
+    """The message indexes of a chunk do not agree with its records.
+
+    `believed` are the chunks by their places as they were taken to be.
+    """
+
+    def __init__(self, reason: str, chunk: Chunk) -> None:
+        super().__init__(reason)
+        self.chunk = chunk
+        self.believed: dict[int, Chunk] = {}
 
 
 class McapBags:
@@ -62,7 +88,7 @@ class McapBags:
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self._shared: Shared[Channel] = Shared(attrgetter("bytes_held"))
         self._finished: FileKey | None = None
-        self._last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel]] = {}, {}
+        self._last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel], int] = {}, {}, 0
 
     def closing(self, path: Path) -> Closing:
         """Whether the writer has finished the file."""
@@ -76,7 +102,7 @@ class McapBags:
     def summarize(self, path: Path) -> BagSummary:
         """Topics with exact counts and first and last log times."""
         with OpenFile(path) as file:
-            index = self._index(file)
+            index = self._proven(file, self._index(file))
         held = [
             Held(index.channels[number], total.count, total.first, total.last)
             for number, total in index.totals.items()
@@ -106,8 +132,21 @@ class McapBags:
         if window.empty:
             return
         with OpenFile(path) as file:
-            runs = self._runs(file, topics, window, newest_first=newest_first)
-            yield from merged(runs, newest_first=newest_first)
+            index = self._index(file)
+            if index.contradiction:
+                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
+            try:
+                runs = self._runs(file, index, topics, window, newest_first=newest_first)
+                yield from merged(runs, newest_first=newest_first)
+            except _ContradictedError as error:
+                # Raised in place of a run: what came before it lies before all that it can hold.
+                index = self._distrust(file, index, error)
+                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
+                left, passed = _parted(window, error.chunk, newest_first=newest_first)
+                if hidden := _hidden(index, error, _wanted(index, topics), passed):
+                    yield hidden
+                runs = self._runs(file, index, topics, left, newest_first=newest_first)
+                yield from merged(runs, newest_first=newest_first)
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """The latest message of the topic inside the window: what `records` begins with.
@@ -118,9 +157,11 @@ class McapBags:
             return None
         with OpenFile(path) as file:
             index = self._index(file)
+            if index.contradiction:
+                raise ContradictionError(index.contradiction, window.start, window.stop - 1)
             wanted = _wanted(index, {topic})
             if index.loose:
-                runs = self._runs(file, {topic}, window, newest_first=True)
+                runs = self._runs(file, index, {topic}, window, newest_first=True)
                 first = next(merged(runs, newest_first=True), None)
                 if isinstance(first, LostError):
                     raise first
@@ -131,10 +172,10 @@ class McapBags:
             for chunk in overlapping:
                 if best is not None and chunk.end < best[0]:
                     break
-                for column in self._chunk_columns(file, chunk, wanted):
+                data = self._chunk_data(file, chunk)
+                for column in self._chunk_columns(file, chunk, wanted, data):
                     times, places = column.between(window.start, window.stop)
                     if times.size:
-                        data = self._chunk_data(file, chunk)
                         found = int(times[-1]), chunk.offset, int(places[-1]), data
                         best = found if best is None else max(best, found)
             if best is None:
@@ -143,43 +184,64 @@ class McapBags:
             return _from_bytes(data, wanted, self._max_chunk_bytes)(place, time)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
-        """The log times of a topic's messages inside the window, ascending."""
+        """The log times of a topic's messages inside the window, ascending.
+
+        They are held against the messages where the chunks take no more than `_PROVEN_BYTES`.
+        """
         with OpenFile(path) as file:
             index = self._index(file)
-            wanted = _wanted(index, {topic})
-            columns = [index.loose[channel] for channel in wanted if channel in index.loose]
-            for chunk in _overlapping(index, wanted, window):
-                columns += self._chunk_columns(file, chunk, wanted)
+            try:
+                columns = self._columns(file, index, topic, window)
+            except _ContradictedError as error:
+                index = self._distrust(file, index, error)
+                columns = self._columns(file, index, topic, window)
         parts = [column.between(window.start, window.stop).times for column in columns]
         if window.empty or not parts:
             return []
         times = np.sort(np.concatenate(parts))
         return [int(time) for time in times.tolist()]
 
+    def _columns(
+        self, file: OpenFile, index: McapIndex, topic: str, window: TimeWindow
+    ) -> list[Column]:
+        """The messages of a topic in the chunks that overlap the window, and outside of chunks."""
+        wanted = _wanted(index, {topic})
+        columns = [index.loose[channel] for channel in wanted if channel in index.loose]
+        chunks = list(_overlapping(index, wanted, window))
+        few = sum([chunk.length for chunk in chunks]) <= _PROVEN_BYTES
+        for chunk in chunks:
+            data = self._data_if_whole(file, chunk) if few else None
+            columns += self._chunk_columns(file, chunk, wanted, data)
+        return columns
+
     def _runs(
-        self, file: OpenFile, topics: Collection[str], window: TimeWindow, *, newest_first: bool
+        self,
+        file: OpenFile,
+        index: McapIndex,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool,
     ) -> Iterator[Run[Record | LostError]]:
-        index = self._index(file)
         wanted = _wanted(index, topics)
 
         large: dict[int, bytes] = {}
 
         def chunk_run(chunk: Chunk) -> Run[Record | LostError]:
             def rows() -> Rows[Record | LostError]:
-                # Of a chunk whose index cannot be read it is not known what of it was wanted.
-                first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
+                # Of a chunk that cannot be read, only what its index says was wanted is lost.
                 try:
                     with damage():
-                        columns = self._chunk_columns(file, chunk, wanted)
-                        column = joined([p.between(window.start, window.stop) for p in columns])
-                        if not column.times.size:
-                            return Rows([], [], _nothing)
-                        first, last = int(column.times[0]), int(column.times[-1])
                         data = self._chunk_data(file, chunk)
                 except UnreachableError:
                     raise
                 except UnreadableError as error:
-                    return _lost(LostError(str(error), first, last), newest_first=newest_first)
+                    lost = self._lost(file, chunk, wanted, window, str(error))
+                    return _lost(lost, newest_first=newest_first) if lost else _NO_ROWS
+                columns = self._chunk_columns(file, chunk, wanted, data)
+                column = joined([each.between(window.start, window.stop) for each in columns])
+                if not column.times.size:
+                    return _NO_ROWS
                 fetch = self._fetching(file, chunk, data, wanted, large)
                 return _rows(column, fetch, newest_first=newest_first)
 
@@ -223,19 +285,54 @@ class McapBags:
         if not isinstance(index, McapIndex):
             finished = file.key == self._finished or is_finished(file)
             index = _index_of(file, self._max_chunk_bytes, finished=finished)
-            index = index._replace(channels=self._shared_of(index.channels))
-            self._found.put(file.key, index, index.bytes_held)
+            index = self._keep(file, index)
         return index
 
-    def _shared_of(self, channels: Mapping[int, Channel]) -> Mapping[int, Channel]:
-        """The channels, one object for all equal ones; the next bag mostly has these very ones."""
-        given, shared = self._last_shared
-        if channels is not given:
-            shared = {number: self._shared.of(each) for number, each in channels.items()}
-            self._last_shared = channels, shared
-        return shared
+    def _keep(self, file: OpenFile, index: McapIndex) -> McapIndex:
+        """Keeps an index, with one object for all equal channels.
 
-    def _chunk_columns(self, file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> list[Column]:
+        The next bag mostly has the very channels of the one before.
+        """
+        given, shared, size = self._last_shared
+        if index.channels is not given:
+            given = index.channels
+            shared = {number: self._shared.of(each) for number, each in given.items()}
+            size = channels_bytes(shared)
+            self._last_shared = given, shared, size
+        index = index._replace(channels=shared)
+        self._found.put(file.key, index, index.bytes_held + size)
+        return index
+
+    def _lost(
+        self,
+        file: OpenFile,
+        chunk: Chunk,
+        wanted: Collection[int],
+        window: TimeWindow,
+        reason: str,
+    ) -> LostError | None:
+        """What is lost of the window with a chunk that cannot be read; None where nothing is."""
+        try:
+            with damage():
+                columns = self._chunk_columns(file, chunk, wanted, None)
+        except UnreachableError:
+            raise
+        except UnreadableError:
+            first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
+            return LostError(reason, first, last)
+        times = joined([each.between(window.start, window.stop) for each in columns]).times
+        return LostError(reason, int(times[0]), int(times[-1])) if times.size else None
+
+    def _chunk_columns(
+        self, file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes | None
+    ) -> list[Column]:
+        """The messages of the wanted channels in a chunk, held against its records.
+
+        Without `data`, the records, what the message indexes say is given as it stands.
+
+        Raises:
+            _ContradictedError: the message indexes do not agree with the records.
+        """
         columns: list[Column] = []
         missing: list[int] = []
         for channel in chunk.channels.intersection(wanted):
@@ -244,15 +341,62 @@ class McapBags:
                 columns.append(column)
             else:
                 missing.append(channel)
-        if missing:
-            if chunk.index_places is not None:
-                read = chunk_columns(file, chunk, missing)
-            else:
-                read = walk(self._chunk_data(file, chunk)).columns
-            for channel, found in read.items():
-                self._found.put((file.key, chunk.offset, channel), found, found.bytes_held)
-            columns += [read[channel] for channel in missing]
-        return columns
+        if not missing:
+            return columns
+        if chunk.index_places is None:
+            read = walk(self._chunk_data(file, chunk) if data is None else data).columns
+        elif data is None:
+            return [*columns, *chunk_columns(file, chunk, missing).values()]
+        else:
+            try:
+                read = proven_columns(file, chunk, missing, data)
+            except UnreachableError:
+                raise
+            except (UnreadableError, ValueError, struct.error) as error:
+                raise _ContradictedError(reason_of(error), chunk) from error
+        for channel, found in read.items():
+            self._found.put((file.key, chunk.offset, channel), found, found.bytes_held)
+        return [*columns, *(read[channel] for channel in missing)]
+
+    def _data_if_whole(self, file: OpenFile, chunk: Chunk) -> bytes | None:
+        """The records of a chunk; None where they cannot be read."""
+        try:
+            with damage():
+                return self._chunk_data(file, chunk)
+        except UnreachableError:
+            raise
+        except UnreadableError:
+            return None
+
+    def _proven(self, file: OpenFile, index: McapIndex) -> McapIndex:
+        """The index, its first and last times held against the messages.
+
+        A bag is chosen for a question by these times, and is not looked into where they are wrong.
+        """
+        ends = sorted({end for each in index.totals.values() for end in (each.first, each.last)})
+        left = _PROVEN_BYTES
+        for chunk in index.chunks:
+            nth = bisect_left(ends, chunk.start)
+            if chunk.index_places is None or nth == len(ends) or ends[nth] > chunk.end:
+                continue
+            left -= chunk.length
+            if left < 0:
+                break
+            data = self._data_if_whole(file, chunk)
+            if data is None:
+                continue
+            try:
+                self._chunk_columns(file, chunk, chunk.channels, data)
+            except _ContradictedError as error:
+                return self._distrust(file, index, error)
+        return index
+
+    def _distrust(self, file: OpenFile, index: McapIndex, error: _ContradictedError) -> McapIndex:
+        """The index of the messages themselves, in place of one that was found to be wrong."""
+        error.believed = {chunk.offset: chunk for chunk in index.chunks}
+        reason = f"{error}; its messages were read without its indexes"
+        found = index_by_scan(file, self._max_chunk_bytes, reason)
+        return self._keep(file, found._replace(contradiction=reason))
 
     def _chunk_data(self, file: OpenFile, chunk: Chunk) -> bytes:
         key = (file.key, chunk.offset)
@@ -288,6 +432,40 @@ def _overlapping(index: McapIndex, wanted: Collection[int], window: TimeWindow) 
             yield chunk
 
 
+def _parted(
+    window: TimeWindow, chunk: Chunk, *, newest_first: bool
+) -> tuple[TimeWindow, TimeWindow]:
+    """The window from a chunk on, in the order of reading, and the part of it before that."""
+    at = chunk.end + 1 if newest_first else chunk.start
+    at = min(max(at, window.start), window.stop)
+    before, behind = TimeWindow(window.start, at), TimeWindow(at, window.stop)
+    return (before, behind) if newest_first else (behind, before)
+
+
+def _hidden(
+    index: McapIndex, error: _ContradictedError, wanted: Collection[int], passed: TimeWindow
+) -> LostError | None:
+    """What lies in a part of a window that was read by indexes which did not know of it."""
+    hidden = [
+        chunk
+        for chunk in _overlapping(index, wanted, passed)
+        if not _knew(error.believed.get(chunk.offset), chunk)
+    ]
+    if not hidden:
+        return None
+    first = max(min(chunk.start for chunk in hidden), passed.start)
+    last = min(max(chunk.end for chunk in hidden), passed.stop - 1)
+    return LostError(str(error), first, last)
+
+
+def _knew(believed: Chunk | None, chunk: Chunk) -> bool:
+    """Whether an index was right on which times and channels a chunk holds."""
+    if believed is None:
+        return False
+    within = believed.start <= chunk.start and chunk.end <= believed.end
+    return within and chunk.channels <= believed.channels
+
+
 def _lost(lost: LostError, *, newest_first: bool) -> Rows[Record | LostError]:
     return Rows([lost.last if newest_first else lost.first], [0], lambda _place, _time: lost)
 
@@ -302,7 +480,10 @@ def _rows(
 
 
 def _nothing(_place: int, _time: Ns) -> Record:
-    raise UnreadableError("damaged: a message is not where its index says")
+    raise UnreadableError(NOT_THERE)
+
+
+_NO_ROWS: Final[Rows[Record | LostError]] = Rows([], [], _nothing)
 
 
 def _from_bytes(
@@ -314,11 +495,11 @@ def _from_bytes(
 
     def fetch(place: int, time: Ns) -> Record:
         if not 0 <= place <= last:
-            raise UnreadableError("damaged: a message is not where its index says")
+            raise UnreadableError(NOT_THERE)
         opcode, length, number, _, log_time, publish_time = unpack(data, place)
         end = place + RECORD.size + length
         if opcode != Opcode.MESSAGE or log_time != time or end > len(data):
-            raise UnreadableError("damaged: a message is not where its index says")
+            raise UnreadableError(NOT_THERE)
         payload = data[place + MESSAGE.size : end]
         return _record(channels, number, log_time, publish_time, payload, max_bytes=max_bytes)
 

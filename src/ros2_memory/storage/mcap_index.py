@@ -8,8 +8,9 @@ messages themselves.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
-from operator import attrgetter, le
+from operator import attrgetter, itemgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -20,12 +21,19 @@ from ros2_memory.storage.mcap_chunk import (
     Extent,
     columns_from_index,
     extents_from_index,
+    index_bytes,
     packed_chunk,
+    require_indexed,
     unpacked,
     unpacked_in_part,
 )
-from ros2_memory.storage.mcap_records import RECORD, Statistics
-from ros2_memory.storage.mcap_summary import Chunk, DoubtError, read_summary
+from ros2_memory.storage.mcap_records import MAGIC_SIZE, RECORD, Opcode, Statistics
+from ros2_memory.storage.mcap_summary import (
+    INDEX_OFFSET_BYTES,
+    Chunk,
+    DoubtError,
+    read_summary,
+)
 from ros2_memory.summaries import (
     MESSAGES_MISSING,
     OUT_OF_ORDER_NS,
@@ -41,6 +49,13 @@ if TYPE_CHECKING:
     from ros2_memory.storage.open_file import OpenFile
     from ros2_memory.timebase import Ns
 
+_CHUNK: Final = int(Opcode.CHUNK)
+_INDEXED: Final = frozenset((_CHUNK, int(Opcode.MESSAGE_INDEX)))
+_OTHER_CHUNKS: Final = "its chunk indexes do not agree with its chunks"
+_STATED: Final = struct.Struct("<BQQQ")
+"""A chunk record up to its times: opcode, length, first and last log time."""
+_STATED_BYTES: Final = _STATED.size
+_stating: Final = _STATED.pack
 _USUAL_BYTES: Final = 32 << 10
 _NEVER: Final = 1 << 64
 """Later than any time that a file can state."""
@@ -60,7 +75,9 @@ class McapIndex(NamedTuple):
 
     `loose` are the messages outside chunks, by channel, at their places in the file. `set_back` is
     by how much a channel's log times go back from one chunk, or one loose message, to a later one,
-    at most; 0 where that is no more than `OUT_OF_ORDER_NS`.
+    at most; 0 where that is no more than `OUT_OF_ORDER_NS`. `contradiction` says where the file's
+    own indexes were found to contradict its messages after they had been believed; else it is
+    empty.
     """
 
     channels: Mapping[int, Channel]
@@ -70,15 +87,20 @@ class McapIndex(NamedTuple):
     complete: bool = True
     notes: tuple[str, ...] = ()
     set_back: Ns = 0
+    contradiction: str = ""
 
     @property
     def bytes_held(self) -> int:
-        """About how much memory it takes."""
+        """About how much memory it takes, but for `channels_bytes`."""
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
-        loose = sum(column.times.nbytes * 2 for column in self.loose.values())
-        # Those of usual length are shared with other files.
-        long = sum([size for c in self.channels.values() if (size := c.bytes_held) > _USUAL_BYTES])
-        return 1000 + 300 * len(self.channels) + 400 * len(self.chunks) + places + loose + long
+        loose = sum([column.times.nbytes * 2 for column in self.loose.values()])
+        return 1000 + 400 * len(self.chunks) + places + loose
+
+
+def channels_bytes(channels: Mapping[int, Channel]) -> int:
+    """About how much memory channels take; those of usual length are shared with other files."""
+    long = sum([size for each in channels.values() if (size := each.bytes_held) > _USUAL_BYTES])
+    return 300 * len(channels) + long
 
 
 def chunk_columns(
@@ -101,6 +123,20 @@ def chunk_columns(
     for times, _ in columns.values():
         if times.size and not chunk.start <= int(times[0]) <= int(times[-1]) <= chunk.end:
             raise _outside()
+    return columns
+
+
+def proven_columns(
+    file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes
+) -> dict[int, Column]:
+    """As `chunk_columns`, held against the decompressed records of the chunk.
+
+    Raises:
+        UnreadableError: the indexes do not agree with the records.
+    """
+    columns = chunk_columns(file, chunk, wanted)
+    for channel, column in columns.items():
+        require_indexed(data, channel, column)
     return columns
 
 
@@ -180,7 +216,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
 
 
 def _index_from_summary(file: OpenFile) -> McapIndex:
-    channels, resolved, chunks, stated = read_summary(file)
+    start, channels, resolved, chunks, stated = read_summary(file)
     if stated is None or not resolved or stated.channels > len(channels):
         raise DoubtError
     counts = stated.counts
@@ -189,7 +225,11 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     held = [chunk for chunk in chunks if chunk.channels]
     if counts and len(held) < len(chunks):  # some have no index places
         raise DoubtError
+    if chunks:
+        _require_as_stated(file, start, chunks)
     exact = _agrees(stated, chunks, held)
+    if exact and not _indexes_all(held, stated.messages):
+        raise DoubtError("its message indexes do not hold what its statistics state")
     totals = totals_of(file, held, counts if exact else None)
     found = {channel: total.count for channel, total in totals.items()}
     if found != counts or sum(found.values()) != stated.messages:
@@ -197,6 +237,52 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     notes = disagreements(stated, totals)
     back = _set_back(file, held)
     return McapIndex(channels, tuple(held), totals, notes=notes, set_back=back)
+
+
+def _require_as_stated(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:
+    """Holds every chunk index against the head of its chunk, and what lies between the chunks.
+
+    Raises:
+        DoubtError: a chunk is not where its index says, or not of these times; or there is a chunk
+            or a message that no index knows.
+    """
+    ordered = sorted(chunks, key=itemgetter(0))
+    if ordered[-1].offset >= file.size:
+        raise DoubtError(_OTHER_CHUNKS)
+    heads = file.read_each([chunk[0] for chunk in ordered], _STATED_BYTES)
+    at, record_bytes = MAGIC_SIZE, RECORD.size
+    for (offset, length, first, last, _, _, behind, _), head in zip(ordered, heads, strict=True):
+        if head != _stating(_CHUNK, length - record_bytes, first, last):
+            raise DoubtError(_OTHER_CHUNKS)
+        if offset != at:
+            _require_no_content(file, at, offset)
+        at = offset + length + behind
+    _require_no_content(file, at, end)
+
+
+def _require_no_content(file: OpenFile, at: int, end: int) -> None:
+    """Holds that no chunk or message lies in this stretch of the data section.
+
+    Raises:
+        DoubtError: one does, or the stretch is not made of records.
+    """
+    while at < end:
+        opcode, length = RECORD.unpack(file.read(at, RECORD.size))
+        if opcode == Opcode.DATA_END:
+            return
+        if opcode == Opcode.MESSAGE:
+            raise DoubtError  # as any writer may write it, though few do
+        if opcode in _INDEXED:
+            raise DoubtError("its chunk indexes do not hold all of its chunks")
+        at += RECORD.size + length
+    if at > end:
+        raise DoubtError(_OTHER_CHUNKS)
+
+
+def _indexes_all(chunks: Sequence[Chunk], messages: int) -> bool:
+    """Whether the message indexes, by their size alone, hold so many messages together."""
+    indexes = sum([len(chunk.index_places or b"") for chunk in chunks]) // INDEX_OFFSET_BYTES
+    return index_bytes(indexes, messages) == sum([chunk.index_length for chunk in chunks])
 
 
 def _agrees(stated: Statistics, chunks: Sequence[Chunk], held: Sequence[Chunk]) -> bool:
@@ -316,6 +402,7 @@ def _add(totals: dict[int, Total], channel: int, extent: Extent) -> None:
         return
     messages, first, last = extent
     total.count += messages
+    # Not by min() and max(), which take longer than all the rest.
     total.first = min(total.first, first)
     total.last = max(total.last, last)
 

@@ -38,7 +38,8 @@ _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 _CHUNK_INDEX_BYTES: Final = _CHUNK_INDEX.size
 _chunk_index: Final = _CHUNK_INDEX.unpack_from
 _INDEX_OFFSET: Final = struct.Struct("<HQ")
-_INDEX_OFFSET_BYTES: Final = _INDEX_OFFSET.size
+INDEX_OFFSET_BYTES: Final = _INDEX_OFFSET.size
+"""What a chunk index takes to say where the message index of one channel lies."""
 _SIZE_BYTES: Final = 8
 _index_size: Final = struct.Struct("<Q").unpack_from
 _tuple: Final = tuple.__new__
@@ -88,7 +89,12 @@ class DoubtError(UnreadableError):
 
 
 class Summary(NamedTuple):
-    """What a summary section states. `resolved` says whether every channel's schema is there."""
+    """What a summary section states, and where in the file it begins.
+
+    `resolved` says whether every channel's schema is there.
+    """
+
+    start: int
 
     channels: Mapping[int, Channel]
     resolved: bool
@@ -103,7 +109,7 @@ def read_summary(file: OpenFile) -> Summary:
         DoubtError: there is none, or not the one that its writer wrote.
         UnreadableError, struct.error and others: it is damaged.
     """
-    section = _section(file)
+    start, section = _section(file)
     beginning = next((each for each in _beginnings if section.startswith(each.records)), None)
     declaring: list[bytes] = [] if beginning is None else [beginning.records]
     chunks: list[Chunk] = []
@@ -127,10 +133,10 @@ def read_summary(file: OpenFile) -> Summary:
     if beginning is None or len(declaring) > 1:
         beginning = _declared(b"".join(declaring))
         _remember(beginning, section)
-    return Summary(beginning.channels, beginning.resolved, chunks, stated)
+    return Summary(start, beginning.channels, beginning.resolved, chunks, stated)
 
 
-def _section(file: OpenFile) -> bytes:
+def _section(file: OpenFile) -> tuple[int, bytes]:
     footer_at = file.size - MAGIC_SIZE - FOOTER.size
     footer = file.read(footer_at, FOOTER.size)
     opcode, _, summary_at, _, crc = FOOTER.unpack(footer)
@@ -141,7 +147,7 @@ def _section(file: OpenFile) -> bytes:
     section = file.read(summary_at, footer_at - summary_at)
     if crc and zlib.crc32(footer[:-4], zlib.crc32(section)) != crc:
         raise DoubtError("its summary section does not match its checksum")
-    return section
+    return summary_at, section
 
 
 def _chunk(section: bytes, at: int, end: int) -> Chunk:
@@ -149,10 +155,10 @@ def _chunk(section: bytes, at: int, end: int) -> Chunk:
     start, last, offset, length, places_size = _chunk_index(section, at)
     at += _CHUNK_INDEX_BYTES
     stop = at + places_size
-    if stop + _SIZE_BYTES > end or places_size % _INDEX_OFFSET_BYTES:
+    if stop + _SIZE_BYTES > end or places_size % INDEX_OFFSET_BYTES:
         raise UnreadableError("damaged: a chunk index is shorter than it states")
     places = section[at:stop]
-    channels = _numbers(places[::_INDEX_OFFSET_BYTES], places[1::_INDEX_OFFSET_BYTES])
+    channels = _numbers(places[::INDEX_OFFSET_BYTES], places[1::INDEX_OFFSET_BYTES])
     (index_length,) = _index_size(section, stop)
     # As a tuple is made, past the function that a named tuple's fields go through.
     return _tuple(Chunk, (offset, length, start, last, channels, places, index_length, None))

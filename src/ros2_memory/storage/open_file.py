@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Self
 from ros2_memory.storage.faults import UnreadableError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
     from types import TracebackType
 
@@ -97,3 +98,8 @@ class OpenFile:
             offset += len(piece)
             missing -= len(piece)
         return b"".join(pieces)
+
+    def read_each(self, offsets: Iterable[int], length: int) -> list[bytes]:
+        """`length` bytes from each of these places, which lie in the file; fewer at its end."""
+        read, descriptor = os.pread, self._descriptor
+        return [read(descriptor, length, offset) for offset in offsets]
