@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.digest import Digest
     from ros2_memory.memory import Memory
     from ros2_memory.model import BagSummary
-    from ros2_memory.motion import PoseDigest, Stop
+    from ros2_memory.motion import Leg, PoseDigest, Stop
     from ros2_memory.settings import Settings
     from ros2_memory.standstills import StandstillDigest, TimedPosition
     from ros2_memory.stories import Story
@@ -138,14 +138,18 @@ def _moved_story(story: Story, by: int) -> Story:
 
 
 def _moved_poses(poses: PoseDigest, by: int) -> PoseDigest:
-    def later(stop: Stop | None) -> Stop | None:
-        return None if stop is None else stop._replace(time=stop.time + by)
+    def later(stop: Stop) -> Stop:
+        return stop._replace(time=stop.time + by)
+
+    def leg(one: Leg | None) -> Leg | None:
+        return one and replace(one, first=later(one.first), last=later(one.last))
 
     return replace(
         poses,
-        first=later(poses.first),
-        last=later(poses.last),
-        anchor=later(poses.anchor),
-        measured_from=later(poses.measured_from),
+        first=poses.first and later(poses.first),
+        last=poses.last and later(poses.last),
+        head=leg(poses.head),
+        tail=leg(poses.tail),
+        resets=tuple(moment + by for moment in poses.resets),
         vertices=tuple((moment + by, place, turn) for moment, place, turn in poses.vertices),
     )

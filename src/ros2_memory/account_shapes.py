@@ -73,6 +73,10 @@ def _recap(answer: accounts.Recap, _bag_dir: Path) -> JsonObject:
     if answer.throughout:
         reply["seen_throughout"] = [*answer.throughout]
     reply["counts"] = dict(answer.counts)
+    if answer.path_sum_m is not None:
+        reply["path_sum_m"] = rounded(answer.path_sum_m, 3)
+    if answer.gap_m is not None:
+        reply["gap_m"] = rounded(answer.gap_m, 3)
     return with_notes(reply, answer.notes)
 
 

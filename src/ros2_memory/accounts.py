@@ -93,6 +93,8 @@ class Recap:
         events: what happened, in order of time.
         throughout: things that were in view all the time.
         counts: how many events of which kind there were, those that are left out too.
+        path_sum_m: the way with what the noise of positions adds, where that is much.
+        gap_m: the way across gaps in the recording, in straight lines; None without a gap.
     """
 
     start: Ns
@@ -107,6 +109,8 @@ class Recap:
     throughout: tuple[str, ...]
     counts: tuple[tuple[str, int], ...] = ()
     notes: tuple[str, ...] = ()
+    path_sum_m: float | None = None
+    gap_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

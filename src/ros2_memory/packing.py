@@ -10,21 +10,25 @@ import math
 import struct
 import zlib
 from functools import lru_cache
-from itertools import chain
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.motion import PoseDigest, Stop
+from ros2_memory.motion import Leg, PoseDigest, Stop
+from ros2_memory.path_length import Creep, End
 from ros2_memory.presences import Seen
 from ros2_memory.standstills import ChainDigest, StandstillDigest
 from ros2_memory.stories import Fault, Flip, Known, Story
 from ros2_memory.summaries import BagSummary, Heading, shared_shape
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.model import JsonValue
     from ros2_memory.motion import Vertex
     from ros2_memory.summaries import Shape
 
-_HEAD: Final = struct.Struct("<qqqqddB??qdddqdddqdddqddd")
+_HEAD: Final = struct.Struct("<qqqqqqBdddddddqdddqddd")
+_LEG: Final = struct.Struct("<qdddqdddqqddBdddd")
+_CREEP: Final = struct.Struct("<ddddddddddd")
 _VERTEX: Final = struct.Struct("<qdddd")
 _STORY: Final = struct.Struct("<qqqqI")
 _NOWHERE: Final = Stop(0, (math.nan, math.nan, math.nan))
@@ -32,28 +36,69 @@ _NOWHERE: Final = Stop(0, (math.nan, math.nan, math.nan))
 
 def packed_poses(poses: PoseDigest) -> bytes:
     """A digest of poses as bytes."""
-    stops = [
-        _NOWHERE if stop is None else stop
-        for stop in (poses.first, poses.last, poses.anchor, poses.measured_from)
-    ]
+    legs = [leg for leg in (poses.head, poses.tail) if leg is not None]
+    first, last = (_NOWHERE if stop is None else stop for stop in (poses.first, poses.last))
     head = _HEAD.pack(
         poses.poses,
         poses.invalid,
         poses.jumps,
+        poses.gaps,
+        len(poses.resets),
         len(poses.vertices),
+        len(legs),
         poses.length_m,
+        poses.sum_m,
         poses.jumped_m,
-        (poses.first is not None) | (poses.anchor is not None) << 1,
-        poses.anchored_by_jump,
-        poses.twist is not None,
-        *chain.from_iterable((stop.time, *stop.position) for stop in stops),
+        poses.gap_m,
+        math.nan if poses.speed_mps is None else poses.speed_mps,
+        math.nan if poses.twist is None else poses.twist,
+        poses.error_m,
+        first.time,
+        *first.position,
+        last.time,
+        *last.position,
     )
     vertices = b"".join(
         _VERTEX.pack(time, *position, turn if isinstance(turn, float) else math.nan)
         for time, position, turn in poses.vertices
     )
-    rest = struct.pack("<ddd", poses.max_speed, poses.twist or 0.0, poses.error_m)
-    return head + vertices + rest + json.dumps(poses.frames).encode()
+    resets = struct.pack(f"<{len(poses.resets)}q", *poses.resets)
+    frames = json.dumps(poses.frames).encode()
+    return b"".join((head, *map(_packed_leg, legs), resets, vertices, frames))
+
+
+def _packed_leg(leg: Leg) -> bytes:
+    ends = (leg.head,) if leg.still else (leg.head, leg.tail)
+    creeps = [end.creep for end in ends]
+    flags = leg.still | leg.head.plain << 1 | leg.tail.plain << 2
+    for place, creep in enumerate(creeps):
+        flags |= (creep is not None) << 3 + place
+    packed = _LEG.pack(
+        leg.first.time,
+        *leg.first.position,
+        leg.last.time,
+        *leg.last.position,
+        leg.poses,
+        -1 if leg.period_ns is None else leg.period_ns,
+        leg.length_m,
+        leg.sum_m,
+        flags,
+        leg.head.pace_m,
+        leg.head.noise_m,
+        leg.tail.pace_m,
+        leg.tail.noise_m,
+    )
+    return packed + b"".join(
+        _CREEP.pack(
+            *creep.start,
+            *((math.nan,) * 3 if creep.second is None else creep.second),
+            creep.middle_m,
+            *creep.end,
+            creep.reach_m,
+        )
+        for creep in creeps
+        if creep is not None
+    )
 
 
 def unpacked_poses(packed: bytes) -> PoseDigest:
@@ -146,37 +191,72 @@ def _told(
 
 
 def _unpacked_poses(packed: bytes) -> PoseDigest:
-    poses, invalid, jumps, count, length_m, jumped_m, stands, by_jump, states, *stops = (
-        _HEAD.unpack_from(packed)
-    )
-    first, last, anchor, measured_from = [
-        Stop(stops[at], (stops[at + 1], stops[at + 2], stops[at + 3])) for at in (0, 4, 8, 12)
-    ]
+    poses, invalid, jumps, gaps, reset, count, legs, *numbers = _HEAD.unpack_from(packed)
+    length_m, sum_m, jumped_m, gap_m, speed_mps, twist, error_m, *ends_of_all = numbers
+    first, last = _stops(ends_of_all)
     begin = _HEAD.size
+    ends: list[Leg] = []
+    for _ in range(legs):
+        leg, begin = _unpacked_leg(packed, begin)
+        ends.append(leg)
+    resets = struct.unpack_from(f"<{reset}q", packed, begin)
+    begin += 8 * len(resets)
     end = begin + count * _VERTEX.size
-    isnan = math.isnan
     vertices: list[Vertex] = [
-        (time, (x, y, z), None if isnan(heading) else heading)
+        (time, (x, y, z), None if math.isnan(heading) else heading)
         for time, x, y, z, heading in _VERTEX.iter_unpack(packed[begin:end])
     ]
-    max_speed, twist, error_m = struct.unpack_from("<ddd", packed, end)
     return PoseDigest(
         poses=poses,
         invalid=invalid,
-        first=first if stands & 1 else None,
-        last=last if stands & 1 else None,
+        first=first if poses else None,
+        last=last if poses else None,
+        head=ends[0] if ends else None,
+        tail=ends[1] if len(ends) > 1 else None,
         length_m=length_m,
+        sum_m=sum_m,
         jumps=jumps,
         jumped_m=jumped_m,
-        anchor=anchor if stands & 2 else None,
-        anchored_by_jump=by_jump,
-        max_speed=max_speed,
-        measured_from=measured_from if stands & 1 else None,
-        twist=twist if states else None,
-        frames=_frames(packed[end + 24 :]),
+        gaps=gaps,
+        gap_m=gap_m,
+        resets=resets,
+        speed_mps=None if math.isnan(speed_mps) else speed_mps,
+        twist=None if math.isnan(twist) else twist,
+        frames=_frames(packed[end:]),
         vertices=tuple(vertices),
         error_m=error_m,
     )
+
+
+def _stops(numbers: Sequence[float]) -> tuple[Stop, Stop]:
+    first, ax, ay, az, last, bx, by, bz = numbers
+    return Stop(int(first), (ax, ay, az)), Stop(int(last), (bx, by, bz))
+
+
+def _unpacked_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
+    """The leg that begins at a byte, and where it ends."""
+    numbers = _LEG.unpack_from(packed, begin)
+    poses, period_ns, length_m, sum_m, flags, *paces = numbers[8:]
+    begin += _LEG.size
+    creeps: list[Creep | None] = [None, None]
+    for place in (0, 1):
+        if flags >> 3 + place & 1:
+            a, b, c, d, e, f, middle_m, g, h, i, reach_m = _CREEP.unpack_from(packed, begin)
+            second = None if math.isnan(d) else (d, e, f)
+            creeps[place] = Creep((a, b, c), second, middle_m, (g, h, i), reach_m)
+            begin += _CREEP.size
+    still = bool(flags & 1)
+    leg = Leg(
+        *_stops(numbers[:8]),
+        poses,
+        None if period_ns < 0 else period_ns,
+        length_m,
+        sum_m,
+        End(paces[0], paces[1], bool(flags & 2), creeps[0]),
+        End(paces[2], paces[3], bool(flags & 4), creeps[0] if still else creeps[1]),
+        still,
+    )
+    return leg, begin
 
 
 @lru_cache(256)

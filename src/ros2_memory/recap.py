@@ -21,7 +21,7 @@ from ros2_memory.stories import tells
 from ros2_memory.tales import standstills_in, story_in
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS, ns_from_unix
 from ros2_memory.unseen import note_edges, note_unseen
-from ros2_memory.ways import way_driven
+from ros2_memory.ways import length_notes, way_driven
 from ros2_memory.wording import Reason, counted
 
 if TYPE_CHECKING:
@@ -100,6 +100,8 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     told = _most_important(view, events, counts)
     latest = view.snapshot.latest
     trajectory = None if drive is None else drive.way.trajectory
+    for note in () if trajectory is None else length_notes(trajectory):
+        view.note(note)
     return Recap(
         start=window.start + START_SLACK_NS,
         end=window.stop - 1 - AT_OR_BEFORE_SLACK_NS,
@@ -113,6 +115,10 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         throughout=tuple(sorted(throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
         notes=view.notes,
+        path_sum_m=trajectory.path_sum_m
+        if trajectory is not None and trajectory.is_noisy
+        else None,
+        gap_m=trajectory.gap_m if trajectory is not None and trajectory.gaps else None,
     )
 
 

@@ -16,6 +16,7 @@ from ros2_memory.figures import degrees, local, metres, moment, rounded, seconds
 from ros2_memory.fitting import compact, without_constant_zeros
 from ros2_memory.geometry import normalised, yaw
 from ros2_memory.timebase import Ns, unix_rounded_up
+from ros2_memory.ways import length_notes
 from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
@@ -336,6 +337,8 @@ def _trajectory(answer: answers.TrajectorySummary, _bag_dir: Path) -> JsonObject
         "start": unix_rounded_up(answer.start),
         "end": unix_rounded_up(answer.end),
         "poses": way.poses,
+        **({"path_sum_m": rounded(way.path_sum_m, 4)} if way.is_noisy else {}),
+        **({"gap_m": rounded(way.gap_m, 4)} if way.gaps else {}),
     }
     return with_notes(reply, (*answer.notes, *_notes_of_way(way)))
 
@@ -344,11 +347,8 @@ def _notes_of_way(way: Trajectory) -> Iterator[str]:
     if way.invalid:
         poses = counted(way.invalid, "pose")
         yield f"{poses} left out: the coordinates are no place (NaN or beyond)"
+    yield from length_notes(way)
     if way.jumps:
-        yield (
-            f"{counted(way.jumps, 'jump')} of {way.jumped_m:.2f} m in all, faster than is "
-            "plausible, left out of distance and speed"
-        )
         drawn = sum(point.jump for point in way.waypoints)
         if drawn:
             longest = "the longest lead" if drawn < way.jumps else "each leads"

@@ -85,7 +85,7 @@ def visits(
     looking = _Looking(view, topic, place, (x, y, radius))
     latest, newest = view.snapshot.latest, looking.newest_time
     found, total = looking.newest(limit)
-    epochs = [] if place.is_map or not found else _restarts(view, topic, found[-1][0].arrived)
+    epochs = () if place.is_map or not found else _restarts(view, topic, found[-1][0].arrived)
     note_unseen(view, TimeWindow.everything(), nothing=not found)
     told = tuple(
         Visit(
@@ -116,14 +116,14 @@ def visits(
     )
 
 
-def _restarts(view: View, topic: str, since: Ns) -> list[Ns]:
+def _restarts(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
     """When odometry began anew after a moment; not known where the time is over before."""
     try:
         return restarts(view, topic, since)
     except QueryTimeoutError:
         view.complete = False
         view.note("the time was over before it was known whether odometry began anew since")
-        return []
+        return ()
 
 
 def _pose_frame(view: View, topic: str) -> str:

@@ -16,7 +16,7 @@ from ros2_memory.packing import packed_poses, unpacked_poses
 from ros2_memory.portions import Kept, Kind, is_whole
 from ros2_memory.sights import Sights
 from ros2_memory.trajectory import PoseCollector, TrajectoryBuilder
-from ros2_memory.wording import listed
+from ros2_memory.wording import counted, listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -98,6 +98,30 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     if first is None or last is None:
         return None
     return Way(builder.result(), builder.frames, first, last)
+
+
+def length_notes(way: Trajectory) -> Iterator[str]:
+    """What is not in the length of a way, and why it is not the sum of all steps."""
+    if way.is_noisy:
+        yield (
+            f"the positions are noisy: step by step they sum up to {way.path_sum_m:.2f} m; "
+            "distance_m is without what the noise adds"
+        )
+    if way.gaps:
+        yield (
+            f"{counted(way.gaps, 'gap')} in which nothing was recorded, {way.gap_m:.2f} m across "
+            "in straight lines (gap_m): left out of distance_m"
+        )
+    if way.jumps:
+        yield (
+            f"{counted(way.jumps, 'jump')} of {way.jumped_m:.2f} m in all, faster than is "
+            "plausible, left out of distance and speed"
+        )
+    if way.resets:
+        yield (
+            f"odometry began anew {counted(len(way.resets), 'time')}: "
+            "what led back to its origin is left out of distance and speed"
+        )
 
 
 def add_poses(

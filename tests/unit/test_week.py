@@ -75,8 +75,6 @@ def moved(poses: PoseDigest, by: int) -> PoseDigest:
         poses,
         first=stop(poses.first),
         last=stop(poses.last),
-        anchor=stop(poses.anchor),
-        measured_from=stop(poses.measured_from),
         vertices=tuple(
             (time + by, (x + by / SPLIT, y, z), turn) for time, (x, y, z), turn in poses.vertices
         ),
