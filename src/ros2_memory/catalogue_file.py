@@ -6,6 +6,7 @@ import errno
 import sqlite3
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.logs import get_logger
@@ -208,7 +209,8 @@ def _ready(path: Path) -> sqlite3.Connection:
 
     Raises:
         _LockedError: another program holds it.
-        OSError: it cannot be set aside.
+        OSError: it cannot be set aside, or another version of this program uses it: each setting
+            the other's file aside, they would digest all bags for ever.
         sqlite3.Error: it cannot be opened, or not be written.
     """
     for _ in range(2):
@@ -216,7 +218,11 @@ def _ready(path: Path) -> sqlite3.Connection:
         try:
             _prepare(base)
         except _OtherError as error:
+            is_used = _is_used(base)
             base.close()
+            if is_used:
+                reason = f"another version of this program uses it: {error}"
+                raise OSError(errno.EBUSY, reason) from error
             set_aside(path, str(error))
             continue
         except sqlite3.OperationalError as error:
@@ -250,7 +256,32 @@ def _prepare(base: sqlite3.Connection) -> None:
     base.execute("COMMIT")
     if tables and version != VERSION:
         raise _OtherError(f"it is of version {version}, and {VERSION} is what is known")
+    if tables and _declared(base) != _expected():
+        raise _OtherError("its tables are not those of this version")
     base.execute(_FIRST_ROWS).fetchall()
+
+
+def _declared(base: sqlite3.Connection) -> dict[str, str]:
+    """The tables of a base, each as it was declared."""
+    rows = base.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall()
+    return {
+        name: " ".join(str(sql).split()) for name, sql in rows if not name.startswith("sqlite_")
+    }
+
+
+@cache
+def _expected() -> dict[str, str]:
+    with closing(in_memory().base) as base:
+        return _declared(base)
+
+
+def _is_used(base: sqlite3.Connection) -> bool:
+    """Whether another connection is open to the file: only the last may leave the WAL mode."""
+    try:
+        mode = base.execute("PRAGMA journal_mode = DELETE").fetchone()[0]
+    except sqlite3.OperationalError:
+        return True
+    return bool(mode != "delete")
 
 
 def set_aside(path: Path, reason: str) -> None:
