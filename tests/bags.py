@@ -27,6 +27,7 @@ VISION_DEFINITIONS: Final = {
     ),
     "ros2_vision_interfaces/msg/StampedString": "std_msgs/Header header\nstring data\n",
 }
+STATUS_FLAGS: Final = tuple(f"flag_{nth:02}" for nth in range(40))
 _QOS: Final = (
     "- history: unknown\n  depth: 0\n  reliability: reliable\n  durability: {durability}\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
@@ -52,8 +53,14 @@ OTHER_ROBOTS: Final = {
     "px4_msgs/msg/VehicleLocalPosition": (
         "uint64 timestamp\nbool xy_valid\nfloat32 x\nfloat32 y\nfloat32 z\nfloat32 heading\n"
     ),
+    "px4_msgs/msg/VehicleStatus": (
+        "uint64 timestamp\nuint8 arming_state\n"
+        + "".join(f"bool {name}\n" for name in STATUS_FLAGS)
+        + "uint8 gcs_connection_lost_counter\n"
+    ),
+    "px4_msgs/msg/ManyFlags": "".join(f"bool flag_{nth:03}\n" for nth in range(600)),
 }
-"""Types that carry a pose in ways of their own (of the last some of its fields)."""
+"""Types that carry a pose in ways of their own (of one some of its fields), or many booleans."""
 
 
 @cache

@@ -445,7 +445,8 @@ def _plain(node: object) -> object:
 
 def _no_such_field(type_name: str, path: str, plan: _Plan, message: object) -> str:
     standing = names_of(message)
-    listed = ", ".join(standing[:_LISTED_NAMES]) + (", ..." if standing[_LISTED_NAMES:] else "")
+    more = len(standing) - _LISTED_NAMES
+    listed = ", ".join(standing[:_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
     if not plan.fields:
         there = f"its fields are: {listed}" if listed else "it has no fields"
         return f"{type_name} has no field {path!r}; {there}"

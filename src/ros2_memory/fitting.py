@@ -222,9 +222,10 @@ def _less_inside(reply: JsonObject, max_chars: int) -> JsonObject:
 
 def _shortened(reply: JsonObject, shorter: _Shorter, max_chars: int) -> JsonObject:
     short = shorter.reply(reply)
-    named = [f"{_in_fields(path)} ({how})" for path, how in list(shorter.touched)[:_MOST_NAMES]]
-    if len(shorter.touched) > _MOST_NAMES:
-        named.append("and others")
+    touched = list(shorter.touched.items())
+    named = [f"{_in_fields(path)} ({how}{kept})" for (path, how), kept in touched[:_MOST_NAMES]]
+    if len(touched) > _MOST_NAMES:
+        named.append(f"and {len(touched) - _MOST_NAMES} more")
     sentence = (
         f"shortened to keep the reply under {max_chars} characters: {', '.join(named)}; "
         "name one of them in fields to see more of it"
@@ -238,20 +239,30 @@ def _in_fields(path: str) -> str:
 
 
 class _Shorter:
-    """One set of limits, and what they touched: (dot-path without indices, how)."""
+    """One set of limits, and what they touched: (dot-path without indices, how), and how much.
+
+    How much is that of the longest list or widest object at the path; empty for texts.
+    """
 
     def __init__(self, keys: int, arrays: int, text: int) -> None:
         self._keys = keys
         self._arrays = arrays
         self._text = text
-        self.touched: dict[tuple[str, str], None] = {}
+        self.touched: dict[tuple[str, str], str] = {}
+        self._most: dict[tuple[str, str], int] = {}
 
     def reply(self, reply: JsonObject) -> JsonObject:
         """The reply with everything below its first level within the limits."""
         self.touched.clear()
+        self._most.clear()
         return {
             key: item if key == "notes" else self._top(key, item) for key, item in reply.items()
         }
+
+    def _touch(self, path: str, how: str, kept: int, total: int) -> None:
+        if total > self._most.get((path, how), 0):
+            self._most[path, how] = total
+            self.touched[path, how] = f": {kept} of {total} kept"
 
     def _top(self, key: str, item: JsonValue) -> JsonValue:
         if isinstance(item, list):
@@ -262,7 +273,7 @@ class _Shorter:
         if isinstance(value, str):
             if len(value) <= self._text:
                 return value
-            self.touched[path, "texts cut"] = None
+            self.touched[path, "texts cut"] = ""
             return _cut_text(value, self._text)
         if isinstance(value, list):
             return self._array(value, path)
@@ -273,13 +284,13 @@ class _Shorter:
     def _array(self, value: list[JsonValue], path: str) -> JsonValue:
         kept = evenly(len(value), self._arrays)
         if len(kept) < len(value):
-            self.touched[path, "evenly thinned"] = None
+            self._touch(path, "evenly thinned", len(kept), len(value))
         return [self._value(value[index], path) for index in kept]
 
     def _object(self, value: JsonObject, path: str) -> JsonValue:
         kept = list(value.items())[: self._keys]
         if len(kept) < len(value):
-            self.touched[path, "keys left out"] = None
+            self._touch(path, "keys left out", len(kept), len(value))
         return {
             _cut_text(key, self._text): self._value(item, f"{path}.{key}") for key, item in kept
         }

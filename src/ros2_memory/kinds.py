@@ -31,9 +31,11 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     topics = [topic for topic in snapshot.topics() if type_name in snapshot.types_of(topic)]
     if not topics:
         known = sorted({each for topic in snapshot.topics() for each in snapshot.types_of(topic)})
+        more = f" and {len(known) - MOST_FIELDS} more" if len(known) > MOST_FIELDS else ""
+        names = ", ".join(known[:MOST_FIELDS]) + more
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,
-            f"no topic was recorded under this type; there are {', '.join(known[:MOST_FIELDS])}",
+            f"no topic was recorded under this type; there are {names}",
         )
     failure = ""
     for topic in topics:

@@ -30,7 +30,9 @@ _HEAD: Final = struct.Struct("<qqqqqqBdddddddqdddqddd")
 _LEG: Final = struct.Struct("<qdddqdddqqddBdddd")
 _CREEP: Final = struct.Struct("<ddddddddddd")
 _VERTEX: Final = struct.Struct("<qdddd")
-_STORY: Final = struct.Struct("<qqqqI")
+_STORY: Final = struct.Struct("<qqqqqI")
+_SHORT_TEXT: Final = 256
+"""A text of so many bytes is not worth compressing."""
 _NOWHERE: Final = Stop(0, (math.nan, math.nan, math.nan))
 
 
@@ -147,15 +149,23 @@ def unpacked_standstills(packed: bytes) -> StandstillDigest:
 
 def packed_story(story: Story) -> bytes:
     """A story as bytes."""
-    counts = (story.first, story.last, story.left_out, story.undecodable)
+    counts = (story.first, story.last, story.left_out, story.undecodable, story.beyond)
+    # Many booleans have the same paths, and times counted from the first message, in every bag.
+    known = [
+        [each.path for each in story.known],
+        [each.at - story.first for each in story.known],
+        "".join(str(each.first + 2 * each.last) for each in story.known),
+    ]
     rest = json.dumps(
-        [story.seen.labels, story.known, story.flips, story.faults],
+        [story.seen.labels, known, story.flips, story.faults],
         ensure_ascii=False,
         separators=(",", ":"),
     )
     rows = story.seen.rows
     # Half a pair of surrogates is no UTF-8, and is kept all the same.
-    return _STORY.pack(*counts, len(rows)) + rows + rest.encode("utf-8", "surrogatepass")
+    text = rest.encode("utf-8", "surrogatepass")
+    shorter = zlib.compress(text) if len(text) > _SHORT_TEXT else text
+    return _STORY.pack(*counts, len(rows)) + rows + shorter
 
 
 def unpacked_story(packed: bytes) -> Story:
@@ -165,26 +175,33 @@ def unpacked_story(packed: bytes) -> Story:
         ValueError: they are of none.
     """
     try:
-        first, last, left_out, undecodable, size = _STORY.unpack_from(packed)
+        first, last, left_out, undecodable, beyond, size = _STORY.unpack_from(packed)
         end = _STORY.size + size
-        labels, known, flips, faults = _told(packed[end:])
-    except (TypeError, struct.error) as error:
+        labels, (paths, after, values), flips, faults = _told(packed[end:])
+        known = tuple(
+            Known(path, first + at, value in "13", value in "23")
+            for path, at, value in zip(paths, after, values, strict=True)
+        )
+    except (TypeError, struct.error, zlib.error) as error:
         raise ValueError(f"not a story: {error}") from error
     seen = Seen(labels, packed[_STORY.size : end])
     if not seen.is_sound:
         raise ValueError("not a story: it tells of things without a name")
-    return Story(first, last, seen, known, flips, faults, left_out, undecodable)
+    return Story(first, last, seen, known, flips, faults, left_out, undecodable, beyond)
 
 
 @lru_cache(2048)
 def _told(
     text: bytes,
-) -> tuple[tuple[str, ...], tuple[Known, ...], tuple[Flip, ...], tuple[Fault, ...]]:
+) -> tuple[tuple[str, ...], tuple[list[str], list[int], str], tuple[Flip, ...], tuple[Fault, ...]]:
     """What a story says in words: of many bags the same, and asked of an hour again and again."""
-    labels, known, flips, faults = json.loads(text.decode("utf-8", "surrogatepass"))
+    plain = text if text.startswith(b"[") else zlib.decompress(text)
+    labels, (paths, after, values), flips, faults = json.loads(
+        plain.decode("utf-8", "surrogatepass")
+    )
     return (
         tuple(labels),
-        tuple(Known(*each) for each in known),
+        (paths, after, values),
         tuple(Flip(*each) for each in flips),
         tuple(Fault(*each) for each in faults),
     )

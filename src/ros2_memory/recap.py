@@ -86,6 +86,11 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
             view.note_thing(_UNDECODED, f"{messages} of {topic}")
         if story.left_out:
             view.note(f"{topic} changes too often to tell each: {story.left_out} more")
+        if story.beyond:
+            view.note(
+                f"{topic} has too many booleans or things in one message: {story.beyond} more are "
+                "not followed"
+            )
     things = united(seen).without(throughout)
     events += [
         _thing(each, goes_on=each.last == there_still.get(each.label))

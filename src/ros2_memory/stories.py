@@ -24,7 +24,10 @@ MOST_HELD: Final = 20_000
 """Flips and faults of a topic in all bags together: what a question about a week may hold."""
 MOST_SEEN: Final = 100_000
 """Presences likewise; they are held as numbers."""
-MOST_FLAGS: Final = 16
+MOST_FLAGS: Final = 512
+"""Booleans of one message that are followed; the rest is counted."""
+MOST_LABELS: Final = 256
+"""Names of things in one message, likewise."""
 
 _ERROR: Final = 2
 _STALE: Final = 3
@@ -39,11 +42,15 @@ _MEASURING: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "tf2_msgs/")
 
 
 class State(NamedTuple):
-    """What one message says: names of things, booleans by dot-path, errors as sentences."""
+    """What one message says: names of things, booleans by dot-path, errors as sentences.
+
+    `beyond` is how many names and booleans it has besides.
+    """
 
     labels: tuple[str, ...] = ()
     flags: tuple[tuple[str, bool], ...] = ()
     faults: tuple[str, ...] = ()
+    beyond: int = 0
 
     @property
     def says_nothing(self) -> bool:
@@ -96,6 +103,7 @@ class Story:
             longest are, of the others the earliest.
         undecodable: messages that cannot be decoded, of which nothing is told; where there are no
             others, `first` lies after `last`.
+        beyond: names of things and booleans of one message that are not followed, at most.
     """
 
     first: Ns
@@ -106,6 +114,7 @@ class Story:
     faults: tuple[Fault, ...] = ()
     left_out: int = 0
     undecodable: int = 0
+    beyond: int = 0
 
     @property
     def says_nothing(self) -> bool:
@@ -130,8 +139,11 @@ def state_of(value: JsonValue, type_name: str) -> State:
     if type_name in _ERROR_LEVELS:
         return State(faults=faults) if faults else NOTHING
     labels = tuple(dict.fromkeys(thing.label for thing in things_of(value)))
-    flags = tuple(_flags(value, ""))[:MOST_FLAGS]
-    return State(labels, flags, faults) if labels or flags else NOTHING
+    flags = tuple(_flags(value, ""))
+    if not (labels or flags):
+        return NOTHING
+    beyond = len(labels[MOST_LABELS:]) + len(flags[MOST_FLAGS:])
+    return State(labels[:MOST_LABELS], flags[:MOST_FLAGS], faults, beyond)
 
 
 class StoryBuilder:
@@ -146,6 +158,7 @@ class StoryBuilder:
         self._faults: dict[str, Fault] = {}
         self._left_out = 0
         self._undecodable = 0
+        self._beyond = 0
 
     def miss(self) -> None:
         """Takes the next message, which cannot be decoded."""
@@ -156,6 +169,7 @@ class StoryBuilder:
         if self._watcher is None:
             self._watcher = Watcher(MOST_SEEN)
         self._watcher.add(time, state.labels)
+        self._beyond = max(self._beyond, state.beyond)
         for path, value in state.flags:
             self._flag(Known(path, time, value, value))
         for text in state.faults:
@@ -181,6 +195,7 @@ class StoryBuilder:
         for fault in story.faults:
             self._fault(fault)
         self._left_out += story.left_out
+        self._beyond = max(self._beyond, story.beyond)
 
     def story(self, at_most: int | None = None) -> Story | None:
         """What was told so far, `at_most` of each kind; None without a message."""
@@ -200,6 +215,7 @@ class StoryBuilder:
             tuple(faults[:at_most]),
             self._left_out + left_out,
             self._undecodable,
+            self._beyond,
         )
 
     def _settle(self) -> None:
@@ -259,13 +275,13 @@ class StoryBuilder:
         )
 
 
-def _flags(value: JsonValue, path: str, depth: int = 3) -> Iterator[tuple[str, bool]]:
+def _flags(value: JsonValue, path: str) -> Iterator[tuple[str, bool]]:
     """The booleans of an object and of the objects in it, by dot-path; none of lists."""
     if isinstance(value, bool):
         yield path, value
-    elif isinstance(value, dict) and depth:
+    elif isinstance(value, dict):
         for name, inner in value.items():
-            yield from _flags(inner, f"{path}.{name}" if path else name, depth - 1)
+            yield from _flags(inner, f"{path}.{name}" if path else name)
 
 
 def _faults(value: JsonValue, least: int | None) -> Iterator[str]:
@@ -280,4 +296,4 @@ def _faults(value: JsonValue, least: int | None) -> Iterator[str]:
         said = each.get("msg", each.get("message"))
         if isinstance(level, int) and level >= least and not (level == _STALE and least == _ERROR):
             text = ": ".join(part for part in (name, said) if isinstance(part, str) and part)
-            yield text[:_LONGEST_TEXT]
+            yield text if len(text) <= _LONGEST_TEXT else text[: _LONGEST_TEXT - 1] + "…"

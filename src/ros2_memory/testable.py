@@ -106,7 +106,8 @@ def _paths(value: JsonValue) -> list[str]:
     """The dot-paths of a value, outermost first, as many as a sentence holds."""
     paths = list(dict.fromkeys(_walk(value, "")))
     paths.sort(key=lambda path: path.count("."))
-    return [*paths[:_LISTED_PATHS], *(["..."] if len(paths) > _LISTED_PATHS else [])]
+    more = len(paths) - _LISTED_PATHS
+    return [*paths[:_LISTED_PATHS], *([f"{more} more"] if more > 0 else [])]
 
 
 def _walk(value: JsonValue, prefix: str) -> Iterator[str]:

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 NAMES: Final = ("label", "class_id", "class_name", "class", "object")
 LISTS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
 """A list of texts under one of these names is a list of things."""
-MOST_THINGS: Final = 256
-"""Things of one message that are looked at."""
 
 _PLACES: Final = (
     ("point",),
@@ -44,12 +42,7 @@ class Thing(NamedTuple):
 
 def things_of(value: JsonValue, frame_id: str = "") -> tuple[Thing, ...]:
     """The things in an extracted value, in order; `frame_id` is the message's own."""
-    found: list[Thing] = []
-    for thing in _things(value, frame_id, _DEEPEST):
-        found.append(thing)
-        if len(found) == MOST_THINGS:
-            break
-    return tuple(found)
+    return tuple(_things(value, frame_id, _DEEPEST))
 
 
 def hangs_on_numbers(value: JsonValue) -> bool:

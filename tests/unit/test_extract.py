@@ -247,7 +247,7 @@ def test_an_unknown_field_of_an_unmapped_type_is_refused_with_what_the_message_h
         EXTRACTOR.shown({"a": 1, "b": 2}, "json", ["c"])
     with pytest.raises(InvalidArgumentsError, match="it has no fields"):
         EXTRACTOR.shown("text", "json", ["c"])
-    with pytest.raises(InvalidArgumentsError, match=r"k39, \.\.\.$"):
+    with pytest.raises(InvalidArgumentsError, match=r"k39 and 10 more$"):
         EXTRACTOR.shown({f"k{n}": n for n in range(50)}, "json", ["c"])
 
 

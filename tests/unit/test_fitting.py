@@ -110,7 +110,7 @@ def test_a_single_huge_array_is_thinned_evenly_with_a_note() -> None:
     ranges = shown["value"]["ranges"]
     assert (ranges[0], ranges[-1]) == (0, 19_999)
     assert len(ranges) > 100
-    assert "ranges (evenly thinned)" in shown["notes"][0]
+    assert f"ranges (evenly thinned: {len(ranges)} of 20000 kept)" in shown["notes"][0]
 
 
 def test_a_single_huge_text_is_cut_with_a_note_and_fills_the_room() -> None:
@@ -125,7 +125,7 @@ def test_a_single_huge_text_is_cut_with_a_note_and_fills_the_room() -> None:
 def test_a_wide_object_loses_keys_with_a_note() -> None:
     shown = strict(fit({"value": {f"key_{n:05}": n for n in range(9000)}}, 2000))
     assert "key_00000" in shown["value"]
-    assert "value (keys left out)" in shown["notes"][0]
+    assert "value (keys left out: 50 of 9000 kept)" in shown["notes"][0]
 
 
 def test_what_cannot_be_shortened_leaves_what_it_is_about() -> None:

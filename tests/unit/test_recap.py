@@ -24,8 +24,9 @@ from ros2_memory.recap import MOST_EVENTS, recap
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.replies import Replies
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.stories import MOST_FLAGS, MOST_LABELS
 from ros2_memory.timebase import FixedClock, unix_from_ns
-from tests.bags import Msg, boolean, detections, make, odom, stamp, write_mcap
+from tests.bags import STATUS_FLAGS, Msg, boolean, detections, make, odom, stamp, write_mcap
 from tests.closed_form import SESSIONS, SPEED
 from tests.histories import write_history
 from tests.memories import SettableClock, memory_of
@@ -251,6 +252,101 @@ def test_errors_in_logs_are_told_once_with_their_count(tmp_path: Path) -> None:
     ]
     assert told.distance_m is None
     assert any("nothing is known of the way" in note for note in told.notes)
+
+
+def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") -> Msg:
+    """The status of a vehicle after so many seconds, with these of its 40 booleans true."""
+    body = make(
+        "px4_msgs/msg/VehicleStatus",
+        timestamp=round(at * 1e6),
+        arming_state=1,
+        gcs_connection_lost_counter=0,
+        **{name: name in set_flags for name in STATUS_FLAGS},
+    )
+    return Msg(topic, "px4_msgs/msg/VehicleStatus", BEGIN + round(at * S), body)
+
+
+@each_way
+@pytest.mark.parametrize("flag", [STATUS_FLAGS[0], STATUS_FLAGS[15], STATUS_FLAGS[16], "flag_39"])
+def test_every_boolean_of_a_status_message_is_followed(
+    tmp_path: Path, recalls: bool, flag: str
+) -> None:
+    for bag in range(4):
+        write_mcap(
+            tmp_path / f"bag_{bag}.mcap",
+            [
+                _status(at, *([flag] if 13 <= at < 26 else []))
+                for at in (bag * 10 + nth * 0.5 for nth in range(20))
+            ],
+        )
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 0, 40)
+    assert times(told.events, "flip") == [
+        (f"/fmu/out/vehicle_status {flag} became true", 13.0),
+        (f"/fmu/out/vehicle_status {flag} became false", 26.0),
+    ]
+    assert not any("vehicle_status" in note for note in told.notes)
+
+
+@each_way
+def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls: bool) -> None:
+    type_name = "px4_msgs/msg/ManyFlags"
+    body = make(type_name, **{f"flag_{nth:03}": False for nth in range(600)})
+    write_mcap(
+        tmp_path / "bag.mcap", [Msg("/many", type_name, BEGIN + n * S, body) for n in (1, 2)]
+    )
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    [note] = [note for note in over(memory, 0, 10).notes if "/many" in note]
+    more = 600 - MOST_FLAGS
+    assert note == (
+        f"/many has too many booleans or things in one message: {more} more are not followed"
+    )
+
+
+@each_way
+def test_things_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls: bool) -> None:
+    labels = [f"thing {nth}" for nth in range(MOST_LABELS + 3)]
+    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN + n * S, labels) for n in (1, 2)])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    assert any("one message: 3 more" in note for note in over(memory, 0, 10).notes)
+
+
+@each_way
+def test_toggles_that_are_too_many_to_keep_are_counted(tmp_path: Path, recalls: bool) -> None:
+    """All 40 booleans flip four times in one bag; 64 flips of a bag are kept."""
+    messages = [_status(at, *(STATUS_FLAGS if at in {1, 3} else ())) for at in range(5)]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 0, 10)
+    more = 4 * 40 - 64
+    assert dict(told.counts) == {"flips": 64}
+    assert f"/fmu/out/vehicle_status changes too often to tell each: {more} more" in told.notes
+    assert any("left out, since they are too many: 39 flips" in note for note in told.notes)
+
+
+def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
+    log = make(
+        "rcl_interfaces/msg/Log",
+        stamp=stamp(BEGIN),
+        level=40,
+        name="planner",
+        msg="no path " * 40,
+        file="",
+        function="",
+        line=0,
+    )
+    write_mcap(tmp_path / "bag.mcap", [Msg("/rosout", "rcl_interfaces/msg/Log", BEGIN + S, log)])
+    [event] = over(memory_of(tmp_path), 0, 10).events
+    assert event.text.startswith("error: planner: no path no path")
+    assert event.text.endswith("…")
 
 
 def test_a_thing_that_was_missed_for_a_moment_did_not_leave(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from ros2_memory import stories
 from ros2_memory.model import JsonValue
+from ros2_memory.packing import packed_story, unpacked_story
 from ros2_memory.presences import Seen, Watcher
 from ros2_memory.stories import (
     NOTHING,
@@ -168,3 +169,15 @@ def test_labels_booleans_and_errors_are_found_in_values() -> None:
     found = state_of({"status": status}, "diagnostic_msgs/msg/DiagnosticArray")
     assert found.faults == ("motor: hot",)
     assert state_of({"value": 3.5}, "std_msgs/msg/Float64") is NOTHING
+
+
+@given(histories(), st.integers(0, 700))
+def test_a_story_comes_back_from_its_bytes_as_it_was(
+    history: tuple[Messages, list[int]], booleans: int
+) -> None:
+    messages, _ = history
+    at = messages[-1][0]
+    many = State(flags=tuple((f"flag_{nth}", nth % 3 == 0) for nth in range(booleans)), beyond=3)
+    story = told([*messages, (at, many), (at + 1, NOTHING)])
+    assert story is not None
+    assert unpacked_story(packed_story(story)) == story
