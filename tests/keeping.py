@@ -56,14 +56,18 @@ def keeper_of(
     monotonic: Callable[[], float] = time.monotonic,
     measure_free: Callable[[Path], int] = lambda _: PLENTY,
     time_sync: TimeSync | None = None,
+    keeps_foreign: bool = False,
 ) -> Housekeeping:
-    """A housekeeper whose clock is right, and an hour later unless one is given."""
+    """A housekeeper, mostly of all bags, whoever made them (retention.foreign=delete).
+
+    Its clock is right, and an hour later unless one is given.
+    """
     return Housekeeping(
         bag_dir,
         CountingReader(reader or McapReader()),
         writer or McapWriter(),
         clock or later(),
-        RetentionLimits(max_bytes, round(max_age_h * HOUR)),
+        RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=keeps_foreign),
         time_sync=time_sync or FakeTimeSync(),
         split_duration_s=10.0,
         moments_bytes=moments_bytes,

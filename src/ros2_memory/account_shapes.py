@@ -170,12 +170,16 @@ def _status(answer: accounts.Status, _bag_dir: Path) -> JsonObject:
 
 
 def _budget(answer: accounts.Status) -> JsonObject:
-    """Gigabytes, and for how many days they last: what is older is deleted then."""
+    """Gigabytes, and for how many days they last: what is older is deleted then.
+
+    `foreign_gb` is what bags take that the recorder did not make; the others leave it out.
+    """
     budget, gigabyte = answer.budget, 1e9
     most, per_day = budget.most, budget.per_day
     shown_budget: JsonObject = {
         "used_gb": round(budget.used / gigabyte, 3),
         "max_gb": None if most is None else round(most / gigabyte, 3),
+        "foreign_gb": None if budget.foreign is None else round(budget.foreign / gigabyte, 3),
         "growth_gb_per_day": None if per_day is None else round(per_day / gigabyte, 3),
     }
     if most is not None and per_day:

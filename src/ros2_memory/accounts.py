@@ -124,12 +124,16 @@ class Stillness:
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Bytes of all bags, how many may be kept, and what a day adds; None where not known."""
+    """Bytes of all bags, how many may be kept, and what a day adds; None where not known.
+
+    `foreign`: the bytes of bags that the recorder did not make; they are in none of the others.
+    """
 
     used: int
     most: int | None
     per_day: int | None
     max_age: Ns | None
+    foreign: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

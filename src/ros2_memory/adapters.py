@@ -53,6 +53,7 @@ def retention_limits(settings: Settings) -> RetentionLimits:
         max_total_bytes=round(kept.max_total_gb * GB),
         max_age_ns=ns_from_unix(kept.max_age_h * 3600),
         min_free_bytes=round(kept.min_free_gb * GB),
+        keeps_foreign=kept.foreign == "keep",
     )
 
 

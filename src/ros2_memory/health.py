@@ -101,6 +101,9 @@ def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
         **{what: len(files) for what, files in amiss.items()},
         "index_age_s": _seconds(now - snapshot.scanned_at),
     }
+    foreign = memory.foreign(snapshot)
+    if foreign is not None:
+        shown["foreign_bytes"] = foreign.total_bytes
     problems = [_short(each) for each in problems_of(snapshot, heartbeat, now)]
     for what, files in amiss.items():
         if files:

@@ -14,9 +14,11 @@ if TYPE_CHECKING:
 
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.recall import Recall
+    from ros2_memory.recorder.foreign import Foreign
     from ros2_memory.recorder.heartbeat import Heartbeat
     from ros2_memory.recorder.index_manager import IndexManager
     from ros2_memory.recorder.retention import RetentionLimits
+    from ros2_memory.recorder.snapshot import Snapshot
     from ros2_memory.storage.base import BagReader
     from ros2_memory.timebase import Clock, Ns
 
@@ -58,6 +60,14 @@ class Memory:
     clock: Clock
     limits: Limits
     recall: Recall | None = None
+
+    def foreign(self, snapshot: Snapshot) -> Foreign | None:
+        """The bags that retention neither deletes nor counts, since the recorder did not make them.
+
+        None where nothing is deleted, or all bags are, or no recorder has listed its own yet.
+        """
+        kept = self.limits.kept
+        return self.index.foreign(snapshot) if kept is not None and kept.keeps_foreign else None
 
     def heartbeat(self) -> Heartbeat | None:
         """What the recorder of these bags last said; None where none was heard of.

@@ -17,9 +17,9 @@ from weakref import WeakKeyDictionary
 
 from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.handover import read_handover
-from ros2_memory.recorder.inventory import is_own_recording
 from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.layout import CARRY_FOLDER
+from ros2_memory.recorder.ownership import has_own_name
 from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -132,9 +132,7 @@ class Sessions:
         return self._joined.get(folder) or self._with_carried(frozenset({folder}))
 
     def _with_carried(self, folders: Session) -> Session:
-        ours = len(folders) > 1 or any(
-            is_own_recording(each.rpartition("/")[2]) for each in folders
-        )
+        ours = len(folders) > 1 or any(has_own_name(each.rpartition("/")[2]) for each in folders)
         return folders | {self._carried} if ours else folders
 
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:

@@ -120,13 +120,15 @@ class ReaderSettings:
 class RetentionSettings:
     """How much history is kept.
 
-    `max_moments_gb`: of the total, for what was asked to be kept; at most half of it.
+    `max_moments_gb`: of the total, for what was asked to be kept; at most half of it. `foreign`:
+    whether bags that the recorder did not make are left alone, or deleted and counted with its own.
     """
 
     max_total_gb: Positive
     max_age_h: Positive
     min_free_gb: Tolerance
     max_moments_gb: Tolerance
+    foreign: Literal["keep", "delete"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

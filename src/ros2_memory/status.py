@@ -132,18 +132,24 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     used, _ = snapshot.taken
     if kept is None:
         return Budget(used, None, None, None)
+    foreign = memory.foreign(snapshot)
+    folders = frozenset[str]() if foreign is None else foreign.folders
+    foreign_bytes = None if foreign is None else foreign.total_bytes
+    used -= 0 if foreign is None else foreign.bag_bytes
     if heartbeat is None or not _is_recording(heartbeat, wall):
-        return Budget(used, kept.max_total_bytes, None, kept.max_age_ns)
+        return Budget(used, kept.max_total_bytes, None, kept.max_age_ns, foreign_bytes)
     grown, since = 0, latest
     if latest is not None:
         for bag in reversed(snapshot.bags):
             if bag.end < latest - _GROWTH_NS:
                 break
+            if str(bag.recording) in folders:
+                continue
             grown += bag.size
             since = min(bag.start, latest if since is None else since)
     span = 0 if latest is None or since is None else latest - since
     per_day = grown * _GROWTH_NS // span if span > 0 else None
-    return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns)
+    return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns, foreign_bytes)
 
 
 def _is_recording(heartbeat: Heartbeat, wall: Ns) -> bool:

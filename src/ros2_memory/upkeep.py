@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 from ros2_memory.adapters import GB, retention_limits
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
+from ros2_memory.recorder.ownership import OwnRecordings
 from ros2_memory.recorder.repair import Repairer
 from ros2_memory.recorder.time_sync import SystemTimeSync
+from ros2_memory.storage.mcap_embedded import custom_data
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.timebase import WallClock
@@ -27,8 +29,33 @@ def moments_bytes(settings: Settings) -> int:
     return round(min(kept.max_moments_gb, kept.max_total_gb / 2) * GB)
 
 
-def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> Housekeeper:
-    """What repairs and deletes in the bag directory of the recorder; nobody else may delete."""
+def claim(own: OwnRecordings) -> None:
+    """Puts the list of a bag directory's own recordings in order; nobody may be recording there.
+
+    Raises:
+        RecorderError: the list cannot be read, or the bag directory cannot be listed.
+    """
+    own.claim(custom_data)
+
+
+def supposed_own(bag_dir: Path) -> OwnRecordings:
+    """The recordings that a bag directory's recorder made; without a list, those it would claim.
+
+    Raises:
+        OSError: the list cannot be read, or the bag directory cannot be listed.
+    """
+    own = OwnRecordings(bag_dir)
+    own.suppose(custom_data)
+    return own
+
+
+def build_housekeeper(
+    settings: Settings, bag_dir: Path, reader: BagReader, own: OwnRecordings | None = None
+) -> Housekeeper:
+    """What repairs and deletes in the bag directory of the recorder; nobody else may delete.
+
+    `own` is the list of the recordings that were made there.
+    """
     limits = retention_limits(settings)
     return InBackground(
         Housekeeping(
@@ -39,6 +66,7 @@ def build_housekeeper(settings: Settings, bag_dir: Path, reader: BagReader) -> H
             limits,
             time_sync=SystemTimeSync(),
             split_duration_s=settings.recording.split_duration_s,
+            own=own,
             moments_bytes=moments_bytes(settings),
             static_topics=settings.data.tf_static_topics,
             grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,

@@ -23,9 +23,11 @@ from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.handover import read_handover
 from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.recorder.layout import LIST_FILE
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests import stub_ros2
+from tests.bags import odom, write_mcap
 from tests.stalls import in_time
 from tests.waiting import PATIENCE_S, until
 
@@ -211,6 +213,24 @@ def test_a_signal_ends_it_and_every_file_is_complete(site: Site, number: int) ->
     assert states == {Closing.CLOSED}
 
 
+def test_bags_of_another_program_outlive_every_limit(site: Site) -> None:
+    folder = site.bag_dir / "session_mcap"
+    old = folder / "session_mcap_0.mcap"
+    write_mcap(old, [odom(10**18 + number, 1.0, 2.0) for number in range(9)])
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    daemon = site.run("retention.max_total_gb=0.000001", "retention.max_age_h=0.001")
+    daemon.wait_for("foreign_bags_kept")
+    until(lambda: any(event["bags"] for event in daemon.events("retention_applied")) or None)
+    [recording] = daemon.recordings()
+    listed = [json.loads(line) for line in (site.bag_dir / LIST_FILE).read_text().splitlines()]
+    assert list(listed[0]) == ["bag_dir_id"]
+    assert listed[1] == {"recording": recording.name}
+    assert listed[2]["inode"] == recording.stat().st_ino
+    assert daemon.stop() == 0
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
 def test_a_killed_recorder_is_replaced_by_a_new_recording(site: Site) -> None:
     daemon = site.run()
     daemon.wait_for("split_closed")
@@ -382,6 +402,11 @@ def test_old_bags_are_cleared_only_when_that_is_asked_for(site: Site) -> None:
     assert site.run().stop() == 0
     assert (old / "rec_old_0.mcap").exists()
     daemon = site.run("recording.clear_on_startup=true")
+    first = daemon.recordings()[0]
+    assert daemon.stop() == 0
+    # What the first one recorded has gone, and what another program did has not.
+    assert daemon.recordings() == [first, old]
+    daemon = site.run("recording.clear_on_startup=true", "retention.foreign=delete")
     assert daemon.stop() == 0
     assert not old.exists()
     assert (site.bag_dir / "notes.txt").exists()

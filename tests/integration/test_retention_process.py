@@ -33,6 +33,7 @@ from tests.integration.test_server_process import serving
 from tests.keeping import keeper_of, size_of
 from tests.live_recorder import answer
 from tests.memories import memory_of
+from tests.owned import own_all
 from tests.questions import ask_everything, write_run
 from tests.split_writer import DOCK
 from tests.unit.test_deep_directories import DEEP, within
@@ -208,6 +209,7 @@ def test_the_daemon_repairs_what_a_crash_left_and_keeps_its_budget(site: Site) -
         [odom(time, 1.0, 2.0) for time in times],
         McapLayout(chunk_size=999, finish=False),
     )
+    own_all(site.bag_dir)
     daemon = site.run("retention.max_total_gb=0.0001")
     (repaired,) = daemon.wait_for("bag_repaired")
     applied = daemon.wait_for("retention_applied")[0]

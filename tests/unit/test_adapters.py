@@ -33,13 +33,19 @@ def test_the_budget_of_the_configuration_is_kept(tmp_path: Path) -> None:
         2.5
         * write_mcap(tmp_path / "probe.mcap", [odom(n, 1.0, 2.0) for n in range(9)]).stat().st_size
     )
-    left = kept(tmp_path / "bags", f"retention.max_total_gb={size / 1e9}")
+    left = kept(
+        tmp_path / "bags", f"retention.max_total_gb={size / 1e9}", "retention.foreign=delete"
+    )
     assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap"]
 
 
 def test_the_age_of_the_configuration_is_kept(tmp_path: Path) -> None:
-    left = kept(tmp_path / "bags", "retention.max_age_h=2.5")
+    left = kept(tmp_path / "bags", "retention.max_age_h=2.5", "retention.foreign=delete")
     assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap", "rec/h2.mcap"]
+
+
+def test_by_default_bags_of_other_programs_are_kept(tmp_path: Path) -> None:
+    assert len(kept(tmp_path / "bags", "retention.max_total_gb=0.000001")) == 6
 
 
 def test_by_default_a_week_within_5_gb_is_kept(tmp_path: Path) -> None:

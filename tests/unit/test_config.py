@@ -58,6 +58,7 @@ class TestDefaults:
                 "max_age_h": 168.0,
                 "min_free_gb": 1.0,
                 "max_moments_gb": 1.0,
+                "foreign": "keep",
             },
             "server": {
                 "name": "episodic",

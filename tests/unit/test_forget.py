@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sqlite3
 import time
 from contextlib import closing
@@ -20,6 +21,7 @@ from ros2_memory.recorder.lock import BagDirLock
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import McapLayout, odom, text, tf, transform, write_mcap
+from tests.owned import OURS, embedding, own_all
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,6 +48,7 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             mount = transform(start, "base_link", "laser", (0.1, 0.0, 0.2))
             messages.insert(0, tf(start, mount, topic="/tf_static"))
         left(write_mcap(tmp_path / f"rec_{number // 2}" / f"rec_{number}.mcap", messages))
+    own_all(tmp_path)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
     return tmp_path
@@ -190,6 +193,60 @@ def test_without_a_window_nothing_is_forgotten(bag_dir: Path, capsys: Capture) -
 def test_of_an_empty_window_it_says_so(bag_dir: Path, capsys: Capture) -> None:
     assert forget(-100, -50, "--yes") == 0
     assert "no closed bag" in capsys.readouterr().out
+
+
+class TestForeignBags:
+    """Bags that this deployment's recorder did not make."""
+
+    def test_they_stay_and_are_named_with_what_to_do(self, bag_dir: Path, capsys: Capture) -> None:
+        (bag_dir / "rec_1").rename(bag_dir / "session")
+        (bag_dir / "rec_0" / "rec_1.mcap").rename(bag_dir / "loose.mcap")
+        assert forget(0, 100, "--yes") == 1
+        assert sorted(path.name for path in bag_dir.rglob("*.mcap")) == [
+            "carried.mcap",
+            "loose.mcap",
+            "rec_2.mcap",
+            "rec_3.mcap",
+        ]
+        told = capsys.readouterr().out
+        assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in told
+        assert "`ros2-memory adopt session` first" in told
+        assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in told
+
+    def test_one_that_was_adopted_goes(self, bag_dir: Path) -> None:
+        (bag_dir / "rec_1").rename(bag_dir / "session")
+        assert cli.main(["adopt", "session"]) == 0
+        assert forget(40, 100, "--yes") == 0
+        assert not (bag_dir / "session").exists()
+
+    def test_with_delete_they_go_too(self, bag_dir: Path) -> None:
+        (bag_dir / "rec_1").rename(bag_dir / "session")
+        assert forget(40, 100, "--yes", "retention.foreign=delete") == 0
+        assert not (bag_dir / "session").exists()
+
+    def test_recordings_of_before_the_list_are_known_by_what_they_carry(
+        self, bag_dir: Path
+    ) -> None:
+        shutil.rmtree(bag_dir / ".episodic")
+        name = "rec_20231114T221320Z"
+        path = embedding(bag_dir / name / f"{name}_0.mcap", OURS, start=T0 + 200 * NS_PER_S)
+        left(path)
+        assert forget(190, 300, "--yes") == 0
+        assert not path.exists()
+        assert forget(0, 100, "--yes") == 1
+        assert len(bags(bag_dir)) == 4
+
+    def test_one_that_took_the_place_of_another_while_it_was_asked_stays(
+        self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def meanwhile(*_: object, **__: object) -> None:
+            shutil.copytree(bag_dir / "rec_1", bag_dir / "copy")
+            (bag_dir / "rec_1").rename(bag_dir.parent / "away")
+            (bag_dir / "copy").rename(bag_dir / "rec_1")
+
+        monkeypatch.setattr("typer.confirm", meanwhile)
+        forget(40, 100)
+        assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
 
 
 class TestMetadata:

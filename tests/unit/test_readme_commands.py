@@ -13,6 +13,7 @@ from ros2_memory.cli import app
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import odom, text, write_mcap
 from tests.memories import ROOT
+from tests.owned import own_all
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,6 +37,8 @@ def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     messages = [odom(T0 + n * NS_PER_S // 10, n / 10, 0.0) for n in range(101)]
     messages.append(text(T0 + NS_PER_S, "scissors", "/vision/scene/scene_objects"))
     write_mcap(tmp_path / "bags" / "rec_0" / "rec_0.mcap", messages)
+    own_all(tmp_path / "bags")
+    write_mcap(tmp_path / "bags" / "old-bags" / "old_0.mcap", [odom(T0 - NS_PER_S, 0.0, 0.0)])
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path / "bags"))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")

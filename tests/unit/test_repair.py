@@ -8,8 +8,8 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 
 from ros2_memory.errors import BagError, BagVanishedError
 from ros2_memory.model import TimeWindow
-from ros2_memory.recorder.inventory import is_own_recording
 from ros2_memory.recorder.layout import recording_name
+from ros2_memory.recorder.ownership import has_own_name
 from ros2_memory.recorder.repair import Repairer, open_files
 from ros2_memory.recorder.scan import bag_kind
 from ros2_memory.storage.base import Closing
@@ -182,9 +182,9 @@ def test_open_files_are_found(tmp_path: Path) -> None:
 def test_a_directory_of_another_is_told_from_one_of_this_program(name: str, tmp_path: Path) -> None:
     own = recording_name(T0, tmp_path)
     (tmp_path / own).mkdir()
-    assert is_own_recording(own)
-    assert is_own_recording(recording_name(T0, tmp_path))
-    assert not is_own_recording(name)
+    assert has_own_name(own)
+    assert has_own_name(recording_name(T0, tmp_path))
+    assert not has_own_name(name)
 
 
 @needs_recorded

@@ -138,7 +138,12 @@ def test_an_empty_memory_has_a_status_too(tmp_path: Path) -> None:
     told = shown(memory_of(tmp_path), tmp_path)
     assert (told["earliest"], told["latest"], told["newest_age_s"]) == (None, None, None)
     assert told["recorder"] is None
-    assert told["budget"] == {"used_gb": 0.0, "max_gb": None, "growth_gb_per_day": None}
+    assert told["budget"] == {
+        "used_gb": 0.0,
+        "max_gb": None,
+        "foreign_gb": None,
+        "growth_gb_per_day": None,
+    }
 
 
 def test_where_nothing_is_recorded_there_is_no_budget_and_nothing_grows(tmp_path: Path) -> None:

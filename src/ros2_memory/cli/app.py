@@ -35,6 +35,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
     "doctor": ("doctor.doctor", "look for what is wrong, and say what to do"),
     "export": ("exporting.export", "a time window as MCAP or Parquet"),
     "forget": ("forgetting.forget", "delete a time window, after asking"),
+    "adopt": ("adopting.adopt", "let the recorder delete bags that it did not make"),
     "demo": ("demonstrating.demo", "a simulated robot, asked questions with known answers"),
     "index": ("filling.index", "look into every bag once, so that answers take milliseconds"),
     "recover": ("recovering.recover", "repair MCAP files that were left unfinished"),

@@ -57,7 +57,8 @@ def examined(
     yield Finding(Level.OK, "config", f"composed from {config_dir(os.environ)}")
     now, snapshot = memory.clock.now(), memory.index.snapshot()
     with busy("asking the disk, ros2, the recorder and the server"):
-        yield from findings.of_bag_dir(settings)
+        foreign = memory.foreign(snapshot)
+        yield from findings.of_bag_dir(settings, 0 if foreign is None else foreign.total_bytes)
         yield from findings.of_clock(snapshot, now)
         yield from findings.of_bags(settings, memory)
         yield from findings.of_what_lies_there(memory, snapshot)

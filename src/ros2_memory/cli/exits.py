@@ -28,6 +28,10 @@ EXITS: Final[Mapping[str, Mapping[int, str]]] = {
         0: "all that lies in the window is deleted (with --dry-run: would be), or there is nothing",
         1: "something in the window stays and is named, or the question was answered with no",
     },
+    "adopt": {
+        0: "the bags are the recorder's own now, or were before",
+        1: "no bag files lie there",
+    },
     "demo": {0: "all answers were right", 1: "one was wrong"},
     "index": {0: "every bag was looked into, or was found to be one that cannot be"},
     "recover": {0: "every file is whole", 1: "a file could not be repaired"},

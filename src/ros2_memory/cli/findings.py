@@ -74,8 +74,11 @@ class Finding:
         }
 
 
-def of_bag_dir(settings: Settings) -> Iterator[Finding]:
-    """Whether the bag directory is there, may be used by this user, and has room."""
+def of_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Finding]:
+    """Whether the bag directory is there, may be used by this user, and has room.
+
+    `foreign_bytes` is what bags take that its recorder did not make, and keeps.
+    """
     bag_dir, about = settings.recording.bag_dir.absolute(), "bag_dir"
     records = not isinstance(settings.recorder, NullRecorderNode)
     if not bag_dir.is_dir():
@@ -92,7 +95,7 @@ def of_bag_dir(settings: Settings) -> Iterator[Finding]:
     else:
         yield from _permissions(bag_dir, records=records)
     if records:
-        yield from _room(settings, bag_dir)
+        yield from _room(settings, bag_dir, foreign_bytes)
 
 
 def _permissions(bag_dir: Path, *, records: bool) -> Iterator[Finding]:
@@ -121,7 +124,7 @@ def _user() -> str:
         return f"user {os.getuid()}"
 
 
-def _room(settings: Settings, bag_dir: Path) -> Iterator[Finding]:
+def _room(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Iterator[Finding]:
     there = next(each for each in (bag_dir, *bag_dir.parents) if each.is_dir())
     try:
         disk = shutil.disk_usage(there)
@@ -132,8 +135,13 @@ def _room(settings: Settings, bag_dir: Path) -> Iterator[Finding]:
         return
     mount = next(each for each in (there, *there.parents) if os.path.ismount(each))
     kept = settings.retention
-    free, used = disk.free / GB, _size(bag_dir) / GB
+    free, used = disk.free / GB, max(_size(bag_dir) - foreign_bytes, 0) / GB
     seen = f"{free:.1f} GB free on {mount}; {used:.1f} of {kept.max_total_gb:g} GB used"
+    if foreign_bytes:
+        seen += (
+            f"; bags that this recorder did not make take {foreign_bytes / GB:.2g} GB more, and "
+            "are neither deleted nor counted: `ros2-memory adopt DIR` takes those of a directory"
+        )
     if free < kept.min_free_gb:
         do = (
             f"recording pauses below retention.min_free_gb={kept.min_free_gb:g}; delete what else "

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +25,7 @@ from ros2_memory.recorder.latched import Carrier
 from ros2_memory.recorder.layout import METADATA_FILE, MOMENTS_FOLDER
 from ros2_memory.recorder.lock import BagDirLock
 from ros2_memory.recorder.metadata import take_out
+from ros2_memory.recorder.ownership import OwnRecordings, is_kept_apart
 from ros2_memory.recorder.removal import Inode, remove_bag, remove_emptied
 from ros2_memory.recorder.scan import other_form
 from ros2_memory.recorder.snapshot import Snapshot
@@ -32,6 +33,7 @@ from ros2_memory.settings import NullRecorderNode
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.timebase import unix_from_ns
+from ros2_memory.upkeep import supposed_own
 from ros2_memory.wording import counted
 
 _MB = 1_000_000
@@ -52,9 +54,9 @@ def forget(
 ) -> None:
     """Delete the closed bags that lie wholly inside a time window, after asking.
 
-    What reaches beyond it stays, and so does what is being written; both are named. Latched
-    messages (maps, static transforms) that later answers need are carried on. Only where this
-    deployment records.
+    What reaches beyond it stays, and so do what is being written and bags that this deployment's
+    recorder did not make; all are named. Latched messages (maps, static transforms) that later
+    answers need are carried on. Only where this deployment records.
     """
     with reporting("forget"):
         settings = settings_for(bag_dir, overrides)
@@ -70,7 +72,9 @@ def forget(
         if snapshot.problem:
             raise RecorderError(snapshot.problem)
         window = window_of(memory, snapshot, start, end, last)
-        plan = planned(snapshot, window, settings.recording.bag_dir)
+        bag_root = settings.recording.bag_dir
+        own = supposed_own(bag_root) if settings.retention.foreign == "keep" else None
+        plan = planned(snapshot, window, bag_root, own)
         carrier = Carrier(
             settings.recording.bag_dir,
             memory.reader,
@@ -91,17 +95,21 @@ def forget(
             if not yes:
                 typer.confirm("Delete them? This cannot be undone.", abort=True)
             counts = _counts(build_reader(settings), plan.doomed)
-            stays += _forgotten(settings.recording.bag_dir, memory, plan, carrier, counts)
+            stays += _forgotten(bag_root, memory, plan, carrier, counts)
     if stays:
         raise typer.Exit(NOT_SO)
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What goes, and, each with its reason, what stays of the window."""
+    """What goes, and, each with its reason, what stays of the window.
+
+    `own` are the recordings of which something may go; all where None.
+    """
 
     doomed: tuple[BagFile, ...]
     stays: tuple[str, ...]
+    own: OwnRecordings | None = None
 
     @property
     def size(self) -> int:
@@ -109,8 +117,13 @@ class Plan:
         return sum(bag.size for bag in self.doomed)
 
 
-def planned(snapshot: Snapshot, window: TimeWindow, bag_dir: Path) -> Plan:
-    """What a window's forgetting would delete. Reads no bag."""
+def planned(
+    snapshot: Snapshot, window: TimeWindow, bag_dir: Path, own: OwnRecordings | None = None
+) -> Plan:
+    """What a window's forgetting would delete: of the recordings that are its `own`, or of all.
+
+    Reads no bag.
+    """
     touched = snapshot.overlapping(window)
     doomed = tuple(
         bag
@@ -118,29 +131,51 @@ def planned(snapshot: Snapshot, window: TimeWindow, bag_dir: Path) -> Plan:
         if bag.state is BagState.CLOSED
         and window.covers(bag.start, bag.end)
         and not _is_kept(bag, bag_dir)
+        and (own is None or is_own(bag.path, own))
     )
-    return Plan(doomed, tuple(_staying(snapshot, window, bag_dir, frozenset(doomed))))
+    plan = Plan(doomed, (), own)
+    return replace(plan, stays=tuple(_staying(snapshot, window, bag_dir, plan)))
 
 
-def _staying(
-    snapshot: Snapshot, window: TimeWindow, bag_dir: Path, doomed: frozenset[BagFile]
-) -> Iterator[str]:
+def is_own(bag: Path, own: OwnRecordings) -> bool:
+    """Whether the recorder made a bag file, or keeps it as carried messages or as a moment."""
+    return is_kept_apart(own.name_of(bag.parent)) or own.owns(bag.parent)
+
+
+def _staying(snapshot: Snapshot, window: TimeWindow, bag_dir: Path, plan: Plan) -> Iterator[str]:
+    doomed = frozenset(plan.doomed)
     for bag in snapshot.overlapping(window):
-        name = _named(bag.path, bag_dir)
-        if bag.state is BagState.ACTIVE:
-            yield f"{name}: it is being written"
-        elif bag.state is BagState.INCOMPLETE:
-            yield f"{name}: a crash left it open; ros2-memory recover closes it"
-        elif _is_kept(bag, bag_dir):
-            yield f"{name}: it was asked to be kept; delete the moment's folder to forget it"
-        elif bag not in doomed:
-            yield f"{name}: it reaches beyond the window"
+        if bag not in doomed:
+            yield f"{_named(bag.path, bag_dir)}: {_reason(bag, bag_dir, plan.own)}"
     for aside, place in snapshot.places.items():
         if place is not None and place.overlaps(window.start, window.stop - 1):
             if not aside.answers:
                 yield f"{_named(aside.path, bag_dir)}: {aside.reason}"
         elif place is None:
             yield f"{_named(aside.path, bag_dir)}: when it was recorded is unknown ({aside.reason})"
+
+
+def _reason(bag: BagFile, bag_dir: Path, own: OwnRecordings | None) -> str:
+    """Why a bag stays."""
+    if bag.state is BagState.ACTIVE:
+        return "it is being written"
+    if own is not None and not is_own(bag.path, own):
+        return _foreign(bag.path, own)
+    if bag.state is BagState.INCOMPLETE:
+        return "a crash left it open; ros2-memory recover closes it"
+    if _is_kept(bag, bag_dir):
+        return "it was asked to be kept; delete the moment's folder to forget it"
+    return "it reaches beyond the window"
+
+
+def _foreign(bag: Path, own: OwnRecordings) -> str:
+    folder = own.name_of(bag.parent)
+    if not folder:
+        return (
+            "this recorder did not make it; to forget it, move it into a directory of its own in "
+            "the bag directory and let `ros2-memory adopt` take that"
+        )
+    return f"this recorder did not make it; to forget it, `ros2-memory adopt {folder}` first"
 
 
 def _is_kept(bag: BagFile, bag_dir: Path) -> bool:
@@ -180,9 +215,11 @@ def _forgotten(
     """
     stays = []
     with busy("deleting"), _alone(bag_dir) as recorder:
-        snapshot = memory.index.refresh()
+        snapshot, own = memory.index.refresh(), plan.own
         there = {*snapshot.bags}
-        doomed = [bag for bag in plan.doomed if bag in there]
+        doomed = [
+            bag for bag in plan.doomed if bag in there and (own is None or is_own(bag.path, own))
+        ]
         removal = _Removal(bag_dir, memory)
         carried = None
         if recorder is None:

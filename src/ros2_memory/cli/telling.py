@@ -162,6 +162,8 @@ def budget_in_words(budget: dict[str, JsonValue]) -> str:
         text += "; recorder=none: nothing is recorded or deleted here, so no budget and no growth"
     else:
         text += f" of {cell(most)} GB"
+    if budget.get("foreign_gb"):
+        text += f"; bags that the recorder did not make take {cell(budget['foreign_gb'])} GB more"
     if growth is not None:
         text += f"; grows by {cell(growth)} GB a day"
     if "full_in_days" in budget:

@@ -21,9 +21,10 @@ from ros2_memory.recorder.daemon import (
     record_until_told,
 )
 from ros2_memory.recorder.notify import ServiceManager
+from ros2_memory.recorder.ownership import OwnRecordings
 from ros2_memory.recorder.topics import load_topics
 from ros2_memory.settings import NullRecorderNode
-from ros2_memory.upkeep import build_housekeeper
+from ros2_memory.upkeep import build_housekeeper, claim
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,18 +70,25 @@ def _record(settings: Settings) -> None:
     load_topics(settings.recording.topics_file)
     bag_dir = settings.recording.bag_dir.absolute()
     reader = ConfinedReader(build_reader(settings), bag_dir)
-    housekeeper = build_housekeeper(settings, bag_dir, reader)
+    own = OwnRecordings(bag_dir)
+    housekeeper = build_housekeeper(settings, bag_dir, reader, own)
     clear = settings.recording.clear_on_startup
     lock = lock_bag_dir(bag_dir, clear=clear)
     try:
         recorder = build_recorder(
-            settings, reader=reader, housekeeper=housekeeper, keep_open=(lock.descriptor,)
+            settings,
+            reader=reader,
+            housekeeper=housekeeper,
+            own=own,
+            keep_open=(lock.descriptor,),
         )
         if not isinstance(recorder, Ticking):
             raise ConfigError(f"recorder: {settings.recorder.target} cannot be run by {PROGRAM}")
         # So does an environment in which nothing can be recorded.
         recorder.check()
-        put_in_order(bag_dir, reader, housekeeper, clear=clear)
+        claim(own)
+        keeps_foreign = settings.retention.foreign == "keep"
+        put_in_order(bag_dir, reader, housekeeper, clear=clear, own=own if keeps_foreign else None)
         _log.info("starting", bag_dir=str(bag_dir))
         record_until_told(recorder, ServiceManager(), Upkeep(bag_dir, reader, lock))
         _log.info("stopped")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import yaml
 
 from ros2_memory.errors import RecorderError
+from ros2_memory.recorder.ownership import BAG_DIR_ID, PROGRAM, RECORDED_BY
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -40,6 +41,7 @@ def record_argv(
     node_name: str,
     use_sim_time: bool = False,
     repeat_latched: Sequence[str] = (),
+    bag_dir_id: str | None = None,
     known_options: Collection[str] = (),
 ) -> list[str]:
     """The argv of one recording.
@@ -55,6 +57,7 @@ def record_argv(
         use_sim_time: whether log times come from `/clock`, before which nothing is recorded.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, where the
             distribution can do that.
+        bag_dir_id: what the files carry, besides who recorded them, where that can be said.
         known_options: the options that this distribution has, see `options_in_help`.
     """
     argv = [ros2, "bag", "record", "-s", "mcap", "-d", str(split_duration_s), "-o", str(directory)]
@@ -70,7 +73,8 @@ def record_argv(
     if NODE_NAME in known_options:
         argv += [NODE_NAME, node_name]
     if CUSTOM_DATA in known_options:
-        argv += [CUSTOM_DATA, "recorded_by=ros2-memory"]
+        argv += [CUSTOM_DATA, f"{RECORDED_BY}={PROGRAM}"]
+        argv += [] if bag_dir_id is None else [f"{BAG_DIR_ID}={bag_dir_id}"]
     if REPEAT in known_options and repeat_latched:
         argv += [REPEAT, *repeat_latched]
     return argv

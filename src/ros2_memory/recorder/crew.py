@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.recorder.journal import Journal
+    from ros2_memory.recorder.ownership import OwnRecordings
     from ros2_memory.recorder.ports import RecorderProcess
     from ros2_memory.recorder.rotation import Moment
     from ros2_memory.recorder.splits import Changes
@@ -41,6 +42,7 @@ class Crew:
         announce: is told the name of a recording before anything of it exists.
         reader: reads splits that are closed.
         journal: where everything is reported.
+        own: the list of recordings that were made here.
         simulated: whether log times come from a simulated clock.
         subscribe_timeout_s: how long a new recorder is waited for in a handover.
         both_s: how long both record then.
@@ -54,6 +56,7 @@ class Crew:
         reader: BagReader,
         journal: Journal,
         *,
+        own: OwnRecordings,
         simulated: bool,
         subscribe_timeout_s: float,
         both_s: float,
@@ -61,6 +64,8 @@ class Crew:
         self._bag_dir = bag_dir
         self._start_child = start_child
         self._announce = announce
+        self._own = own
+        self._unlisted: set[str] = set()
         self._reader = reader
         self._journal = journal
         self._simulated = simulated
@@ -119,6 +124,7 @@ class Crew:
         for session in self.sessions:
             self._journal.tell(session.name, session.hear())
             changes = session.splits.look(now.monotonic_s)
+            self._list(session)
             closed = closed or bool(changes.closed)
             self._report(session, changes)
             if changes.gone and session not in self._leaving:
@@ -205,14 +211,28 @@ class Crew:
         self._leaving.clear()
 
     def _launch(self, name: str, now: Moment) -> Session:
+        self._own.begin(name)
         self._announce(name)
         directory = self._bag_dir / name
         try:
             child = self._start_child(name, directory)
         except OSError as error:
             raise RecorderError(f"ros2 bag record cannot be started: {error}") from error
+        self._unlisted.add(name)
         self._journal.note("recorder_started", recording=name, pid=child.pid)
         return Session(name, child, Splits(directory, self._reader), now)
+
+    def _list(self, session: Session) -> None:
+        """Notes which directory the child has made, as soon as it has; a fault is tried again."""
+        if session.name not in self._unlisted:
+            return
+        try:
+            if self._own.complete(session.name):
+                self._unlisted.remove(session.name)
+        except RecorderError as error:
+            self._journal.fail_once("recording_not_listed", session.name, str(error))
+        else:
+            self._journal.over("recording_not_listed", session.name)
 
     def _report(self, session: Session, changes: Changes) -> None:
         for name in changes.closed:
@@ -295,6 +315,8 @@ class Crew:
                 takeover.old_has_ended()
             except RecorderError as error:
                 self._journal.fail("rotation_failed", str(error), recording=session.name)
+        self._list(session)
+        self._unlisted.discard(session.name)
         splits = session.splits
         if remove_if_empty(splits.directory):
             self._journal.note("recording_empty", recording=session.name)

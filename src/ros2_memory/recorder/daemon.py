@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from ros2_memory.recorder.notify import ServiceManager
+    from ros2_memory.recorder.ownership import OwnRecordings
     from ros2_memory.recorder.ports import Housekeeper
     from ros2_memory.storage.base import BagReader
 
@@ -72,10 +73,16 @@ def lock_bag_dir(bag_dir: Path, *, clear: bool) -> BagDirLock:
 
 
 def put_in_order(
-    bag_dir: Path, reader: BagReader, housekeeper: Housekeeper, *, clear: bool
+    bag_dir: Path,
+    reader: BagReader,
+    housekeeper: Housekeeper,
+    *,
+    clear: bool,
+    own: OwnRecordings | None = None,
 ) -> None:
     """Puts a bag directory in order whose lock the caller holds; clears it before, where asked to.
 
+    That deletes the recorder's `own` recordings alone, unless None; and moments.
     Bags that a crash left open are repaired, and handovers that it cut short are settled. What
     fails of that is reported, and recording begins all the same.
 
@@ -83,7 +90,7 @@ def put_in_order(
         RecorderError: it must not be cleared.
     """
     if clear:
-        wiped = clear_bags(bag_dir)
+        wiped = clear_bags(bag_dir, own)
         _log.warning("bags_cleared", files=wiped.files, bytes=wiped.bytes)
         for fault in wiped.faults:
             _log.error("not_cleared", reason=fault)

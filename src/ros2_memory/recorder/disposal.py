@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.recorder.inventory import Known
     from ros2_memory.recorder.latched import Carrier
+    from ros2_memory.recorder.ownership import OwnRecordings
     from ros2_memory.recorder.recorded_time import RecordedTime
     from ros2_memory.recorder.retention import RetentionLimits, Stock, StoredBag
     from ros2_memory.recorder.snapshot import Snapshot
@@ -43,9 +44,10 @@ class Disposed:
     """What one pass did.
 
     `total_bytes` is what the budget counts afterwards, and `fits` whether the limits are kept.
-    `carried` is how many latched messages are carried, where their bag was written anew; `failed`
-    is how many bags could not be deleted. `held` is how many are too old by their dates and stay,
-    since the clock is not known to be right.
+    `foreign_bytes` is what bags take that the recorder did not make and no limit counts. `carried`
+    is how many latched messages are carried, where their bag was written anew; `failed` is how many
+    bags could not be deleted. `held` is how many are too old by their dates and stay, since the
+    clock is not known to be right.
     """
 
     bags: int = 0
@@ -54,6 +56,7 @@ class Disposed:
     carried: int | None = None
     failed: int = 0
     total_bytes: int = 0
+    foreign_bytes: int = 0
     fits: bool = True
     held: int = 0
 
@@ -88,6 +91,7 @@ class Disposal:
         bag_dir: the bag directory.
         limits: how much is kept.
         carrier: carries latched messages on.
+        own: the recordings that the recorder made.
         recorded: how long was recorded after each recording.
         time_sync: knows whether the system clock is synchronised.
         static_topics: topics that are latched whatever their publishers say.
@@ -100,6 +104,7 @@ class Disposal:
         bag_dir: Path,
         limits: RetentionLimits,
         carrier: Carrier,
+        own: OwnRecordings,
         *,
         recorded: RecordedTime,
         time_sync: TimeSync,
@@ -112,7 +117,7 @@ class Disposal:
         self._carrier = carrier
         self._recorded = recorded
         self._time_sync = time_sync
-        self._inventory = Inventory(bag_dir, static_topics)
+        self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
         self._grace_s = grace_s
         self._monotonic = monotonic
         self._carried_since: dict[str, float] = {}
@@ -136,7 +141,8 @@ class Disposal:
             min_free_bytes: what must be free, where that is not as the limits have it.
 
         Raises:
-            OSError: what is free cannot be measured.
+            OSError: what is free cannot be measured, or it cannot be read which recordings are the
+                recorder's own.
         """
         limits = self._limits
         if min_free_bytes is not None:
@@ -148,6 +154,7 @@ class Disposal:
                 stock = replace(stock, free_bytes=free_bytes())
             stock = self._with_clocks(stock, limits, under_way)
             found = weighed(stock, limits)
+            under_way.done.foreign_bytes = stock.foreign_bytes
             under_way.done.total_bytes, under_way.done.fits = found.total_bytes, found.fits
             doomed = found.doomed[: MOST_AT_ONCE - len(under_way.gone)]
             if doomed:

@@ -22,11 +22,11 @@ from ros2_memory.recorder.disk import free_bytes
 from ros2_memory.recorder.disposal import Disposal
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
-from ros2_memory.recorder.inventory import is_own_recording
 from ros2_memory.recorder.keeper import Keeper
 from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.latched import Carrier
 from ros2_memory.recorder.layout import METADATA_FILE
+from ros2_memory.recorder.ownership import OwnRecordings, has_own_name
 from ros2_memory.recorder.recorded_time import RecordedTime
 from ros2_memory.recorder.removal import left_by_repair, remove_emptied
 from ros2_memory.recorder.repair import Repairer, open_files
@@ -63,9 +63,11 @@ class Housekeeping:
         reader: reads bags.
         writer: writes those that are repaired, and the one of carried messages.
         clock: the wall clock.
-        limits: how much is kept.
+        limits: how much is kept, and whether bags of other programs are no part of it. Then those
+            are not repaired either.
         time_sync: knows whether the system clock is synchronised.
         split_duration_s: how long the recorder writes one file.
+        own: the recordings that the recorder made.
         moments_bytes: how much of it moments may take that were asked to be kept.
         static_topics: topics that are latched whatever their publishers say.
         grace_s: for how long a question may hold what was known of the bags before.
@@ -83,6 +85,7 @@ class Housekeeping:
         *,
         time_sync: TimeSync,
         split_duration_s: float,
+        own: OwnRecordings | None = None,
         moments_bytes: int = 0,
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
@@ -90,10 +93,13 @@ class Housekeeping:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._recorded = RecordedTime(bag_dir)
+        self._own = own or OwnRecordings(bag_dir)
+        self._keeps_foreign = limits.keeps_foreign
         disposal = Disposal(
             bag_dir,
             limits,
             Carrier(bag_dir, reader, writer, static_topics),
+            self._own,
             recorded=self._recorded,
             time_sync=time_sync,
             static_topics=static_topics,
@@ -118,18 +124,24 @@ class Housekeeping:
         self._measure_free = measure_free
         self._tried: set[tuple[Path, int, int]] = set()
         self._short = False
+        self._foreign = False
 
     def repair(self, bag_dir: Path) -> None:
         """Puts right what a crash left in recordings of this program. Nothing may be recording.
 
         Raises:
-            OSError: the bag directory cannot be listed.
+            OSError: the bag directory cannot be listed, or it cannot be read which recordings are
+                the recorder's own.
         """
         named = _named(bag_dir)
         for directory in sorted(bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
                 continue
-            if directory in named or (is_own_recording(directory.name) and _unfinished(directory)):
+            if self._keeps_foreign:
+                left = self._own.owns(directory)
+            else:
+                left = directory in named or has_own_name(directory.name)
+            if left and (directory in named or _unfinished(directory)):
                 self._repair_recording(bag_dir, directory)
 
     def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
@@ -158,6 +170,7 @@ class Housekeeping:
         self._report(done, begun)
         self._tell_shortage(done)
         self._tell_held(done)
+        self._tell_foreign(done)
         if self._repair_left(bag_dir, self._index.snapshot()):
             self._index.refresh()
 
@@ -252,8 +265,10 @@ class Housekeeping:
         tried = (path, status.st_size, status.st_mtime_ns) in self._tried
         if tried or self._names.is_kept(str(path)):
             return False
+        if self._keeps_foreign:
+            return self._own.owns(path.parent)
         lay_still = abs(self._clock.now() - status.st_mtime_ns) > self._patience
-        return lay_still or is_own_recording(path.parent.name)
+        return lay_still or has_own_name(path.parent.name)
 
     def _repair(self, path: Path) -> bool:
         """Repairs one file, and tells what came of it; whether it was not whole."""
@@ -301,6 +316,7 @@ class Housekeeping:
             carried=done.carried,
             failed=done.failed,
             total_bytes=done.total_bytes,
+            foreign_bytes=done.foreign_bytes,
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
             **values,
         )
@@ -312,6 +328,18 @@ class Housekeeping:
             _log.warning("age_held", bags=self._held, reason=self.age_held())
         elif before and not self._held:
             _log.info("age_no_longer_held")
+
+    def _tell_foreign(self, done: Disposed) -> None:
+        """Says once that there are bags which no limit counts."""
+        if done.foreign_bytes and not self._foreign:
+            _log.warning(
+                "foreign_bags_kept",
+                bytes=done.foreign_bytes,
+                reason="the recorder did not make them, so they are neither deleted nor counted in "
+                "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
+                "retention.foreign=delete all",
+            )
+        self._foreign = bool(done.foreign_bytes)
 
     def _tell_shortage(self, done: Disposed) -> None:
         """Says once that the budget cannot be held."""

@@ -19,6 +19,7 @@ import structlog
 
 from ros2_memory.model import BagState
 from ros2_memory.recorder.disposal import Disposed
+from ros2_memory.recorder.foreign import ForeignBags
 from ros2_memory.recorder.heartbeat import read_heartbeat
 from ros2_memory.recorder.snapshot import Snapshot
 from ros2_memory.recorder.standing import Scene
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from structlog.typing import FilteringBoundLogger
 
     from ros2_memory.recorder.disposal import Disposal
+    from ros2_memory.recorder.foreign import Foreign
     from ros2_memory.recorder.heartbeat import Heartbeat
     from ros2_memory.recorder.standing import FormerFile
     from ros2_memory.recorder.survey import Change
@@ -85,6 +87,7 @@ class IndexManager:
         self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._log: FilteringBoundLogger = structlog.get_logger()
         self._lock = threading.Lock()
+        self._foreign = ForeignBags(bag_dir)
         self.published: Snapshot | None = None
         self._survey = self._new_survey()
 
@@ -138,6 +141,11 @@ class IndexManager:
             if done.bags:
                 self._scan()
             return done
+
+    def foreign(self, snapshot: Snapshot) -> Foreign | None:
+        """What bags take that the recorder of this directory did not make; None where not known."""
+        heartbeat = self.heartbeat()
+        return self._foreign.measured(snapshot, () if heartbeat is None else heartbeat.recordings)
 
     def heartbeat(self) -> Heartbeat | None:
         """What the recorder last wrote of itself, live or not; None where that cannot be read."""

@@ -1,13 +1,12 @@
 """What lies in the bag directory because of this program, and which of it may be deleted.
 
-The index knows the bags; here stands what retention weighs besides: what goes with the last bag of
-a recording, what nothing may delete, and which files are two names of one. Worked out for what
-changed since the last time, since a week is 60,000 bags.
+The index knows the bags; here stands what retention weighs besides: which recordings are its
+recorder's own, what goes with the last bag of a recording, what nothing may delete, and which files
+are two names of one. Worked out for what changed since the last time, since a week is 60,000 bags.
 """
 
 from __future__ import annotations
 
-import re
 import stat
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from ros2_memory.recorder.layout import (
     ROS_LOG_DIR,
     is_carried,
 )
+from ros2_memory.recorder.ownership import OwnRecordings, has_own_name, identity_of
 from ros2_memory.recorder.removal import beside_bags
 from ros2_memory.recorder.retention import Span, Stock, StoredBag, StoredFile
 from ros2_memory.recorder.scan import other_form
@@ -32,6 +32,7 @@ from ros2_memory.timebase import NS_PER_S, Ns
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
+    from ros2_memory.recorder.ownership import Identity
     from ros2_memory.recorder.scan import Stamp
     from ros2_memory.recorder.standing import FileNotes, Verdict
 
@@ -41,12 +42,6 @@ SETTLED_NS: Final[Ns] = 120 * NS_PER_S
 """A directory that changed longer ago holds what it will hold."""
 _BLOCK: Final = 4096
 _WHOLE: Final = frozenset({Standing.CLOSED, Standing.EMPTY})
-_OWN_RECORDING: Final = re.compile(r"rec_\d{8}T\d{6}Z(_\d+)?")
-
-
-def is_own_recording(name: str) -> bool:
-    """Whether a directory is called as this program calls a recording."""
-    return _OWN_RECORDING.fullmatch(name) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +67,7 @@ class _Fate(Enum):
     MAY_GO = auto()
     MAY_GO_UNNAMED = auto()  # where the recorder does not name its recording
     STAYS = auto()
+    DAMAGED = auto()  # stays, and counts where the recorder made it
     FROM_ELSEWHERE = auto()  # stays, and does not count
     KEPT = auto()  # in a moment: stays, and counts with the others there
 
@@ -86,22 +82,34 @@ class _Entry(NamedTuple):
 
 
 class _Folder(NamedTuple):
-    """A recording's directory: its device, and the size of what goes with its last bag."""
+    """A recording's directory: its device, and the size of what goes with its last bag.
+
+    `identity` is that of the directory itself, as of `ctime_ns`.
+    """
 
     mtime_ns: Ns
     settled: bool
     device: int
     size: int
+    ctime_ns: Ns = 0
+    identity: Identity | None = None
 
 
 class Inventory:
     """The stock of one bag directory. Not for several threads at once.
 
-    `static_topics` are latched whatever their publishers say.
+    `static_topics` are latched whatever their publishers say. Of bags that are not among the
+    recorder's `own` only the size is told; all bags are weighed where None.
     """
 
-    def __init__(self, root: Path, static_topics: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        root: Path,
+        static_topics: Collection[str] = (),
+        own: OwnRecordings | None = None,
+    ) -> None:
         self._root = root
+        self._own = own
         self._static_topics = frozenset(static_topics)
         self._entries: dict[str, _Entry] = {}
         self._folders: dict[str, _Folder] = {}
@@ -118,11 +126,18 @@ class Inventory:
             known: what the index knows.
             gone: bags that have been deleted since.
             staying: bags that cannot be deleted.
+
+        Raises:
+            OSError: it cannot be read which recordings are the recorder's own.
         """
         bags: list[StoredBag] = []
         others = self._own_bytes()
         occupied: set[str] = set()
+        foreign: set[StoredFile] = set()
         named = {str(self._root / name) for name in known.named}
+        owned: dict[str, bool] = {}
+        if self._own is not None:
+            self._own.names()
         entries, files = self._entries, known.files
         for path, verdict in known.counted.items():
             if path in gone:
@@ -135,19 +150,41 @@ class Inventory:
             ):
                 entry = entries[path] = self._entered(path, verdict, known)
             fate, bag = entry.fate, entry.bag
+            own = owned.get(bag.recording)
+            if own is None:
+                own = owned[bag.recording] = self._is_own(bag.recording, known.now)
+            # One that has just been begun is listed with its directory some moments later.
+            ours = own or bag.recording in named or is_carried(Path(path))
+            if not ours and fate is not _Fate.KEPT:
+                foreign.update(bag.files)
+                continue
             unnamed = fate is _Fate.MAY_GO_UNNAMED and bag.recording not in named
-            if (fate is _Fate.MAY_GO or unnamed) and path not in staying:
+            if own and (fate is _Fate.MAY_GO or unnamed) and path not in staying:
                 bags.append(bag)
             else:
                 occupied.add(bag.recording)
-                if fate not in {_Fate.FROM_ELSEWHERE, _Fate.KEPT}:
+                if fate is not _Fate.KEPT and not self._is_from_elsewhere(fate, bag):
                     others += sum(file.size for file in bag.files)
         self._forget(known)
         emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
         sidecars = {each: self._folder(each, known.now).size for each in emptied}
         occupied.update(bag.recording for bag in bags)
         others += sum(self._folder(each, known.now).size for each in occupied - emptied)
-        return Stock(bags, known.now, sidecars, others, kept=self._kept(known))
+        elsewhere = sum({file.inode: file.size for file in foreign}.values())
+        kept = self._kept(known)
+        return Stock(bags, known.now, sidecars, others, kept=kept, foreign_bytes=elsewhere)
+
+    def _is_own(self, recording: str, now: Ns) -> bool:
+        if self._own is None:
+            return True
+        name = self._own.name_of(recording)
+        return self._own.lists(name, self._folder(recording, now).identity)
+
+    def _is_from_elsewhere(self, fate: _Fate, bag: StoredBag) -> bool:
+        """Whether a bag that stays does not count: where all are weighed, its name has to tell."""
+        if fate is _Fate.DAMAGED:
+            return self._own is None and not has_own_name(Path(bag.recording).name)
+        return fate is _Fate.FROM_ELSEWHERE
 
     def _entered(self, path: str, verdict: Verdict, known: Known) -> _Entry:
         bag = self._stored(path, verdict, known)
@@ -203,6 +240,13 @@ class Inventory:
             size = beside_bags(Path(path))
             known = _Folder(status.st_mtime_ns, since >= SETTLED_NS, status.st_dev, size)
             self._folders[path] = known
+        if known.ctime_ns != status.st_ctime_ns or known.identity is None:
+            identity = None
+            if self._own is not None:
+                with suppress(OSError):
+                    identity = identity_of(path)
+            known = known._replace(ctime_ns=status.st_ctime_ns, identity=identity)
+            self._folders[path] = known
         return known
 
     def _forget(self, known: Known) -> None:
@@ -235,8 +279,9 @@ def _fate(verdict: Verdict, bag: StoredBag) -> _Fate:
         return _Fate.MAY_GO_UNNAMED
     if verdict.standing in _WHOLE:
         return _Fate.STAYS if is_carried(path) else _Fate.MAY_GO
-    foreign = verdict.standing is Standing.DAMAGED and not is_own_recording(path.parent.name)
-    return _Fate.FROM_ELSEWHERE if foreign or verdict.standing is Standing.UNREAD else _Fate.STAYS
+    if verdict.standing is Standing.DAMAGED:
+        return _Fate.DAMAGED
+    return _Fate.FROM_ELSEWHERE if verdict.standing is Standing.UNREAD else _Fate.STAYS
 
 
 def _on_disk(size: int) -> int:

@@ -17,6 +17,7 @@
           rec_20261120T043000Z/            hard links, under the names that the bags have above
       .episodic/recorded.jsonl     how long was recorded when each recording ended (`recorded_time`)
       .episodic/requests/          what the query server asks of the recorder (see `mailbox`)
+      .episodic/recordings.jsonl   which recordings the recorder made (see `ownership`)
 
 The two YAML files stand beside the recordings, since a recording's own directory must not exist
 before `ros2 bag record` creates it, and it reads one of them again at every split. They say the
@@ -49,6 +50,7 @@ MOMENT_FILE: Final = "moment.json"
 OWN_FOLDER: Final = ".episodic"
 RECORDED_FILE: Final = "recorded.jsonl"
 REQUESTS_FOLDER: Final = f"{OWN_FOLDER}/requests"
+LIST_FILE: Final = f"{OWN_FOLDER}/recordings.jsonl"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """What may be deleted from the bag directory itself, besides bags: it is written anew."""

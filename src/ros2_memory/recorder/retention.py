@@ -37,11 +37,15 @@ SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 
 @dataclass(frozen=True, slots=True)
 class RetentionLimits:
-    """How much is kept: bytes in all, age of the oldest, and what must stay free on the disk."""
+    """How much is kept: bytes in all, age of the oldest, and what must stay free on the disk.
+
+    `keeps_foreign`: bags that the recorder did not make are no part of it, and never deleted.
+    """
 
     max_total_bytes: int
     max_age_ns: Ns
     min_free_bytes: int = 0
+    keeps_foreign: bool = True
 
 
 class StoredFile(NamedTuple):
@@ -84,6 +88,7 @@ class Stock:
     `sidecars` says, for each recording that goes with its last bag, how many bytes go with it.
     `other_bytes` is what nothing here may delete: open bags, and what is not worth deleting.
     `kept` are the files of moments, which nothing here deletes; bags may be other names of them.
+    `foreign_bytes` is what bags of other programs take that are kept; no limit counts them.
     `free_bytes` is what the disk has left; None where that is not to count. `recorded_since` is by
     recording how long was recorded after it, by the monotonic clock (none where it is missing), and
     `synchronised` whether the system clock is.
@@ -97,6 +102,7 @@ class Stock:
     kept: Sequence[StoredFile] = ()
     recorded_since: Mapping[str, Ns] = field(default_factory=dict)
     synchronised: bool = False
+    foreign_bytes: int = 0
 
 
 class Ages(NamedTuple):

@@ -17,6 +17,7 @@ from ros2_memory.recorder.command import (
 )
 from ros2_memory.recorder.environment import find_ros2, robot_environment
 from ros2_memory.recorder.layout import QOS_FILE, ROS_LOG_DIR, STORAGE_FILE, node_name
+from ros2_memory.recorder.ownership import OwnRecordings
 from ros2_memory.recorder.ports import NoHousekeeping
 from ros2_memory.recorder.supervisor import Orders, Supervisor
 from ros2_memory.recorder.sync import write_durably
@@ -56,6 +57,7 @@ class Ros2BagRecorder(Recorder):
             can do that. Their log times may lie long before the split.
         chunk_bytes: size of an MCAP chunk before compression.
         housekeeper: repairs and deletes; nobody where None.
+        own: the list of the recordings that were made here.
         clock: the wall clock.
         keep_open: file descriptors that the recorder's process inherits.
     """
@@ -75,6 +77,7 @@ class Ros2BagRecorder(Recorder):
         repeat_latched: Sequence[str],
         chunk_bytes: int,
         housekeeper: Housekeeper | None = None,
+        own: OwnRecordings | None = None,
         clock: Clock | None = None,
         keep_open: Collection[int] = (),
     ) -> None:
@@ -87,6 +90,7 @@ class Ros2BagRecorder(Recorder):
         self._repeat_latched = tuple(repeat_latched)
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
+        self._own = own or OwnRecordings(self._bag_dir)
         self._started = False
         self._checked = False
         self._topics = TopicSelection(())
@@ -106,6 +110,7 @@ class Ros2BagRecorder(Recorder):
             housekeeper or NoHousekeeping(),
             clock or WallClock(),
             expected=lambda: self._topics.exact,
+            own=self._own,
         )
 
     def check(self) -> None:
@@ -182,6 +187,7 @@ class Ros2BagRecorder(Recorder):
             node_name=node_name(name),
             use_sim_time=self._use_sim_time,
             repeat_latched=self._repeat_latched,
+            bag_dir_id=self._own.bag_dir_id,
             known_options=self._options,
         )
         return Child.start(argv, self._env, keep_open=self._keep_open)

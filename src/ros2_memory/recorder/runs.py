@@ -97,6 +97,15 @@ class Run:
         return taken_by(self.recorded)
 
     @cached_property
+    def taken_in(self) -> dict[str, int]:
+        """The bytes that those take on disk, by the folder in which they lie."""
+        taken: dict[str, int] = {}
+        for bag in self.recorded:
+            folder = bag.file[: bag.file.rfind("/")]
+            taken[folder] = taken.get(folder, 0) + bag.size
+        return taken
+
+    @cached_property
     def folders(self) -> frozenset[str]:
         """The folders in which the bags lie."""
         return frozenset([bag.file[: bag.file.rfind("/")] for bag in self.bags])

@@ -17,6 +17,7 @@ from ros2_memory.recorder.crew import Crew
 from ros2_memory.recorder.disk import HomeDisk, device_of, free_bytes
 from ros2_memory.recorder.heartbeat import RecorderState
 from ros2_memory.recorder.journal import Journal
+from ros2_memory.recorder.ownership import OwnRecordings
 from ros2_memory.recorder.plan import Backoff, SilenceWatch, session_over
 from ros2_memory.recorder.pulse import Pulse
 from ros2_memory.recorder.rotation import BOTH_S, SUBSCRIBE_TIMEOUT_S, Moment, Step
@@ -65,7 +66,7 @@ class Supervisor:
     """Keeps one recording going, two during a handover.
 
     `start_child` starts the recorder of a recording, given its name and its directory. `expected`
-    gives the topics that are to be recorded by name.
+    gives the topics that are to be recorded by name, `own` is the list of recordings made here.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class Supervisor:
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
         expected: Callable[[], Sequence[str]] = tuple,
+        own: OwnRecordings | None = None,
     ) -> None:
         self._orders = orders
         self._clock = clock
@@ -103,6 +105,7 @@ class Supervisor:
             self._announce,
             reader,
             self._journal,
+            own=own or OwnRecordings(orders.bag_dir),
             simulated=orders.simulated,
             subscribe_timeout_s=orders.subscribe_timeout_s,
             both_s=orders.both_s,

@@ -1,8 +1,9 @@
 """Deletes what is not history: recordings without a byte, and all bags where that is asked for.
 
-`recording.clear_on_startup` is for simulation and tests, so moments go too. Only files that are
-known by name are deleted; a directory goes when that leaves it empty. Links are not followed, and
-another file system that is mounted below is left alone.
+`recording.clear_on_startup` is for simulation and tests, so moments go too. Bags of other programs
+stay, unless retention deletes those as well (`retention.foreign`). Only files that are known by
+name are deleted; a directory goes when that leaves it empty. Links are not followed, and another
+file system that is mounted below is left alone.
 """
 
 from __future__ import annotations
@@ -24,10 +25,13 @@ from ros2_memory.recorder.layout import (
     OWN_FILES,
     RECORDING_FILES,
 )
+from ros2_memory.recorder.ownership import identity_at, is_kept_apart
 from ros2_memory.recorder.scan import bag_kind
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from ros2_memory.recorder.ownership import OwnRecordings
 
 MOST_FAULTS: Final = 100
 
@@ -47,8 +51,8 @@ class Wiped:
     more: int = 0
 
 
-def clear_bags(bag_dir: Path) -> Wiped:
-    """Deletes every bag below the directory.
+def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Wiped:
+    """Deletes the bags below the directory: every one, or the recorder's `own` and moments.
 
     Raises:
         RecorderError: the directory is `/`, a home directory or above one: a mistake, surely.
@@ -57,7 +61,9 @@ def clear_bags(bag_dir: Path) -> Wiped:
     root = bag_dir.resolve()
     wiped = Wiped()
     try:
-        _Clearing(root, wiped).run()
+        if own is not None:
+            own.names()
+        _Clearing(root, wiped, own).run()
     except FileNotFoundError:
         pass
     except OSError as error:
@@ -128,8 +134,9 @@ class _Clearing:
     path meanwhile is not touched. The way up is `..`, if that is the directory it was come from.
     """
 
-    def __init__(self, root: Path, wiped: Wiped) -> None:
+    def __init__(self, root: Path, wiped: Wiped, own: OwnRecordings | None = None) -> None:
         self._root = root
+        self._own = own
         self._wiped = wiped
         self._open = -1
         self._way: list[_Folder] = []
@@ -180,7 +187,8 @@ class _Clearing:
         level = len(self._way)
         moments = level in {1, 2} and (name if level == 1 else self._way[1].name) == MOMENTS_FOLDER
         had_bags = moments or any(_is_bag(entry) for entry in entries)
-        names = RECORDING_FILES if had_bags else frozenset()
+        ours = self._is_ours(name)
+        names = RECORDING_FILES if had_bags and ours else frozenset()
         if level == 0:
             names |= OWN_FILES
         elif level == 2 and moments:
@@ -191,7 +199,7 @@ class _Clearing:
             try:
                 if _is_directory(entry, self._device):
                     folder.waiting.append(entry.name)
-                elif _is_bag(entry) or (
+                elif (ours and _is_bag(entry)) or (
                     entry.name in names and entry.is_file(follow_symlinks=False)
                 ):
                     size = entry.stat(follow_symlinks=False).st_size
@@ -202,6 +210,13 @@ class _Clearing:
                 continue
             except OSError as error:
                 self._fault(entry.name, error)
+
+    def _is_ours(self, name: str) -> bool:
+        """Whether the bags in the open directory may go."""
+        if self._own is None:
+            return True
+        path = "/".join([*(each.name for each in self._way if each.name), name])
+        return is_kept_apart(path) or self._own.lists(path, identity_at(self._open))
 
     def _leave(self) -> None:
         """Goes up again, and deletes the directory where it had bags and nothing is left in it."""
