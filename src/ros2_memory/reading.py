@@ -13,6 +13,7 @@ from ros2_memory.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.model import BagState, TimeWindow
+from ros2_memory.recall import bags_without_entry
 from ros2_memory.timebase import MAX_NS, MIN_NS
 from ros2_memory.wording import Reason
 
@@ -98,9 +99,26 @@ class Reading:
         deadline = self.call.deadline
         if deadline.expired():
             raise QueryTimeoutError(
-                f"the question needs more than {deadline.budget_s:g} s; "
+                f"the question needs more than {deadline.budget_s:g} s; {self.behind()}"
                 "ask about a shorter window or a single topic"
             )
+
+    def behind(self) -> str:
+        """How far the catalogue is, for a sentence on lack of time; empty where that is no cause.
+
+        Bags without an entry are read for every question, which takes long where they are many.
+        """
+        recall = self.memory.recall
+        closed = sum(bag.state is BagState.CLOSED for bag in self.snapshot.bags)
+        if recall is None or not closed:
+            return ""
+        missing = len(bags_without_entry(self.snapshot.runs, recall))
+        if missing * 100 <= closed:
+            return ""
+        return (
+            f"the catalogue, which makes such questions quick, has {closed - missing} of {closed} "
+            "bags so far: wait for it, or "
+        )
 
     def recalled(self, run: Run) -> RunNotes | None:
         """What the catalogue says of a run of the snapshot; None without a catalogue."""

@@ -165,7 +165,7 @@ class Search:
         budget_s = self._view.call.deadline.budget_s
         return QueryTimeoutError(
             f"no match back to {moment(back_to)}, and {budget_s:g} s are over; "
-            f"to go on from there, ask again with before={moment(back_to)}",
+            f"{self._view.behind()}to go on from there, ask again with before={moment(back_to)}",
             searched_back_to=back_to,
         )
 

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from mcap.writer import Writer
 
 from ros2_memory import cli
 from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.timebase import NS_PER_S
 from tests import stub_ros2
-from tests.bags import odom, write_mcap
+from tests.bags import McapLayout, Msg, odom, write_mcap
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -159,15 +160,61 @@ def test_data_from_the_future_means_that_the_clock_is_wrong(robot: Path, capsys:
     assert "chrony" in wrong["clock"][0]["do"]
 
 
-def test_damaged_bags_lead_to_recover(robot: Path, capsys: Capture) -> None:
-    (robot / "old").mkdir()
-    (robot / "old" / "old_0.mcap").write_bytes(b"a letter")
+def lay(robot: Path, name: str, content: bytes) -> None:
+    path = robot / name / f"{name}_0.mcap"
+    path.parent.mkdir()
+    path.write_bytes(content)
     hour_ago = time.time() - 3600
-    os.utime(robot / "old" / "old_0.mcap", (hour_ago, hour_ago))
+    os.utime(path, (hour_ago, hour_ago))
+
+
+def test_bags_that_a_crash_cut_lead_to_recover(robot: Path, capsys: Capture) -> None:
+    whole = (robot / "rec" / "rec_0.mcap").read_bytes()
+    for name, content in (("cut", whole[: len(whole) // 2]), ("empty", b""), ("begun", whole[:40])):
+        lay(robot, name, content)
     code, wrong = examined(capsys)
     assert code == 1
     assert wrong["bags"][0]["do"] == f"ros2-memory recover {robot}"
-    assert "old_0.mcap (not an MCAP file" in wrong["bags"][0]["seen"]
+
+
+def test_recover_is_not_advised_for_files_that_it_refuses(robot: Path, capsys: Capture) -> None:
+    lay(robot, "letter", b"a letter")
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert "recover" not in wrong["bags"][0]["do"]
+    assert wrong["bags"][0]["do"].startswith("copy them anew")
+    assert "letter_0.mcap (not an MCAP file" in wrong["bags"][0]["seen"]
+    whole = (robot / "rec" / "rec_0.mcap").read_bytes()
+    lay(robot, "cut", whole[: len(whole) // 2])
+    _, wrong = examined(capsys)
+    assert wrong["bags"][0]["do"].startswith(
+        f"ros2-memory recover {robot}; 1 of them it cannot repair: "
+    )
+
+
+def test_msg_folders_are_advised_for_what_they_would_mend_alone(
+    robot: Path, capsys: Capture
+) -> None:
+    path = robot / "other" / "other_0.mcap"
+    path.parent.mkdir()
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="", library="test")
+        schema = writer.register_schema("keelson.Envelope", "protobuf", b"")
+        channel = writer.register_channel("/keelson", "protobuf", schema)
+        now = time.time_ns() - 3600 * NS_PER_S
+        writer.add_message(channel, now, b"\x08\x01", now)
+        writer.finish()
+    _, wrong = examined(capsys)
+    [told] = wrong["bags"]
+    assert "/keelson (its message encoding 'protobuf' is not read" in told["seen"]
+    assert ".msg" not in told["do"]
+    foreign = Msg("/foreign", "nobody_msgs/msg/Unknown", now, b"\x00\x01\x00\x00abc")
+    write_mcap(robot / "odd" / "odd_0.mcap", [foreign], McapLayout(definitions=False))
+    _, wrong = examined(capsys)
+    by_topic = {each["seen"].split("(")[0]: each["do"] for each in wrong["bags"]}
+    assert "reader.custom_msg_paths" in by_topic["1 topic cannot be decoded: /foreign "]
+    assert ".msg" not in by_topic["1 topic cannot be decoded: /keelson "]
 
 
 def test_an_empty_directory_is_not_in_order(robot: Path, capsys: Capture) -> None:

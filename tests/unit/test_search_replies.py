@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+from functools import partial
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from ros2_memory.memory import Limits
+from ros2_memory import queries
+from ros2_memory.errors import QueryTimeoutError
+from ros2_memory.memory import Call, Limits
+from ros2_memory.timebase import Deadline
 from tests.asking import asked
 from tests.bags import McapLayout, Msg, boolean, detections, make, stamp, write_mcap
 from tests.mcap_surgery import spoil_chunk
@@ -196,3 +201,33 @@ def test_wrong_statistics_of_a_file_that_was_read_whole_do_not_make_never_uncert
     bag_dir = REAL / "rosbag2_time0_mcap"
     given = {"topic": "*", "condition_type": "equals", "value": "never recorded"}
     assert asked(memory_of(bag_dir), bag_dir, "find_last_match", **given) is None
+
+
+@pytest.mark.parametrize("known", [0, 2, 3])
+def test_a_question_that_runs_out_of_time_says_how_far_the_catalogue_is(
+    bag_dir: Path, known: int
+) -> None:
+    memory = recalling(memory_of(bag_dir), bag_dir, part=known / 3)
+    call = Call(Deadline.after(0.0))
+    with pytest.raises(QueryTimeoutError) as late:
+        queries.find_last_match(memory, call, "/*", "contains", "never")
+    told = f"has {known} of 3 bags so far: wait for it, or ask about a shorter window"
+    assert (told in str(late.value)) == (known < 3)
+    assert "ask about a shorter window or a single topic" in str(late.value)
+
+
+def test_a_search_that_got_somewhere_says_how_far_the_catalogue_is(bag_dir: Path) -> None:
+    memory = recalling(memory_of(bag_dir), bag_dir, part=0.0)
+    call = Call(Deadline.after(6.0, partial(next, map(float, count()))))
+    with pytest.raises(QueryTimeoutError) as late:
+        queries.find_last_match(memory, call, "/*", "contains", "never")
+    assert late.value.searched_back_to is not None
+    assert "has 0 of 3 bags so far: wait for it, or to go on from there" in str(late.value)
+
+
+def test_without_a_catalogue_a_shorter_window_is_all_that_is_advised(bag_dir: Path) -> None:
+    with pytest.raises(QueryTimeoutError) as late:
+        queries.find_last_match(
+            memory_of(bag_dir), Call(Deadline.after(0.0)), "/*", "contains", "never"
+        )
+    assert "catalogue" not in str(late.value)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory import directories
 from ros2_memory.adapters import GB, build_recorder
 from ros2_memory.cli.oddities import counted_as_active, merged
-from ros2_memory.errors import EpisodicError
+from ros2_memory.errors import BagError, EpisodicError
 from ros2_memory.memory import Call
 from ros2_memory.overview import data_time_range, nothing_here, odd_bags
 from ros2_memory.recorder.clock_faults import FIRST_BAGS_NS, FUTURE_NS
@@ -26,15 +26,16 @@ from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.recorder.listed_splits import absence_told, absent_splits
 from ros2_memory.recorder.topics import TopicSelection, load_topics
 from ros2_memory.settings import NullRecorderNode
+from ros2_memory.storage.base import Closing
 from ros2_memory.timebase import NS_PER_S, iso_local, unix_from_ns
 from ros2_memory.wording import NAMED, counted, listed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.memory import Memory
-    from ros2_memory.model import JsonValue
+    from ros2_memory.model import JsonValue, SetAside
     from ros2_memory.recorder.heartbeat import Heartbeat
     from ros2_memory.recorder.snapshot import Snapshot
     from ros2_memory.settings import Settings
@@ -44,6 +45,9 @@ if TYPE_CHECKING:
 LATELY_NS: Final = 3600 * NS_PER_S
 """A topic that is not in the newest data of this length is not recorded just now."""
 
+_MSG_FOLDERS: Final = "reader.custom_msg_paths"
+_NOT_DECODED: Final = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
+_NOT_REPAIRED: Final = "copy them anew from where they were recorded, or delete them"
 _UNOFFERED: Final = "no publisher has offered it since the recorder started"
 
 
@@ -209,7 +213,7 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
             "bags",
             f"{len(told.damaged)} damaged and {len(told.incomplete)} unfinished: "
             f"{listed([f'{each.path.name} ({each.reason})' for each in left])}",
-            f"ros2-memory recover {settings.recording.bag_dir}",
+            _how_to_repair(left, memory.reader, settings.recording.bag_dir),
         )
     if told.unread:
         names = listed([each.path.name for each in told.unread])
@@ -226,10 +230,32 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         do = "copy what is missing from where it was recorded"
         yield Finding(Level.WARNING, "bags", sentence, do)
     if told.undecodable:
-        topics = listed([f"{each.topic} ({each.reason})" for each in told.undecodable])
-        number = counted(len(told.undecodable), "topic")
-        do = "name the folder with the .msg files in reader.custom_msg_paths"
-        yield Finding(Level.WARNING, "bags", f"{number} cannot be decoded: {topics}", do)
+        # Those that a configured folder would mend say so themselves.
+        lacking = [each for each in told.undecodable if _MSG_FOLDERS in each.reason]
+        others = [each for each in told.undecodable if _MSG_FOLDERS not in each.reason]
+        name_them = f"name the folder with the .msg files in {_MSG_FOLDERS}"
+        for some, do in ((lacking, name_them), (others, _NOT_DECODED)):
+            if some:
+                topics = listed([f"{each.topic} ({each.reason})" for each in some])
+                seen = f"{counted(len(some), 'topic')} cannot be decoded: {topics}"
+                yield Finding(Level.WARNING, "bags", seen, do)
+
+
+def _how_to_repair(left: Sequence[SetAside], reader: BagReader, bag_dir: Path) -> str:
+    """What mends bags that were left open or are damaged, as far as anything does."""
+    others = sum(not _is_repairable(each.path, reader) for each in left)
+    if others == len(left):
+        return _NOT_REPAIRED
+    rest = f"; {others} of them it cannot repair: {_NOT_REPAIRED}" if others else ""
+    return f"ros2-memory recover {bag_dir}{rest}"
+
+
+def _is_repairable(path: Path, reader: BagReader) -> bool:
+    """Whether `ros2-memory recover` takes a file: MCAP that its writer did not finish."""
+    try:
+        return path.suffix == ".mcap" and reader.closing(path) is Closing.OPEN
+    except BagError:
+        return False
 
 
 def of_what_lies_there(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:

@@ -162,7 +162,8 @@ def _reason(bag: BagFile, bag_dir: Path, own: OwnRecordings | None) -> str:
     if own is not None and not is_own(bag.path, own):
         return _foreign(bag.path, own)
     if bag.state is BagState.INCOMPLETE:
-        return "a crash left it open; ros2-memory recover closes it"
+        closes = "; ros2-memory recover closes it" if bag.path.suffix == ".mcap" else ""
+        return f"a crash left it open{closes}"
     if _is_kept(bag, bag_dir):
         return "it was asked to be kept; delete the moment's folder to forget it"
     return "it reaches beyond the window"
