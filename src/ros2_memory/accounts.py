@@ -91,7 +91,7 @@ class Recap:
         shortest_stop: what stands for less is no standstill.
         frame_id: of the places in texts.
         events: what happened, in order of time.
-        throughout: things that were in view all the time.
+        throughout: things that a detector saw all the time of the window at its usual rate.
         counts: how many events of which kind there were, those that are left out too.
         path_sum_m: the way with what the noise of positions adds, where that is much.
         gap_m: the way across gaps in the recording, in straight lines; None without a gap.

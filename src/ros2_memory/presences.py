@@ -3,6 +3,10 @@
 A thing stays in view from one message that has it to the next where these follow each other on its
 topic within `SILENCE_NS`, or lie within `FLICKER_NS` whatever is between them: detectors miss
 things now and then. Where a history is cut into bags changes nothing.
+
+Many detectors publish only what they see, so a presence alone does not show that the thing was seen
+all the time. It was seen where its messages follow each other at the detector's own usual rate: no
+farther apart than `USUAL_PERIODS` times their mean distance, or `SHORT_NS`.
 """
 
 from __future__ import annotations
@@ -23,8 +27,19 @@ SILENCE_NS: Final[Ns] = 10 * NS_PER_S
 """After so long without a message a thing counts as gone: many detectors speak only of what is."""
 FLICKER_NS: Final[Ns] = 3 * NS_PER_S
 """A thing that is missed for less did not leave."""
+USUAL_PERIODS: Final = 3
+SHORT_NS: Final[Ns] = NS_PER_S
 
-_ROW: Final = np.dtype([("first", "<i8"), ("last", "<i8"), ("label", "<u4"), ("ends", "u1")])
+_ROW: Final = np.dtype(
+    [
+        ("first", "<i8"),
+        ("last", "<i8"),
+        ("label", "<u4"),
+        ("ends", "u1"),
+        ("count", "<u4"),
+        ("longest", "<i8"),
+    ]
+)
 Rows: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.void]]"
 
 _FROM_START: Final = 1
@@ -44,8 +59,9 @@ class Seen(NamedTuple):
 
     Attributes:
         labels: the names of the things, sorted.
-        rows: of each presence its first and last time, the place of its label, and whether the
-            first and the last message of all have it.
+        rows: of each presence its first and last time, the place of its label, whether the first
+            and the last message of all have it, how many messages have it, and the longest time
+            between two of these.
     """
 
     labels: tuple[str, ...] = ()
@@ -66,7 +82,7 @@ class Seen(NamedTuple):
     def presences(self) -> tuple[Presence, ...]:
         """Each of them."""
         told = _rows(self.rows).tolist()
-        return tuple(Presence(self.labels[label], first, last) for first, last, label, _ in told)
+        return tuple(Presence(self.labels[label], first, last) for first, last, label, *_ in told)
 
     def most_lasting(self, at_most: int) -> Seen:
         """So many of them, those that lasted longest; of equal ones the earliest."""
@@ -77,13 +93,21 @@ class Seen(NamedTuple):
         kept, rows["label"] = np.unique(rows["label"], return_inverse=True)
         return Seen(tuple(self.labels[place] for place in kept.tolist()), rows.tobytes())
 
-    def labels_of(self, *, first: Ns | None = None, last: Ns) -> list[str]:
-        """The things that a presence with this last time, and this first one, is of."""
+    def throughout(self, start: Ns, end: Ns) -> list[str]:
+        """The things that were seen all the time between two moments, at their usual rate."""
         rows = _rows(self.rows)
-        chosen = rows["last"] == last
-        if first is not None:
-            chosen &= rows["first"] == first
-        return [self.labels[place] for place in rows["label"][chosen].tolist()]
+        pause = _longest_pause(rows)
+        chosen = (rows["longest"] <= pause) & (rows["count"] > 1)
+        chosen &= (rows["first"] <= start + pause) & (rows["last"] >= end - pause)
+        return self._named(rows[chosen])
+
+    def at_end(self, last: Ns, known_to: Ns) -> list[str]:
+        """The things of the last message, at `last`, that may be in view still at `known_to`."""
+        rows = _rows(self.rows)
+        return self._named(rows[(rows["last"] == last) & (known_to - last <= _longest_pause(rows))])
+
+    def _named(self, rows: Rows) -> list[str]:
+        return [self.labels[place] for place in rows["label"].tolist()]
 
     def without(self, labels: Collection[str]) -> Seen:
         """The presences of all other things."""
@@ -146,7 +170,7 @@ class Watcher:
             if known is None:
                 self._open[label] = _Open(time, self._nth)
             elif known.nth >= self._nth - 1 or time - known.last <= FLICKER_NS:
-                known.last, known.nth = time, self._nth
+                known.add(time, self._nth)
             else:
                 if len(self._over) < self._at_most:
                     self._over.append((label, known))
@@ -167,6 +191,8 @@ class Watcher:
                 each.last,
                 place[label],
                 (each.began == 1) * _FROM_START | (each.nth == self._nth) * _TO_END,
+                each.count,
+                each.longest,
             )
             for label, each in told
         ]
@@ -176,11 +202,18 @@ class Watcher:
 class _Open:
     """A presence that may go on; `began` and `nth` are its first and last message's number."""
 
-    __slots__ = ("began", "first", "last", "nth")
+    __slots__ = ("began", "count", "first", "last", "longest", "nth")
 
     def __init__(self, time: Ns, nth: int) -> None:
         self.first = self.last = time
         self.began = self.nth = nth
+        self.count = 1
+        self.longest = 0
+
+    def add(self, time: Ns, nth: int) -> None:
+        self.longest = max(self.longest, time - self.last)
+        self.last, self.nth = time, nth
+        self.count += 1
 
 
 def joined(parts: Sequence[Part]) -> Part:
@@ -213,6 +246,10 @@ def _merged(seen: Sequence[Seen], follow: NDArray[np.bool_]) -> Seen:
     stops = np.append(begins[1:], len(rows)) - 1
     found = np.empty(len(begins), _ROW)
     found["first"], found["last"], found["label"] = first[begins], reach[stops], label[begins]
+    found["count"] = np.add.reduceat(rows["count"], begins)
+    # Times below may be as far apart as any two can be: only those of one presence are told.
+    pauses = np.append(0, np.where(goes_on, np.maximum(first[1:] - reach[:-1], 0), 0))
+    found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
     found["ends"] = (ends[begins] & _FROM_START) * (part[begins] == 0)
     found["ends"] |= (ends[stops] & _TO_END) * (part[stops] == len(seen) - 1)
     return Seen(labels, found[np.lexsort((found["label"], found["first"]))].tobytes())
@@ -245,6 +282,16 @@ def _reach(label: NDArray[np.intp], last: NDArray[np.int64]) -> NDArray[np.int64
     far = label * len(last)
     latest: NDArray[np.int64] = last[by_time[np.maximum.accumulate(rank + far) - far]]
     return latest
+
+
+def _longest_pause(rows: Rows) -> NDArray[np.int64]:
+    """Of each row the longest time between two of its messages at the detector's usual rate."""
+    spans = rows["last"] - rows["first"]
+    # How often a thing is seen that is seen once is not known: it is missed for a moment, at most.
+    usual = USUAL_PERIODS * spans // np.maximum(rows["count"].astype(np.int64) - 1, 1)
+    pause = np.where(rows["count"] > 1, np.maximum(usual, SHORT_NS), FLICKER_NS)
+    longest: NDArray[np.int64] = np.minimum(pause, SILENCE_NS)
+    return longest
 
 
 def _by_length(rows: Rows) -> NDArray[np.intp]:

@@ -15,7 +15,7 @@ from ros2_memory.absence import resolve_pose_topic
 from ros2_memory.accounts import Event, Recap
 from ros2_memory.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.moments import open_span
-from ros2_memory.presences import SILENCE_NS, united
+from ros2_memory.presences import united
 from ros2_memory.standstills import SHORTEST_NS
 from ros2_memory.stories import tells
 from ros2_memory.tales import standstills_in, story_in
@@ -68,6 +68,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         QueryTimeoutError: the call's time is over.
     """
     view, window = open_span(memory, call, span)
+    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     drive = _drive(view, window)
     events = [] if drive is None else [*_stops(drive)]
     seen: list[Seen] = []
@@ -78,9 +79,8 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     for topic, story in _stories(view, window):
         events += [*_flips(topic, story), *map(_error, story.faults)]
         seen.append(story.seen)
-        throughout.update(story.seen.labels_of(first=story.first, last=story.last))
-        if known_to - story.last <= SILENCE_NS:
-            there_still |= dict.fromkeys(story.seen.labels_of(last=story.last), story.last)
+        throughout.update(story.seen.throughout(start, end))
+        there_still |= dict.fromkeys(story.seen.at_end(story.last, known_to), story.last)
         if story.undecodable:
             messages = counted(story.undecodable, "message")
             view.note_thing(_UNDECODED, f"{messages} of {topic}")
@@ -108,8 +108,8 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     for note in () if trajectory is None else length_notes(trajectory):
         view.note(note)
     return Recap(
-        start=window.start + START_SLACK_NS,
-        end=window.stop - 1 - AT_OR_BEFORE_SLACK_NS,
+        start=start,
+        end=end,
         now=memory.clock.now() if memory.limits.now == "wall" or latest is None else latest,
         distance_m=None if trajectory is None else trajectory.distance_m,
         max_speed=None if trajectory is None else trajectory.max_speed,

@@ -148,8 +148,60 @@ def test_presences_without_some_things_are_those_of_the_others() -> None:
     seen = watched([(0, ("a", "b")), (20 * NS_PER_S, ("a",))]).seen
     assert seen.without({"a", "x"}).presences() == (Presence("b", 0, 0),)
     assert seen.without({"x"}) is seen
-    assert seen.labels_of(first=0, last=0) == ["a", "b"]
-    assert seen.labels_of(last=20 * NS_PER_S) == ["a"]
+
+
+def each_s(begin: float, end: float, period: float, *labels: str) -> Messages:
+    return [
+        (round((begin + n * period) * NS_PER_S), labels) for n in range(int((end - begin) / period))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("messages", "is_seen"),
+    [
+        (each_s(0, 65, 0.2, "a"), True),
+        (each_s(0.5, 64.5, 0.2, "a"), True),
+        (each_s(0, 66, 3, "a"), True),
+        (each_s(12, 17, 0.2, "a"), False),
+        (each_s(2, 65, 0.2, "a"), False),
+        (each_s(0, 63, 0.2, "a"), False),
+        (each_s(0, 30, 0.2, "a") + each_s(32, 65, 0.2, "a"), False),
+        (each_s(0, 30, 0.2, "a") + each_s(30.6, 65, 0.2, "a"), True),
+        (each_s(0, 30, 0.2, "a") + each_s(30, 32, 0.2) + each_s(32, 65, 0.2, "a"), False),
+        (each_s(0, 65, 0.2, "b"), False),
+        (each_s(30, 31, 1, "a"), False),
+    ],
+)
+def test_a_thing_is_seen_throughout_where_it_is_seen_at_the_usual_rate(
+    messages: Messages, is_seen: bool
+) -> None:
+    seen = watched(messages).seen
+    assert ("a" in seen.throughout(0, 65 * NS_PER_S)) is is_seen
+    half = len(messages) // 2 or 1
+    parts = [watched(part) for part in (messages[:half], messages[half:]) if part]
+    assert ("a" in joined(parts).seen.throughout(0, 65 * NS_PER_S)) is is_seen
+
+
+def test_a_thing_that_is_not_seen_any_more_is_not_there_still() -> None:
+    messages = each_s(0, 20, 0.2, "a")
+    last = messages[-1][0]
+    seen = watched(messages).seen
+    assert seen.at_end(last, last + NS_PER_S) == ["a"]
+    assert seen.at_end(last, last + 2 * NS_PER_S) == []
+    assert seen.at_end(last - 1, last) == []
+
+
+@given(histories())
+def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
+    messages: Messages,
+) -> None:
+    seen = watched(messages).seen
+    start, end = messages[0][0], messages[-1][0]
+    for label in seen.throughout(start, end):
+        times = [time for time, labels in messages if label in labels]
+        usual = (times[-1] - times[0]) / (len(times) - 1)
+        edges = [start, *times, end]
+        assert max(b - a for a, b in pairwise(edges)) <= max(NS_PER_S, 3 * usual)
 
 
 def test_nothing_seen_is_joined_to_nothing_seen() -> None:

@@ -357,6 +357,32 @@ def test_a_thing_that_was_missed_for_a_moment_did_not_leave(tmp_path: Path) -> N
     assert times(told.events, "thing") == [("cup in view", 1.0), ("cup in view", 8.0)]
 
 
+@each_way
+def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """It saw scissors for 5 s of 65, and the table all the time."""
+    rows = [(at / 5, "scissors") for at in range(60, 85)]
+    rows += [(at / 5 + 0.1, "table") for at in range(325)]
+    messages = [
+        detections(BEGIN + round(at * S), [label], topic=f"/vision/{label}") for at, label in rows
+    ]
+    messages += [odom(BEGIN + n * S, 0.1 * n, 0.0, 0.0) for n in range(66)]
+    messages.sort(key=lambda each: each.log_time)
+    for nth in range(0, len(messages), 100):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[nth : nth + 100])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 0, 65)
+    assert told.throughout == ("table",)
+    assert times(told.events, "thing") == [("scissors in view", 12.0)]
+    assert over(memory, 12.5, 16).throughout == ("scissors", "table")
+    # What the memory does not hold was not looked at.
+    assert over(memory, 0, 80).throughout == ()
+    assert over(memory, -10, 60).throughout == ()
+
+
 def test_a_thing_that_several_detectors_see_is_told_once(tmp_path: Path) -> None:
     one = [detections(BEGIN + at * S, ["cup"] if at in {2, 3} else []) for at in range(10)]
     other = [
