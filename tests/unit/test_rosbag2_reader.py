@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 import zstandard
 
-from ros2_memory.errors import BagError, UndecodableError
+from ros2_memory.errors import BagContradictionError, BagError, UndecodableError
 from ros2_memory.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -112,6 +112,52 @@ class TestSqliteSchemas:
         change(path, "DROP INDEX timestamp_idx")
         assert read(reader, path) == with_index
         assert times(with_index) == [1, 1, 2, 3]
+
+    @pytest.mark.parametrize("asked_first", ["newest", "records", "log_times", "summarize"])
+    def test_an_index_that_is_declared_descending_and_stored_ascending_is_not_believed(
+        self, tmp_path: Path, asked_first: str
+    ) -> None:
+        path = write_db3(tmp_path / "a.db3", [text(at, "x") for at in range(1000, 1400)])
+        change(
+            path,
+            "PRAGMA writable_schema = 1",
+            "UPDATE sqlite_master SET sql = replace(sql, 'ASC', 'DESC') WHERE type = 'index'",
+        )
+        upto = TimeWindow(0, 1200)
+        reader = Rosbag2Reader()
+        if asked_first == "newest":
+            with pytest.raises(BagError, match="index by time is damaged"):
+                reader.newest(path, "/chatter", upto)
+        elif asked_first == "log_times":
+            assert list(reader.log_times(path, "/chatter", upto)) == [*range(1000, 1200)]
+        elif asked_first == "records":
+            with pytest.raises(BagContradictionError):
+                read(reader, path)
+        assert any("index by time is damaged" in note for note in reader.summarize(path).notes)
+        for newest_first in (False, True):
+            records = reader.records(path, ["/chatter"], upto, newest_first=newest_first)
+            with pytest.raises(BagContradictionError):
+                next(records)
+            found = [each.log_time for each in records]
+            assert found == sorted(range(1000, 1200), reverse=newest_first)
+        assert list(reader.log_times(path, "/chatter", upto)) == [*range(1000, 1200)]
+
+    def test_a_message_that_the_index_has_elsewhere_is_found_where_it_is(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_db3(tmp_path / "a.db3", [text(at, "x") for at in range(1_000_000, 1_000_400)])
+        data = path.read_bytes()
+        # A record of the index: its header, the time, and the row.
+        at = data.rindex((1_000_150).to_bytes(3, "big") + (151).to_bytes(2, "big"))
+        path.write_bytes(data[:at] + (900_000).to_bytes(3, "big") + data[at + 3 :])
+        window = TimeWindow(0, 1_000_151)
+        with pytest.raises(BagError):
+            Rosbag2Reader().newest(path, "/chatter", window)
+        reader = Rosbag2Reader()
+        records = reader.records(path, ["/chatter"], window, newest_first=True)
+        with pytest.raises(BagContradictionError):
+            next(records)
+        assert next(records).log_time == 1_000_150
 
     @pytest.mark.parametrize(
         "statement",

@@ -37,6 +37,7 @@ class _Room(Protocol):
 
     def summarize(self, path: Path) -> BagSummary: ...
     def channels(self, path: Path) -> Sequence[Channel]: ...
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None: ...
     def profile(self, path: Path) -> str: ...
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]: ...
     def records(
@@ -113,6 +114,11 @@ class Rosbag2Reader(BagReader):
                 yield from records(opened.path, topics, window, newest_first=newest_first)
 
         return map(partial(whole, path), found())
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """The latest message of the topic inside the window."""
+        with reading(path), self._opened(path) as opened:
+            return opened.room.newest(opened.path, topic, window)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """The log times of the topic inside the window, without payloads."""

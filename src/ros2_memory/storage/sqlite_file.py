@@ -13,11 +13,14 @@ import sqlite3
 import stat
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from operator import attrgetter
+from functools import partial
+from itertools import starmap, zip_longest
+from operator import attrgetter, eq
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.model import TimeWindow
 from ros2_memory.storage.base import ROS2_PROFILE, Channel, Closing, Record, Schema
-from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.faults import ContradictionError, UnreadableError
 from ros2_memory.storage.limits import (
     MAX_CHANNELS,
     MAX_CHUNK_MB,
@@ -31,17 +34,19 @@ from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.sqlite_guard import guard, require_plain_tables
 from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
-from ros2_memory.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import BagSummary, TimeWindow
+    from ros2_memory.model import BagSummary
+    from ros2_memory.storage.faults import LostError
+    from ros2_memory.storage.open_file import FileKey
     from ros2_memory.timebase import Ns
 
 JOURNALS: Final = ("-wal", "-journal")
 _KEPT_BYTES: Final = 16 << 20
+_PROOF_BYTES: Final = 200
 _TOTALS: Final = """
     SELECT topic_id, count(*), min(timestamp), max(timestamp),
            sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob')
@@ -54,8 +59,13 @@ _ASCENDING: Final = """
     ORDER BY timestamp, rowid
 """
 _DESCENDING: Final = _ASCENDING.replace("timestamp, rowid\n", "timestamp DESC, rowid DESC\n")
-# Answered from an index where there is one: it may be damaged where the messages are not.
-_COUNT: Final = "SELECT count(*) FROM messages WHERE timestamp >= ? AND timestamp < ?"
+_BEHIND: Final = """
+    SELECT 1 FROM messages NOT INDEXED
+    WHERE rowid > ? AND rowid <= ? AND timestamp > ? AND timestamp < ?
+    AND topic_id IN (SELECT value FROM json_each(?)) LIMIT 1
+"""
+_LOOKED_BEHIND: Final = 128
+_WRONG_INDEX: Final = "its index by time is damaged; its messages were read without it"
 _METADATA: Final = (
     ("offered_qos_profiles", "offered_qos_profiles"),
     ("type_description_hash", "topic_type_hash"),
@@ -64,7 +74,7 @@ _METADATA: Final = (
 _SIZE_OF_DEFINITIONS: Final = (
     "SELECT total(length(encoded_message_definition)) FROM message_definitions"
 )
-_PAYLOAD: Final = "SELECT data FROM messages WHERE rowid = ?"
+_PAYLOAD: Final = "SELECT data, timestamp, topic_id FROM messages WHERE rowid = ?"
 
 
 _MESSAGE_COLUMNS: Final = {"topic_id", "timestamp", "data"}
@@ -72,8 +82,9 @@ _MESSAGE_COLUMNS: Final = {"topic_id", "timestamp", "data"}
 
 @dataclass(frozen=True, slots=True)
 class _Topics:
-    """The channels of a file by topic id."""
+    """The channels of a file by topic id; `key` is the content of the file."""
 
+    key: FileKey
     channels: Mapping[int, Channel]
 
     def named(self, topics: Collection[str]) -> dict[int, Channel]:
@@ -96,26 +107,28 @@ class SqliteBags:
         self._max_message_bytes = max_message_mb << 20
         self._known: ByteLru[_Topics] = ByteLru(_KEPT_BYTES)
         self._shared: Shared[Channel] = Shared(attrgetter("bytes_held"))
+        # Whether the indexes of a file give what its table holds.
+        self._proven: ByteLru[bool] = ByteLru(_KEPT_BYTES)
 
     def summarize(self, path: Path) -> BagSummary:
         """Topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
             rows: list[tuple[int, int, int, int, int]] = base.execute(_TOTALS).fetchall()
-            (indexed,) = base.execute(_COUNT, (MIN_NS, MAX_NS)).fetchone()
+            right = self._is_indexed_right(base, topics)
         if any(wrong for *_, wrong in rows):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
             )
-        if indexed != sum(row[1] for row in rows):
-            raise UnreadableError("damaged: its index by time lacks messages")
         held = [
             Held(topics.channels[number], count, first, last)
             for number, count, first, last, _ in rows
             if number in topics.channels
         ]
         orphans = sum(row[1] for row in rows) - sum(each.messages for each in held)
-        notes = (f"{orphans} messages belong to no topic and were left out",) if orphans else ()
-        return bag_summary(held, topics.channels.values(), notes=notes)
+        notes = [] if right else [_WRONG_INDEX]
+        if orphans:
+            notes.append(f"{orphans} messages belong to no topic and were left out")
+        return bag_summary(held, topics.channels.values(), notes=tuple(notes))
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """The topics declared in the file."""
@@ -129,28 +142,84 @@ class SqliteBags:
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
-    ) -> Iterator[Record]:
-        """The messages of `topics` inside the window, in order."""
+    ) -> Iterator[Record | LostError]:
+        """The messages of `topics` inside the window, in order.
+
+        An error stands for an index that is not believed; no message is lost with it.
+        """
+        if window.empty:
+            return
         with self._opened(path) as (base, known):
             wanted = known.named(topics)
-            order = _DESCENDING if newest_first else _ASCENDING
-            arguments = (window.start, window.stop, json.dumps(list(wanted)))
-            for time, row, number in _sorted(
-                base.execute(order, arguments), newest_first=newest_first
+            right = self._is_indexed_right(base, known)
+            if not right:
+                yield ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
+            for time, row, number in _placed(
+                base, wanted, window, newest_first=newest_first, indexed=right
             ):
-                found = base.execute(_PAYLOAD, (row,)).fetchone()
-                if found is None or not isinstance(found[0], bytes):
-                    raise UnreadableError("damaged: a message without a binary payload")
-                channel = wanted[number]
-                payload = self._plain(found[0]) if channel.encoding == "cdr" else found[0]
-                yield Record(channel, time, time, payload)
+                yield self._record(base, wanted, time, row, number)
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """The latest message of the topic inside the window: what `records` begins with.
+
+        Where it is not known yet whether the indexes are right, only what this one message needs of
+        them is held against the table, which takes some microseconds.
+
+        Raises:
+            ContradictionError: the indexes do not agree with the table.
+        """
+        if window.empty:
+            return None
+        with self._opened(path) as (base, known):
+            wanted = known.named({topic})
+            right = self._proven.get(known.key)
+            found = None
+            if right is not False:
+                rows = _placed(base, wanted, window, newest_first=True, indexed=True)
+                found = rows.fetchone()
+            if right is None and (found is None or not _is_newest(base, wanted, window, found)):
+                right = self._is_indexed_right(base, known)
+            if right is False:
+                raise ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
+            return None if found is None else self._record(base, wanted, *found)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
         """The log times of a topic's messages inside the window, ascending."""
         with self._opened(path) as (base, known):
-            arguments = (window.start, window.stop, json.dumps(list(known.named({topic}))))
-            rows = _sorted(base.execute(_ASCENDING, arguments), newest_first=False)
+            wanted, right = known.named({topic}), self._is_indexed_right(base, known)
+            rows = _placed(base, wanted, window, indexed=right)
             return [time for time, _, _ in rows]
+
+    def _record(
+        self,
+        base: sqlite3.Connection,
+        wanted: Mapping[int, Channel],
+        time: Ns,
+        row: int,
+        number: int,
+    ) -> Record:
+        found = base.execute(_PAYLOAD, (row,)).fetchone()
+        if found is None or not isinstance(found[0], bytes):
+            raise UnreadableError("damaged: a message without a binary payload")
+        if found[1:] != (time, number):
+            raise UnreadableError("damaged: a message is not the one that an index names")
+        channel = wanted[number]
+        payload = self._plain(found[0]) if channel.encoding == "cdr" else found[0]
+        return Record(channel, time, time, payload)
+
+    def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:
+        """Whether the indexes of a file give what its table holds; looked at once for each file."""
+        right = self._proven.get(known.key)
+        if right is None:
+            every = partial(_placed, base, known.channels, TimeWindow.everything())
+            try:
+                both = zip_longest(every(indexed=True), every(indexed=False))
+                right = all(starmap(eq, both))
+            except sqlite3.DatabaseError:
+                # An index may be malformed where the table is not.
+                right = False
+            self._proven.put(known.key, right, _PROOF_BYTES)
+        return right
 
     def _plain(self, payload: bytes) -> bytes:
         return plain_payload(payload, self._max_message_bytes)
@@ -174,12 +243,12 @@ class SqliteBags:
             topics = self._known.get(key)
             if topics is None:
                 require_plain_tables(base)
-                topics = self._topics(base)
+                topics = _Topics(key, self._channels(base))
                 size = 1000 + sum(300 + c.bytes_held for c in topics.channels.values())
                 self._known.put(key, topics, size)
             yield base, topics
 
-    def _topics(self, base: sqlite3.Connection) -> _Topics:
+    def _channels(self, base: sqlite3.Connection) -> dict[int, Channel]:
         have = _columns(base, "topics")
         if not {"id", "name", "type"} <= have or not _columns(base, "messages") >= _MESSAGE_COLUMNS:
             raise UnreadableError("not a rosbag2 file: it lacks the tables topics and messages")
@@ -207,25 +276,45 @@ class SqliteBags:
             raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
         if sum(len(c.topic) + len(c.type) for c in channels.values()) > MAX_NAMES_CHARS:
             raise UnreadableError("its topics and types have longer names than any can have")
-        return _Topics(channels)
+        return channels
 
 
 def _text(raw: bytes) -> str:
     return raw.decode("utf-8", errors="replace")
 
 
-def _sorted(
-    rows: Iterable[tuple[int, int, int]], *, newest_first: bool
-) -> Iterator[tuple[int, int, int]]:
-    """The rows, whose order comes from an index that may be damaged."""
-    sign = -1 if newest_first else 1
-    before: tuple[int, int] | None = None
-    for row in rows:
-        key = (sign * row[0], sign * row[1])
-        if before is not None and key <= before:
-            raise UnreadableError("damaged: its index by time is out of order")
-        before = key
-        yield row
+def _placed(
+    base: sqlite3.Connection,
+    wanted: Collection[int],
+    window: TimeWindow,
+    *,
+    newest_first: bool = False,
+    indexed: bool,
+) -> sqlite3.Cursor:
+    """Log time, row and topic of the messages, in order; by an index only where that is right."""
+    query = _DESCENDING if newest_first else _ASCENDING
+    arguments = (window.start, window.stop, json.dumps(list(wanted)))
+    return base.execute(query if indexed else _without_index(query), arguments)
+
+
+def _without_index(query: str) -> str:
+    return query.replace("FROM messages", "FROM messages NOT INDEXED", 1)
+
+
+def _is_newest(
+    base: sqlite3.Connection,
+    wanted: Collection[int],
+    window: TimeWindow,
+    found: tuple[Ns, int, int],
+) -> bool:
+    """Whether a message that an index gave is the newest, as far as the table tells for little.
+
+    A message that the index lacks, or has elsewhere, or that is not found since the index is stored
+    in another order than it declares, was mostly written soon after the one given in its place.
+    """
+    time, row, _ = found
+    arguments = (row, row + _LOOKED_BEHIND, time, window.stop, json.dumps(list(wanted)))
+    return base.execute(_BEHIND, arguments).fetchone() is None
 
 
 def _columns(base: sqlite3.Connection, table: str) -> set[str]:
