@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.catalogue_file import (
     BUSY_S,
+    VERSION,
     fault_of,
     in_memory,
     is_busy,
@@ -132,7 +133,7 @@ class KeptBase:
                 if opened is None:
                     return False
                 try:
-                    _transact(opened.base, write)
+                    _transact(opened.base, write, probing=self._failing)
                 except (sqlite3.Error, MemoryError) as error:
                     if not is_busy(error) or self._monotonic() >= give_up_s:
                         self._failed(error)
@@ -243,10 +244,18 @@ class KeptBase:
             log.warning("catalogue_not_set_aside", path=str(opened.path), reason=str(error))
 
 
-def _transact(base: sqlite3.Connection, write: Callable[[sqlite3.Connection], None]) -> None:
+def _transact(
+    base: sqlite3.Connection, write: Callable[[sqlite3.Connection], None], *, probing: bool
+) -> None:
+    """Writes in one transaction; `probing`: one page at least, where `write` may have nothing to.
+
+    A transaction without a change touches no disk, and says nothing of it.
+    """
     base.execute("BEGIN IMMEDIATE")
     try:
         write(base)
+        if probing:
+            base.execute(f"PRAGMA user_version = {VERSION:d}")
         base.execute("COMMIT")
     except BaseException:
         with suppress(sqlite3.Error):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -81,6 +82,28 @@ async def test_leaving_a_request_ends_its_query(is_modern: bool) -> None:
             writer.write(head("POST", "/mcp", len(body), more) + body)
             await set_in_time(query.begun)
             assert not query.ended.is_set()
+        await set_in_time(query.ended)
+        await none_left(dispatcher)
+
+
+async def test_a_client_that_cancels_a_call_ends_its_query_and_stays() -> None:
+    query = Endless()
+    async with serving(query) as (port, dispatcher), connected(port) as (stream, writer):
+        writer.write(head("GET", "/sse"))
+        async with asyncio.timeout(BOUND_S):
+            await stream.readuntil(b"session_id=")
+            session = (await stream.readuntil(b"\r\n")).strip().decode()
+        cancelled = {
+            "jsonrpc": "2.0",
+            "method": "notifications/cancelled",
+            "params": {"requestId": 7, "reason": "the person asked something else"},
+        }
+        to = f"/messages/?session_id={session}"
+        for body in (*opening(), call("endless", "{}", 7)):
+            assert (await posted(port, body, to))[0] == 202
+        await set_in_time(query.begun)
+        assert not query.ended.is_set()
+        assert (await posted(port, json.dumps(cancelled).encode(), to))[0] == 202
         await set_in_time(query.ended)
         await none_left(dispatcher)
 

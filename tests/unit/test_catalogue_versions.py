@@ -35,7 +35,10 @@ CALLS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("recap", {"start": 0, "end": 4e9}),
     ("visits", {"x": 0, "y": 0, "radius_m": 5}),
     ("find_matches", {"topic": "/*", "condition_type": "contains", "value": "a"}),
-    ("find_last_match", {"topic": "/odom", "condition_type": "above", "value": 0}),
+    (
+        "find_last_match",
+        {"topic": "/odom", "condition_type": "above", "value": 0, "field": "position.x"},
+    ),
     ("get_position_seconds_ago", {"seconds_ago": 3}),
     ("memory_status", {}),
 )

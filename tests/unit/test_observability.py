@@ -78,6 +78,30 @@ class TestMetrics:
         assert at(found, "answers_total", tool="ask", outcome="timeout", reason="") == 1
         assert at(found, "build_info", version="1.2.3") == 1
 
+    async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole(self) -> None:
+        metrics = Metrics(lambda: Measures(None, None, None), "1")
+        tools = [Tool("full", "f", "A.", {}, blocking=False, question=partial(asking, "full"))]
+        dispatcher = Dispatcher(
+            cast("Memory", None),
+            tools,
+            Replies(Path("bags"), 1000),
+            call_timeout_s=5,
+            telemetry=Telemetry((metrics,)),
+        )
+        hostile = ['a"} 1\nup 0\n#', "\\", "\x00", "\ud800", "x" * 100_000, "full\n", "", "{"]
+        await dispatcher.answer("full", {})
+        for n in range(200):
+            name = hostile[n % len(hostile)] + str(n)
+            await dispatcher.answer(name, {name: name})
+        shown = await metrics.exposition()
+        assert len(shown.body) < 20_000
+        found = await scraped(metrics)
+        tool_labels = {dict(labels).get("tool") for _, labels in found}
+        assert tool_labels == {None, "full", UNKNOWN_TOOL}
+        asked = {"tool": UNKNOWN_TOOL, "outcome": "invalid_arguments", "reason": ""}
+        assert at(found, "answers_total", **asked) == 200
+        dispatcher.stop()
+
     async def test_durations_are_counted_in_buckets_by_tool(self) -> None:
         metrics = Metrics(lambda: Measures(None, None, None), "1")
         for seconds in (0.03, 0.3, 100.0):

@@ -1,0 +1,77 @@
+"""A disk that fails on writes: what lies there stands, answers stay right, and it is got over."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import pytest
+import structlog
+
+from ros2_memory.catalogue import FILE, FOLDER
+from ros2_memory.recorder.sync import write_all_durably, write_durably
+from tests.faults.test_catalogue_faults import assert_sound, trouble_of
+from tests.faults.world import fill_up, plainly, served, told, write_bags
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@contextmanager
+def no_file_grows_beyond(size: int) -> Iterator[None]:
+    """Writes fail in the kernel, as SQLite's own do, which it takes for a fault of the disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("size", [4096, 20_000])
+def test_a_catalogue_that_cannot_be_written_costs_no_answer_and_is_filled_later(
+    tmp_path: Path, size: int
+) -> None:
+    (tmp_path / "recorder.json").write_text("{}")
+    write_bags(tmp_path, 3)
+    memory, filler = served(tmp_path)
+    fill_up(filler)
+    write_bags(tmp_path, 3, first=3)
+    right = plainly(tmp_path, count=6)
+    with no_file_grows_beyond(size), structlog.testing.capture_logs() as logs:
+        for _ in range(3):
+            fill_up(filler)
+        assert "cannot be used" in (trouble_of(filler) or "")
+        assert filler.progress().waiting == 3
+        assert told(memory, count=6) == right
+    said = [each["event"] for each in logs if each["event"].startswith("catalogue")]
+    assert said == ["catalogue_failed"]
+    filler.look_after(thorough=True)
+    fill_up(filler)
+    assert (trouble_of(filler), filler.progress().waiting) == (None, 0)
+    assert told(memory, count=6) == right
+    assert_sound(tmp_path / FOLDER / FILE)
+
+
+@pytest.mark.parametrize("function", ["fsync", "open", "replace"])
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC, errno.EROFS])
+def test_what_cannot_be_replaced_stands_and_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str, number: int
+) -> None:
+    names = [tmp_path / "handover.json", tmp_path / "other.json"]
+    for each in names:
+        write_durably(each, "as it was")
+
+    def fail(path: object, *_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number), str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, function, fail)
+        with pytest.raises(OSError, match=os.strerror(number)):
+            write_all_durably(dict.fromkeys(names, "anew"))
+    assert [each.read_text() for each in names] == ["as it was"] * 2
+    assert sorted(tmp_path.iterdir()) == sorted(names)
