@@ -146,6 +146,8 @@ def _kind(schema: Mapping[str, Any]) -> str:
     """What an argument or a key may hold."""
     if "enum" in schema:
         return ", ".join(f"`{each}`" for each in schema["enum"])
+    if "$ref" in schema:
+        return "mapping"
     if "anyOf" in schema:
         return " or ".join(dict.fromkeys(_kind(each) for each in schema["anyOf"]))
     kind = {

@@ -68,13 +68,17 @@ class TimeRange:
 
 @dataclass(frozen=True, slots=True)
 class TopicValue:
-    """One message of one topic."""
+    """One message of one topic; with `latched` it holds, however old it is.
+
+    `age` counts back from now, where the question did, or else from the moment asked about.
+    """
 
     topic: str
     type: str
     sample: Sample
     notes: tuple[str, ...] = ()
     age: Ns | None = None
+    latched: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -132,6 +132,8 @@ def limits_of(settings: Settings) -> Limits:
         split_duration_s=settings.recording.split_duration_s,
         include_active=settings.reader.include_active,
         kept=retention_limits(settings) if records else None,
+        latched_topics=data.latched_topics.include,
+        never_latched_topics=data.latched_topics.exclude,
     )
 
 

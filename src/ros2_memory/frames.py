@@ -74,14 +74,18 @@ def transform_at(
     if not _recorded(view, (*limits.tf_topics, *limits.tf_static_topics)):
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
     sessions = sessions_of(view)
-    holding = sessions.at(at) if recording is None else [sessions.lending_to(recording, at)]
+    if recording is not None:
+        return _transform_in(view, sessions.lending_to(recording, at), (parent, child), at)
+    holding = sessions.recorded_at(at)
     answers: list[tuple[Session, FoundTransform]] = []
     failure: NoDataError | None = None
-    for session in holding or [frozenset()]:
+    for session in (sessions.nearest_to(at) if holding is None else holding) or [frozenset()]:
         try:
             answers.append((session, _transform_in(view, session, (parent, child), at)))
         except NoDataError as error:
             failure = failure or error
+        if holding is None and answers:
+            break
     if not answers and failure is not None:
         raise failure
     session, found = answers[0]
@@ -246,7 +250,8 @@ def _known_pairs(
     for bag, first, last in run.extents(topic):
         if window.overlaps(first, last) and _is_among(view, bag, among):
             edge = edges.get(numbers.get(bag.file, 0))
-            if edge is None:
+            mixed = among is not None and sessions_of(view).is_carried(bag)
+            if edge is None or mixed:
                 rest.append((first, last + 1))
             else:
                 known.update(edge.pairs)
@@ -412,7 +417,10 @@ def _transforms(
     else:
         # A latched message that was received again counts in the recording that received it, too.
         holdings = _holdings(view, recorded, window, among)
-        found = view.used(view.merged(holdings, recorded, window, newest_first=False))
+        sessions = sessions_of(view)
+        merged = view.used(view.merged(holdings, recorded, window, newest_first=False))
+        several = any(sessions.is_carried(held.bag) for held in holdings)
+        found = (each for each in merged if not several or sessions.has(among, each))
     for each in found:
         yield from _decoded(view, each, static=static)
 

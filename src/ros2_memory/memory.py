@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
+from ros2_memory.latching import Latching
 from ros2_memory.timebase import Deadline, ms_from_ns
 
 if TYPE_CHECKING:
@@ -45,6 +46,13 @@ class Limits:
     split_duration_s: float = 10.0
     include_active: bool = False
     kept: RetentionLimits | None = None
+    latched_topics: tuple[str, ...] = ()
+    never_latched_topics: tuple[str, ...] = ()
+
+    @property
+    def latching(self) -> Latching:
+        """Which topics are latched."""
+        return Latching(self.tf_static_topics, self.latched_topics, self.never_latched_topics)
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,7 +87,8 @@ def topic_value(
     """
     view, at, now = open_moment(memory, call, moment)
     found = _found_at(view, resolve_topic(view, topic), at, tolerance_s)
-    return _value(view, found, fields, now)
+    value = _value(view, found, fields, now)
+    return _held(view, value, found, at)
 
 
 def topic_range(
@@ -138,6 +139,7 @@ def position(
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic)
     found = _found_at(view, name, at, tolerance_s)
+    _note_held(view, found, at)
     message, type_name = decoded(view, found), found.record.channel.type
     pose = memory.extractor.pose(message, type_name)
     if pose is None:
@@ -169,6 +171,7 @@ def velocity(
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic, "velocity")
     found = _found_at(view, name, at, tolerance_s)
+    _note_held(view, found, at)
     twist = memory.extractor.twist(decoded(view, found), found.record.channel.type)
     if twist is None:
         raise InvalidArgumentsError(carries_no(view, "velocity", found))
@@ -263,11 +266,11 @@ def value_when(
         view.note(f"{name} held no message yet at {moment(found.time)}")
         return answers.ValueWhen(matched, None, view.notes)
     distance = found.time - held.time
-    if distance > ns_from_unix(memory.limits.time_tolerance_s) and not view.snapshot.is_latched(
-        name
-    ):
+    latched = memory.limits.latching.holds(view.snapshot, held)
+    if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
         view.note(f"the value is {seconds(distance)} older than the match")
-    return answers.ValueWhen(matched, _value(view, held, fields, None), view.notes)
+    told = _held(view, _value(view, held, fields, None), held, found.time)
+    return answers.ValueWhen(matched, told, view.notes)
 
 
 def trajectory_summary(
@@ -302,20 +305,44 @@ def _before(before_s: float | None) -> Ns:
 
 
 def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Found:
-    if tolerance_s is None and view.snapshot.is_latched(topic):
-        tolerance = None
-    else:
-        limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
-        tolerance = ns_argument("tolerance_s", limit)
-    start = MIN_NS if tolerance is None else at - tolerance - START_SLACK_NS
+    """The newest message of a topic at or before a moment: of any age where it is latched.
+
+    Raises:
+        NoDataError: there is none within the tolerance.
+    """
+    limits = view.memory.limits
+    limit = limits.time_tolerance_s if tolerance_s is None else tolerance_s
+    tolerance: Ns | None = ns_argument("tolerance_s", limit)
+    start = at - (tolerance or 0) - START_SLACK_NS
     if start <= MIN_NS:
         start, tolerance = MIN_NS, None
     stop = min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
     found = view.newest(topic, TimeWindow(start, stop))
+    if found is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
+        found = view.newest(topic, TimeWindow(MIN_NS, stop))
+        if found is None:
+            tolerance = None
+        elif not limits.latching.holds(view.snapshot, found):
+            found = None
     if found is None:
         raise nothing_at(view, (topic,), at, tolerance)
     note_unseen(view, TimeWindow(found.time, stop))
     return found
+
+
+def _held(view: View, value: answers.TopicValue, found: Found, at: Ns) -> answers.TopicValue:
+    """A value with whether it is latched, and then how old it is."""
+    if not view.memory.limits.latching.holds(view.snapshot, found):
+        return value
+    age = max(at - found.time, 0) if value.age is None else value.age
+    return replace(value, latched=True, age=age)
+
+
+def _note_held(view: View, found: Found, at: Ns) -> None:
+    """Says of a value that is not shown with its age that it is latched, and how old."""
+    if view.memory.limits.latching.holds(view.snapshot, found):
+        topic = found.record.channel.topic
+        view.note(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
 
 
 def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> answers.TopicValue:

@@ -14,6 +14,7 @@ from ros2_memory.errors import (
 )
 from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.recall import bags_without_entry
+from ros2_memory.recorder.layout import is_carried
 from ros2_memory.timebase import MAX_NS, MIN_NS
 from ros2_memory.wording import Reason
 
@@ -281,8 +282,10 @@ class Reading:
         if self.memory.recall is None or len(topics) != 1:
             return None
         [topic] = topics
+        if is_carried(bag.path):  # of which recording a message was its channel says
+            return None
         static = topic in self.memory.limits.tf_static_topics
-        if not static and not self.snapshot.is_latched(topic):
+        if not static and not self.snapshot.is_transient_local(topic):
             return None
         entry = self.entry(bag)
         if entry is None:

@@ -2,7 +2,7 @@
 
 A transform holds in the session in which it was published: another robot, or the same one after it
 was started anew, has its own. A session is a recording and those that it is joined with by
-handovers; the bag of carried messages belongs to every session of our recorder.
+handovers, and what was carried of these when their bags were deleted.
 
 Recordings of one time complete each other where one has moving transforms alone and the other
 static ones alone, of other frames, or where one has none at all and one session beside it has some:
@@ -19,13 +19,15 @@ from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.handover import read_handover
 from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.layout import CARRY_FOLDER
-from ros2_memory.recorder.ownership import has_own_name
+from ros2_memory.recorder.origin import origin_of
 from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.copies import Found
+    from ros2_memory.model import BagFile
     from ros2_memory.reading import Reading
     from ros2_memory.recorder.timeline import Timeline
 
@@ -59,8 +61,8 @@ class Sessions:
         self._topics = {"moving": tuple(moving), "static": tuple(static)}
         self._children = children
         self._names = KeptNames(view.memory.index.bag_dir)
-        root = str(view.memory.index.bag_dir).rstrip("/")
-        self._carried = f"{root}/{CARRY_FOLDER}"
+        self._root = str(view.memory.index.bag_dir).rstrip("/")
+        self._carried = f"{self._root}/{CARRY_FOLDER}"
         self._spans: dict[str, dict[str, tuple[Ns, Ns]]] = {
             kind: self._spans_of(topics) for kind, topics in self._topics.items()
         }
@@ -70,6 +72,20 @@ class Sessions:
     def folder(self, recording: Path) -> str:
         """Where a recording lies, or lay when it was recorded, if a moment keeps it."""
         return self._names.recorded_as(str(recording))
+
+    def has(self, session: Session, found: Found) -> bool:
+        """Whether a message is of a session; a carried one that names no recording is of each."""
+        folder = self.folder(found.bag.recording)
+        if folder != self._carried:
+            return folder in session
+        origin = origin_of(found.record.channel)
+        if origin is None or session == {self._carried}:
+            return True
+        return any(f"{self._root}/{each}" in session for each in origin.recordings)
+
+    def is_carried(self, bag: BagFile) -> bool:
+        """Whether a bag is that of carried messages, which are of several sessions."""
+        return self.folder(bag.recording) == self._carried
 
     def of(self, recording: Path) -> Session:
         """The session of a recording."""
@@ -82,15 +98,16 @@ class Sessions:
             self._lending[key] = self._completed(self._of(key[0]), at)
         return self._lending[key]
 
-    def at(self, moment: Ns) -> list[Session]:
-        """The sessions whose transforms may hold at a moment.
-
-        Those that were being recorded then; where nothing was, all, the nearest in time first.
-        """
+    def recorded_at(self, moment: Ns) -> list[Session] | None:
+        """The sessions whose transforms hold at a moment; None where nothing was recorded then."""
         around = self._around(moment)
-        if around:
-            holding = (each for each in around if self._kinds(each))
-            return [*dict.fromkeys(self._completed(each, moment) for each in holding)]
+        if not around:
+            return None
+        holding = (each for each in around if self._kinds(each))
+        return [*dict.fromkeys(self._completed(each, moment) for each in holding)]
+
+    def nearest_to(self, moment: Ns) -> list[Session]:
+        """All sessions that hold transforms, the nearest in time first."""
         spans = [span for by_folder in self._spans.values() for span in by_folder.items()]
         near = sorted(spans, key=lambda each: (_off(each[1], moment), each[0]))
         return [*dict.fromkeys(self._of(folder) for folder, _ in near)]
@@ -129,11 +146,9 @@ class Sessions:
         return [*dict.fromkeys(self._of(folder) for folder in sorted(folders))]
 
     def _of(self, folder: str) -> Session:
-        return self._joined.get(folder) or self._with_carried(frozenset({folder}))
-
-    def _with_carried(self, folders: Session) -> Session:
-        ours = len(folders) > 1 or any(has_own_name(each.rpartition("/")[2]) for each in folders)
-        return folders | {self._carried} if ours else folders
+        if folder == self._carried:
+            return frozenset({folder})
+        return self._joined.get(folder) or frozenset({folder, self._carried})
 
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
         spans: dict[str, tuple[Ns, Ns]] = {}
@@ -153,7 +168,7 @@ class Sessions:
             recordings = [self._view.snapshot.recordings(topic) for topic in every]
             paths = {self.folder(path): path for some in recordings for path in some}
             chains = _joined(paths) if len(paths) > 1 else {}
-            known = {folder: self._with_carried(chain) for folder, chain in chains.items()}
+            known = {folder: chain | {self._carried} for folder, chain in chains.items()}
             if timeline is not None:
                 _JOINED[timeline] = known
         return known

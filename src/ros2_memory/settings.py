@@ -81,6 +81,14 @@ class RecordingSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class LatchedTopics:
+    """Names or globs of topics that are latched whatever is offered, and of those that are not."""
+
+    include: tuple[Text, ...]
+    exclude: tuple[Text, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class DataSettings:
     """How recorded data is read and judged.
 
@@ -99,6 +107,7 @@ class DataSettings:
     now: Literal["wall", "latest"]
     tf_clock: Literal["auto", "stamp", "log"]
     max_plausible_speed_mps: Positive
+    latched_topics: LatchedTopics
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

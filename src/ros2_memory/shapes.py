@@ -169,6 +169,8 @@ def _topic_value(answer: answers.TopicValue, _bag_dir: Path) -> JsonObject:
         "timestamp": unix_rounded_up(answer.sample.time),
         "value": answer.sample.value,
     }
+    if answer.latched:
+        reply["latched"] = True
     return _finished(reply, answer.age, answer.notes)
 
 
@@ -305,6 +307,8 @@ def _value_when(answer: answers.ValueWhen, _bag_dir: Path) -> JsonObject | None:
         "condition_topic": matched.topic,
         "value_topic": None if held is None else held.topic,
     }
+    if held is not None and held.latched:
+        reply |= {"value_latched": True, "value_age_s": seconds(held.age or 0)}
     notes = _once(matched.notes, () if held is None else held.notes, answer.notes)
     return _finished(reply, matched.age, notes)
 

@@ -15,6 +15,7 @@ from ros2_memory.wording import counted, listed
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from ros2_memory.latching import Latching
     from ros2_memory.memory import Call, Memory
     from ros2_memory.recorder.heartbeat import Heartbeat
     from ros2_memory.recorder.snapshot import Snapshot
@@ -45,7 +46,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         restarts=0 if heartbeat is None else heartbeat.restarts,
         missing=() if heartbeat is None else heartbeat.missing,
         never_heard=() if heartbeat is None else heartbeat.silent,
-        fell_silent=tuple(_fallen_silent(snapshot)),
+        fell_silent=tuple(_fallen_silent(snapshot, memory.limits.latching)),
         damaged=len(snapshot.damaged),
         incomplete=snapshot.taken[1],
         unread=len(snapshot.unread),
@@ -104,13 +105,13 @@ def _age_held(heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
         yield heartbeat.age_held
 
 
-def _fallen_silent(snapshot: Snapshot) -> Iterator[Stillness]:
+def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[Stillness]:
     """Topics that were heard often, and not any more when the newest data was recorded."""
     latest = snapshot.dating.latest
     if latest is None:
         return
     for topic in snapshot.topics():
-        if snapshot.is_latched(topic):
+        if snapshot.is_log(topic) or latching.is_latched(snapshot, topic):
             continue
         stated = [*snapshot.stated(topic).values()]
         messages = sum(each.messages for each in stated)

@@ -163,7 +163,7 @@ class Streams(Reading):
     def received_twice(self, topics: Iterable[str]) -> bool:
         """Whether a latched message of these topics may have been received by two recordings."""
         return any(
-            self.snapshot.is_latched(topic) and len(self.snapshot.recordings(topic)) > 1
+            self.snapshot.is_transient_local(topic) and len(self.snapshot.recordings(topic)) > 1
             for topic in topics
         )
 

@@ -44,6 +44,7 @@ class TestDefaults:
                 "now": "wall",
                 "tf_clock": "auto",
                 "max_plausible_speed_mps": 10.0,
+                "latched_topics": {"include": (), "exclude": ()},
             },
             "reader": {
                 "index_refresh_s": 5.0,

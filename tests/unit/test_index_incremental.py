@@ -208,6 +208,6 @@ def _views(snapshot: Snapshot) -> tuple[object, ...]:
         snapshot.topics(),
         [snapshot.holding(topic) for topic in snapshot.topics()],
         [snapshot.types_of(topic) for topic in snapshot.topics()],
-        [snapshot.is_latched(topic) for topic in snapshot.topics()],
+        [snapshot.is_transient_local(topic) for topic in snapshot.topics()],
         snapshot.overlapping(TimeWindow(20, 60)),
     )

@@ -85,11 +85,11 @@ def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> No
     assert snapshot.types_of("/nothing") == ()
 
 
-def test_a_topic_is_latched_where_any_bag_says_so() -> None:
+def test_a_topic_is_transient_local_where_any_bag_says_so() -> None:
     snapshot = Snapshot(bags=(_bag("a", ("/tf_static", 0, 0), ("/tf", 0, 9)),))
-    assert snapshot.is_latched("/tf_static")
-    assert not snapshot.is_latched("/tf")
-    assert not snapshot.is_latched("/nothing")
+    assert snapshot.is_transient_local("/tf_static")
+    assert not snapshot.is_transient_local("/tf")
+    assert not snapshot.is_transient_local("/nothing")
 
 
 def test_heard_topics_come_sorted_without_the_silent_ones() -> None:

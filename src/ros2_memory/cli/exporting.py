@@ -125,14 +125,19 @@ def _held(view: View, topics: Sequence[str], start: Ns) -> list[Found]:
     broadcaster publishes only its own.
     """
     before = TimeWindow(MIN_NS, start)
+    latching = view.memory.limits.latching
     held: dict[tuple[str, str], Found] = {}
     for topic in topics:
-        if not (view.snapshot.is_latched(topic) or topic in view.memory.limits.tf_static_topics):
+        if not latching.may_hold(view.snapshot, topic):
             continue
         if any(each.endswith("/TFMessage") for each in view.snapshot.types_of(topic)):
+            if not latching.is_latched(view.snapshot, topic):
+                continue
             for found in view.stream([topic], before):
                 held.update(((topic, frame), found) for frame in _frames(view.memory, found))
-        elif (newest := view.newest(topic, before)) is not None:
+        elif (newest := view.newest(topic, before)) is not None and latching.holds(
+            view.snapshot, newest
+        ):
             held[topic, ""] = newest
     once = {id(found): found for found in held.values()}
     return sorted(once.values(), key=lambda found: found.time)

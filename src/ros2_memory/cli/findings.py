@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory import directories
 from ros2_memory.adapters import GB, build_recorder
+from ros2_memory.bootstrap import limits_of
 from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.errors import BagError, EpisodicError
 from ros2_memory.memory import Call
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.latching import Latching
     from ros2_memory.memory import Memory
     from ros2_memory.model import JsonValue, SetAside
     from ros2_memory.recorder.heartbeat import Heartbeat
@@ -355,7 +357,7 @@ def of_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Findi
     except EpisodicError as error:
         yield Finding(Level.ERROR, "topics", str(error), "correct recording.topics_file")
         return
-    missing = never_heard(selection, snapshot)
+    missing = never_heard(selection, snapshot, limits_of(settings).latching)
     heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
     live = heartbeat is not None and heartbeat.is_live(now)
     unoffered = [*heartbeat.missing] if live and heartbeat is not None else []
@@ -383,13 +385,16 @@ def of_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Findi
             yield Finding(Level.WARNING, "topics", f"{entry} is in {file}; {_UNOFFERED}", do)
 
 
-def never_heard(selection: TopicSelection, snapshot: Snapshot) -> Mapping[str, list[str]]:
+def never_heard(
+    selection: TopicSelection, snapshot: Snapshot, latching: Latching
+) -> Mapping[str, list[str]]:
     """The entries of which nothing was recorded lately, with recorded names that are like them."""
     latest = snapshot.dating.latest
     heard = []
     for topic in snapshot.topics():
         last = max(each.last for each in snapshot.stated(topic).values())
-        if latest is None or snapshot.is_latched(topic) or last > latest - LATELY_NS:
+        waits = latching.is_latched(snapshot, topic) or snapshot.is_log(topic)
+        if latest is None or waits or last > latest - LATELY_NS:
             heard.append(topic)
     if not snapshot.bags:
         return {}

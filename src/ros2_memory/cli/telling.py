@@ -21,6 +21,7 @@ from ros2_memory.cli.running import (
 )
 from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.showing import cell, show
+from ros2_memory.latching import Latching
 from ros2_memory.memory import Call, Memory
 from ros2_memory.model import JsonValue, TimeWindow
 from ros2_memory.overview import list_recorded_topics
@@ -54,7 +55,7 @@ def topics(
         {
             **row,
             **remarks.get((str(row["topic"]), str(row["type"])), {}),
-            "rate_hz": usual_rate(snapshot, str(row["topic"])),
+            "rate_hz": usual_rate(snapshot, str(row["topic"]), memory.limits.latching),
         }
         for row in rows
     ]
@@ -82,9 +83,9 @@ def _remarks(memory: Memory) -> dict[tuple[str, str], dict[str, JsonValue]]:
     return remarks
 
 
-def usual_rate(snapshot: Snapshot, topic: str) -> float | None:
+def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
     """How often a topic was heard in its newest hour (Hz); None where that says nothing."""
-    if snapshot.is_latched(topic):
+    if latching.is_latched(snapshot, topic):
         return None
     stated = [*snapshot.stated(topic).values()]
     if not stated:

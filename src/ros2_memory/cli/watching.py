@@ -181,12 +181,17 @@ def _courses(memory: Memory, snapshot: Snapshot) -> Iterator[Course]:
         return
     window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
     for topic in snapshot.topics():
-        if snapshot.is_latched(topic):
+        if memory.limits.latching.is_latched(snapshot, topic):
             continue
         last = max(each.last for each in snapshot.stated(topic).values())
         heard = _heard(memory, snapshot, topic, window)
         age_s = max(unix_from_ns(latest - last), 0.0)
-        yield Course(topic, heard / unix_from_ns(WINDOW_NS), usual_rate(snapshot, topic), age_s)
+        yield Course(
+            topic,
+            heard / unix_from_ns(WINDOW_NS),
+            usual_rate(snapshot, topic, memory.limits.latching),
+            age_s,
+        )
 
 
 def _heard(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -> int:

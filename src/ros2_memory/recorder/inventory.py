@@ -23,8 +23,10 @@ from ros2_memory.recorder.layout import (
     is_carried,
 )
 from ros2_memory.recorder.ownership import OwnRecordings, has_own_name, identity_of
+from ros2_memory.recorder.pace import Pace, is_rare
 from ros2_memory.recorder.removal import beside_bags
 from ros2_memory.recorder.retention import Span, Stock, StoredBag, StoredFile
+from ros2_memory.recorder.runs import Stated
 from ros2_memory.recorder.scan import other_form
 from ros2_memory.recorder.standing import Standing
 from ros2_memory.timebase import NS_PER_S, Ns
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.ownership import Identity
     from ros2_memory.recorder.scan import Stamp
     from ros2_memory.recorder.standing import FileNotes, Verdict
+    from ros2_memory.summaries import TopicSummary
 
 OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
 """What is derived from bags, and what `ros2` logs."""
@@ -222,11 +225,17 @@ class Inventory:
         said = [
             (topic.first, topic.last)
             for topic in verdict.bag.summary.topics
-            if not topic.latched and topic.topic not in self._static_topics
+            if not self._is_received_again(topic)
         ]
         if not said:
             return None
         return Span(min(first for first, _ in said), max(last for _, last in said))
+
+    def _is_received_again(self, topic: TopicSummary) -> bool:
+        """Whether all that a bag holds of a topic may be what each recording receives again."""
+        pace = Pace(Stated(topic.first, topic.last, topic.count), topic.first, topic.last)
+        rare = topic.latched and is_rare(pace)
+        return rare or topic.topic in self._static_topics
 
     def _folder(self, path: str, now: Ns) -> _Folder:
         known = self._folders.get(path)

@@ -4,7 +4,7 @@ A latched message holds until the next one, so an answer about today may need on
 ago: a transform of `/tf_static` stands only in the split in which it was received. What answers
 still need is therefore carried into one small bag, `latched/carried.mcap`, before its split is
 deleted. Everything of a message stays as it is but the file that it stands in, so that an answer
-stays the same to the nanosecond.
+stays the same to the nanosecond; its channel says of which recordings it was (see `origin`).
 
 What is needed, of all messages that would be gone otherwise:
 
@@ -21,9 +21,11 @@ Whatever is superseded leaves the bag when that is written the next time, so it 
 from __future__ import annotations
 
 import hashlib
+import os
 from bisect import bisect_left
 from collections import defaultdict
 from contextlib import suppress
+from dataclasses import replace
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -31,7 +33,10 @@ import structlog
 
 from ros2_memory.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.model import TimeWindow
+from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.layout import CARRY_FILE, CARRY_FOLDER, is_carried
+from ros2_memory.recorder.origin import Origin, origin_of, with_origin
+from ros2_memory.recorder.pace import is_rare
 from ros2_memory.recorder.sync import flush
 from ros2_memory.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
@@ -169,32 +174,75 @@ class Carrier:
         if not leaving:
             return None
         topics = self._topics(snapshot)
-        before = set(self._read(self.path, topics))
-        messages = {*before, *(each for bag in leaving for each in self._read(bag.path, topics))}
         gone = {*doomed} - {*kept}
         there = [bag for bag in snapshot.bags if bag.path not in gone and not is_carried(bag.path)]
-        repeated = self._repeated(snapshot, topics, doomed)
-        wanted = worth_carrying(messages, _presence(there), repeated)
-        if {each[:2] for each in wanted} == {each[:2] for each in before}:
+        carried = dict(self._carried(topics))
+        origins = dict(carried)
+        staying = {self._folder(bag.path) for bag in there}
+        for bag in leaving:
+            origins.update(self._read(snapshot, bag, topics))
+        wanted = worth_carrying(origins, _presence(there), self._repeated(snapshot, topics, doomed))
+        chosen = {each[:2]: _united(each, origins, staying) for each in wanted}
+        if chosen == {each[:2]: origin for each, origin in carried.items()}:
             return None
         sources = [self.path, *(bag.path for bag in leaving)]
-        fetched = sorted(self._fetched(sources, topics, wanted), key=lambda each: each.log_time)
-        if len(fetched) < len({each[:2] for each in wanted}):
+        fetched = sorted(self._fetched(sources, topics, chosen), key=lambda each: each.log_time)
+        if len(fetched) < len(chosen):
             raise BagError(str(self.path), "a latched message could not be read a second time")
         self._write(fetched)
         return len(wanted)
 
     def _topics(self, snapshot: Snapshot) -> tuple[str, ...]:
+        """Also of topics that say much: nobody may have said since what the last message did."""
         return tuple(
             topic
             for topic in snapshot.topics()
-            if topic in self._static_topics or snapshot.is_latched(topic)
+            if topic in self._static_topics or snapshot.is_held(topic)
         )
 
-    def _read(self, path: Path, topics: Collection[str]) -> Iterator[Latched]:
-        """The messages of these topics; of a bag that cannot be read to its end, the readable."""
-        for record in self._records(path, topics):
-            yield latched_message(record, self._frames(record))
+    def _carried(self, topics: Collection[str]) -> Iterator[tuple[Latched, Origin | None]]:
+        """What is carried already."""
+        for record in self._records(self.path, topics):
+            yield latched_message(record, self._frames(record)), origin_of(record.channel)
+
+    def _read(
+        self, snapshot: Snapshot, bag: BagFile, topics: Collection[str]
+    ) -> Iterator[tuple[Latched, Origin]]:
+        """The messages of these topics; of a bag that cannot be read to its end, the readable.
+
+        Of a topic that has many only the newest: what it said before holds no longer.
+        """
+        folder = self._folder(bag.path)
+        here = [topic for topic in topics if bag.summary.of(topic)]
+        often = {topic for topic in here if self._is_often(snapshot, topic, bag.recording)}
+        for record in self._records(bag.path, [topic for topic in here if topic not in often]):
+            yield latched_message(record, self._frames(record)), Origin((folder,), often=False)
+        for topic in often:
+            for record in self._newest(bag.path, topic):
+                yield latched_message(record, ()), Origin((folder,), often=True)
+
+    def _newest(self, path: Path, topic: str) -> Iterator[Record]:
+        """The newest message of a topic that can be read."""
+        try:
+            newest = self._reader.newest(path, topic, TimeWindow.everything())
+        except BagVanishedError:
+            return
+        except BagError:
+            found = {each.log_time: each for each in self._records(path, (topic,))}
+            newest = found[max(found)] if found else None
+        if newest is not None:
+            yield newest
+
+    def _is_often(self, snapshot: Snapshot, topic: str, recording: Path) -> bool:
+        """Whether a recording has messages of a topic often; transforms are of many frames."""
+        if topic in self._static_topics or any(map(_is_tf, snapshot.types_of(topic))):
+            return False
+        return not is_rare(snapshot.pace(topic, recording))
+
+    def _folder(self, bag: Path) -> str:
+        """The folder of a bag's recording, from the bag directory on; also of a moment's bag."""
+        bag_dir = self.path.parent.parent
+        return os.path.relpath(KeptNames(bag_dir).recorded_as(str(bag.parent)), bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
         """The messages of these topics.
@@ -214,20 +262,24 @@ class Carrier:
             _log.warning("latched_not_read", path=str(path), reason=error.reason)
 
     def _fetched(
-        self, sources: Iterable[Path], topics: Collection[str], wanted: Collection[Latched]
+        self,
+        sources: Iterable[Path],
+        topics: Collection[str],
+        chosen: Mapping[tuple[Ns, Identity], Origin | None],
     ) -> Iterator[Record]:
-        """The messages themselves; the chosen are few, so they are held at once."""
-        missing = {each[:2] for each in wanted}
+        """The messages themselves, with their origins; they are few, so they are held at once."""
+        missing = {*chosen}
         for path in sources:
             for record in self._records(path, topics):
-                key = latched_message(record, ())[:2]
-                if key in missing:
-                    missing.remove(key)
-                    yield record
+                log_time, identity, _ = latched_message(record, ())
+                if (log_time, identity) in missing:
+                    missing.remove((log_time, identity))
+                    origin = chosen[log_time, identity]
+                    yield record if origin is None else with_origin(record, origin)
 
     def _frames(self, record: Record) -> tuple[str, ...]:
         """The child frames of a message of transforms, as they are written in it."""
-        if record.channel.type.rpartition("/")[2].lower() != "tfmessage":
+        if not _is_tf(record.channel.type):
             return ()
         try:
             message = self._reader.decode(record)
@@ -287,6 +339,28 @@ class Carrier:
             raise
         flush(folder)
         flush(folder.parent)
+
+
+def _is_tf(type_name: str) -> bool:
+    return type_name.rpartition("/")[2].lower() == "tfmessage"
+
+
+def _united(
+    wanted: Latched, origins: Mapping[Latched, Origin | None], staying: Collection[str]
+) -> Origin | None:
+    """The origin of a message and its copies: of these the recordings that still have bags."""
+    own = origins[wanted]
+    if own is None:
+        return None
+    copies = [
+        recording
+        for each, origin in origins.items()
+        if each.identity == wanted.identity and origin is not None
+        for recording in origin.recordings
+        if recording in staying
+    ]
+    first, *others = own.recordings
+    return replace(own, recordings=(first, *sorted({*others, *copies} - {first})))
 
 
 def _presence(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:

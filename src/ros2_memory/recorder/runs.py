@@ -5,7 +5,7 @@ It is worked out once, when it is first asked for, and serves for as long as the
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -243,9 +243,49 @@ class Run:
         )
 
     @cached_property
+    def held(self) -> frozenset[str]:
+        """Those of them that are no logs: `/rosout` is transient local everywhere."""
+        return frozenset(
+            heading.topic
+            for shape in self._shapes
+            for heading in shape.topics
+            if heading.latched and not is_log(heading.type)
+        )
+
+    def stated_in(self, topic: str, recording: Path) -> Stated | None:
+        """What the summaries of a recording's bags say of a topic, under all of its types."""
+        folder = str(recording)
+        if folder not in self.folders or topic not in self.stated:
+            return None
+        if len(self.folders) == 1:
+            said = [*self.stated[topic].values()]
+        else:
+            said = [
+                Stated(held.first, held.last, held.count)
+                for bag, held in self.holding(topic)
+                if bag.recording == recording
+            ]
+        return reduce(Stated.with_more, said) if said else None
+
+    def extent_of(self, recording: Path) -> Span | None:
+        """The times (inclusive) between which a recording has bags among these."""
+        folder = str(recording)
+        if folder not in self.folders:
+            return None
+        if len(self.folders) == 1:
+            return self.bags[0].start, self.latest
+        own = [bag for bag in self.bags if bag.recording == recording]
+        return own[0].start, max(bag.end for bag in own)
+
+    @cached_property
     def silent(self) -> frozenset[str]:
         """The topics that some bag declares without a message."""
         return frozenset(chain.from_iterable(shape.silent for shape in self._shapes))
+
+
+def is_log(type_name: str) -> bool:
+    """Whether messages of a type are lines of a log."""
+    return type_name in {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}
 
 
 def taken_by(bags: Sequence[BagFile]) -> tuple[int, int]:

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.recorder import bearings
+from ros2_memory.recorder.runs import is_log
 from ros2_memory.recorder.timeline import RUN_LIMIT, Timeline
 
 if TYPE_CHECKING:
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.model import BagFile, SetAside, TimeWindow
     from ros2_memory.recorder.clock_faults import ClockFault, Dating
+    from ros2_memory.recorder.pace import Pace
     from ros2_memory.recorder.runs import Extent, Held, Run, Span, Stated
     from ros2_memory.timebase import Ns
 
@@ -135,9 +137,27 @@ class Snapshot:
         """The message types under which the topic was heard, sorted; empty where it was not."""
         return self._timeline.types.get(topic, ())
 
-    def is_latched(self, topic: str) -> bool:
-        """Whether some publisher offered the topic as transient local."""
+    def is_transient_local(self, topic: str) -> bool:
+        """Whether some publisher offered the topic as transient local.
+
+        Then a subscriber may receive its last messages again, long after they were published.
+        """
         return topic in self._timeline.latched
+
+    def is_held(self, topic: str) -> bool:
+        """Whether that may have been for its last message to hold: it is no log.
+
+        Which topics are latched `latching` says.
+        """
+        return topic in self._timeline.held
+
+    def is_log(self, topic: str) -> bool:
+        """Whether the topic is a log, whose lines come when something happens."""
+        return all(map(is_log, self.types_of(topic)))
+
+    def pace(self, topic: str, recording: Path) -> Pace:
+        """How often a recording has messages of a topic; it must hold some."""
+        return self._timeline.pace(topic, recording)
 
     @property
     def taken(self) -> tuple[int, int]:

@@ -8,18 +8,19 @@ falls into is worked out again.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.recorder.runs import Run, in_time, taken_by, wider
+from ros2_memory.recorder.pace import Pace
+from ros2_memory.recorder.runs import Run, Stated, in_time, taken_by, wider
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.model import BagFile, TimeWindow
-    from ros2_memory.recorder.runs import Extent, Held, Span, Stated
+    from ros2_memory.recorder.runs import Extent, Held, Span
     from ros2_memory.timebase import Ns
 
 RUN_LIMIT: Final = 256
@@ -148,6 +149,21 @@ class Timeline:
     def latched(self) -> frozenset[str]:
         """The topics that some publisher offered as transient local."""
         return frozenset(chain.from_iterable(run.latched for run in self._runs))
+
+    @cached_property
+    def held(self) -> frozenset[str]:
+        """Those of them that are no logs."""
+        return frozenset(chain.from_iterable(run.held for run in self._runs))
+
+    def pace(self, topic: str, recording: Path) -> Pace:
+        """How often a recording has messages of a topic; it must hold some."""
+        stated, extents = [], []
+        for run in self._runs:
+            extent = run.extent_of(recording)
+            if extent is not None:
+                extents.append(extent)
+                stated.append(run.stated_in(topic, recording))
+        return Pace(reduce(Stated.with_more, filter(None, stated)), *reduce(wider, extents))
 
     @cached_property
     def silent(self) -> frozenset[str]:
