@@ -10,6 +10,7 @@ from mcap.writer import Writer
 from ros2_memory.accounts import Stillness
 from ros2_memory.memory import Call
 from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.recorder.listed_splits import absent_splits
 from ros2_memory.recorder.retention import RetentionLimits
 from ros2_memory.replies import Replies
 from ros2_memory.status import memory_status
@@ -272,6 +273,29 @@ class TestWhatIsMissingIsNamedAndCounted:
         assert "lists 4 files" in self.trust(tmp_path)
         beating(tmp_path, RecorderState.STOPPED, 59)
         assert "lists 1 file that is not there and 5 messages" in self.trust(tmp_path)
+
+    def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(
+        self, tmp_path: Path
+    ) -> None:
+        self.recording(tmp_path / "rec", *((f"rec_{n}.mcap", 5) for n in range(-3, 3)))
+        beating(tmp_path, RecorderState.STOPPED, 59)
+        own = tmp_path / ".episodic" / "recordings.jsonl"
+        own.parent.mkdir()
+        inode = (tmp_path / "rec").stat().st_ino
+        own.write_text('{"bag_dir_id": "5f0c"}\n')
+        assert "lists 4 files" in self.trust(tmp_path)
+        with own.open("a") as stream:
+            stream.write(json.dumps({"recording": "rec", "inode": inode}) + "\n")
+        assert "lists 1 file that is not there" in self.trust(tmp_path)
+
+    def test_nothing_behind_a_link_is_looked_at(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "bags" / "rec", ("rec_0.mcap", 5), ("gone.mcap", 5))
+        memory = memory_of(tmp_path / "bags")
+        snapshot = memory.index.snapshot()
+        (tmp_path / "bags" / "rec").rename(tmp_path / "outside")
+        (tmp_path / "bags" / "rec").symlink_to(tmp_path / "outside")
+        (absent,) = absent_splits(snapshot, tmp_path / "bags")
+        assert (absent.files, absent.unreadable) == ((), True)
 
     def test_splits_cut_by_a_handover_hold_fewer_than_listed(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 9), ("rec_1.mcap", 9))

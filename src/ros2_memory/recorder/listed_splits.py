@@ -9,26 +9,26 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from collections import Counter
 from functools import lru_cache
 from itertools import takewhile
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.directories import opened
 from ros2_memory.recorder.heartbeat import HEARTBEAT_FILE
 from ros2_memory.recorder.layout import HANDOVER_FILE, METADATA_FILE
+from ros2_memory.recorder.ownership import OwnRecordings
 from ros2_memory.recorder.scan import COMPRESSED, bag_kind, settled
-from ros2_memory.recorder.sync import open_plain
 from ros2_memory.wording import NAMED, counted, listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
 
     from ros2_memory.recorder.snapshot import Snapshot
 
-OWNERSHIP_FILE: Final = ".episodic/recordings.jsonl"
-
+_AS_IT_IS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
 _READ_AT_MOST: Final = 64 << 20
 _AT_HAND: Final = 1024
 _NAME: Final = re.compile(r"^\s*(?:- )?(?:- |path:)\s*['\"]?([^'\"\n]+?)['\"]?\s*$", re.MULTILINE)
@@ -77,7 +77,7 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
     """
     if not snapshot.described:
         return []
-    is_ours = any((bag_dir / name).exists() for name in (HEARTBEAT_FILE, OWNERSHIP_FILE))
+    own = OwnRecordings(bag_dir)
     bags: Counter[str] = Counter()
     messages: Counter[str] = Counter()
     for run in snapshot.runs:
@@ -87,7 +87,7 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
     found = []
     for folder in snapshot.described:
         try:
-            beside = _beside(folder, snapshot.scanned_at)
+            beside = _beside(bag_dir, Path(folder), snapshot.scanned_at)
         except FileNotFoundError:
             continue
         except (OSError, ValueError):
@@ -95,10 +95,22 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
             continue
         if beside is None:
             continue
+        is_ours = _may_be_deleted(own, bag_dir, Path(folder))
         absent = _absent(folder, beside, bags[folder], messages[folder], is_ours=is_ours)
         if absent.files or absent.messages or absent.unreadable:
             found.append(absent)
     return found
+
+
+def _may_be_deleted(own: OwnRecordings, bag_dir: Path, folder: Path) -> bool:
+    """Whether the recorder here deletes the oldest splits of a recording."""
+    try:
+        if own.exists():
+            return own.owns(folder)
+        # Versions before the list may have deleted any.
+        return (bag_dir / HEARTBEAT_FILE).exists()
+    except OSError:
+        return True
 
 
 def absence_told(absent: Sequence[Absent]) -> Iterator[str]:
@@ -152,26 +164,30 @@ def _absent(folder: str, beside: _Beside, bags: int, held: int, *, is_ours: bool
     return Absent(folder, tuple(missing), lost)
 
 
-def _beside(folder: str, now: int) -> _Beside | None:
+def _beside(root: Path, folder: Path, now: int) -> _Beside | None:
     """What lies in a folder with a metadata.yaml; None where that is being written.
 
     Raises:
         OSError: it cannot be looked at.
         ValueError: it is no regular file.
     """
-    status = os.lstat(os.path.join(folder, METADATA_FILE))  # noqa: PTH118 - many of them
-    changed = os.stat(folder).st_mtime_ns  # noqa: PTH116
-    look = _looked_at if settled(changed, now) else _looked_at.__wrapped__
+    status = os.lstat(folder / METADATA_FILE)
+    changed = folder.stat().st_mtime_ns
     if not settled(status.st_mtime_ns, now):
         return None
-    return look(folder, (status.st_mtime_ns, status.st_size, changed))
+    look = _looked_at if settled(changed, now) else _looked_at.__wrapped__
+    return look(root, folder, (status.st_mtime_ns, status.st_size, changed))
 
 
 @lru_cache(maxsize=_AT_HAND)
-def _looked_at(folder: str, _stamp: tuple[int, int, int]) -> _Beside:
-    with open_plain(os.path.join(folder, METADATA_FILE)) as stream:  # noqa: PTH118
-        text = stream.read(_READ_AT_MOST).decode("utf-8", errors="replace")
-    names = os.listdir(folder)  # noqa: PTH208
+def _looked_at(root: Path, folder: Path, _stamp: tuple[int, int, int]) -> _Beside:
+    with opened(root, folder) as directory:
+        names = os.listdir(directory)  # noqa: PTH208 - of a descriptor
+        descriptor = os.open(METADATA_FILE, _AS_IT_IS, dir_fd=directory)
+        with os.fdopen(descriptor, "rb") as stream:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise ValueError(f"{METADATA_FILE} is not a regular file")
+            text = stream.read(_READ_AT_MOST).decode("utf-8", errors="replace")
     present = frozenset(name.removesuffix(COMPRESSED) for name in names if bag_kind(name))
     return _Beside(_listing(text), present, HANDOVER_FILE in names)
 
