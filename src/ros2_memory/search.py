@@ -12,7 +12,7 @@ from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError, Undecod
 from ros2_memory.model import TimeWindow
 from ros2_memory.testable import can_be_untestable, untestable
 from ros2_memory.timebase import MIN_NS
-from ros2_memory.unseen import note_unsearched
+from ros2_memory.unseen import is_searched, note_unseen
 from ros2_memory.wording import Reason
 
 if TYPE_CHECKING:
@@ -175,5 +175,8 @@ def unsearched(view: View, window: TimeWindow | None = None) -> tuple[str, ...]:
 
     Empty where it was.
     """
-    note_unsearched(view, window or TimeWindow.everything())
+    searched = window or TimeWindow.everything()
+    if is_searched(view, searched):
+        return ()
+    note_unseen(view, searched, nothing=True)
     return view.notes

@@ -83,8 +83,15 @@ class Shape:
 
 
 WRONG_STATISTICS: Final = "its own statistics are wrong"
-SUMMARY_NOT_USED: Final = "its summary section is not used"
+READ_WITHOUT_INDEXES: Final = "its messages were read without its indexes"
 MESSAGES_MISSING: Final = "messages may be missing"
+DOUBTS: Final = (
+    WRONG_STATISTICS,
+    "its summary section ",
+    "its message indexes ",
+    "its chunk indexes ",
+)
+"""How notes begin on what a file says of itself, in spite of which it was read from end to end."""
 
 
 def set_back_while_written(by: Ns) -> str:

@@ -15,12 +15,12 @@ Named are, the first few of each and the others counted:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.reading import short_name
 from ros2_memory.recorder.handover import LOG_CLOCK_NOTE
-from ros2_memory.summaries import MESSAGES_MISSING, SUMMARY_NOT_USED, WRONG_STATISTICS
+from ros2_memory.summaries import DOUBTS, MESSAGES_MISSING, READ_WITHOUT_INDEXES
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS, unix_rounded_up
 from ros2_memory.wording import NAMED, counted, listed, shortened
 
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.clock_faults import ClockFault
     from ros2_memory.recorder.snapshot import Snapshot
     from ros2_memory.timebase import Ns
-
-
-_OF_WHOLE_BAGS: Final = (WRONG_STATISTICS, SUMMARY_NOT_USED, LOG_CLOCK_NOTE)
 
 
 def note_unseen(view: Reading, window: TimeWindow, *, nothing: bool = False) -> None:
@@ -73,15 +70,14 @@ def _moment(at: Ns) -> str:
     return f"{unix_rounded_up(at):.6f}"
 
 
-def note_unsearched(view: Reading, window: TimeWindow) -> None:
-    """As `note_unseen` of a search without a match, where closed files could not be read.
+def is_searched(view: Reading, window: TimeWindow) -> bool:
+    """Whether a search of a window that found nothing read all that closed files hold of it.
 
-    Nothing is noted where all of them could be: that one is being written is no reason to doubt
-    it, or a robot that records would never be told that something was not there.
+    That one is being written is no reason to doubt it, or a robot that records would never be told
+    that something was not there.
     """
-    closed = lost_in(view.snapshot, window, nothing=True)
-    if closed or view.notes or any(_may_lack(bag) for bag in view.snapshot.odd(window)):
-        note_unseen(view, window, nothing=True)
+    lost = lost_in(view.snapshot, window, nothing=True)
+    return view.complete and not lost and not any(map(_may_lack, view.snapshot.odd(window)))
 
 
 def _may_lack(bag: BagFile) -> bool:
@@ -91,7 +87,9 @@ def _may_lack(bag: BagFile) -> bool:
 
 def _is_whole(note: str) -> bool:
     """Whether all messages of a bag were read of which this note says what is odd."""
-    return note.startswith(_OF_WHOLE_BAGS) and not note.endswith(MESSAGES_MISSING)
+    if note.startswith(DOUBTS):
+        return not note.endswith(MESSAGES_MISSING)
+    return note.endswith(READ_WITHOUT_INDEXES) or note == LOG_CLOCK_NOTE
 
 
 def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> Iterator[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 
 from ros2_memory import queries
 from ros2_memory.errors import QueryTimeoutError
@@ -16,12 +17,13 @@ from ros2_memory.memory import Call, Limits
 from ros2_memory.timebase import Deadline
 from tests.asking import asked
 from tests.bags import McapLayout, Msg, boolean, detections, make, stamp, write_mcap
-from tests.mcap_surgery import spoil_chunk
+from tests.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
 from tests.memories import SettableClock, memory_of
 from tests.recalled import recalling
 from tests.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from ros2_memory.memory import Memory
@@ -201,6 +203,39 @@ def test_wrong_statistics_of_a_file_that_was_read_whole_do_not_make_never_uncert
     bag_dir = REAL / "rosbag2_time0_mcap"
     given = {"topic": "*", "condition_type": "equals", "value": "never recorded"}
     assert asked(memory_of(bag_dir), bag_dir, "find_last_match", **given) is None
+
+
+def lie_in_a_message_index(path: Path) -> None:
+    chunk = chunks_of(path)[0]
+    change_index(path, chunk, 0, chunk.message_start_time + 1)
+
+
+def lie_in_the_chunk_indexes(path: Path) -> None:
+    def later(body: bytearray) -> None:
+        body[0:8] = (int.from_bytes(body[0:8], "little") + 5).to_bytes(8, "little")
+
+    edit_summary(path, Opcode.CHUNK_INDEX, later)
+
+
+def lie_in_the_statistics(path: Path) -> None:
+    def later(body: bytearray) -> None:
+        body[26:34] = (int.from_bytes(body[26:34], "little") + 5).to_bytes(8, "little")
+
+    edit_summary(path, Opcode.STATISTICS, later)
+
+
+@each_search
+@each_way
+@pytest.mark.parametrize(
+    "lie", [lie_in_a_message_index, lie_in_the_chunk_indexes, lie_in_the_statistics]
+)
+def test_a_bag_that_was_read_in_spite_of_its_lies_was_read(
+    bag_dir: Path, tool: str, recalls: bool, lie: Callable[[Path], None]
+) -> None:
+    lie(bag_dir / "rec" / "rec_1.mcap")
+    memory = memory_of(bag_dir)
+    memory = recalling(memory, bag_dir) if recalls else memory
+    assert never(memory, bag_dir, tool) is None
 
 
 @pytest.mark.parametrize("known", [0, 2, 3])

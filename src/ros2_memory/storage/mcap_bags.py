@@ -44,6 +44,7 @@ from ros2_memory.storage.merge import Rows, Run, merged
 from ros2_memory.storage.open_file import OpenFile
 from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
+from ros2_memory.summaries import READ_WITHOUT_INDEXES
 from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:
@@ -394,7 +395,7 @@ class McapBags:
     def _distrust(self, file: OpenFile, index: McapIndex, error: _ContradictedError) -> McapIndex:
         """The index of the messages themselves, in place of one that was found to be wrong."""
         error.believed = {chunk.offset: chunk for chunk in index.chunks}
-        reason = f"{error}; its messages were read without its indexes"
+        reason = f"{error}; {READ_WITHOUT_INDEXES}"
         found = index_by_scan(file, self._max_chunk_bytes, reason)
         return self._keep(file, found._replace(contradiction=reason))
 

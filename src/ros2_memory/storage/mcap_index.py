@@ -37,7 +37,6 @@ from ros2_memory.storage.mcap_summary import (
 from ros2_memory.summaries import (
     MESSAGES_MISSING,
     OUT_OF_ORDER_NS,
-    SUMMARY_NOT_USED,
     WRONG_STATISTICS,
 )
 from ros2_memory.timebase import MAX_NS, unix_from_ns
@@ -212,7 +211,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
     except (DoubtError, OSError):
         raise
     except Exception as error:
-        raise DoubtError(f"{SUMMARY_NOT_USED} ({reason_of(error)})") from error
+        raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
 
 
 def _index_from_summary(file: OpenFile) -> McapIndex:
