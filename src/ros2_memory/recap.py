@@ -53,10 +53,10 @@ _PLURALS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Drive:
-    """How the robot moved; `frame_id` is that of its poses."""
+    """How the robot moved: its way, where there are poses, and its stops, and which go on."""
 
-    way: Way
-    standstills: tuple[Standstill, ...]
+    way: Way | None
+    stops: tuple[tuple[Standstill, bool], ...]
 
 
 def recap(memory: Memory, call: Call, span: Span) -> Recap:
@@ -104,7 +104,8 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         counts["thing"] = things.size
     told = _most_important(view, events, counts)
     latest = view.snapshot.latest
-    trajectory = None if drive is None else drive.way.trajectory
+    way = None if drive is None else drive.way
+    trajectory = None if way is None else way.trajectory
     for note in () if trajectory is None else length_notes(trajectory):
         view.note(note)
     return Recap(
@@ -113,9 +114,9 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         now=memory.clock.now() if memory.limits.now == "wall" or latest is None else latest,
         distance_m=None if trajectory is None else trajectory.distance_m,
         max_speed=None if trajectory is None else trajectory.max_speed,
-        stood=None if drive is None else sum(each.end - each.start for each in drive.standstills),
+        stood=None if drive is None else sum(stop.end - stop.start for stop, _ in drive.stops),
         shortest_stop=SHORTEST_NS,
-        frame_id=None if drive is None else drive.way.frames[0],
+        frame_id=None if way is None else way.frames[0],
         events=tuple(told),
         throughout=tuple(sorted(throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
@@ -132,14 +133,13 @@ def _drive(view: View, window: TimeWindow) -> _Drive | None:
     try:
         topic = resolve_pose_topic(view)
         way = way_driven(view, topic, window)
+        stops = standstills_in(view, topic, window)
         if way is None:
             view.note(f"{topic} has no poses in this time: nothing is known of the way")
-            return None
-        standstills = standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
         view.note(f"nothing is known of the way: {error}")
         return None
-    return _Drive(way, standstills)
+    return None if way is None and not stops else _Drive(way, stops)
 
 
 def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, Story]]:
@@ -151,10 +151,9 @@ def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, Story]]:
 
 
 def _stops(drive: _Drive) -> Iterator[Event]:
-    for start, end, box in drive.standstills:
+    for (start, end, box), goes_on in drive.stops:
         x, y, _ = box.centre
-        text = f"stood at x {x:z.2f}, y {y:z.2f}"
-        yield Event("stop", start, end, text, goes_on=end >= drive.way.last)
+        yield Event("stop", start, end, f"stood at x {x:z.2f}, y {y:z.2f}", goes_on)
 
 
 def _flips(topic: str, story: Story) -> Iterator[Event]:

@@ -465,6 +465,12 @@ class StandstillBuilder:
         self._close(self._linking.end(None))
         return tuple(self._done)
 
+    @property
+    def last(self) -> Ns | None:
+        """The log time of the last pose, once all standstills were returned."""
+        newest = self._linking.newest
+        return None if newest is None else newest.last
+
     def _may_stand_into(self, bag: StandstillDigest) -> bool:
         """Whether a standstill that is long enough may lie where a bag begins."""
         if _opens(bag) or self._linking.chain is not None or self._tail is None:

@@ -62,8 +62,12 @@ class _Standing:
             self._to.add(time, pose.position)
 
 
-def standstills_in(view: View, topic: str, window: TimeWindow) -> tuple[Standstill, ...]:
+def standstills_in(
+    view: View, topic: str, window: TimeWindow
+) -> tuple[tuple[Standstill, bool], ...]:
     """Return where the poses of a topic stand still, in order, as far as it is in a window.
+
+    With each comes whether it goes on after the window, or up to the last pose that is known.
 
     Poses outside of the window count too: a standstill that goes on beyond an end of the window
     ends there, however little of it is inside. So those of windows that follow each other add up.
@@ -90,9 +94,13 @@ def standstills_in(view: View, topic: str, window: TimeWindow) -> tuple[Standsti
                 builder.join(digest)
                 if span is not None and not failures:
                     kept.keep(group, digest, span)
+    found = builder.standstills()
     return tuple(
-        each._replace(start=max(each.start, start), end=min(each.end, end))
-        for each in builder.standstills()
+        (
+            each._replace(start=max(each.start, start), end=min(each.end, end)),
+            each.end > end or each.end == builder.last,
+        )
+        for each in found
         if each.start < end and each.end > start
     )
 

@@ -170,6 +170,35 @@ def test_a_window_that_ends_in_a_stop_counts_what_it_holds_of_it(
         assert (over(memory, begin, end).stood or 0) / S == pytest.approx(stood, abs=0.0201)
 
 
+def test_a_stop_goes_on_where_it_does_after_the_window_or_up_to_the_newest_pose(
+    tmp_path: Path,
+) -> None:
+    [(began, ended), _] = _drive(tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5), (5.0, 0.0)])
+    memory = memory_of(tmp_path)
+
+    def goes_on(end: float) -> list[bool]:
+        told = over(memory, began - 2, end)
+        return [each.goes_on for each in told.events if each.kind == "stop"]
+
+    assert goes_on(ended - 1) == [True]
+    assert goes_on(ended) == [False]
+    assert goes_on(ended + 3) == [False]
+    assert goes_on(ended + 20) == [False, True]
+
+
+def test_a_window_between_two_poses_of_a_stop_is_a_stop(tmp_path: Path) -> None:
+    write_mcap(
+        tmp_path / "bag.mcap", [odom(BEGIN + at * S, 1.0, 2.0, 0.0) for at in range(0, 20, 2)]
+    )
+    memory = memory_of(tmp_path)
+    told = over(memory, 6.5, 7.5)
+    assert told.stood == S
+    assert told.distance_m is None
+    assert any("no poses in this time" in note for note in told.notes)
+    parts = [over(memory, at, at + 0.5).stood or 0 for at in (n / 2 for n in range(36))]
+    assert sum(parts) == over(memory, 0, 18).stood == 18 * S
+
+
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     legs=st.lists(
