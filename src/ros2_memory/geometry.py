@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Columns: TypeAlias = "tuple[Numbers, Numbers, Numbers]"
+Clock: TypeAlias = "tuple[Sequence[float], Numbers]"
+"""The same times twice: one by one the numbers of an array take longer to get."""
 
 IDENTITY: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
@@ -30,6 +32,10 @@ _PARALLEL_COSINE: Final = 1 - 1e-10
 
 _SCANS_PER_POINT: Final = 64
 """How often, on average, path refinement may look at a point before it halves intervals."""
+
+_BACK: Final = 0.5**2
+_LATE: Final = 0.1**2
+"""What a way back along a segment, and a distance in time, count in squares of deviations."""
 
 _MANY_POINTS: Final = 48
 """From so many on, looking through points as arrays is faster than one by one."""
@@ -162,7 +168,10 @@ def off_segment(
 
 
 def simplify_to(
-    points: Sequence[Vector3], tolerance_m: float, at_most: int
+    points: Sequence[Vector3],
+    tolerance_m: float,
+    at_most: int,
+    seconds: Sequence[float] | None = None,
 ) -> tuple[list[int], float]:
     """The vertices that are enough to draw a path (Ramer, Douglas and Peucker), and no more.
 
@@ -171,9 +180,15 @@ def simplify_to(
     allow. Points must be finite. Cost is bounded: where the splits stay lopsided, intervals are
     halved instead, which keeps some vertices more than needed.
 
+    With `seconds`, the time of each point, the path is drawn in space and time. A point is then
+    also off by half the way that it lies back along its segment from a point before it, so that a
+    turning point stays; and by a tenth of its distance from where the segment has the robot at
+    that time, so that a stop stays (the synchronised distance of Meratnia and de By,
+    Spatiotemporal Compression Techniques for Moving Point Objects, EDBT 2004).
+
     Returns:
-        Their indices, ascending, and the largest distance (m) of a dropped point from the kept
-        segment that spans it.
+        Their indices, ascending, and how far (m) a dropped point is off the kept segment that
+        spans it, at most.
 
     Raises:
         ValueError: `at_most` is below 2: both ends are always kept.
@@ -188,7 +203,8 @@ def simplify_to(
     # kept set is that of the recursive algorithm, in another order.
     kept = [0, last]
     columns = _columns(points)
-    worst = [_farthest(points, columns, 0, last)]
+    clock = None if seconds is None else (seconds, np.array(seconds, dtype=np.float64))
+    worst = [_farthest(points, columns, 0, last, clock)]
     scans_left = _SCANS_PER_POINT * len(points)
     while worst and -worst[0][0] > tolerance_m and len(kept) < at_most:
         _, split, start, end = heapq.heappop(worst)
@@ -198,7 +214,7 @@ def simplify_to(
         for low, high in ((start, split), (split, end)):
             if high - low > 1:
                 scans_left -= high - low
-                heapq.heappush(worst, _farthest(points, columns, low, high))
+                heapq.heappush(worst, _farthest(points, columns, low, high, clock))
     return sorted(kept), -worst[0][0] if worst else 0.0
 
 
@@ -211,41 +227,53 @@ def _columns(points: Sequence[Vector3]) -> Columns | None:
 
 
 def _farthest(
-    points: Sequence[Vector3], columns: Columns | None, start: int, end: int
+    points: Sequence[Vector3],
+    columns: Columns | None,
+    start: int,
+    end: int,
+    clock: Clock | None = None,
 ) -> tuple[float, int, int, int]:
-    """The point between `start` and `end` that lies farthest from the segment between them.
+    """The point between `start` and `end` that is farthest off the segment between them.
 
     Returns:
-        (minus its distance in metres, its index, start, end): ready for a heap.
+        (minus how far in metres, its index, start, end): ready for a heap.
     """
     if columns is not None and end - start >= _MANY_POINTS:
-        most, where = _farthest_in(columns, start, end)
+        most, where = _farthest_in(columns, start, end, None if clock is None else clock[1])
         if math.isfinite(most):
             return -math.sqrt(most), where, start, end
     ax, ay, az = points[start]
     bx, by, bz = points[end]
     dx, dy, dz = bx - ax, by - ay, bz - az
     scale = _scale(dx, dy, dz)
-    most, where = -1.0, start + 1
+    squared = dx * dx + dy * dy + dz * dz
+    seconds = None if clock is None else clock[0]
+    since, rate = (0.0, 0.0) if seconds is None else (seconds[start], _rate(seconds, start, end))
+    most, where, reach = -1.0, start + 1, 0.0
     for index in range(start + 1, end):
         x, y, z = points[index]
         x -= ax
         y -= ay
         z -= az
         along = (x * dx + y * dy + z * dz) * scale
-        if along > 0:
-            along = min(along, 1.0)
-            x -= along * dx
-            y -= along * dy
-            z -= along * dz
-        off = x * x + y * y + z * z
+        along = min(along, 1.0) if along > 0 else 0.0
+        ox, oy, oz = x - along * dx, y - along * dy, z - along * dz
+        off = ox * ox + oy * oy + oz * oz
+        if seconds is not None:
+            reach = max(reach, along)
+            back = (reach - along) * (reach - along) * squared * _BACK
+            at = (seconds[index] - since) * rate
+            lx, ly, lz = x - at * dx, y - at * dy, z - at * dz
+            off = max(off, back, (lx * lx + ly * ly + lz * lz) * _LATE if rate else 0.0)
         if off > most:
             most, where = off, index
     return -math.sqrt(most), where, start, end
 
 
-def _farthest_in(columns: Columns, start: int, end: int) -> tuple[float, int]:
-    """The same of many points: its squared distance and its index, by the same steps."""
+def _farthest_in(
+    columns: Columns, start: int, end: int, seconds: Numbers | None
+) -> tuple[float, int]:
+    """The same of many points: the square of how far it is off, and its index."""
     (ax, dx), (ay, dy), (az, dz) = (
         (float(column[start]), float(column[end]) - float(column[start])) for column in columns
     )
@@ -253,12 +281,26 @@ def _farthest_in(columns: Columns, start: int, end: int) -> tuple[float, int]:
     with np.errstate(all="ignore"):  # what is not finite the caller works out point by point
         x, y, z = xs[start + 1 : end] - ax, ys[start + 1 : end] - ay, zs[start + 1 : end] - az
         along = ((x * dx + y * dy + z * dz) * _scale(dx, dy, dz)).clip(0.0, 1.0)
-        x -= along * dx
-        y -= along * dy
-        z -= along * dz
-        off = x * x + y * y + z * z
+        ox, oy, oz = x - along * dx, y - along * dy, z - along * dz
+        off = ox * ox + oy * oy + oz * oz
+        if seconds is not None:
+            back = np.maximum.accumulate(along) - along
+            np.maximum(off, back * back * (dx * dx + dy * dy + dz * dz) * _BACK, out=off)
+            rate = _rate(seconds, start, end)
+            if rate:
+                at = (seconds[start + 1 : end] - seconds[start]) * rate
+                x -= at * dx
+                y -= at * dy
+                z -= at * dz
+                np.maximum(off, (x * x + y * y + z * z) * _LATE, out=off)
     where = int(off.argmax())
     return float(off[where]), start + 1 + where
+
+
+def _rate(seconds: Sequence[float] | Numbers, start: int, end: int) -> float:
+    """One over the time from one point to another; 0 where there is none."""
+    lasted = float(seconds[end]) - float(seconds[start])
+    return 1 / lasted if lasted > 0 else 0.0
 
 
 def _scale(dx: float, dy: float, dz: float) -> float:

@@ -1,5 +1,7 @@
 """The drawn path of a robot: few vertices, no pose far from them, and no line where it jumped.
 
+It is drawn in space and time: where the robot turned back, or stopped, is a vertex too.
+
 Built vertex by vertex in bounded memory. Where a robot jumped (a localisation that was corrected,
 a simulator that was reset) the path is parted: both ends of the jump are kept, and nothing is drawn
 between them.
@@ -12,6 +14,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.geometry import distance, simplify_to
+from ros2_memory.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -24,6 +27,8 @@ PARTED: Final[Vertex] = (0, (math.nan, math.nan, math.nan), None)
 _BLOCK: Final = 4096
 _MOST_VERTICES: Final = 20_000
 _MOST_PIECES: Final = 1000
+_STAY_NS: Final[Ns] = NS_PER_S
+"""Of a longer stay on a spot the end is drawn too."""
 
 
 class Drawn(NamedTuple):
@@ -74,9 +79,11 @@ class DrawnPath:
                 self._merged_m = max(self._merged_m, off)
                 self._merged = vertex
                 return
+        if self._merged is not None and self._merged[0] - self._block[-1][0] > _STAY_NS:
+            self._block.append(self._merged)  # where a stop ends
         self._merged = None
         self._block.append(vertex)
-        if len(self._block) == _BLOCK:
+        if len(self._block) >= _BLOCK:
             self._block = self._close_block()[-1:]
             self._kept.pop()
 
@@ -165,5 +172,11 @@ def _drawn(
 def _thinned(
     vertices: list[Vertex], tolerance_m: float, at_most: int
 ) -> tuple[list[Vertex], float]:
-    indices, error = simplify_to([vertex[1] for vertex in vertices], tolerance_m, max(at_most, 2))
+    since = vertices[0][0] if vertices else 0
+    indices, error = simplify_to(
+        [vertex[1] for vertex in vertices],
+        tolerance_m,
+        max(at_most, 2),
+        [unix_from_ns(vertex[0] - since) for vertex in vertices],
+    )
     return [vertices[index] for index in indices], error

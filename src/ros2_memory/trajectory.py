@@ -56,8 +56,8 @@ class Trajectory:
         avg_speed: `distance_m / duration_s` (m/s); 0 where there is no duration.
         max_speed: the highest speed (m/s), from `max_speed_from`.
         max_speed_from: `twist`: the messages' own; `positions`: over a second and eight poses.
-        waypoints: vertices of the drawn path, first and last pose among them, and both ends of
-            the longest jumps.
+        waypoints: vertices of the path drawn in space and time: first and last pose, corners,
+            turning points, ends of stops, and both ends of the longest jumps.
         waypoint_error_m: no pose lies farther than this from the drawn path.
         poses: valid poses counted.
         invalid: poses left out, since a coordinate is NaN, infinite or beyond any place.

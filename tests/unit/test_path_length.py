@@ -1,4 +1,4 @@
-"""How far and how fast a robot drove, by positions that carry noise, are missing, or begin anew."""
+"""How far, how fast and where a robot drove, by poses with noise, gaps, resets and turns."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.geometry import simplify_to
 from ros2_memory.memory import Call
 from ros2_memory.model import Pose
 from ros2_memory.moments import Span
@@ -373,3 +374,95 @@ def test_recordings_that_hand_over_are_one_way(tmp_path: Path, recalls: bool) ->
     for reply in replies(tmp_path, recalls=recalls):
         assert reply["distance_m"] == 10.0
         assert "gap_m" not in reply
+
+
+# Waypoints
+
+
+def shuttles(*corners: float, hertz: float = 20, noise_m: float = 0.0) -> Points:
+    return noisy(through([(x, 0.0, 0.0) for x in corners], 1.0, hertz), noise_m)
+
+
+@each_way
+@pytest.mark.parametrize("split_s", [3.0, 5.0, 7.0, 60.0])
+def test_a_turning_point_is_a_waypoint(tmp_path: Path, split_s: float, recalls: bool) -> None:
+    legs = [(10.0 * nth, 10.0 * (nth % 2), 10.0 * ((nth + 1) % 2)) for nth in range(5)]
+    history(tmp_path, legs, split_s=split_s)
+    way, _ = replies(tmp_path, recalls=recalls)
+    assert way["distance_m"] == 50.0
+    turns = [round(point["x"], 6) for point in way["waypoints"]]
+    # Where a leg ends and the next one begins there are two messages.
+    assert [x for x, before in zip(turns, [None, *turns], strict=False) if x != before] == [
+        0.0,
+        10.0,
+        0.0,
+        10.0,
+        0.0,
+        10.0,
+    ]
+    for point in way["waypoints"]:
+        at = round(point["timestamp"] - BEGIN / S, 1)
+        assert point["x"] == pytest.approx(10 - abs(10 - at % 20), abs=0.11)
+
+
+@pytest.mark.parametrize("hertz", [0.1, 1, 5, 50])
+def test_a_shuttle_has_its_turning_points_at_any_rate(hertz: float) -> None:
+    poses = shuttles(0, 10, 0, 10, 0, 10, hertz=hertz)
+    found = summarise(poses, hertz)
+    assert [point.position[0] for point in found.waypoints] == [0, 10, 0, 10, 0, 10]
+
+
+def test_noise_hides_no_turning_point() -> None:
+    found = summarise(shuttles(0, 10, 0, 10, 0, 10, noise_m=0.005), 20)
+    for at in (10.0, 20.0, 30.0, 40.0):
+        nearest = min(found.waypoints, key=lambda point: abs((point.time - BEGIN) / S - at))
+        assert abs((nearest.time - BEGIN) / S - at) < 0.5
+    assert len(found.waypoints) <= 50
+
+
+def test_where_a_robot_stopped_on_its_way_are_waypoints_with_their_times() -> None:
+    x = np.concatenate([np.arange(200) / 20, np.full(1200, 10.0), 10 + np.arange(200) / 20])
+    poses = np.column_stack([x, 0 * x, 0 * x])
+    for found in (summarise(poses, 20), summarise(poses, 20, range(0, 1600, 130))):
+        stops = [point for point in found.waypoints if abs(point.position[0] - 10) < 0.3]
+        times = [(point.time - BEGIN) / S for point in stops]
+        assert min(times) == pytest.approx(10, abs=0.5)
+        assert max(times) == pytest.approx(70, abs=0.5)
+
+
+def test_a_way_at_one_speed_is_drawn_by_its_corners_alone() -> None:
+    poses = through([(0, 0, 0), (10, 0, 0), (10, 10, 0)], 0.5, 20)
+    for found in (summarise(poses, 20), summarise(poses, 20, range(0, len(poses), 77))):
+        assert [point.position for point in found.waypoints] == [
+            (0.0, 0.0, 0.0),
+            (10.0, 0.0, 0.0),
+            (10.0, 10.0, 0.0),
+        ]
+
+
+def test_of_very_many_turns_as_many_as_may_be_are_drawn() -> None:
+    poses = shuttles(*[10.0 * (nth % 2) for nth in range(200)], hertz=5)
+    found = summarise(poses, 5)
+    assert len(found.waypoints) == 50
+    assert (found.waypoints[0].time, found.waypoints[-1].position) == (BEGIN, (10.0, 0.0, 0.0))
+    assert found.waypoint_error_m > 0.05
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=80), st.integers(2, 50))
+def test_no_way_back_is_dropped_that_is_longer_than_twice_what_is_said(
+    xs: list[float], at_most: int
+) -> None:
+    times = [float(nth) for nth in range(len(xs))]
+    path = [(x, 0.0, 0.0) for x in xs]
+    kept, error_m = simplify_to(path, 0.05, at_most, times)
+    assert len(kept) <= at_most
+    for begin, end in pairwise(kept):
+        rising = 1.0 if xs[end] >= xs[begin] else -1.0
+        reach = -math.inf
+        for x in xs[begin : end + 1]:
+            held = min(max(rising * x, min(rising * xs[begin], rising * xs[end])), rising * xs[end])
+            reach = max(reach, held)
+            assert reach - held <= 2 * error_m + 1e-9
+        for nth in range(begin, end + 1):
+            there = xs[begin] + (xs[end] - xs[begin]) * (nth - begin) / (end - begin)
+            assert abs(xs[nth] - there) <= 10 * error_m + 1e-9
