@@ -96,6 +96,14 @@ def recording_now(bag_dir: Path, *recordings: str, clock: Clock | None = None) -
     )
 
 
+def recorded_before(bag_dir: Path) -> Path:
+    """A bag directory in which a recorder was at work, long ago."""
+    bag_dir.mkdir(parents=True, exist_ok=True)
+    beat = Heartbeat(1, NS_PER_S, RecorderState.STOPPED, (), NS_PER_S, 0, (), (), None, 2.0)
+    write_heartbeat(bag_dir, beat)
+    return bag_dir
+
+
 @contextmanager
 def recorder_at_work(bag_dir: Path, clock: Clock) -> Iterator[None]:
     """A recorder that looks for wishes again and again, as the daemon does."""

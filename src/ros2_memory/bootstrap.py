@@ -25,6 +25,7 @@ from ros2_memory.recall import Recall
 from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.recorder.layout import has_recorded
 from ros2_memory.recorder.stand_in import StandInReader
 from ros2_memory.release import PACKAGE, package_version
 from ros2_memory.replies import Replies
@@ -53,7 +54,8 @@ def build_memory(settings: Settings) -> Memory:
     counting = CountingReader(build_reader(settings))
     reader = StandInReader(ConfinedReader(counting, bag_dir), bag_dir)
     reading = way_of_reading(settings, schemas)
-    catalogue = Catalogue(catalogue_places(settings), reading, waits_for=bag_dir)
+    places = partial(catalogue_places, settings)
+    catalogue = Catalogue(places, reading, waits_for=bag_dir)
     index = IndexManager(
         bag_dir,
         reader,
@@ -69,10 +71,14 @@ def build_memory(settings: Settings) -> Memory:
 
 
 def catalogue_places(settings: Settings) -> tuple[Path, ...]:
-    """Where the catalogue may lie, best first: beside the bags only where they are recorded."""
+    """Where the catalogue may lie now, best first.
+
+    Beside the bags only where a recorder has been at work, and may be again: a folder of other
+    people's bags is left as it is.
+    """
     bag_dir = settings.recording.bag_dir
-    beside = bag_dir / FOLDER / FILE
-    places = () if isinstance(settings.recorder, NullRecorderNode) else (beside,)
+    records = not isinstance(settings.recorder, NullRecorderNode) and has_recorded(bag_dir)
+    places = (bag_dir / FOLDER / FILE,) if records else ()
     given = os.environ.get("XDG_CACHE_HOME")
     try:
         cache = Path(given) if given else Path.home() / ".cache"

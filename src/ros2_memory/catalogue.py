@@ -76,6 +76,7 @@ class Catalogue:
 
     Args:
         places: where the file may lie, in order of preference; memory where none can be written.
+            Where that may change, a function that gives the places of the moment.
         config: what digests depend on besides the bag, as a hash.
         waits_for: a directory; until it exists, nothing is opened or made.
         monotonic: a clock that never steps, in seconds.
@@ -83,7 +84,7 @@ class Catalogue:
 
     def __init__(
         self,
-        places: Sequence[Path],
+        places: Sequence[Path] | Callable[[], Sequence[Path]],
         config: str,
         *,
         waits_for: Path | None = None,

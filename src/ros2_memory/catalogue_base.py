@@ -47,18 +47,19 @@ class KeptBase:
 
     Args:
         places: where the file may lie, in order of preference; memory where none can be written.
+            Where that may change, a function that gives the places of the moment.
         waits_for: a directory; while it does not exist, nothing is opened or made.
         monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
         self,
-        places: Sequence[Path],
+        places: Sequence[Path] | Callable[[], Sequence[Path]],
         *,
         waits_for: Path | None = None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._places = tuple(places)
+        self._places = places if callable(places) else lambda: places
         self._waits_for = waits_for
         self._monotonic = monotonic
         self._lock = threading.Lock()
@@ -151,6 +152,8 @@ class KeptBase:
     def look_after(self, *, thorough: bool = False) -> None:
         """Goes on with the file where it was deleted, replaced, or could not be opened before.
 
+        Where a better place for it has come up since, it moves there, with all that it holds.
+
         It may take a while, so no question should wait for it.
 
         Args:
@@ -163,8 +166,9 @@ class KeptBase:
             if not opened.is_in_place():
                 self._lose("its file was deleted or replaced", aside=opened.is_mixed())
                 return
-        if opened.path is None:
-            self._leave_memory()
+        if self._is_due():
+            self._go_on_at_a_better_place(opened)
+        if opened.path is None or self._opened is not opened:
             return
         # What is kept in memory of a file hides that it was overwritten.
         fault = fault_of(opened.path, thorough=thorough)
@@ -173,7 +177,7 @@ class KeptBase:
                 if self._opened is opened:
                     self._failed(fault)
 
-    # What follows runs under the lock, but for `_leave_memory`.
+    # What follows runs under the lock, but for `_go_on_at_a_better_place`.
 
     def _may_open(self) -> bool:
         return not self._closed and (self._waits_for is None or self._waits_for.is_dir())
@@ -182,30 +186,42 @@ class KeptBase:
         """The open base; None where there is none yet, or no more."""
         if self._opened is None and self._may_open():
             self._tried_s = self._monotonic()
-            found = open_file(self._places)
+            places = self._places()
+            found = open_file(places)
             self._opened = in_memory() if isinstance(found, str) else found
             self._trouble = None
-            if isinstance(found, str) and self._places:
+            if isinstance(found, str) and places:
                 self._trouble = f"is kept in memory: {found}"
         return self._opened
 
-    def _leave_memory(self) -> None:
-        """Opens the file that could not be opened before; what memory held is found again."""
-        if not self._places or self._monotonic() - self._tried_s < RETRY_S:
-            return
+    def _is_due(self) -> bool:
+        return self._monotonic() - self._tried_s >= RETRY_S
+
+    def _go_on_at_a_better_place(self, before: Opened) -> None:
+        """Opens the file at a place that is preferred to the present one, where there is one now.
+
+        What a file held is copied there before; what memory held is found again.
+        """
         self._tried_s = self._monotonic()
-        found = open_file(self._places, again=True)
+        places = tuple(self._places())
+        # It is not moved away from where it may no longer be made.
+        if before.path is not None:
+            places = places[: places.index(before.path)] if before.path in places else ()
+        found = open_file(places, again=True, former=before.path) if places else ""
         if isinstance(found, str):
             return
         with self._lock:
-            if self._closed or self._opened is None or self._opened.path is not None:
+            if self._closed or self._opened is not before:
                 found.base.close()
                 return
-            self._opened.base.close()
+            before.base.close()
             self._opened = found
             self._bases += 1
             self._trouble, self._failing = None, False
-            log.info("catalogue_in_file_again", path=str(found.path))
+            if before.path is None:
+                log.info("catalogue_in_file_again", path=str(found.path))
+            else:
+                log.info("catalogue_moved", path=str(found.path))
 
     def _works(self) -> None:
         """It could be written: nothing is amiss any more."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import errno
+import os
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Final
@@ -102,18 +103,24 @@ class Opened:
         return self.beside != _identities(self.path)
 
 
-def open_file(places: Sequence[Path], *, again: bool = False) -> Opened | str:
+def open_file(
+    places: Sequence[Path], *, again: bool = False, former: Path | None = None
+) -> Opened | str:
     """The base at the first place that can be written; why not where none can.
 
     Args:
         places: where it may lie, in order of preference.
         again: that this was tried before: what is as it was is not told once more.
+        former: where it lay until now. What lies there, or else at the next place, is copied to
+            where there is no file yet.
     """
     reason = ""
-    for path in places:
+    for nth, path in enumerate(places, start=1):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             _refuse_links(path)
+            if not path.exists():
+                _copy_one_of((former,) if former else places[nth:], path)
             base = _ready(path)
             base.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
             return Opened(base, path, _identity(path), _identities(path))
@@ -126,6 +133,38 @@ def open_file(places: Sequence[Path], *, again: bool = False) -> Opened | str:
             tell("catalogue_place_refused", path=str(path), reason=str(error))
             reason = str(error.strerror if isinstance(error, OSError) else error)
     return f"no file can be written for it ({reason})"
+
+
+def _copy_one_of(sources: Sequence[Path], path: Path) -> None:
+    """Makes a catalogue from the first of these that is one; none where there is none.
+
+    It is there whole or not at all, and takes the place of none that another program made.
+    """
+    for source in sources:
+        beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            if not source.is_file():
+                continue
+            beside.unlink(missing_ok=True)
+            _refuse_links(source)
+            address = f"{source.absolute().as_uri()}?mode=ro"
+            with (
+                closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as base,
+                closing(sqlite3.connect(beside)) as copy,
+            ):
+                if base.execute("PRAGMA user_version").fetchone()[0] != VERSION:
+                    continue
+                base.backup(copy)
+            with suppress(FileExistsError):
+                os.link(beside, path)
+        except (OSError, sqlite3.Error) as error:
+            log.debug("catalogue_not_copied", path=str(source), reason=str(error))
+        else:
+            return
+        finally:
+            for name in (beside, *(_beside(beside, suffix) for suffix in _BESIDE)):
+                with suppress(OSError):
+                    name.unlink(missing_ok=True)
 
 
 def _refuse_links(path: Path) -> None:

@@ -21,6 +21,7 @@ from ros2_memory.sightings import find_matches
 from ros2_memory.timebase import NS_PER_S, FixedClock
 from ros2_memory.visits import visits
 from tests.bags import McapLayout, detections, odom, tf, transform, write_mcap
+from tests.keeping import recorded_before
 from tests.memories import memory_of
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ NOW = FixedClock(T0 + 1_000_000 * NS_PER_S)
 
 def write_bags(bag_dir: Path, count: int = 12, *, first: int = 0) -> list[Path]:
     """Bags of ten seconds, each with odometry, transforms and a thing of its own."""
+    recorded_before(bag_dir)
     return [write_bag(bag_dir, number) for number in range(first, first + count)]
 
 

@@ -21,6 +21,7 @@ from ros2_memory.config import load_settings
 from ros2_memory.memory import Call
 from ros2_memory.timebase import NS_PER_S, FixedClock
 from tests.bags import detections, odom, tf, transform, write_mcap
+from tests.keeping import recorded_before
 from tests.memories import memory_of
 from tests.waiting import until
 
@@ -32,6 +33,7 @@ T0 = 1_700_000_000 * NS_PER_S
 
 
 def write_bags(bag_dir: Path) -> None:
+    recorded_before(bag_dir)
     for number in range(BAGS):
         start = T0 + number * 10 * NS_PER_S
         messages = [odom(start + n * NS_PER_S // 2, number + n / 20, 0.0) for n in range(20)]

@@ -241,7 +241,7 @@ def test_a_clock_that_stepped_forward_deletes_nothing_before_it_is_synchronised(
         )
         for n in range(1, 20)
     ]
-    daemon = site.run("retention.max_age_h=168")
+    daemon = site.run("retention.max_age_h=168", "retention.foreign=delete")
     (held,) = daemon.wait_for("age_held")
     assert held["bags"] == 10
     until(lambda: age_held(site.bag_dir) == held["reason"])
@@ -264,12 +264,14 @@ def test_folders_nested_without_end_are_cleared_and_it_records(site: Site) -> No
     site.bag_dir.mkdir()
     with within(site.bag_dir, DEEP, "d") as inner:
         os.link(bag, "deep.mcap", dst_dir_fd=inner)
-    daemon = site.run("recording.clear_on_startup=true")
-    (cleared,) = daemon.wait_for("bags_cleared")
-    assert (cleared["files"], daemon.events("not_cleared")) == (1, [])
-    assert daemon.stop() == 0
-    # pytest would recurse.
-    subprocess.run(["rm", "-rf", str(site.bag_dir / "d")], check=True)
+    try:
+        daemon = site.run("recording.clear_on_startup=true", "retention.foreign=delete")
+        (cleared,) = daemon.wait_for("bags_cleared")
+        assert (cleared["files"], daemon.events("not_cleared")) == (1, [])
+        assert daemon.stop() == 0
+    finally:
+        # pytest would recurse.
+        subprocess.run(["rm", "-rf", str(site.bag_dir / "d")], check=True)
 
 
 def state(folder: Path) -> dict[str, tuple[object, ...]]:

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
+
+import pytest
 
 from ros2_memory.adapters import build_reader
 from ros2_memory.config import load_settings
@@ -28,6 +31,15 @@ def kept(bag_dir: Path, *overrides: str) -> list[str]:
     return files_in(bag_dir)
 
 
+def with_timedatectl(monkeypatch: pytest.MonkeyPatch, folder: Path, answer: str) -> None:
+    """Has the system's clock reported as synchronised, or not."""
+    folder.mkdir()
+    program = folder / "timedatectl"
+    program.write_text(f"#!/bin/sh\necho {answer}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+
+
 def test_the_budget_of_the_configuration_is_kept(tmp_path: Path) -> None:
     size = (
         2.5
@@ -39,9 +51,20 @@ def test_the_budget_of_the_configuration_is_kept(tmp_path: Path) -> None:
     assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap"]
 
 
-def test_the_age_of_the_configuration_is_kept(tmp_path: Path) -> None:
+def test_the_age_of_the_configuration_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_timedatectl(monkeypatch, tmp_path / "bin", "yes")
     left = kept(tmp_path / "bags", "retention.max_age_h=2.5", "retention.foreign=delete")
     assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap", "rec/h2.mcap"]
+
+
+def test_age_deletes_nothing_where_the_clock_is_not_synchronised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_timedatectl(monkeypatch, tmp_path / "bin", "no")
+    left = kept(tmp_path / "bags", "retention.max_age_h=2.5", "retention.foreign=delete")
+    assert len(left) == 6
 
 
 def test_by_default_bags_of_other_programs_are_kept(tmp_path: Path) -> None:

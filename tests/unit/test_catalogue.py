@@ -13,6 +13,7 @@ import pytest
 import structlog
 
 from ros2_memory.catalogue import FILE, FOLDER, BagKey, Catalogue, relative
+from ros2_memory.catalogue_base import RETRY_S
 from ros2_memory.digest import Digester
 from ros2_memory.stories import QUIET
 from tests.bags import boolean, detections, odom, tf, transform
@@ -339,3 +340,74 @@ def test_nothing_is_made_before_the_bag_directory_exists(tmp_path: Path) -> None
     bag_dir.mkdir()
     assert catalogue.put(KEY, DIGEST)
     assert holds(catalogue)
+
+
+class TestAPlaceThatComesUp:
+    """As when a recorder comes to bags whose catalogue lies in the cache."""
+
+    def catalogue(self, places: list[Path], monotonic: list[float]) -> Catalogue:
+        return Catalogue(lambda: places, "config", monotonic=lambda: monotonic[0])
+
+    def test_what_the_former_place_holds_goes_along(self, tmp_path: Path) -> None:
+        beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
+        places, now = [cache], [0.0]
+        catalogue = self.catalogue(places, now)
+        assert catalogue.put(KEY, DIGEST)
+        [number] = catalogue.find([KEY])
+        places.insert(0, beside)
+        catalogue.look_after()
+        assert catalogue.path == cache, "it is tried now and then"
+        now[0] = RETRY_S
+        catalogue.look_after()
+        assert catalogue.path == beside
+        assert holds(catalogue)
+        assert number is not None
+        assert not catalogue.is_current(number)
+        other = KEY._replace(path="rec/later.mcap")
+        assert catalogue.put(other, DIGEST)
+        assert not holds(Catalogue([cache], "config"), other)
+        assert [path.name for path in beside.parent.iterdir() if path.name.startswith(".")] == []
+
+    def test_it_takes_the_place_of_none_that_lies_there(self, tmp_path: Path) -> None:
+        beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
+        other = KEY._replace(path="rec/other.mcap")
+        assert Catalogue([beside], "config").put(other, DIGEST)
+        assert Catalogue([cache], "config").put(KEY, DIGEST)
+        catalogue = Catalogue([beside, cache], "config")
+        assert (holds(catalogue, other), holds(catalogue)) == (True, False)
+
+    def test_one_that_is_none_of_this_version_is_not_taken_along(self, tmp_path: Path) -> None:
+        beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
+        assert Catalogue([cache], "config").put(KEY, DIGEST)
+        with closing(sqlite3.connect(cache)) as base:
+            base.execute("PRAGMA user_version = 1")
+        before = cache.read_bytes()
+        catalogue = Catalogue([beside, cache], "config")
+        assert (catalogue.path, holds(catalogue)) == (beside, False)
+        assert cache.read_bytes() == before
+        cache.write_bytes(b"no catalogue at all")
+        third = Catalogue([tmp_path / "third" / FILE, cache], "config")
+        assert third.put(KEY, DIGEST)
+
+    def test_it_is_not_left_where_it_may_no_longer_be_made(self, tmp_path: Path) -> None:
+        beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
+        places, now = [beside, cache], [0.0]
+        catalogue = self.catalogue(places, now)
+        assert catalogue.put(KEY, DIGEST)
+        del places[0]
+        now[0] = RETRY_S
+        catalogue.look_after()
+        assert catalogue.path == beside
+        assert holds(catalogue)
+
+    def test_where_it_cannot_be_written_the_former_one_goes_on(self, tmp_path: Path) -> None:
+        (tmp_path / "bags").write_text("a file, and no folder")
+        cache = tmp_path / "cache" / FILE
+        places, now = [cache], [0.0]
+        catalogue = self.catalogue(places, now)
+        assert catalogue.put(KEY, DIGEST)
+        places.insert(0, tmp_path / "bags" / FILE)
+        for now[0] in (RETRY_S, 3 * RETRY_S):
+            catalogue.look_after()
+            assert catalogue.path == cache
+            assert holds(catalogue)

@@ -29,6 +29,7 @@ from ros2_memory.recall import Recall
 from ros2_memory.recorder.handover import Handover, write_handover
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import McapLayout, odom, text, write_mcap
+from tests.keeping import recorded_before
 from tests.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
@@ -231,7 +232,7 @@ def test_on_a_terminal_one_line_moves_and_elsewhere_only_its_end_is_shown() -> N
 def test_the_command_fills_the_catalogue_beside_the_bags(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(recorded_before(tmp_path)))
     path = bag(tmp_path, 0)
     hour_ago = time.time_ns() - 3600 * NS_PER_S
     os.utime(path, ns=(hour_ago, hour_ago))

@@ -27,6 +27,7 @@ No name here ends as a bag file's does, so the index passes them by.
 
 from __future__ import annotations
 
+import stat
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
@@ -56,6 +57,22 @@ OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """What may be deleted from the bag directory itself, besides bags: it is written anew."""
 RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE})
 """What stands in a recording's directory besides its bags, and has no meaning without them."""
+
+
+def has_recorded(bag_dir: Path) -> bool:
+    """Whether a recorder of this program has been at work in a directory, by its own files.
+
+    Only there anything is written beside bags. Nothing behind a link counts.
+    """
+    return any(_is_file(bag_dir / name) for name in (HEARTBEAT_FILE, LIST_FILE))
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        here = stat.S_ISREG(path.lstat().st_mode)
+        return here and not path.parent.is_symlink() if path.parent.name == OWN_FOLDER else here
+    except OSError:
+        return False
 
 
 def is_carried(bag: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.errors import RecorderError
@@ -155,7 +156,10 @@ class Ros2BagRecorder(Recorder):
         return self._supervisor.is_recording
 
     def _known_options(self) -> frozenset[str]:
-        finished = run_bounded([self._ros2, *HELP_ARGV], self._env, HELP_TIMEOUT_S)
+        # Nothing is recorded yet, or never where only somebody looks: no log goes beside the bags.
+        with TemporaryDirectory() as elsewhere:
+            env = {**self._env, "ROS_LOG_DIR": elsewhere}
+            finished = run_bounded([self._ros2, *HELP_ARGV], env, HELP_TIMEOUT_S)
         if finished.status != 0:
             said = " ".join(finished.errors.decode(errors="replace").split())[-300:]
             raise RecorderError(

@@ -1,0 +1,163 @@
+"""Whatever only looks leaves a folder of other people's bags as it is, entry for entry."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from typing import TYPE_CHECKING, Final
+
+import pytest
+from mcp import Client
+
+from ros2_memory.catalogue import FILE, FOLDER
+from ros2_memory.recorder.heartbeat import HEARTBEAT_FILE
+from tests.bags import McapLayout, odom, write_db3, write_mcap
+from tests.integration.test_retention_process import state
+from tests.integration.test_server_process import serving
+from tests.keeping import recorded_before
+from tests.questions import T0, ask_everything, write_run
+from tests.waiting import PATIENCE_S, until
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+COMMANDS: Final = {
+    "info": ["info"],
+    "topics": ["topics"],
+    "ask": ["ask", "list_recorded_topics"],
+    "ask a search": ["ask", "find_last_match", "topic=/odom", "condition_type=contains", "value=x"],
+    "ask for a moment": ["ask", "remember_moment", "label=x", "--set", "server.write_tools=true"],
+    "doctor": ["doctor"],
+    "watch": ["watch", "--count", "2", "--every", "0.1"],
+    "index": ["index"],
+    "export": ["export", "--mcap", "{out}/out.mcap", "--latched"],
+    "forget": ["forget", "--last", "1", "--dry-run"],
+    "config": ["config", "show"],
+}
+STORAGES: Final = ("mcap", "rosbag2")
+
+
+@pytest.fixture
+def strangers(tmp_path: Path) -> Path:
+    """Bags of every kind that no recorder of this program made, some of them left open."""
+    folder = tmp_path / "strangers"
+    write_run(folder)
+    messages = [odom(T0 + n * 10**8, 1.0, 2.0) for n in range(50)]
+    write_mcap(folder / "cut/cut_0.mcap", messages, McapLayout(chunk_size=400, finish=False))
+    write_db3(folder / "lite/lite_0.db3", messages)
+    (folder / "cut/empty.mcap").touch()
+    # As a crash leaves it: the last messages are in the log beside it.
+    before = write_db3(tmp_path / "wal.db3", messages)
+    with closing(sqlite3.connect(before)) as base:
+        base.execute("PRAGMA journal_mode = WAL")
+        base.execute("DELETE FROM messages WHERE id = 1")
+        base.commit()
+        (folder / "wal").mkdir()
+        for name in ("wal.db3", "wal.db3-wal"):
+            shutil.copy(tmp_path / name, folder / "wal" / name)
+    for path in folder.rglob("*"):
+        os.utime(path, ns=(T0, T0))
+    return folder
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> dict[str, str]:
+    """The shipped defaults, and a `ros2` that leaves a log with every run, as the real one does."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    ros2 = programs / "ros2"
+    ros2.write_text('#!/bin/sh\nmkdir -p "$ROS_LOG_DIR" && date > "$ROS_LOG_DIR/ros2.log"\n')
+    ros2.chmod(0o755)
+    kept = {name: text for name, text in os.environ.items() if not name.startswith("MEMORY_")}
+    path = f"{programs}:{os.environ['PATH']}"
+    return {**kept, "PATH": path, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+
+
+def run(env: dict[str, str], bag_dir: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "ros2_memory.cli", *command],
+        env={**env, "MEMORY_BAG_DIR": str(bag_dir)},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_no_command_that_only_looks_writes_beside_strangers_bags(
+    strangers: Path, tmp_path: Path, env: dict[str, str], storage: str
+) -> None:
+    before = state(strangers)
+    env = {**env, "MEMORY_CONFIG_OVERRIDES": f"storage={storage}"}
+    for name, command in COMMANDS.items():
+        ran = run(env, strangers, *(each.format(out=tmp_path) for each in command))
+        assert "Traceback" not in ran.stderr, (name, ran.stderr)
+        assert state(strangers) == before, (name, ran.stdout, ran.stderr)
+    assert (tmp_path / "out.mcap").stat().st_size
+    assert [*(tmp_path / "cache").rglob(FILE)]
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+async def test_no_server_with_the_shipped_defaults_writes_beside_strangers_bags(
+    strangers: Path, tmp_path: Path, env: dict[str, str], storage: str
+) -> None:
+    before = state(strangers)
+    with serving(strangers, tmp_path / "log", f"storage={storage}", **env) as served:
+        async with Client(served.url("/mcp")) as client:
+            await ask_everything(client)
+        until(lambda: catalogue(served.get("/health")[1])["state"] == "ready")
+        assert state(strangers) == before
+    assert state(strangers) == before
+    assert [*(tmp_path / "cache").rglob(FILE)]
+
+
+def catalogue(health: bytes) -> dict[str, object]:
+    shown: dict[str, object] = json.loads(health)["catalogue"]
+    return shown
+
+
+def entries(file: Path) -> int:
+    with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
+        return int(base.execute("SELECT count(*) FROM bags").fetchone()[0])
+
+
+async def test_when_a_recorder_comes_the_catalogue_goes_beside_the_bags_with_all_it_holds(
+    strangers: Path, tmp_path: Path, env: dict[str, str]
+) -> None:
+    beside = strangers / FOLDER / FILE
+    with serving(strangers, tmp_path / "log", "logging.level=debug", **env) as served:
+        until(lambda: catalogue(served.get("/health")[1])["state"] == "ready")
+        [cached] = (tmp_path / "cache").rglob(FILE)
+        known = entries(cached)
+        assert known > 0
+        recorded_before(strangers)
+        until(lambda: "catalogue_moved" in {each["event"] for each in served.events()})
+        digested = [each for each in served.events() if each["event"] == "bag_digested"]
+        assert entries(beside) == known == len(digested)
+        async with Client(served.url("/mcp")) as client:
+            await ask_everything(client)
+        assert len(digested) == len(
+            [each for each in served.events() if each["event"] == "bag_digested"]
+        )
+    # Started where there is one already, it takes over what the cache holds just the same.
+    shutil.rmtree(strangers / FOLDER)
+    assert run(env, strangers, "info").returncode == 0
+    assert entries(beside) == known
+
+
+def test_it_stays_in_the_cache_where_nothing_is_recorded_though_a_heartbeat_was_copied_along(
+    strangers: Path, tmp_path: Path, env: dict[str, str]
+) -> None:
+    recorded_before(strangers)
+    before = state(strangers)
+    for preset in ("query_only", "replay"):
+        ran = run({**env, "MEMORY_DEPLOYMENT": preset}, strangers, "index")
+        assert "in the catalogue" in ran.stderr
+        assert state(strangers) == before
+    assert (strangers / HEARTBEAT_FILE).is_file()
