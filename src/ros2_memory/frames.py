@@ -196,12 +196,18 @@ def children_moving(view: View, among: Session) -> set[str]:
 def edges(view: View) -> tuple[FrameEdge, ...]:
     """Every parent and child pair that was recorded, sorted; `static` where it was so published.
 
-    A pair that was published both ways stands once, as dynamic.
+    A pair that was published both ways stands once, as dynamic. One in which a frame has no name
+    is none to tf2, and left out with a note.
     """
     limits = view.memory.limits
     pairs: dict[tuple[str, str], bool] = {}
     for topics, static in ((limits.tf_static_topics, True), (limits.tf_topics, False)):
         pairs.update((pair, static) for pair in _pairs(view, topics, static=static))
+    refused = [pair for pair in pairs if not _is_edge(pair)]
+    for pair in refused:
+        del pairs[pair]
+    if refused:
+        view.note(f"pairs left out, since a frame has no name: {len(refused)}")
     return tuple(
         FrameEdge(parent, child, static) for (parent, child), static in sorted(pairs.items())
     )
@@ -232,6 +238,12 @@ def _pairs(
         for each in _transforms(view, recorded, TimeWindow(*span), among, static=static):
             pairs.add((each.parent, each.child))
     return pairs
+
+
+def _is_edge(pair: tuple[str, str]) -> bool:
+    """Whether tf2 takes a parent and a child for an edge of the tree."""
+    parent, child = (name.lstrip("/") for name in pair)
+    return bool(parent and child) and parent != child
 
 
 def _known_pairs(
@@ -325,7 +337,7 @@ def connected(
     except QueryTimeoutError:
         return False
     origin, target = (name.lstrip("/") for name in frames)
-    pairs = {(parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs}
+    pairs = {(pair[0].lstrip("/"), pair[1].lstrip("/")) for pair in pairs if _is_edge(pair)}
     reached, waiting = {origin}, [origin]
     while waiting:
         here = waiting.pop()

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.errors import BagVanishedError
+from ros2_memory.memory import Call
 from ros2_memory.model import TimeWindow
+from ros2_memory.overview import list_recorded_topics
 from ros2_memory.recorder.confined import ConfinedReader
 from ros2_memory.recorder.kept_names import KeptNames
 from ros2_memory.recorder.stand_in import StandInReader
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.bags import odom, write_mcap
+from tests.memories import memory_of
 from tests.unit.test_dormant import Start
 
 if TYPE_CHECKING:
@@ -140,3 +143,39 @@ class TestTheIndex:
         shutil.copy(recorded, start.bag_dir / "copy")
         (start.bag_dir / "copy").replace(recorded)
         assert len(start.read().bags) == 7
+
+
+class TestOtherNames:
+    def test_a_hard_link_beside_its_original_is_no_second_bag(self, tmp_path: Path) -> None:
+        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+        memory = memory_of(tmp_path)
+        assert [bag.file for bag in memory.index.refresh().bags] == [str(recorded)]
+        linked = tmp_path / "rec/rec_0_link.mcap"
+        os.link(recorded, linked)
+        (tmp_path / "z/backup").mkdir(parents=True)
+        os.link(recorded, tmp_path / "z/backup/rec_0.mcap")
+        for index in (memory.index, memory_of(tmp_path).index):
+            assert [bag.file for bag in index.refresh().bags] == [str(recorded)]
+        [row] = list_recorded_topics(memory, Call())
+        assert row.count == 1
+        recorded.unlink()
+        assert [bag.file for bag in memory.index.refresh().bags] == [str(linked)]
+        linked.unlink()
+        assert len(memory.index.refresh().bags) == 1
+
+    def test_a_hard_link_with_an_earlier_name_takes_over(self, tmp_path: Path) -> None:
+        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+        memory = memory_of(tmp_path)
+        memory.index.refresh()
+        outer = tmp_path / "a.mcap"
+        os.link(recorded, outer)
+        assert [bag.file for bag in memory.index.refresh().bags] == [str(outer)]
+
+    @pytest.mark.parametrize("name", [".x.mcap", ".x.db3", ".x.mcap.zstd", ".X.MCAP"])
+    def test_a_hidden_file_is_no_bag(self, tmp_path: Path, name: str) -> None:
+        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+        shutil.copy(recorded, tmp_path / "rec" / name)
+        (tmp_path / "rec/.y.mcap").symlink_to(recorded)
+        snapshot = memory_of(tmp_path).index.refresh()
+        assert [bag.file for bag in snapshot.bags] == [str(recorded)]
+        assert (snapshot.unread, snapshot.damaged) == ((), ())

@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.errors import NoDataError
 from ros2_memory.memory import Call
 from ros2_memory.moments import Moment
-from ros2_memory.queries import transform
+from ros2_memory.queries import frames, transform
 from ros2_memory.recorder.handover import Handover, write_handover
 from ros2_memory.sightings import find_matches
 from ros2_memory.timebase import unix_from_ns
@@ -197,3 +197,17 @@ def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
     assert found.thing.position[0] == pytest.approx(103.0)
     assert found.robot is not None
     assert found.robot.position[0] == pytest.approx(2.0)
+
+
+@each_way
+def test_a_frame_without_a_name_is_none(tmp_path: Path, recalls: bool) -> None:
+    """Neither listed, nor a reason to advise another time."""
+    nameless = moving(BEGIN, 20, "", "base_link", 0.0, 0.0)
+    record(tmp_path / "one", [*nameless, *moving(BEGIN, 20, "odom", "wheel", 0.0, 0.0)])
+    memory = remembered(tmp_path, recalls=recalls)
+    found = frames(memory, Call())
+    assert [(edge.parent, edge.child) for edge in found.edges] == [("odom", "wheel")]
+    assert [note for note in found.notes if "no name" in note and note.endswith("1")]
+    with pytest.raises(NoDataError) as refused:
+        asked(memory, BEGIN + 300 * S, "", "base_link")
+    assert "ask about then" not in refused.value.detail

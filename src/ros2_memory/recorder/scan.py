@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.model import SetAside
-from ros2_memory.recorder.layout import HANDOVER_FILE, METADATA_FILE
+from ros2_memory.recorder.layout import HANDOVER_FILE, METADATA_FILE, MOMENTS_FOLDER
 from ros2_memory.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ _LINK = "a symbolic link, which is not followed: move or mount the bags into the
 
 
 def bag_kind(name: str) -> str | None:
-    """The kind of bag that a file name claims, one of `BAG_KINDS`, or None."""
+    """The kind of bag that a file name claims, one of `BAG_KINDS`, or None, as of hidden files."""
     lowered = name.lower()
-    if not lowered.endswith(BAG_KINDS) or lowered in BAG_KINDS:
+    if not lowered.endswith(BAG_KINDS) or lowered.startswith("."):
         return None
     return next(kind for kind in BAG_KINDS if lowered.endswith(kind))
 
@@ -108,6 +108,8 @@ class _Folder:
     device: int = 0
     folders: list[str] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
+    inodes: list[int] = field(default_factory=list)
+    linked: set[int] = field(default_factory=set)
     links: list[Path] = field(default_factory=list)
     odd: list[SetAside] = field(default_factory=list)
     sidecar_ns: Ns = 0
@@ -118,13 +120,17 @@ class Tree:
     """The directories under one root, as the last walk saw them.
 
     The root itself may be a symbolic link; inside it none is followed. Folders whose name begins
-    with a dot are left out, and so is `lost+found`. Not for several threads at once.
+    with a dot are left out, and so is `lost+found`. Of the hard links of one file the first name
+    alone is found, but for those in moments, which `KeptNames` weighs. Not for several threads at
+    once.
     """
 
     def __init__(self, root: Path) -> None:
         self._root = str(root)
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
+        self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}"
+        self._second: set[str] = set()
 
     def walk(self, now: Ns, watched: Iterable[str]) -> Walked:
         """Looks for what is new, changed or gone since the last walk, and at the `watched` files.
@@ -148,7 +154,40 @@ class Tree:
                 walked.gone.update(set(folder.files).difference(after.files if after else ()))
         for file in watched:
             self._look(file, walked)
+        self._leave_out_second_names(before, walked)
         return walked
+
+    def _leave_out_second_names(self, before: dict[str, _Folder], walked: Walked) -> None:
+        """Has each file found under one name: the others are gone, until the first one is."""
+        if all(self._folders.get(path) is folder for path, folder in before.items()) and len(
+            before
+        ) == len(self._folders):
+            second = self._second
+        else:
+            second = self._second_names()
+        for path in second:
+            walked.looked_at.pop(path, None)
+        walked.gone.update(second - self._second)
+        for path in self._second - second - walked.gone:
+            self._look(path, walked)
+        self._second = second
+
+    def _second_names(self) -> set[str]:
+        """All but the first name of each file that has several outside of moments."""
+        folders = [
+            folder
+            for path, folder in self._folders.items()
+            if path != self._moments and not path.startswith(f"{self._moments}/")
+        ]
+        linked = {(folder.device, inode) for folder in folders for inode in folder.linked}
+        if not linked:
+            return set()
+        names: dict[tuple[int, int], list[str]] = {}
+        for folder in folders:
+            for path, inode in zip(folder.files, folder.inodes, strict=True):
+                if (folder.device, inode) in linked:
+                    names.setdefault((folder.device, inode), []).append(path)
+        return {path for each in names.values() for path in sorted(each, key=_outermost)[1:]}
 
     def distrust(self, path: str) -> None:
         """Has the folder of a file listed again in the next walk, whatever its mtime says."""
@@ -242,7 +281,7 @@ def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]
     if not hidden and entry.name.endswith(BAG_KINDS) and entry.is_file(follow_symlinks=False):
         _enter_file(folder, entry, looked_at)
     elif entry.is_symlink():
-        if not hidden or bag_kind(entry.name):
+        if not hidden:
             folder.links.append(Path(entry.path))
     elif entry.is_dir(follow_symlinks=False):
         if not hidden and entry.name != LOST_AND_FOUND:
@@ -260,7 +299,7 @@ def _enter(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]
 
 def _enter_file(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, Stamp]) -> None:
     try:
-        looked_at[entry.path] = Stamp.of(entry.stat(follow_symlinks=False))
+        status = entry.stat(follow_symlinks=False)
     except FileNotFoundError:
         return
     except OSError as error:
@@ -269,8 +308,13 @@ def _enter_file(folder: _Folder, entry: os.DirEntry[str], looked_at: dict[str, S
         folder.trusted = False
         # One that is known is not gone because of it.
         folder.files.append(entry.path)
+        folder.inodes.append(0)
         return
+    looked_at[entry.path] = Stamp.of(status)
     folder.files.append(entry.path)
+    folder.inodes.append(status.st_ino)
+    if status.st_nlink > 1:
+        folder.linked.add(status.st_ino)
 
 
 def _enter_sidecar(folder: _Folder, entry: os.DirEntry[str]) -> None:
@@ -278,6 +322,11 @@ def _enter_sidecar(folder: _Folder, entry: os.DirEntry[str]) -> None:
         folder.sidecar_ns = entry.stat(follow_symlinks=False).st_mtime_ns
     except OSError:
         folder.trusted = False
+
+
+def _outermost(path: str) -> tuple[int, str]:
+    """What orders the names of one file: the one nearest to the root first."""
+    return path.count("/"), path
 
 
 def _is_gone(error: OSError) -> bool:
