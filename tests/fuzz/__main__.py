@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _COLUMNS: Final = {
     "mutants": 8,
     "served": 7,
+    "held": 6,
     "reasons": 8,
     "questions": 10,
     "crashes": 8,

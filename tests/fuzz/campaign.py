@@ -32,6 +32,7 @@ class Tally:
     name: str
     mutants: int = 0
     served: int = 0
+    held: int = 0
     reasons: int = 0
     questions: int = 0
     crashes: int = 0
@@ -52,6 +53,7 @@ class Tally:
             self.hangs += verdict["died"] == "hang"
         else:
             self.served += verdict["served"]
+            self.held += verdict["told_apart"] and verdict["served"]
             self.reasons += not verdict["served"]
             self.questions += verdict["asked"]
             self.peak_mb = max(self.peak_mb, verdict["peak_mb"])

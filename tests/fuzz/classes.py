@@ -6,7 +6,7 @@ import random
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from tests.fuzz import around, bombs, bytewise, content, definitions, tables
+from tests.fuzz import around, bombs, bytewise, content, definitions, indexes, tables
 from tests.fuzz.good import goods, mcaps, sqlites
 
 if TYPE_CHECKING:
@@ -54,6 +54,12 @@ CLASSES: Final[dict[str, MutationClass]] = {
     "sqlite_hostile": MutationClass(
         (tables.hostile_schema, tables.looping_pages, tables.odd_journals), sqlites
     ),
+    "message_indexes": MutationClass(
+        (indexes.flip_message_index, indexes.wrong_message_index), mcaps
+    ),
+    "chunk_indexes": MutationClass((indexes.wrong_chunk_index, indexes.wrong_chunk_head), mcaps),
+    "statistics": MutationClass((indexes.wrong_statistics,), mcaps),
+    "sqlite_indexes": MutationClass((indexes.wrong_order, indexes.flip_index_page), sqlites),
     "foreign_metadata": MutationClass((around.foreign_metadata,)),
     "symlink_loops": MutationClass((around.symlink_loops,)),
     "unreadable_files": MutationClass((around.unreadable_files,)),
@@ -77,8 +83,8 @@ class Job:
 
     @property
     def place(self) -> int:
-        """A number that no other mutant of the same seed has."""
-        return [*CLASSES].index(self.name) * 1_000_000 + self.number
+        """A number that no other mutant of the same seed has; small, for it becomes a time."""
+        return [*CLASSES].index(self.name) * 100_000 + self.number
 
     def made(self) -> tuple[Mutant, Good, str]:
         """The mutant, the good bag that it was, and the mutation's name."""

@@ -44,7 +44,8 @@ class Mutant:
 
     def place(self, bag_dir: Path, number: int) -> Path:
         """Lays it into a bag directory; the path of its bag. No other has this number."""
-        folder = bag_dir / FOLDER
+        # At one place it would be a file that changes, and so one that is being written.
+        folder = bag_dir / f"{FOLDER}_{number}"
         folder.mkdir(parents=True, exist_ok=True)
         for name, data in self.files.items():
             target = folder / name

@@ -1,17 +1,33 @@
-"""A few mutants of every class, the same in each run; `python -m tests.fuzz` tries more."""
+"""A few mutants of every class, the same in each run; more of those whose indexes lie.
+
+EPISODIC_LONG=1 tries a hundred times as many; so does `python -m tests.fuzz`, with a table.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import os
+import random
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
 from tests.fuzz.campaign import Child, campaign
 from tests.fuzz.classes import CLASSES, Job
+from tests.fuzz.good import goods, sqlites
+from tests.fuzz.holding import hold, truth_of
+from tests.fuzz.mutant import mutant_of
+from tests.fuzz.trial import World
+
+if TYPE_CHECKING:
+    from tests.fuzz.oracle import Readable
 
 SEED: Final = 1
-OF_EACH: Final = 3
+LONG: Final = 100 if os.environ.get("EPISODIC_LONG") == "1" else 1
+OF_EACH: Final = 3 * LONG
+OF_INDEXES: Final = 12 * LONG
+_INDEXES: Final = ("message_indexes", "chunk_indexes", "statistics", "sqlite_indexes")
 _NAMES: Final = [*CLASSES]
 _THIRDS: Final = [_NAMES[third::3] for third in range(3)]
 
@@ -30,6 +46,48 @@ def test_whatever_a_bag_is_it_answers_or_says_why_not_and_disturbs_no_other(
     assert not found, "\n".join(found)
     assert [tally.mutants for tally in tallies] == [OF_EACH] * len(names)
     assert all(tally.questions == 7 * OF_EACH for tally in tallies)
+
+
+@pytest.mark.parametrize("name", _INDEXES)
+def test_whatever_an_index_says_every_answer_is_what_can_be_read(name: str) -> None:
+    [tally] = campaign([name], OF_INDEXES, SEED)
+    found = [
+        f"{verdict['number']} {verdict['mutation']} of {verdict['good']}: {fault}"
+        for verdict in tally.found
+        for fault in verdict["faults"]
+    ]
+    assert not found, "\n".join(found)
+    assert tally.held >= OF_INDEXES // 4
+
+
+@pytest.mark.parametrize("kind", ["small chunks", "unchunked", "db3"])
+def test_the_oracle_agrees_with_a_good_bag_and_misses_a_message(tmp_path: Path, kind: str) -> None:
+    [good] = [each for each in goods() if each.kind == kind]
+    mutant = mutant_of(good, good.plain)
+    truth = truth_of(mutant, good)
+    assert truth is not None
+    world = World(tmp_path, "rosbag2", catalogue=False)
+    path = mutant.place(world.bag_dir, 0)
+    memory, server = world.serving()
+    [bag] = [each for each in memory.index.snapshot().bags if each.path == path]
+
+    def faults(said: list[Readable]) -> list[str]:
+        return asyncio.run(hold(memory, server, bag, said, random.Random(1)))
+
+    assert faults(truth) == []
+    assert len({each.topic for each in truth}) == 7
+    for topic in ("/odom", "/chatter"):
+        one = next(each for each in truth if each.topic == topic)
+        assert faults([each for each in truth if each is not one])
+        assert faults([*truth, one._replace(time=one.time + 30_000_000)])
+
+
+def test_of_damaged_content_the_oracle_knows_no_right_answer() -> None:
+    good = goods()[0]
+    assert truth_of(mutant_of(good, good.plain[:-1]), good) is None
+    assert truth_of(mutant_of(good, good.plain.replace(b"step 3 of", b"step 8 of")), good) is None
+    db3 = sqlites()[0]
+    assert truth_of(mutant_of(db3, db3.plain[:4096]), db3) is None
 
 
 @pytest.mark.parametrize("name", ["bit_flips", "odd_payloads", "lz4_bombs", "foreign_metadata"])

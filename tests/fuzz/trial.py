@@ -25,6 +25,7 @@ from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.recovery import recover
 from tests.fuzz.asking import OF_GOOD, ask, comparable, of_mutant
 from tests.fuzz.good import neighbours
+from tests.fuzz.holding import hold, truth_of
 from tests.fuzz.mutant import LONG_AGO_S
 from tests.fuzz.traps import sprung
 
@@ -35,7 +36,9 @@ if TYPE_CHECKING:
     from ros2_memory.protocol import EpisodicServer
     from ros2_memory.settings import Settings
     from tests.fuzz.classes import Job
+    from tests.fuzz.good import Good
     from tests.fuzz.mutant import Mutant
+    from tests.fuzz.oracle import Readable
 
 MOST_S: Final = 10.0
 MOST_MB: Final = 512
@@ -51,11 +54,14 @@ _SERVED_AT_MOST: Final = 20
 class Verdict:
     """What became of one mutant. `faults` are what must not happen.
 
+    `told_apart`: what of it can be read is known, and its answers were held to that.
+
     `seconds` are of the slowest question by the clock on the wall; the others are of the processor,
     since a machine that is busy otherwise is no fault.
     """
 
     served: bool = False
+    told_apart: bool = False
     state: str = ""
     asked: int = 0
     seconds: float = 0.0
@@ -123,18 +129,21 @@ class World:
         return self._known
 
 
-def tried(world: World, job: Job, mutant: Mutant) -> Verdict:
+def tried(world: World, job: Job, mutant: Mutant, good: Good) -> Verdict:
     """Lays the mutant down, asks, and judges; takes it away again."""
     verdict = Verdict()
     world.clear()
     with _failures_in(verdict.faults):
         known = world.answers()
+    truth = truth_of(mutant, good)
+    verdict.told_apart = truth is not None
     bag = mutant.place(world.bag_dir, job.place)
+    trapped = mutant.trap is not None
     # What was used to make it is not the program's.
     reset_peak()
     with _failures_in(verdict.faults), sprung(mutant.trap, bag):
         try:
-            asyncio.run(_asked(world, job, known, bag, verdict, trapped=mutant.trap is not None))
+            asyncio.run(_asked(world, job, known, bag, verdict, truth, trapped=trapped))
             if job.number % _RECOVERED_EVERY == 0:
                 _recovered(world, verdict)
             if job.number % _INDEXED_EVERY == 0:
@@ -150,7 +159,14 @@ def tried(world: World, job: Job, mutant: Mutant) -> Verdict:
 
 
 async def _asked(
-    world: World, job: Job, known: list[Any], bag: Path, verdict: Verdict, *, trapped: bool
+    world: World,
+    job: Job,
+    known: list[Any],
+    bag: Path,
+    verdict: Verdict,
+    truth: list[Readable] | None,
+    *,
+    trapped: bool,
 ) -> None:
     begun, busy = time.monotonic(), time.process_time()
     memory, server = world.serving()
@@ -164,6 +180,9 @@ async def _asked(
         await _timed(server, name, given, verdict)
     told = await _timed(server, "data_time_range", {}, verdict)
     _look_for(memory, bag, told, verdict, trapped=trapped)
+    held = next((each for each in memory.index.snapshot().bags if each.path == bag), None)
+    if truth and held is not None:
+        verdict.faults += await hold(memory, server, held, truth, rng)
     if world.catalogue and not job.number % 2:
         _digested(world, memory, verdict)
     for at in rng.sample(range(len(OF_GOOD)), _ASKED_OF_GOOD):

@@ -60,7 +60,7 @@ def _verdict(worlds: dict[tuple[str, bool], World], job: Job) -> dict[str, objec
         if good.needs_rosbag2 and job.number % 16 > 1:
             storage = "rosbag2"
         told |= {"good": good.kind, "mutation": mutation, "told": mutant.told, "storage": storage}
-        verdict = tried(worlds[storage, catalogue], job, mutant)
+        verdict = tried(worlds[storage, catalogue], job, mutant, good)
         if verdict.left_mb > _MUCH_MB:
             _let_go(worlds.values())
             verdict.left_mb = resident_mb()

@@ -282,6 +282,25 @@ class TestIndexesThatAreWrong:
         [note] = reader.summarize(path).notes
         assert note == "its message indexes do not hold what its statistics state"
 
+    def test_a_channel_that_a_chunk_index_calls_by_another_number_is_not_lost(
+        self, tmp_path: Path
+    ) -> None:
+        both = [each for n in range(20) for each in (*chatter(1, start=n), boolean(n, True))]
+        path = write_mcap(tmp_path / "a.mcap", both, SMALL)
+        middle = chunks_of(path)[2].chunk_start_offset
+
+        def renamed(body: bytearray) -> None:
+            if from_bytes(bytes(body[16:24])) == middle:
+                body[36:38] = struct.pack("<H", 999)
+
+        edit_summary(path, Opcode.CHUNK_INDEX, renamed)
+        for newest_first in (False, True):
+            reader = McapReader()
+            found, told = read_on(reader, path, newest_first=newest_first)
+            assert found == sorted(range(20), reverse=newest_first)
+            assert told or reader.summarize(path).notes
+            assert times(read(McapReader(), path, "/bumper")) == [*range(20)]
+
     def test_a_chunk_that_neither_indexes_nor_statistics_know_is_not_lost(
         self, tmp_path: Path
     ) -> None:

@@ -27,7 +27,7 @@ from ros2_memory.storage.faults import (
 )
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.lru import ByteLru, Shared
-from ros2_memory.storage.mcap_chunk import NOT_THERE, Column, joined, walk
+from ros2_memory.storage.mcap_chunk import NO_MESSAGES, NOT_THERE, Column, joined, walk
 from ros2_memory.storage.mcap_file import closing_of, is_finished, profile_of
 from ros2_memory.storage.mcap_index import (
     McapIndex,
@@ -36,6 +36,7 @@ from ros2_memory.storage.mcap_index import (
     chunk_data,
     index_from_summary,
     proven_columns,
+    require_channels,
 )
 from ros2_memory.storage.mcap_records import MESSAGE, RECORD
 from ros2_memory.storage.mcap_scan import index_by_scan
@@ -64,10 +65,11 @@ _PROVEN_BYTES: Final = 32 << 20
 class _ContradictedError(UnreadableError):
     """The message indexes of a chunk do not agree with its records.
 
+    `chunk` is the one in place of whose messages this is raised; None before any was read.
     `believed` are the chunks by their places as they were taken to be.
     """
 
-    def __init__(self, reason: str, chunk: Chunk) -> None:
+    def __init__(self, reason: str, chunk: Chunk | None = None) -> None:
         super().__init__(reason)
         self.chunk = chunk
         self.believed: dict[int, Chunk] = {}
@@ -167,22 +169,30 @@ class McapBags:
                 if isinstance(first, LostError):
                     raise first
                 return first
-            overlapping = list(_overlapping(index, wanted, window))
-            overlapping.sort(key=attrgetter("end"), reverse=True)
-            best: tuple[Ns, int, int, bytes] | None = None
-            for chunk in overlapping:
-                if best is not None and chunk.end < best[0]:
-                    break
-                data = self._chunk_data(file, chunk)
-                for column in self._chunk_columns(file, chunk, wanted, data):
-                    times, places = column.between(window.start, window.stop)
-                    if times.size:
-                        found = int(times[-1]), chunk.offset, int(places[-1]), data
-                        best = found if best is None else max(best, found)
-            if best is None:
-                return None
-            time, _, place, data = best
-            return _from_bytes(data, wanted, self._max_chunk_bytes)(place, time)
+            return self._newest_of(file, index, wanted, window)
+
+    def _newest_of(
+        self, file: OpenFile, index: McapIndex, wanted: dict[int, Channel], window: TimeWindow
+    ) -> Record | None:
+        """The latest message inside the window of a file that has all of them in chunks."""
+        within = [each for each in index.chunks if _overlaps(each, window)] if wanted else []
+        within.sort(key=attrgetter("end"), reverse=True)
+        best: tuple[Ns, int, int, bytes] | None = None
+        for chunk in within:
+            if best is not None and chunk.end < best[0]:
+                break
+            if not self._holds_any(file, chunk, wanted):
+                continue
+            data = self._chunk_data(file, chunk)
+            for column in self._chunk_columns(file, chunk, wanted, data):
+                times, places = column.between(window.start, window.stop)
+                if times.size:
+                    found = int(times[-1]), chunk.offset, int(places[-1]), data
+                    best = found if best is None else max(best, found)
+        if best is None:
+            return None
+        time, _, place, data = best
+        return _from_bytes(data, wanted, self._max_chunk_bytes)(place, time)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
         """The log times of a topic's messages inside the window, ascending.
@@ -208,7 +218,7 @@ class McapBags:
         """The messages of a topic in the chunks that overlap the window, and outside of chunks."""
         wanted = _wanted(index, {topic})
         columns = [index.loose[channel] for channel in wanted if channel in index.loose]
-        chunks = list(_overlapping(index, wanted, window))
+        chunks = list(self._holding(file, index, wanted, window))
         few = sum([chunk.length for chunk in chunks]) <= _PROVEN_BYTES
         for chunk in chunks:
             data = self._data_if_whole(file, chunk) if few else None
@@ -248,7 +258,7 @@ class McapBags:
 
             return Run(chunk.start, chunk.end, chunk.offset, rows)
 
-        for chunk in _overlapping(index, wanted, window):
+        for chunk in self._holding(file, index, wanted, window):
             yield chunk_run(chunk)
         loose = [column for channel, column in index.loose.items() if channel in wanted]
         column = joined([part.between(window.start, window.stop) for part in loose])
@@ -323,6 +333,36 @@ class McapBags:
             return LostError(reason, first, last)
         times = joined([each.between(window.start, window.stop) for each in columns]).times
         return LostError(reason, int(times[0]), int(times[-1])) if times.size else None
+
+    def _holding(
+        self, file: OpenFile, index: McapIndex, wanted: Collection[int], window: TimeWindow
+    ) -> Iterator[Chunk]:
+        """The chunks that overlap the window and hold messages of one of the channels.
+
+        Raises:
+            _ContradictedError: a chunk index names other channels than its chunk holds.
+        """
+        for chunk in index.chunks if wanted else ():
+            if _overlaps(chunk, window) and self._holds_any(file, chunk, wanted):
+                yield chunk
+
+    def _holds_any(self, file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> bool:
+        """Whether a chunk holds messages of one of the channels; not by its chunk index alone.
+
+        Raises:
+            _ContradictedError: that names other channels than the message indexes do.
+        """
+        if chunk.index_places is not None and not chunk.channels.issuperset(wanted):
+            key = file.key, chunk.offset, -1
+            if self._found.get(key) is None:
+                try:
+                    require_channels(file, chunk)
+                except UnreachableError:
+                    raise
+                except (UnreadableError, struct.error) as error:
+                    raise _ContradictedError(reason_of(error)) from error
+                self._found.put(key, NO_MESSAGES, NO_MESSAGES.bytes_held)
+        return not chunk.channels.isdisjoint(wanted)
 
     def _chunk_columns(
         self, file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes | None
@@ -426,17 +466,16 @@ def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:
     }
 
 
-def _overlapping(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:
-    start, stop = window.start, window.stop
-    for chunk in index.chunks:
-        if chunk.start < stop and chunk.end >= start and not chunk.channels.isdisjoint(wanted):
-            yield chunk
+def _overlaps(chunk: Chunk, window: TimeWindow) -> bool:
+    return chunk.start < window.stop and chunk.end >= window.start
 
 
 def _parted(
-    window: TimeWindow, chunk: Chunk, *, newest_first: bool
+    window: TimeWindow, chunk: Chunk | None, *, newest_first: bool
 ) -> tuple[TimeWindow, TimeWindow]:
     """The window from a chunk on, in the order of reading, and the part of it before that."""
+    if chunk is None:
+        return window, TimeWindow(window.start, window.start)
     at = chunk.end + 1 if newest_first else chunk.start
     at = min(max(at, window.start), window.stop)
     before, behind = TimeWindow(window.start, at), TimeWindow(at, window.stop)
@@ -449,7 +488,8 @@ def _hidden(
     """What lies in a part of a window that was read by indexes which did not know of it."""
     hidden = [
         chunk
-        for chunk in _overlapping(index, wanted, passed)
+        for chunk in index.chunks
+        if _overlaps(chunk, passed) and not chunk.channels.isdisjoint(wanted)
         if not _knew(error.believed.get(chunk.offset), chunk)
     ]
     if not hidden:

@@ -101,12 +101,15 @@ class Column(NamedTuple):
         return Column(times[first:last], self.places[first:last])
 
 
+NO_MESSAGES: Final = Column(_EMPTY, _EMPTY)
+
+
 def joined(columns: list[Column]) -> Column:
     """Several channels' messages as one column."""
     if len(columns) == 1:
         return columns[0]
     if not columns:
-        return Column(_EMPTY, _EMPTY)
+        return NO_MESSAGES
     times = np.concatenate([column.times for column in columns])
     places = np.concatenate([column.places for column in columns])
     order = np.lexsort((places, times))
@@ -211,6 +214,21 @@ def extents_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> 
     if index_bytes(len(offsets), held) != len(region):
         raise UnreadableError("damaged: a chunk has message indexes that its chunk index lacks")
     return extents
+
+
+def indexed_channels(region: bytes) -> frozenset[int]:
+    """The channels whose message indexes lie in these bytes behind a chunk."""
+    channels = []
+    at, size = 0, len(region)
+    while at < size:
+        if at + _INDEX_HEAD_BYTES > size:
+            raise UnreadableError(_NO_INDEX)
+        opcode, length, number, _ = _index_head(region, at)
+        if opcode != _MESSAGE_INDEX:
+            raise UnreadableError(_NO_INDEX)
+        channels.append(number)
+        at += RECORD.size + length
+    return frozenset(channels)
 
 
 def index_bytes(indexes: int, messages: int) -> int:

@@ -22,6 +22,7 @@ from ros2_memory.storage.mcap_chunk import (
     columns_from_index,
     extents_from_index,
     index_bytes,
+    indexed_channels,
     packed_chunk,
     require_indexed,
     unpacked,
@@ -123,6 +124,18 @@ def chunk_columns(
         if times.size and not chunk.start <= int(times[0]) <= int(times[-1]) <= chunk.end:
             raise _outside()
     return columns
+
+
+def require_channels(file: OpenFile, chunk: Chunk) -> None:
+    """Holds the channels that a chunk index names against the message indexes behind the chunk.
+
+    Raises:
+        UnreadableError: they are others.
+    """
+    if indexed_channels(_index_region(file, chunk)) != chunk.channels:
+        raise UnreadableError(
+            "damaged: a chunk index names other channels than have messages in its chunk"
+        )
 
 
 def proven_columns(

@@ -1,0 +1,167 @@
+"""Mutations of what points to messages: every index lies, and every message is as it was."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Final
+
+from mcap.opcode import Opcode
+
+from tests.fuzz.mutant import Mutant, mutant_of
+from tests.fuzz.records import as_it_was, pieces, with_summary_sealed
+
+if TYPE_CHECKING:
+    from random import Random
+
+    from tests.fuzz.good import Good
+    from tests.fuzz.records import Piece
+
+_PAIR: Final = 16
+_INDEX_PAGES: Final = (2, 10)
+"""What the first byte of a page of an index is in sqlite's file format (1.6)."""
+
+
+def flip_message_index(rng: Random, good: Good) -> Mutant:
+    """One bit, or some, of the times and places in message indexes."""
+    records = pieces(good.plain)
+    at = [n for n, each in enumerate(records) if each.opcode == Opcode.MESSAGE_INDEX]
+    if not at:
+        return mutant_of(good, good.plain)
+    for _ in range(rng.choice((1, 1, 1, 4))):
+        number = rng.choice(at)
+        body = bytearray(records[number].body)
+        if len(body) <= 6:
+            continue
+        body[rng.randrange(6, len(body))] ^= 1 << rng.randrange(8)
+        records[number] = replace(records[number], body=bytes(body))
+    return mutant_of(good, as_it_was(good.plain, records))
+
+
+def wrong_message_index(rng: Random, good: Good) -> Mutant:
+    """Message indexes with pairs that are another's: swapped, doubled, moved in time."""
+    records = pieces(good.plain)
+    at = [n for n, each in enumerate(records) if each.opcode == Opcode.MESSAGE_INDEX]
+    if not at:
+        return mutant_of(good, good.plain)
+    number = rng.choice(at)
+    body = bytearray(records[number].body)
+    count = (len(body) - 6) // _PAIR
+    if not count:
+        return mutant_of(good, good.plain)
+    one, other = (6 + _PAIR * rng.randrange(count) for _ in range(2))
+    match rng.randrange(4):
+        case 0:
+            body[one : one + _PAIR] = body[other : other + _PAIR]
+        case 1:
+            body[one : one + 8], body[other : other + 8] = (
+                body[other : other + 8],
+                body[one : one + 8],
+            )
+        case 2:
+            (time,) = struct.unpack_from("<Q", body, one)
+            moved = time + rng.choice((-1, 1, 50_000_000, -200_000_000))
+            struct.pack_into("<Q", body, one, moved % (1 << 64))
+        case _:
+            donor = records[rng.choice(at)].body
+            if len(donor) >= len(body):
+                body[6:] = donor[6 : len(body)]
+    records[number] = replace(records[number], body=bytes(body))
+    return mutant_of(good, as_it_was(good.plain, records))
+
+
+def wrong_chunk_index(rng: Random, good: Good) -> Mutant:
+    """A chunk index that names another chunk, other times, or other message indexes."""
+    records = pieces(good.plain)
+    at = [n for n, each in enumerate(records) if each.opcode == Opcode.CHUNK_INDEX]
+    if not at:
+        return mutant_of(good, good.plain)
+    number, donor = rng.choice(at), records[rng.choice(at)].body
+    records[number] = _with_a_lie(rng, records[number], donor)
+    return mutant_of(good, with_summary_sealed(as_it_was(good.plain, records)))
+
+
+def _with_a_lie(rng: Random, index: Piece, donor: bytes) -> Piece:
+    body = bytearray(index.body)
+    field = rng.choice((0, 8, 16, 24))
+    (places,) = struct.unpack_from("<I", body, 32)
+    match rng.randrange(5):
+        case 0:
+            body[field : field + 8] = donor[field : field + 8]
+        case 1:
+            body[:16] = donor[:16]
+        case 2:
+            (value,) = struct.unpack_from("<Q", body, field)
+            moved = value + rng.choice((-1, 1, 100_000_000, -100_000_000))
+            struct.pack_into("<Q", body, field, moved % (1 << 64))
+        case 3 if places >= 20:
+            # Two channels change places: each has the other's message index.
+            one, other = (36 + 10 * rng.randrange(places // 10) for _ in range(2))
+            body[one : one + 2], body[other : other + 2] = (
+                body[other : other + 2],
+                body[one : one + 2],
+            )
+        case _ if places:
+            struct.pack_into("<H", body, 36 + 10 * rng.randrange(places // 10), 999)
+    return replace(index, body=bytes(body))
+
+
+def wrong_statistics(rng: Random, good: Good) -> Mutant:
+    """Statistics or summary offsets that state something else."""
+    records = pieces(good.plain)
+    kinds = rng.choice(((Opcode.STATISTICS,), (Opcode.SUMMARY_OFFSET,)))
+    at = [n for n, each in enumerate(records) if each.opcode in kinds]
+    if not at:
+        return mutant_of(good, good.plain)
+    number = rng.choice(at)
+    body = bytearray(records[number].body)
+    body[rng.randrange(len(body))] ^= 1 << rng.randrange(8)
+    records[number] = replace(records[number], body=bytes(body))
+    return mutant_of(good, with_summary_sealed(as_it_was(good.plain, records)))
+
+
+def wrong_chunk_head(rng: Random, good: Good) -> Mutant:
+    """A chunk that states other times than it holds."""
+    records = pieces(good.plain)
+    at = [n for n, each in enumerate(records) if each.opcode == Opcode.CHUNK]
+    if not at:
+        return mutant_of(good, good.plain)
+    number = rng.choice(at)
+    body = bytearray(records[number].body)
+    body[rng.randrange(16)] ^= 1 << rng.randrange(8)
+    records[number] = replace(records[number], body=bytes(body))
+    return mutant_of(good, as_it_was(good.plain, records))
+
+
+def wrong_order(_rng: Random, good: Good) -> Mutant:
+    """An index by time that is declared descending and stored ascending."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "bag.db3"
+        path.write_bytes(good.plain)
+        try:
+            with closing(sqlite3.connect(path)) as base:
+                base.execute("PRAGMA writable_schema = 1")
+                base.execute(
+                    "UPDATE sqlite_master SET sql = replace(sql, 'ASC', 'DESC') WHERE type = ?",
+                    ("index",),
+                )
+                base.commit()
+        except sqlite3.Error:
+            return mutant_of(good, good.plain)
+        return mutant_of(good, path.read_bytes())
+
+
+def flip_index_page(rng: Random, good: Good) -> Mutant:
+    """Bits of the pages of an index of a sqlite bag."""
+    data = bytearray(good.plain)
+    size = int.from_bytes(data[16:18], "big") or 4096
+    pages = [at for at in range(size, len(data), size) if data[at] in _INDEX_PAGES]
+    if not pages or size < 512:
+        return mutant_of(good, good.plain)
+    for _ in range(rng.choice((1, 1, 3))):
+        data[rng.choice(pages) + rng.randrange(size)] ^= 1 << rng.randrange(8)
+    return mutant_of(good, bytes(data))
