@@ -32,7 +32,7 @@ KEPT_BYTES: Final = 128 << 10
 """Of what was sent and is not acknowledged: several replies of usual length."""
 LINGER_S: Final = 1.0
 MOST_CONNECTIONS: Final = 256
-MOST_STRANGERS: Final = 64
+MOST_STRANGERS: Final = 128
 ACCEPTED_AT_ONCE: Final = 16
 """In one turn of the event loop, three of which pass before a new connection is read from: so none
 is put out before what it sent at once was looked at."""

@@ -67,9 +67,9 @@ async def many_calls_at_once(port: int) -> Seen:
 def hostile_bodies() -> Iterator[tuple[bytes, str]]:
     """Requests that only a program in error or in anger sends, and what is wrong in each."""
     deep, big = "[" * 10_000 + "]" * 10_000, "x" * 1_000_000
-    for value in ("NaN", "Infinity", "-1", "1e308", "1" + "0" * 400, '"1"', "true", "{}", deep):
+    for value in ("NaN", "Infinity", "1e308", "1" + "0" * 400, '"1"', "true", "{}", deep):
         yield call("get_position_at", f'{{"timestamp": {value}}}'), "timestamp"
-    yield call("get_position_at", '{"timestamp": 1, "timestamp": -1}'), "timestamp"
+    yield call("get_position_at", '{"timestamp": 1, "timestamp": "x"}'), "timestamp"
     for value in (f'"{big}"', '"\\u0000"', '"\\ud800"', "7", deep, "null", '""'):
         yield call("get_topic_in_last", f'{{"topic": {value}, "seconds": 1}}'), "topic"
     yield call("trajectory_summary", '{"start": 9, "end": 1}'), "start"
@@ -109,6 +109,11 @@ async def hostile(port: int) -> Seen:
         if status == 202:  # taken for a notification, which has no answer
             seen["accepted"] += 1
             continue
+        if status == 413:  # not even parsed
+            assert told.startswith(b"The request "), (body[:80], told)
+            seen["too much"] += 1
+            continue
+        assert told, (body[:80], status)
         reply = json.loads(told)
         if "result" in reply:
             assert len(told) < 4_000, (body[:80], len(told))

@@ -367,7 +367,8 @@ def of_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Findi
         seen = f"{file} lists {listed_there}; nothing is recorded yet"
         yield Finding(Level.OK, "topics", seen)
     elif not missing and not unoffered:
-        yield Finding(Level.OK, "topics", f"{listed_there} of {file}: all are recorded")
+        seen = f"{listed_there} of {file}: all are in the newest hour of data, or latched"
+        yield Finding(Level.OK, "topics", seen)
     for entry, near in missing.items():
         hint = f"is it {' or '.join(near)}? " if near else ""
         why = f"; {_UNOFFERED}" if entry in unoffered else ""
