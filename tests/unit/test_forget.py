@@ -195,6 +195,12 @@ def test_of_an_empty_window_it_says_so(bag_dir: Path, capsys: Capture) -> None:
     assert "no closed bag" in capsys.readouterr().out
 
 
+def test_of_a_recording_that_has_gone_no_metadata_is_told(bag_dir: Path, capsys: Capture) -> None:
+    (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    assert forget(40, 75, "--yes") == 0
+    assert "metadata.yaml" not in capsys.readouterr().out
+
+
 class TestForeignBags:
     """Bags that this deployment's recorder did not make."""
 

@@ -54,6 +54,41 @@ class TestKeeping:
         assert (told["start_ns"], told["end_ns"]) == (T0 + 15 * S, T0 + 25 * S)
         assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
 
+    def test_a_bag_that_went_since_the_index_was_made_is_named_as_missing(
+        self, tmp_path: Path
+    ) -> None:
+        # As `forget`, in another process, deletes beside the recorder.
+        made = recording(tmp_path, A, 0)
+        house = house_of(tmp_path)
+        slot = asked(tmp_path, 15, 25)
+        with house._index.undisturbed() as snapshot:
+            made[1].unlink()
+            house._keeper.keep(snapshot)
+        outcome = slot.outcome()
+        assert outcome is not None
+        assert outcome.bags == 1
+        told = told_of(tmp_path)
+        assert told["complete"] is False
+        assert told["missing"] == [f"{A}/{A}_1.mcap has gone, or another file of that name is kept"]
+
+    def test_a_sidecar_that_goes_meanwhile_refuses_no_moment(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        recording(tmp_path, A, 0)
+        sidecar = tmp_path / A / "handover.json"
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 15, 25)
+        samefile = type(sidecar).samefile
+
+        def gone(path: Path, other: Path) -> bool:
+            sidecar.unlink(missing_ok=True)
+            return samefile(path, other)
+
+        monkeypatch.setattr(type(sidecar), "samefile", gone)
+        with structlog.testing.capture_logs() as logs:
+            house._keeper.follow()
+        assert [each for each in logs if each["event"] == "moment_not_followed"] == []
+
     def test_what_was_never_recorded_is_refused(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
         outcome = kept(house_of(tmp_path), tmp_path, 500, 600)

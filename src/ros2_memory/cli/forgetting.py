@@ -364,6 +364,8 @@ class _Removal:
                     lists = take_out(recording, gone)
                 if lists:
                     said.append(f"{name} lists what is left")
+            except FileNotFoundError:
+                continue  # the recording has gone, and its metadata.yaml with it
             except (OSError, ValueError) as error:
                 said.append(
                     f"{name} still lists what was deleted ({error}); rosbag2 opens the folder "

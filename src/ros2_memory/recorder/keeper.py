@@ -223,15 +223,18 @@ class Keeper:
         allowed = None if files is None else fitting(every, files, self._share)
         touched: set[Path] = set()
         for bag in bags:
+            name = os.path.relpath(self._names.recorded_as(bag.file), self._bag_dir)
+            target = folder / name
+            if not weights[bag.file] and not target.exists():
+                # `forget` deletes in another process, since the index was made.
+                missing[_gone(name)] = None
             for inode, size in weights[bag.file]:
                 if allowed is not None and inode not in allowed:
                     missing[_FULL] = None
                     continue
-                name = os.path.relpath(self._names.recorded_as(bag.file), self._bag_dir)
-                target = folder / name
                 directories.make(self._bag_dir, target.parent)
                 if not _link_bag(bag.path, target, inode):
-                    missing[f"{name} has gone, or another file of that name is kept"] = None
+                    missing[_gone(name)] = None
                     continue
                 linked[inode] = size
                 if target.parent not in touched:
@@ -260,6 +263,10 @@ def _weighed(bag: BagFile) -> tuple[Weight, ...]:
     return (Weight(status.st_ino, status.st_size),)
 
 
+def _gone(name: str) -> str:
+    return f"{name} has gone, or another file of that name is kept"
+
+
 def _all_files(book: dict[str, Held]) -> dict[int, int]:
     """What all moments hold, each file once."""
     return {inode: size for held in book.values() for inode, size in held.files.items()}
@@ -278,10 +285,10 @@ def _link_bag(bag: Path, target: Path, inode: int) -> bool:
     """
     try:
         os.link(bag, target, follow_symlinks=False)
-    except FileNotFoundError:
+    except (FileNotFoundError, FileExistsError):
+        with suppress(FileNotFoundError):
+            return target.lstat().st_ino == inode
         return False
-    except FileExistsError:
-        return target.lstat().st_ino == inode
     return True
 
 
@@ -292,11 +299,11 @@ def _link_sidecar(recording: Path, folder: Path) -> None:
         OSError: it cannot be linked.
     """
     source, target = recording / HANDOVER_FILE, folder / HANDOVER_FILE
-    if not source.exists() or (target.exists() and source.samefile(target)):
-        return
     beside = folder / f".{HANDOVER_FILE}.tmp"
-    beside.unlink(missing_ok=True)
     with suppress(FileNotFoundError):
+        if not source.exists() or (target.exists() and source.samefile(target)):
+            return
+        beside.unlink(missing_ok=True)
         os.link(source, beside, follow_symlinks=False)
         beside.replace(target)
     beside.unlink(missing_ok=True)

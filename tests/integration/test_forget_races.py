@@ -1,0 +1,140 @@
+"""`forget` and moments beside a recorder that deletes: two processes, one bag directory.
+
+Nothing that a moment keeps is lost, nothing foreign is deleted, and nobody ends in a traceback.
+8 rounds; EPISODIC_LONG=1 makes it 24.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import cli
+from ros2_memory.recorder.keepsake import held_in
+from ros2_memory.recorder.mailbox import Slot
+from ros2_memory.recorder.ownership import OwnRecordings, identity_of
+from tests.bags import odom, write_mcap
+from tests.keeping import size_of
+from tests.memories import ROOT
+from tests.waiting import until
+
+if TYPE_CHECKING:
+    from ros2_memory.recorder.mailbox import Outcome
+
+S = 10**9
+ROUNDS = 24 if os.environ.get("EPISODIC_LONG") == "1" else 8
+SPLITS = 12
+T0 = time.time_ns() // S * S - 3600 * S
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@dataclass
+class Robot:
+    """A bag directory in which recordings come to lie whole, as the recorder's own."""
+
+    bag_dir: Path
+    workshop: Path
+    content: dict[str, str] = field(default_factory=dict)
+    kept: list[Outcome] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+
+    def record(self, number: int) -> None:
+        name = f"rec_20260101T{number // 60:02}{number % 60:02}00Z"
+        for split in range(SPLITS):
+            start = T0 + (number * SPLITS + split) * 2 * S
+            path = self.workshop / name / f"{name}_{split}.mcap"
+            write_mcap(path, [odom(start + n * S // 20, n / 10, float(number)) for n in range(20)])
+            os.utime(path, (T0 / S, T0 / S))
+            self.content[f"{name}/{path.name}"] = digest(path)
+        (self.workshop / name / "handover.json").write_text('{"format": 1}')
+        identity = identity_of(self.workshop / name)
+        assert identity is not None
+        OwnRecordings(self.bag_dir).adopt({name: identity})
+        (self.workshop / name).rename(self.bag_dir / name)
+
+    def ask_for_moments(self, number: int, chance: random.Random) -> None:
+        for label in range(3):
+            start = T0 + (number * SPLITS + chance.randrange(SPLITS)) * 2 * S
+            slot = Slot(self.bag_dir, f"r{number} m{label}", start, start + 3 * S, time.time_ns())
+            try:
+                slot.post()
+                self.kept.append(until(slot.outcome))
+                slot.close()
+            except Exception as error:  # noqa: BLE001 - of a thread
+                self.faults.append(repr(error))
+
+
+def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = Robot(tmp_path / "bags", tmp_path / "workshop")
+    foreign = [
+        write_mcap(robot.bag_dir / name, [odom(T0 + n * S, 1.0, 2.0) for n in range(500)])
+        for name in ("session_mcap/session_0.mcap", "loose.mcap", "deep/er/x.mcap")
+    ]
+    before = {path: digest(path) for path in foreign}
+    # A moment keeps what other programs recorded then, too.
+    robot.content |= {str(path.relative_to(robot.bag_dir)): before[path] for path in foreign}
+    robot.record(0)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(robot.bag_dir))
+    stop = tmp_path / "stop"
+    budget = size_of(robot.bag_dir / "rec_20260101T000000Z") // 2
+    house = subprocess.Popen(
+        [sys.executable, "-m", "tests.racing_house", robot.bag_dir, str(budget), stop],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    chance = random.Random(7)
+    try:
+        for number in range(1, ROUNDS + 1):
+            robot.record(number)
+            asker = threading.Thread(target=robot.ask_for_moments, args=(number, chance))
+            asker.start()
+            while asker.is_alive():
+                start = T0 / S + (number * SPLITS + chance.randrange(SPLITS)) * 2
+                window = ["--start", str(start), "--end", str(start + chance.choice([3, 9, 24]))]
+                assert cli.main(["forget", *window, "--yes"]) in {0, 1}
+            asker.join()
+    finally:
+        stop.touch()
+        said, _ = house.communicate(timeout=60)
+    assert house.returncode == 0, said
+    assert "Traceback" not in said
+    # That the budget is not held is right: moments are more than it.
+    wrong = [
+        line for line in said.splitlines() if "[error" in line and "budget_not_held" not in line
+    ]
+    assert wrong == []
+    assert robot.faults == []
+    assert {path: digest(path) for path in foreign} == before
+    granted = [each for each in robot.kept if each.moment is not None]
+    assert granted
+    assert not [each.refused for each in robot.kept if "hard links" in str(each.refused)]
+    moments = {held.folder.name: held for held in held_in(robot.bag_dir)}
+    for each in granted:
+        held = moments[str(each.moment)]
+        files = {
+            path.relative_to(held.folder).as_posix(): digest(path)
+            for path in held.folder.rglob("*.mcap")
+        }
+        assert files.items() <= robot.content.items()
+        assert len(files) >= each.bags
+        assert not held.keepsake.pending
+    out = capsys.readouterr()
+    assert "Traceback" not in out.err
+    assert "still lists what was deleted" not in out.out
