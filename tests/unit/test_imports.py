@@ -12,6 +12,7 @@ import pytest
 
 from ros2_memory.timebase import NS_PER_S
 from tests.bags import odom, text, write_mcap
+from tests.owned import own_all
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,6 +41,7 @@ PEOPLE: Final = {"pyarrow", "ros2_memory.cli", "ros2_memory.demo", "typer"}
 def env(tmp_path: Path) -> dict[str, str]:
     messages = [odom(T0 + n * NS_PER_S, float(n), 0.0) for n in range(5)]
     write_mcap(tmp_path / "bags" / "rec_0" / "rec_0.mcap", [*messages, text(T0, "a word")])
+    own_all(tmp_path / "bags")
     return {
         **os.environ,
         "MEMORY_BAG_DIR": str(tmp_path / "bags"),
