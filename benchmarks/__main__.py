@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from benchmarks import backlog, digests, footprint, ours, report, serving
 from benchmarks.bags import HOUR, MESSAGES_OF_A_SPLIT, WEEK, made
-from benchmarks.links import linked
+from benchmarks.copies import copied
 from benchmarks.questions import QUESTIONS, Case
 from benchmarks.timing import agreed, timed
 from benchmarks.week import RECORDINGS, WEEK_QUESTIONS, Week
@@ -88,10 +88,10 @@ def _hour(
 def _week(
     hour: History, slugs: Sequence[str], runs: int, *, whole: bool
 ) -> tuple[list[Row], list[Figure]]:
-    links = linked(hour, RECORDINGS)
-    week = Week(links, ours.settings_for(links.folder))
+    copies = copied(hour, RECORDINGS)
+    week = Week(copies, ours.settings_for(copies.folder))
     rows = measured({slug: WEEK_QUESTIONS[slug] for slug in slugs}, week, runs)
-    return rows, serving.figures(links.folder, links.bags, hour.end) if whole else []
+    return rows, serving.figures(copies.folder, copies.bags, hour.end) if whole else []
 
 
 def _described(history: History) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from benchmarks import ours
 from benchmarks.bags import ODOM
-from benchmarks.links import linked
+from benchmarks.copies import copied
 from benchmarks.questions import Case
 from benchmarks.report import Figure
 from benchmarks.timing import Timed
@@ -38,7 +38,7 @@ def figures(history: History) -> list[Figure]:
         RuntimeError: the backlog was digested before all was asked, or never.
     """
     # Another name for the same bags, where no catalogue lies.
-    bare = linked(history, 1).folder
+    bare = copied(history, 1).folder
     case = Case(history, ours.settings_for(bare), known=False)
     _ask(case, Timed())
     quiet, busy = Timed(), Timed()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from benchmarks import digests, floor, ours, plain
 from benchmarks.bags import HOUR, ODOM, SCENE, SPLIT_NS
-from benchmarks.links import linked
+from benchmarks.copies import copied
 from benchmarks.motion import NOWHERE
 from benchmarks.payloads import NEVER_SEEN
 from benchmarks.timing import FLOOR, OURS, PLAIN
@@ -125,7 +125,7 @@ def index(case: Case) -> Question:
 
     def mine() -> Sequence[Ask]:
         # Under another name, where no catalogue lies.
-        bare = linked(case.history, 1)
+        bare = copied(case.history, 1)
         memory = ours.memory(ours.settings_for(bare.folder))
         return [lambda: ours.counts(memory)]
 

@@ -1,9 +1,8 @@
-"""A week of history without its 5 GB: an hour of bags, linked into 168 recordings.
+"""A week of history from one hour of bags, copied into 168 recordings (5 GB).
 
-Every recording is another name for the same 360 files; the newest one tells the truth, and for the
-others the catalogue is told what the same bags would have held some hours earlier. So questions
-that the catalogue answers see 60,480 bags of a week, and those that read a bag must read one of the
-newest hour.
+The newest recording is true; for the others the catalogue is given what the same bags would hold
+had they been recorded some hours earlier. So questions that the catalogue answers see 60,480 bags
+of a week, and those that read a bag must read one of the newest hour.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from ros2_memory.visits import visits
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from benchmarks.links import Linked
+    from benchmarks.copies import Copies
     from benchmarks.timing import Ask
     from ros2_memory.catalogue import Catalogue
     from ros2_memory.digest import Digest
@@ -46,14 +45,14 @@ _BATCH: Final = 1_000
 class Week:
     """What the questions of a week are asked of."""
 
-    whole: Linked
+    whole: Copies
     settings: Settings
 
     @cached_property
     def digests(self) -> list[Digest]:
         """Of the bags of the hour, oldest first."""
         digester = digests.digester_of(ours.memory(self.settings), self.settings)
-        return [digester.digest(link) for link, _, later in self.whole.links() if not later]
+        return [digester.digest(copy) for copy, _, later in self.whole.files() if not later]
 
     @cached_property
     def filled(self) -> Settings:
@@ -94,9 +93,9 @@ class Week:
     def _fill(self, catalogue: Catalogue) -> None:
         """Tells the catalogue of every bag."""
         batch: list[tuple[BagKey, Digest]] = []
-        for nth, (link, _, later) in enumerate(self.whole.links()):
-            stat = link.stat()
-            key = BagKey(relative(link, self.whole.folder), stat.st_size, stat.st_mtime_ns, 0)
+        for nth, (copy, _, later) in enumerate(self.whole.files()):
+            stat = copy.stat()
+            key = BagKey(relative(copy, self.whole.folder), stat.st_size, stat.st_mtime_ns, 0)
             batch.append((key, digests.moved(self.digests[nth % len(self.digests)], later)))
             if len(batch) == _BATCH:
                 catalogue.put_all(batch)

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import ours, report
 from benchmarks.__main__ import main, measured
 from benchmarks.bags import MESSAGES_OF_A_SPLIT, ODOM, TOPICS, made
-from benchmarks.links import linked
+from benchmarks.copies import copied
 from benchmarks.payloads import NEVER_SEEN, typestore
 from benchmarks.questions import QUESTIONS, Case, Target
 from benchmarks.timing import FLOOR, OURS, PLAIN, DisagreementError, Timed, agreed, timed
@@ -144,10 +144,10 @@ def test_the_command_prints_a_table_and_writes_json(
 
 
 def test_a_week_is_made_of_one_hour_and_its_catalogue_knows_every_bag(history: History) -> None:
-    links = linked(history, 3)
-    week = Week(links, ours.settings_for(links.folder))
+    copies = copied(history, 3)
+    week = Week(copies, ours.settings_for(copies.folder))
     snapshot = week.memory.index.snapshot()
-    assert len(snapshot.bags) == links.bags == 6
+    assert len(snapshot.bags) == copies.bags == 6
     assert snapshot.latest is not None
     assert snapshot.earliest is not None
     assert snapshot.latest - snapshot.earliest > 5 * 10_000_000_000
@@ -159,15 +159,15 @@ def test_a_week_is_made_of_one_hour_and_its_catalogue_knows_every_bag(history: H
 
 @pytest.mark.parametrize("slug", WEEK_QUESTIONS)
 def test_both_sides_agree_on_what_a_week_never_held(history: History, slug: str) -> None:
-    links = linked(history, 3)
-    week = Week(links, ours.settings_for(links.folder))
+    copies = copied(history, 3)
+    week = Week(copies, ours.settings_for(copies.folder))
     (row,) = measured({slug: WEEK_QUESTIONS[slug]}, week, runs=1)
     assert row.ours_s > 0
 
 
 def test_the_substring_search_goes_through_what_the_digests_hold(history: History) -> None:
-    links = linked(history, 3)
-    week = Week(links, ours.settings_for(links.folder))
+    copies = copied(history, 3)
+    week = Week(copies, ours.settings_for(copies.folder))
     label = next(word for word in week.text.split() if word.isalpha())
     assert week.text.count(f"{label}\n") >= 3
     assert NEVER_SEEN not in week.text

@@ -1,4 +1,8 @@
-"""Many recordings from one: other names for the same bag files, which cost no disk."""
+"""Many recordings from one: copies of its bag files.
+
+The newest recording is hard links, which cost no disk. The others are files of their own, since an
+index counts two names of one file once.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Linked:
-    """Recordings in a folder, each of them links to the bags of one history."""
+class Copies:
+    """Recordings in a folder, each of them the bags of one history."""
 
     folder: Path
     hour: History
@@ -29,8 +33,8 @@ class Linked:
         """How many bag files there are."""
         return self.hour.bags * self.recordings
 
-    def links(self) -> Iterator[tuple[Path, Path, int]]:
-        """Link, file, and by how many nanoseconds the link's bag is later; oldest first."""
+    def files(self) -> Iterator[tuple[Path, Path, int]]:
+        """Copy, original, and by how many nanoseconds the copy's bag is later; oldest first."""
         for recording in range(self.recordings):
             later = (recording - self.recordings + 1) * self.hour.bags * SPLIT_NS
             name = f"rec_{recording:04}"
@@ -38,15 +42,18 @@ class Linked:
                 yield self.folder / name / f"{name}_{split.number}.mcap", split.path, later
 
 
-def linked(hour: History, recordings: int) -> Linked:
+def copied(hour: History, recordings: int) -> Copies:
     """The recordings beside the history that they are made of, made anew."""
-    folder = hour.folder.with_name(f"linked_{hour.bags}_{recordings}")
+    folder = hour.folder.with_name(f"copied_{hour.bags}_{recordings}")
     shutil.rmtree(folder, ignore_errors=True)
-    whole = Linked(folder, hour, recordings)
-    for link, file, _ in whole.links():
-        if not link.parent.is_dir():
-            link.parent.mkdir(parents=True)
-        link.hardlink_to(file)
+    whole = Copies(folder, hour, recordings)
+    for copy, file, later in whole.files():
+        if not copy.parent.is_dir():
+            copy.parent.mkdir(parents=True)
+        if later:
+            shutil.copy2(file, copy)
+        else:
+            copy.hardlink_to(file)
     # A folder that changed within the last two seconds is looked through again at every scan.
     for place in (*folder.iterdir(), folder):
         os.utime(place, ns=(hour.end, hour.end))
