@@ -417,6 +417,10 @@ class McapBags:
         ends = sorted({end for each in index.totals.values() for end in (each.first, each.last)})
         left = _PROVEN_BYTES
         for chunk in index.chunks:
+            try:
+                self._holds_any(file, chunk, index.channels)
+            except _ContradictedError as error:
+                return self._distrust(file, index, error)
             nth = bisect_left(ends, chunk.start)
             if chunk.index_places is None or nth == len(ends) or ends[nth] > chunk.end:
                 continue

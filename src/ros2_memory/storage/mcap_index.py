@@ -237,6 +237,8 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     held = [chunk for chunk in chunks if chunk.channels]
     if counts and len(held) < len(chunks):  # some have no index places
         raise DoubtError
+    if not all(each <= channels.keys() for each in {chunk.channels for chunk in held}):
+        raise DoubtError("its chunk indexes name channels that it does not declare")
     if chunks:
         _require_as_stated(file, start, chunks)
     exact = _agrees(stated, chunks, held)
