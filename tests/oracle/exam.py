@@ -1,0 +1,530 @@
+"""Random questions to the server's own dispatcher, and what brute force says of each answer.
+
+A check returns None where the answer is right, else what is wrong with it. Times at the edge of a
+window are right on either side within a microsecond, which is what float seconds resolve.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from bisect import bisect_left
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import anyio
+import numpy as np
+import yaml
+
+from ros2_memory.bootstrap import build_dispatcher, build_filler, build_memory
+from ros2_memory.config import load_settings
+from ros2_memory.indexing import fill
+from tests.oracle.truth import SLACK_NS, History, Row, Topic, path_of, planar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from random import Random
+
+    from tests.oracle.worlds import World
+
+NEAR_M: Final = 0.5
+"""`data.position_tolerance_m` as shipped."""
+TOLERANCE_NS: Final = 100_000_000
+"""`data.time_tolerance_s` as shipped."""
+COARSE: Final = 2e-4
+"""Metres and units: replies round."""
+
+
+SHOWN: Final[Mapping[str, Mapping[str, str]]] = {
+    "nav_msgs/msg/Odometry": {
+        "pose.pose.position": "position",
+        "twist.twist.linear": "linear_velocity",
+        "twist.twist.angular": "angular_velocity",
+    },
+    **{
+        f"std_msgs/msg/{name}": {"data": "value"}
+        for name in ("String", "Bool", "Float32", "Float64", "Int32", "UInt8", "UInt32")
+    },
+    "rcl_interfaces/msg/Log": {"level": "level", "name": "name", "msg": "msg"},
+    "sensor_msgs/msg/BatteryState": {"percentage": "percentage", "voltage": "voltage"},
+}
+"""How the shipped schema map names fields: by type, path in the message -> name in a reply."""
+LISTED: Final = frozenset(
+    yaml.safe_load((Path(__file__).parents[2] / "config/message_schemas.yaml").read_text())[
+        "schemas"
+    ]
+)
+"""Types of which a reply shows some fields alone."""
+
+
+@dataclass
+class Report:
+    """How many questions of each kind were asked, and every answer that is wrong."""
+
+    asked: dict[str, int] = field(default_factory=dict)
+    wrong: list[str] = field(default_factory=list)
+
+    @property
+    def total(self) -> int:
+        """All questions."""
+        return sum(self.asked.values())
+
+
+class Server:
+    """The dispatcher of a query server over a folder, in this process.
+
+    Args:
+        bag_dir: the folder, which is only read.
+        catalogue: fill the catalogue first, below the environment's cache folder.
+    """
+
+    def __init__(self, bag_dir: Path, world: World, *, catalogue: bool) -> None:
+        settings = load_settings(
+            [
+                f"recording.bag_dir={bag_dir}",
+                "recorder=none",
+                f"storage={world.storage}",
+                "data.now=latest",
+                "server.max_reply_chars=400000",
+                *world.settings,
+            ],
+            env={},
+        )
+        memory = build_memory(settings)
+        if catalogue:
+            fill(build_filler(settings, memory), None, lambda: False)
+        self._dispatcher = build_dispatcher(settings, memory)
+
+    def ask(self, name: str, given: dict[str, Any]) -> Any:
+        """The reply to one call, decoded."""
+        return json.loads(anyio.run(self._dispatcher.answer, name, given).text)
+
+    def stop(self) -> None:
+        """Ends its threads."""
+        self._dispatcher.stop()
+
+
+def examine(world: World, history: History, server: Server, draw: Random, count: int) -> Report:
+    """Asks `count` questions of kinds drawn at random."""
+    report = Report()
+    kinds = [*_kinds(world, history)]
+    while report.total < count:
+        kind = draw.choice(kinds)
+        name, given, check = kind(draw)
+        report.asked[name] = report.asked.get(name, 0) + 1
+        answer = server.ask(name, given)
+        wrong = check(answer)
+        if wrong:
+            shown = json.dumps(answer)[:600]
+            report.wrong.append(
+                f"{world.folder.name}: {name}({json.dumps(given)}): {wrong}: {shown}"
+            )
+    return report
+
+
+Check = "Callable[[Any], str | None]"
+Kind = "Callable[[Random], tuple[str, dict[str, Any], Check]]"
+
+
+def _kinds(world: World, history: History) -> Iterator[Any]:
+    paper = _Paper(world, history)
+    yield paper.topics
+    yield paper.span
+    if paper.volatile:
+        yield from [paper.value_at] * 3
+    yield from [paper.values_in] * 3
+    if paper.testable:
+        yield from [paper.last_match] * 4
+        yield from [paper.matches] * 2
+        yield paper.when
+    if any(name in history.topics for name in world.odometry):
+        yield from [paper.position] * 2
+        yield paper.velocity
+        yield from [paper.near] * 2
+        yield paper.closest
+    if world.tf:
+        yield from [paper.transform] * 2
+    if world.moved is not None:
+        yield from [paper.driven] * 2
+
+
+class _Paper:
+    """The questions about one history."""
+
+    def __init__(self, world: World, history: History) -> None:
+        self._world = world
+        self._history = history
+        self._topics = [each for each in history.topics.values() if each.rows]
+        self._edges = history.edges(world.tf)
+        self._odometry = [history.topics[each] for each in world.odometry if each in history.topics]
+        self._scalars = {each.name: history.scalars(each.name) for each in self._topics}
+        named = {each.name: self._fields(each) for each in self._topics}
+        self.testable = {name: paths for name, paths in named.items() if paths}
+        self.volatile = [each for each in self._topics if not each.latched]
+
+    # -- what is there
+
+    def topics(self, draw: Random) -> Any:
+        def check(answer: Any) -> str | None:
+            rows = {row["topic"]: row for row in answer}
+            for topic in self._topics:
+                row = rows.get(topic.name)
+                if row is None or row["count"] != self._history.counts[topic.name]:
+                    return f"{topic.name} has {self._history.counts[topic.name]} messages"
+                if not _same_time(row["first_ts"], int(topic.times[0])):
+                    return f"{topic.name} begins at {topic.times[0]}"
+                if not _same_time(row["last_ts"], int(topic.times[-1])):
+                    return f"{topic.name} ends at {topic.times[-1]}"
+            return None
+
+        return "list_recorded_topics", {}, check
+
+    def span(self, draw: Random) -> Any:
+        def check(answer: Any) -> str | None:
+            right = _same_time(answer["earliest"], self._history.start) and _same_time(
+                answer["latest"], self._history.end
+            )
+            return None if right else f"[{self._history.start}, {self._history.end}]"
+
+        return "data_time_range", {}, check
+
+    # -- values
+
+    def value_at(self, draw: Random) -> Any:
+        topic = draw.choice(self.volatile)
+        at = self._moment(draw, topic)
+        tolerance = draw.choice([TOLERANCE_NS, 10**9, 0])
+        given: dict[str, Any] = {"topic": topic.name, "timestamp": at / 1e9}
+        if tolerance != TOLERANCE_NS:
+            given["tolerance_s"] = tolerance / 1e9
+        names = [*self._scalars[topic.name]]
+        if names:
+            given["fields"] = draw.sample(names, min(2, len(names)))
+
+        def check(answer: Any) -> str | None:
+            return _one_of(answer, _candidates(topic, at, tolerance), given.get("fields", []))
+
+        return "get_topic_at_time", given, check
+
+    def values_in(self, draw: Random) -> Any:
+        topic = draw.choice(self._topics)
+        start, end = sorted((self._moment(draw, topic), self._moment(draw, topic)))
+        if start == end:
+            end += 10**9
+        names = [name for name, kind in self._scalars[topic.name].items() if kind in {int, float}]
+        chosen = draw.sample(names, min(2, len(names)))
+        given = {"topic": topic.name, "start": start / 1e9, "end": end / 1e9, "max_samples": 7}
+        if chosen:
+            given["fields"] = chosen
+
+        def check(answer: Any) -> str | None:
+            inner = topic.within(start + SLACK_NS, end - SLACK_NS)
+            outer = topic.within(start - SLACK_NS, end + SLACK_NS)
+            if "error" in answer:
+                return f"{len(inner)} messages are there" if inner else None
+            if not len(inner) <= answer["total"] <= len(outer):
+                return f"total is {len(inner)} to {len(outer)}"
+            times = [sample["timestamp"] for sample in answer["samples"]]
+            if times != sorted(times) or len(times) > max(7, 1):
+                return "samples are not in order"
+            if not all(_recorded(time, outer) for time in times):
+                return "a sample is no recorded message"
+            for name in chosen:
+                told = answer.get("extremes", {}).get(name)
+                wrong = _extremes(told, name, inner, outer)
+                if wrong:
+                    return wrong
+            return None
+
+        return "get_topic_in_range", given, check
+
+    # -- conditions
+
+    def last_match(self, draw: Random) -> Any:
+        topic, given, holds = self._condition(draw)
+        before = self._moment(draw, topic) if draw.random() < 0.4 else None
+        if before is not None:
+            given["before"] = before / 1e9
+
+        def check(answer: Any) -> str | None:
+            return _last(answer, topic.rows, holds, before)
+
+        return "find_last_match", given, check
+
+    def near(self, draw: Random) -> Any:
+        topic = draw.choice(self._odometry)
+        where = planar([draw.choice(topic.rows)])[0] + [draw.uniform(-2, 2), draw.uniform(-2, 2)]
+        at = {"x": round(float(where[0]), 3), "y": round(float(where[1]), 3)}
+        given = {"topic": topic.name, "condition_type": "near_position", "value": at}
+
+        def far(row: Row) -> float:
+            place = row.body.pose.pose.position
+            return math.hypot(place.x - at["x"], place.y - at["y"])
+
+        def check(answer: Any) -> str | None:
+            surely = _last(answer, topic.rows, lambda row: far(row) <= NEAR_M - 1e-6, None)
+            return surely and _last(answer, topic.rows, lambda row: far(row) <= NEAR_M + 1e-6, None)
+
+        return "find_last_match", given, check
+
+    def matches(self, draw: Random) -> Any:
+        topic, given, holds = self._condition(draw)
+        start, end = sorted((self._moment(draw, topic), self._moment(draw, topic) + 10**9))
+        given |= {"start": start / 1e9, "end": end / 1e9, "limit": 100}
+
+        def check(answer: Any) -> str | None:
+            inner = [row for row in topic.within(start + SLACK_NS, end - SLACK_NS) if holds(row)]
+            outer = [row for row in topic.within(start - SLACK_NS, end + SLACK_NS) if holds(row)]
+            if "error" in answer:
+                return f"{len(inner)} messages match" if inner else None
+            found = answer["sightings"]
+            if answer["total"] is None or answer["total"] > len(found):
+                return None
+            total = sum(each["count"] for each in found)
+            if not len(inner) <= total <= len(outer):
+                return f"{len(inner)} to {len(outer)} messages match, {total} are counted"
+            edges = [each[key] for each in found for key in ("first_seen", "last_seen")]
+            if not all(_recorded(edge, outer) for edge in edges):
+                return "a sighting begins or ends where nothing matches"
+            return None
+
+        return "find_matches", given, check
+
+    def when(self, draw: Random) -> Any:
+        topic, condition, holds = self._condition(draw)
+        value = draw.choice(self._topics)
+        given = {
+            "value_topic": value.name,
+            "condition_topic": condition["topic"],
+            **{key: condition[key] for key in condition if key != "topic"},
+        }
+
+        def check(answer: Any) -> str | None:
+            if answer is not None and answer.get("error") == "no_data":
+                return None  # no value near the match
+            return _last(answer, topic.rows, holds, None)
+
+        return "get_value_when", given, check
+
+    def _condition(self, draw: Random) -> tuple[Topic, dict[str, Any], Callable[[Row], bool]]:
+        """A topic, the arguments of a condition on one of its fields, and the condition."""
+        topic = draw.choice([each for each in self._topics if each.name in self.testable])
+        path, kind, shown = draw.choice(self.testable[topic.name])
+        value = path_of(draw.choice(topic.rows).body, path)
+        given: dict[str, Any] = {"topic": topic.name, "field": shown}
+        if kind is float and not math.isfinite(value):
+            value = 0.0
+        if kind is bool:
+            wanted = draw.random() < 0.5
+            given |= {
+                "condition_type": "equals",
+                "value": draw.choice([wanted, int(wanted), str(wanted).lower()]),
+            }
+            return topic, given, lambda row: bool(path_of(row.body, path)) is wanted
+        if kind is str:
+            if value and draw.random() < 0.8:
+                first = draw.randrange(len(value))
+                needle = value[first : first + draw.randint(1, 6)].strip() or value
+            else:
+                needle = "never recorded"
+            given |= {"condition_type": "contains", "value": needle}
+            folded = needle.casefold()
+            return topic, given, lambda row: folded in path_of(row.body, path).casefold()
+        if draw.random() < 0.3:
+            given |= {"condition_type": "equals", "value": value}
+            return topic, given, lambda row: path_of(row.body, path) == value
+        above = draw.random() < 0.5
+        limit = value + draw.choice([0, 0.25, -0.25, 40, -40])
+        given |= {"condition_type": "above" if above else "below", "value": limit}
+        if above:
+            return topic, given, lambda row: path_of(row.body, path) > limit
+        return topic, given, lambda row: path_of(row.body, path) < limit
+
+    def _fields(self, topic: Topic) -> list[tuple[str, type, str]]:
+        """The path of each scalar that replies show, its type, and the name that it has there."""
+        shown = SHOWN.get(topic.rows[0].type)
+        found = []
+        for path, kind in self._history.scalars(topic.name, as_shown=True).items():
+            if shown is None and topic.rows[0].type not in LISTED:
+                found.append((path, kind, path))
+            for field_, name in (shown or {}).items():
+                if path == field_ or path.startswith(f"{field_}."):
+                    found.append((path, kind, name + path.removeprefix(field_)))
+        return found
+
+    # -- the robot
+
+    def position(self, draw: Random) -> Any:
+        topic = draw.choice(self._odometry)
+        at = self._moment(draw, topic)
+
+        def check(answer: Any) -> str | None:
+            rows = _candidates(topic, at, TOLERANCE_NS)
+            if "error" in answer:
+                return None if None in rows else "a pose is there"
+            places = [(*planar([row])[0], row.log_ns) for row in rows if row is not None]
+            for x, y, log_ns in places:
+                apart = math.hypot(answer["x"] - x, answer["y"] - y)
+                if apart < COARSE and _same_time(answer["timestamp"], log_ns):
+                    return None
+            return f"expected one of {places}"
+
+        return "get_position_at", {"topic": topic.name, "timestamp": at / 1e9}, check
+
+    def velocity(self, draw: Random) -> Any:
+        topic = draw.choice(self._odometry)
+        at = self._moment(draw, topic)
+
+        def check(answer: Any) -> str | None:
+            rows = _candidates(topic, at, TOLERANCE_NS)
+            if "error" in answer:
+                return None if None in rows else "a velocity is there"
+            known = [row.body.twist.twist.linear.x for row in rows if row is not None]
+            right = any(abs(answer["linear"]["x"] - each) < COARSE for each in known)
+            return None if right else f"expected one of {known}"
+
+        return "get_velocity_at", {"topic": topic.name, "timestamp": at / 1e9}, check
+
+    def closest(self, draw: Random) -> Any:
+        topic = self._odometry[0]
+        where = planar([draw.choice(topic.rows)])[0] + [draw.uniform(-1, 1), draw.uniform(-1, 1)]
+        x, y = (round(float(each), 3) for each in where)
+        radius = draw.choice([0.3, 1.0, 2.5])
+        frame = topic.rows[0].body.header.frame_id
+        given = {"x": x, "y": y, "frame_id": frame, "radius_m": radius, "limit": 100}
+
+        def check(answer: Any) -> str | None:
+            apart = np.hypot(*(planar(topic.rows) - [x, y]).T)
+            inside = apart <= radius - COARSE
+            if "error" in answer:
+                return f"{int(inside.sum())} poses are there" if inside.any() else None
+            if answer["total"] == 0:
+                return f"{int(inside.sum())} poses are there" if inside.any() else None
+            nearest = min(each["closest_m"] for each in answer["visits"])
+            if answer["total"] > len(answer["visits"]) or abs(nearest - apart.min()) < 2e-3:
+                return None
+            return f"the closest pose is {apart.min():.4f} m away"
+
+        return "visits", given, check
+
+    def driven(self, draw: Random) -> Any:
+        topic = self._odometry[0]
+        start, end = sorted(draw.sample(range(int(topic.times[0]), int(topic.times[-1])), 2))
+        moved = self._world.moved
+        assert moved is not None
+
+        def check(answer: Any) -> str | None:
+            inside = topic.within(start, end)
+            if len(inside) < 2:
+                return None
+            if "error" in answer:
+                return f"{len(inside)} poses are there"
+            truth = moved(inside[0].log_ns, inside[-1].log_ns)
+            allowed = self._world.path_tolerance * truth + 0.06
+            if abs(answer["distance_m"] - truth) <= allowed:
+                return None
+            return f"it drove {truth:.3f} m"
+
+        return "trajectory_summary", {"start": start / 1e9, "end": end / 1e9}, check
+
+    def transform(self, draw: Random) -> Any:
+        edge = draw.choice([*self._edges.values()])
+        lasts = [each for each in self._edges.values() if not each.static]
+        stamps = draw.choice(lasts).stamps if edge.static else edge.stamps
+        at = draw.randint(min(stamps), max(stamps))
+        given = {"parent": edge.parent, "child": edge.child, "timestamp": at / 1e9}
+
+        def check(answer: Any) -> str | None:
+            known = edge.at(at)
+            if "error" in answer:
+                lost = edge.static or known is None or edge.neighbours_apart(at) > 1
+                return None if lost else "there is a transform"
+            if known is None:
+                return "there is no transform"
+            shift, turn = known
+            told = np.array([answer["translation"][axis] for axis in "xyz"])
+            if np.abs(told - shift).max() > COARSE:
+                return f"the translation is {shift}"
+            rotated = [answer["rotation"][axis] for axis in "xyzw"]
+            apart = abs(float(np.dot(rotated, turn.as_quat())))
+            return None if apart > 1 - 1e-6 else f"the rotation is {turn.as_quat()}"
+
+        return "get_transform_at", given, check
+
+    # -- moments
+
+    def _moment(self, draw: Random, topic: Topic) -> int:
+        """A time to ask about: at, beside or between messages, now and then far off; never < 0."""
+        at = int(draw.choice(topic.times))
+        moved = draw.choice([0, 0, 1, -1, 10**6, 7 * 10**7, -(10**8), 10**9, 20 * 10**9])
+        return max(at + moved * draw.randint(1, 3), 0)
+
+
+# -- comparing ---------------------------------------------------------------------------------
+
+
+def _same_time(told_s: float | None, at: int) -> bool:
+    return told_s is not None and abs(told_s * 1e9 - at) <= 2 * SLACK_NS
+
+
+def _recorded(told_s: float, rows: Sequence[Row]) -> bool:
+    at = round(told_s * 1e9)
+    first = bisect_left(rows, at - 2 * SLACK_NS, key=lambda row: row.log_ns)
+    return first < len(rows) and _same_time(told_s, rows[first].log_ns)
+
+
+def _candidates(topic: Topic, at: int, tolerance: int) -> list[Row | None]:
+    """Every message that may be the answer; with None where there may be none."""
+    found: list[Row | None] = []
+    for slack in (-SLACK_NS, 0, SLACK_NS):
+        for reach in (-SLACK_NS, 0, SLACK_NS):
+            rows = topic.newest(at + slack, max(tolerance + slack + reach, 0))
+            found.extend(rows or [None])
+    return found
+
+
+def _one_of(answer: Any, rows: Sequence[Row | None], paths: Sequence[str]) -> str | None:
+    if "error" in answer:
+        return None if None in rows else "a message is there"
+    for row in rows:
+        if row is None or not _same_time(answer["timestamp"], row.log_ns):
+            continue
+        if all(_same(answer["value"].get(path), path_of(row.body, path)) for path in paths):
+            return None
+    return f"expected one of {[row.log_ns for row in rows if row is not None][:3]}"
+
+
+def _same(told: Any, value: Any) -> bool:
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            return told is None
+        return isinstance(told, int | float) and abs(told - value) <= max(COARSE, 1e-5 * abs(value))
+    return bool(told == value)
+
+
+def _extremes(told: Any, path: str, inner: Sequence[Row], outer: Sequence[Row]) -> str | None:
+    values = [[path_of(row.body, path) for row in rows] for rows in (inner, outer)]
+    finite = [[each for each in part if math.isfinite(each)] for part in values]
+    if told is None:
+        return f"{path} has numbers" if finite[0] else None
+    for key, best in (("min", min), ("max", max)):
+        known = [best(part) for part in finite if part]
+        if not any(_same(told[key], each) for each in known):
+            return f"the {key} of {path} is {known[0]}"
+    return None
+
+
+def _last(
+    answer: Any, rows: Sequence[Row], holds: Callable[[Row], bool], before: int | None
+) -> str | None:
+    """Whether the answer is the newest row that holds; either side of `before` within slack."""
+    found = set()
+    for slack in (-SLACK_NS, 0, SLACK_NS):
+        upto = [row for row in rows if before is None or row.log_ns <= before + slack]
+        found.add(next((row.log_ns for row in reversed(upto) if holds(row)), None))
+    if answer is None or answer.get("timestamp") is None:
+        early = answer is not None and answer.get("error") == "no_data"
+        return None if None in found and (answer is None or early) else f"it held at {found}"
+    right = any(each is not None and _same_time(answer["timestamp"], each) for each in found)
+    return None if right else f"it last held at {found}"

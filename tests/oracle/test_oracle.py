@@ -1,0 +1,75 @@
+"""Answers agree with brute force over odd histories, the recorded sessions and public bags."""
+
+from __future__ import annotations
+
+import os
+import random
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from tests.oracle.exam import Server, examine
+from tests.oracle.truth import History
+from tests.oracle.worlds import WORLDS, World
+from tests.shared_bags import REAL, RECORDED, needs_real, needs_recorded
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.xdist_group("heavy")
+
+LONG: Final = os.environ.get("EPISODIC_LONG") == "1"
+QUESTIONS: Final = 2000 if LONG else 150
+SEEDS: Final = range(5) if LONG else range(1)
+
+
+def held(world: World, seed: int, *, catalogue: bool) -> None:
+    history = History(world.folder)
+    server = Server(world.folder, world, catalogue=catalogue)
+    try:
+        report = examine(world, history, server, random.Random(seed), QUESTIONS)
+    finally:
+        server.stop()
+    assert report.total >= QUESTIONS
+    assert not report.wrong, "\n".join(report.wrong[:10])
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The catalogue lies in this test's own cache folder."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.mark.parametrize("catalogue", [False, True], ids=["bags", "catalogue"])
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", WORLDS)
+def test_answers_about_odd_worlds(name: str, seed: int, catalogue: bool, tmp_path: Path) -> None:
+    held(WORLDS[name](tmp_path / name, random.Random(seed)), seed, catalogue=catalogue)
+
+
+@needs_recorded
+@pytest.mark.parametrize("catalogue", [False, True], ids=["bags", "catalogue"])
+@pytest.mark.parametrize("name", ["session_mcap", "session_zstd", "session_sqlite3"])
+def test_answers_about_recorded_sessions(name: str, catalogue: bool) -> None:
+    storage = "rosbag2" if name.endswith("sqlite3") else "mcap"
+    tf = (("/tf", False), ("/tf_static", True))
+    held(World(RECORDED / name, storage, tf=tf), 7, catalogue=catalogue)
+
+
+@needs_real
+@pytest.mark.parametrize("catalogue", [False, True], ids=["bags", "catalogue"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "mobrob_odom_mcap",
+        "evo_tf_example_db3",
+        "rerun_sensors_mcap",
+        "rosbags_rs_94types_mcap",
+        "rosbags_rs_94types_db3",
+        "rosbag2_3split_nometa_mcap",
+        "cougars_auv_mcap",
+    ],
+)
+def test_answers_about_public_bags(name: str, catalogue: bool) -> None:
+    storage = "rosbag2" if name.endswith("db3") else "mcap"
+    held(World(REAL / name, storage, odometry=()), 7, catalogue=catalogue)
