@@ -32,6 +32,8 @@ NEAR_M: Final = 0.5
 """`data.position_tolerance_m` as shipped."""
 TOLERANCE_NS: Final = 100_000_000
 """`data.time_tolerance_s` as shipped."""
+STOP_ENDS_S: Final = 0.5
+"""Of all stops in a window together: where noise hides when a slow robot began to move."""
 COARSE: Final = 2e-4
 """Metres and units: replies round."""
 
@@ -147,6 +149,8 @@ def _kinds(world: World, history: History) -> Iterator[Any]:
         yield from [paper.transform] * 2
     if world.moved is not None:
         yield from [paper.driven] * 2
+    if world.stood is not None:
+        yield from [paper.stood] * 2
 
 
 class _Paper:
@@ -427,6 +431,22 @@ class _Paper:
             return f"it drove {truth:.3f} m"
 
         return "trajectory_summary", {"start": start / 1e9, "end": end / 1e9}, check
+
+    def stood(self, draw: Random) -> Any:
+        topic = self._odometry[0]
+        start, end = sorted(draw.sample(range(int(topic.times[0]), int(topic.times[-1])), 2))
+        stood = self._world.stood
+        assert stood is not None
+
+        def check(answer: Any) -> str | None:
+            inside = topic.within(start, end)
+            if len(inside) < 2:
+                return None
+            truth = stood(inside[0].log_ns, inside[-1].log_ns)
+            told = answer.get("stood_s", math.nan)
+            return None if abs(told - truth) <= STOP_ENDS_S else f"it stood for {truth:.3f} s"
+
+        return "recap", {"start": start / 1e9, "end": end / 1e9}, check
 
     def transform(self, draw: Random) -> Any:
         edge = draw.choice([*self._edges.values()])

@@ -49,6 +49,7 @@ class World:
 
     Attributes:
         moved: true path length (m) between two times (ns), where the world knows it.
+        stood: how long (s) the robot stood between two times (ns), where the world knows it.
         tf: whether transforms may be asked: `(topic, is it static)`.
         odometry: the topics that carry the robot's pose.
     """
@@ -56,6 +57,7 @@ class World:
     folder: Path
     storage: str = "mcap"
     moved: Callable[[int, int], float] | None = None
+    stood: Callable[[int, int], float] | None = None
     path_tolerance: float = 0.0
     tf: Sequence[tuple[str, bool]] = ()
     odometry: Sequence[str] = ("/odom",)
@@ -84,6 +86,7 @@ def drifting_map(folder: Path, draw: Random) -> World:
     return World(
         folder,
         moved=lambda start, end: _length(legs, (start - START) / S, (end - START) / S),
+        stood=lambda start, end: _standing(legs, (start - START) / S, (end - START) / S),
         path_tolerance=0.03,
         tf=(("/tf", False), ("/tf_static", True)),
     )
@@ -215,6 +218,12 @@ def _length(legs: Sequence[_Leg], start: float, end: float) -> float:
         leg.speed * max(min(leg.end, end) - max(leg.begin, start), 0.0)
         for leg in legs
     )  # fmt: skip
+
+
+def _standing(legs: Sequence[_Leg], start: float, end: float) -> float:
+    return sum(
+        max(min(leg.end, end) - max(leg.begin, start), 0.0) for leg in legs if leg.speed == 0
+    )
 
 
 def _runs_of(runs: int, apart_s: int, length_s: int, speed: float) -> Callable[[int, int], float]:
