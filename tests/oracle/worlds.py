@@ -7,7 +7,6 @@ each recording is a folder of splits.
 from __future__ import annotations
 
 import math
-import os
 import sqlite3
 from dataclasses import dataclass
 from functools import cache
@@ -30,6 +29,7 @@ STATUS: Final = "px4_msgs/msg/VehicleStatus"
 FLAGS: Final = tuple(f"flag_{number:02}" for number in range(24))
 LABELS: Final = ("cup", "scissors", "red chair", "Person 2", "straße")
 TRANSIENT: Final = "- history: 1\n  depth: 1\n  reliability: 1\n  durability: transient_local\n"
+_DRIVE_S: Final = 60
 VOLATILE: Final = "- history: 1\n  depth: 10\n  reliability: 1\n  durability: volatile\n"
 
 
@@ -67,8 +67,8 @@ class World:
 def drifting_map(folder: Path, draw: Random) -> World:
     """A robot with 5 mm of pose noise, a moving map, and /tf_static repeated in every split."""
     messages: list[Out] = []
-    legs = _legs(draw, 60)
-    for tick in range(60 * 50):
+    legs = _legs(draw, _DRIVE_S)
+    for tick in range(_DRIVE_S * 50):
         at = START + tick * S // 50
         x, y, yaw, speed = _along(legs, tick / 50)
         noise = [draw.gauss(0, 0.005), draw.gauss(0, 0.005)]
@@ -221,8 +221,10 @@ def _length(legs: Sequence[_Leg], start: float, end: float) -> float:
 
 
 def _standing(legs: Sequence[_Leg], start: float, end: float) -> float:
+    """Seconds in stops of 3 s and more; the recording ends after `_DRIVE_S`."""
+    stops = [(leg.begin, min(leg.end, _DRIVE_S)) for leg in legs if leg.speed == 0]
     return sum(
-        max(min(leg.end, end) - max(leg.begin, start), 0.0) for leg in legs if leg.speed == 0
+        max(min(last, end) - max(first, start), 0.0) for first, last in stops if last - first >= 3
     )
 
 
@@ -418,4 +420,3 @@ def write_db3(path: Path, messages: Sequence[Out]) -> None:
         )
     base.commit()
     base.close()
-    os.utime(path, ns=(START, START))  # long closed
