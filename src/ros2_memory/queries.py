@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.copies import Found
+    from ros2_memory.extract import Extracted
     from ros2_memory.memory import Call, Memory
     from ros2_memory.model import JsonValue
 
@@ -345,12 +346,19 @@ def _note_held(view: View, found: Found, at: Ns) -> None:
         view.note(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
 
 
+def _extracted(view: View, found: Found, fields: Sequence[str]) -> Extracted:
+    """A message as a reply shows it, with the notes on that message alone."""
+    begin = time.perf_counter_ns()
+    message = decoded(view, found)
+    shown = view.memory.extractor.shown(message, found.record.channel.type, fields)
+    view.call.stages.add("extract", time.perf_counter_ns() - begin)
+    return shown
+
+
 def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> answers.TopicValue:
     """A message as a reply shows it, with the notes of the whole view so far."""
-    begin = time.perf_counter_ns()
+    shown = _extracted(view, found, fields)
     channel = found.record.channel
-    shown = view.memory.extractor.shown(decoded(view, found), channel.type, fields)
-    view.call.stages.add("extract", time.perf_counter_ns() - begin)
     return answers.TopicValue(
         channel.topic,
         channel.type,
@@ -373,13 +381,13 @@ def _samples(
     failures: Counter[str] = Counter()
     for found in chosen:
         try:
-            value = _value(view, found, fields, None)
+            shown = _extracted(view, found, fields)
         except NoDataError as error:
             failures[error.detail] += 1
             continue
-        samples.append(value.sample)
-        types[value.type] = None
-        for sentence in value.notes:
+        samples.append(Sample(found.time, shown.value))
+        types[found.record.channel.type] = None
+        for sentence in shown.notes:
             view.note(sentence)
     if failures and not samples:
         raise NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))

@@ -133,8 +133,7 @@ def _kinds(world: World, history: History) -> Iterator[Any]:
     paper = _Paper(world, history)
     yield paper.topics
     yield paper.span
-    if paper.volatile:
-        yield from [paper.value_at] * 3
+    yield from [paper.value_at] * 3
     yield from [paper.values_in] * 3
     if paper.testable:
         yield from [paper.last_match] * 4
@@ -165,7 +164,6 @@ class _Paper:
         self._scalars = {each.name: history.scalars(each.name) for each in self._topics}
         named = {each.name: self._fields(each) for each in self._topics}
         self.testable = {name: paths for name, paths in named.items() if paths}
-        self.volatile = [each for each in self._topics if not each.latched]
 
     # -- what is there
 
@@ -196,12 +194,14 @@ class _Paper:
     # -- values
 
     def value_at(self, draw: Random) -> Any:
-        topic = draw.choice(self.volatile)
+        topic = draw.choice(self._topics)
         at = self._moment(draw, topic)
-        tolerance = draw.choice([TOLERANCE_NS, 10**9, 0])
         given: dict[str, Any] = {"topic": topic.name, "timestamp": at / 1e9}
-        if tolerance != TOLERANCE_NS:
-            given["tolerance_s"] = tolerance / 1e9
+        asked = draw.choice([None, 10**9, 0])
+        if asked is not None:
+            given["tolerance_s"] = asked / 1e9
+        unasked = at if topic.latched else TOLERANCE_NS
+        tolerance = unasked if asked is None else asked
         names = [*self._scalars[topic.name]]
         if names:
             given["fields"] = draw.sample(names, min(2, len(names)))

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 SLACK_NS: Final = 1_000
 """A time in float seconds lies up to half a microsecond beside its nanoseconds."""
 
+STATIC: Final = ("/tf_static",)
+SELDOM_NS: Final = 5 * 10**9
 CONVERTED: Final = (
     "builtin_interfaces/msg/Duration",
     "builtin_interfaces/msg/Time",
@@ -54,7 +56,17 @@ class Topic:
 
     name: str
     rows: list[Row]
-    latched: bool = False
+    transient_local: bool = False
+
+    @property
+    def latched(self) -> bool:
+        """Whether its newest message holds at any age: what is published seldom, for latecomers."""
+        if self.name in STATIC:
+            return True
+        if not self.transient_local or self.rows[0].type == "rcl_interfaces/msg/Log":
+            return False
+        span = int(self.times[-1] - self.times[0])
+        return len(self.rows) == 1 or span / (len(self.rows) - 1) >= SELDOM_NS
 
     @cached_property
     def times(self) -> NDArray[np.int64]:
@@ -118,7 +130,7 @@ class History:
 
     def __init__(self, folder: Path) -> None:
         rows: dict[str, list[Row]] = {}
-        self.latched: set[str] = set()
+        self.transient_local: set[str] = set()
         self.undecodable: set[str] = set()
         self.counts: dict[str, int] = {}
         for path in sorted(folder.rglob("*")):
@@ -131,7 +143,9 @@ class History:
             for row in found:
                 rows.setdefault(row.topic, []).append(row)
         self.topics = {
-            name: Topic(name, sorted(each, key=lambda row: row.log_ns), name in self.latched)
+            name: Topic(
+                name, sorted(each, key=lambda row: row.log_ns), name in self.transient_local
+            )
             for name, each in rows.items()
         }
 
@@ -163,7 +177,7 @@ class History:
                     if "durability: transient_local" in str(record.metadata) or (
                         "durability: 1" in str(record.metadata)
                     ):
-                        self.latched.add(record.topic)
+                        self.transient_local.add(record.topic)
                 elif isinstance(record, Message):
                     channel = channels[record.channel_id]
                     schema = schemas[channel.schema_id]
@@ -189,7 +203,7 @@ class History:
                 )
             }
             stores = {kind: _store(kind, texts.get(kind, "")) for _, kind, _ in topics.values()}
-            self.latched |= {
+            self.transient_local |= {
                 name for name, _, qos in topics.values() if "durability: transient_local" in qos
             }
             for number, at, data in base.execute(
