@@ -29,7 +29,13 @@ _OF_ALL: Final = ("/tf", "/tf_static")
 """Topics of which the good bags hold messages too."""
 _SLACK_NS: Final = 2_000
 """Unix seconds as floats, rounded to microseconds, are so far from a log time at most."""
-_EXCUSES: Final = ("could not be read", "left out", "ends early", "no possible log time")
+_EXCUSES: Final = (
+    "could not be read",
+    "could not be decoded",
+    "left out",
+    "ends early",
+    "no possible log time",
+)
 """What a note says where messages are known to be missing."""
 
 
@@ -145,7 +151,9 @@ async def _wrong_match(server: EpisodicServer, truth: list[Readable], rng: Rando
         if each.topic == "/chatter" and each.payload[:4] == b"\0\1\0\0":
             text = each.payload[8:].rstrip(b"\0")
             texts[text] = max(each.time, texts.get(text, 0))
-    whole = {text: at for text, at in texts.items() if text.endswith(b" of a way")}
+    whole = {
+        text: at for text, at in texts.items() if text.isascii() and text.endswith(b" of a way")
+    }
     if not whole:
         return []
     text, at = rng.choice(sorted(whole.items()))

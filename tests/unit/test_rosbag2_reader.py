@@ -142,6 +142,13 @@ class TestSqliteSchemas:
             assert found == sorted(range(1000, 1200), reverse=newest_first)
         assert list(reader.log_times(path, "/chatter", upto)) == [*range(1000, 1200)]
 
+    def test_a_time_that_no_clock_shows_is_left_out_and_told(self, tmp_path: Path) -> None:
+        path = write_db3(tmp_path / "a.db3", chatter(3))
+        change(path, "UPDATE messages SET timestamp = 9223372036854775807 WHERE id = 2")
+        summary = Rosbag2Reader().summarize(path)
+        assert summary.count == len(read(Rosbag2Reader(), path)) == 2
+        assert summary.notes == ("1 messages bear no possible log time",)
+
     def test_a_message_that_the_index_has_elsewhere_is_found_where_it_is(
         self, tmp_path: Path
     ) -> None:

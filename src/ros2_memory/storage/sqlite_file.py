@@ -34,6 +34,7 @@ from ros2_memory.storage.open_file import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.sqlite_guard import guard, require_plain_tables
 from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
+from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -49,8 +50,9 @@ _KEPT_BYTES: Final = 16 << 20
 _PROOF_BYTES: Final = 200
 _TOTALS: Final = """
     SELECT topic_id, count(*), min(timestamp), max(timestamp),
-           sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob')
-    FROM messages GROUP BY topic_id
+           sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob'),
+           timestamp IS ? AS impossible
+    FROM messages NOT INDEXED GROUP BY topic_id, impossible
 """
 # Without the payload, so that sorting holds none of them; it follows row by row.
 _ASCENDING: Final = """
@@ -113,21 +115,25 @@ class SqliteBags:
     def summarize(self, path: Path) -> BagSummary:
         """Topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
-            rows: list[tuple[int, int, int, int, int]] = base.execute(_TOTALS).fetchall()
+            found: list[tuple[int, int, int, int, int, int]]
+            found = base.execute(_TOTALS, (MAX_NS,)).fetchall()
             right = self._is_indexed_right(base, topics)
-        if any(wrong for *_, wrong in rows):
+        if any(wrong for *_, wrong, _ in found):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
             )
+        rows = [row for row in found if not row[5]]
         held = [
             Held(topics.channels[number], count, first, last)
-            for number, count, first, last, _ in rows
+            for number, count, first, last, *_ in rows
             if number in topics.channels
         ]
         orphans = sum(row[1] for row in rows) - sum(each.messages for each in held)
         notes = [] if right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"{orphans} messages belong to no topic and were left out")
+        if impossible := sum(row[1] for row in found if row[5]):
+            notes.append(f"{impossible} messages bear no possible log time")
         return bag_summary(held, topics.channels.values(), notes=tuple(notes))
 
     def channels(self, path: Path) -> Sequence[Channel]:
