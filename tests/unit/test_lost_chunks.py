@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
+from mcap.opcode import Opcode
 
 from ros2_memory import queries
 from ros2_memory.errors import BagError
@@ -24,7 +25,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.asking import asked as asked_tool
 from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
-from tests.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
+from tests.mcap_surgery import SMALL, chatter, chunks_of, edit_summary, spoil_chunk
 from tests.memories import memory_of
 from tests.recalled import recalling
 
@@ -250,3 +251,52 @@ class TestAnIndexThatContradictsItsMessages:
         )
         assert any("contradicts itself" in note for note in wrong.pop("notes"))
         assert wrong == right
+
+
+class TestASummarySectionThatDeclaresOtherThanItsChunks:
+    """What a chunk declares is protected by its checksum; the summary section repeats it."""
+
+    def misnamed(self, bag_dir: Path) -> Path:
+        """A drive whose summary section has the numbers of two topics of one type swapped."""
+        moving = [
+            each
+            for n in range(100)
+            for at in [T0 + n * S // 10]
+            for each in (odom(at, n / 10, 0.0), odom(at, -n / 10, 0.0, topic="/ghost"))
+        ]
+        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", moving, McapLayout(chunk_size=8000))
+        numbers = {b"\x01\x00": b"\x02\x00", b"\x02\x00": b"\x01\x00"}
+
+        def swapped(body: bytearray) -> None:
+            body[:2] = numbers[bytes(body[:2])]
+
+        edit_summary(path, Opcode.CHANNEL, swapped)
+        return path
+
+    @pytest.mark.parametrize("storage", ["mcap", "rosbag2"])
+    def test_where_the_robot_was_is_what_the_chunks_say(self, tmp_path: Path, storage: str) -> None:
+        self.misnamed(tmp_path)
+        plain = memory_of(tmp_path, storage=storage)
+        for memory in (plain, recalling(plain, tmp_path)):
+            for topic, sign in (("/odom", 1), ("/ghost", -1)):
+                told = asked_tool(
+                    memory, tmp_path, "get_position_at", topic=topic, timestamp=T0 / S + 5
+                )
+                assert told["x"] == pytest.approx(sign * 5.0, abs=1e-6)
+                assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+
+    def test_a_topic_that_the_summary_section_calls_otherwise_is_found(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "dock"), text(T0 + S, "bay")])
+        edit_summary(
+            path,
+            Opcode.CHANNEL,
+            lambda body: body.__setitem__(slice(None), body.replace(b"/chatter", b"/chattes")),
+        )
+        asks = {"topic": "/chatter", "condition_type": "contains", "value": "dock"}
+        told = asked_tool(memory_of(tmp_path), tmp_path, "find_last_match", **asks)
+        assert told["timestamp"] == pytest.approx(T0 / S)
+        assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+        topics = asked_tool(memory_of(tmp_path), tmp_path, "list_recorded_topics")
+        assert [each["topic"] for each in topics] == ["/chatter"]

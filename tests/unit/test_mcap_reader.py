@@ -224,6 +224,68 @@ class TestIndexesThatAreWrong:
         whole = write_mcap(tmp_path / "b.mcap", [*chatter(9), boolean(9, True)])
         assert McapReader().summarize(whole).notes == ()
 
+    @pytest.mark.parametrize(
+        ("kind", "old", "new"),
+        [
+            pytest.param(Opcode.CHANNEL, b"/chatter", b"/chattes", id="topic"),
+            pytest.param(Opcode.CHANNEL, b"\x01\x00\x01\x00", b"\x01\x00\x02\x00", id="schema"),
+            pytest.param(Opcode.CHANNEL, b"cdr", b"cbr", id="encoding"),
+            pytest.param(Opcode.CHANNEL, b"volatile", b"volatild", id="metadata"),
+            pytest.param(Opcode.SCHEMA, b"msg/String", b"msg/Strinh", id="type"),
+            pytest.param(Opcode.SCHEMA, b"ros2msg", b"ros2mso", id="kind of definition"),
+            pytest.param(Opcode.SCHEMA, b"string data", b"string dada", id="definition"),
+        ],
+    )
+    @pytest.mark.parametrize("cache_mb", [64, 0])
+    def test_what_a_summary_section_declares_otherwise_than_the_chunks_is_named(
+        self, tmp_path: Path, kind: Opcode, old: bytes, new: bytes, cache_mb: int
+    ) -> None:
+        """Also after the index was let go of, and of a message in another chunk."""
+        both = [each for n in range(20) for each in (*chatter(1, start=n), boolean(n, True))]
+        path = write_mcap(tmp_path / "a.mcap", both, SMALL)
+        (right,) = (each for each in McapReader().channels(path) if each.topic == "/chatter")
+        before = path.read_bytes()
+
+        def otherwise(body: bytearray) -> None:
+            body[:] = body.replace(old, new, 1)
+
+        edit_summary(path, kind, otherwise)
+        assert path.read_bytes() != before
+        reader = McapReader(cache_mb=cache_mb)
+        summary = reader.summarize(path)
+        assert [each.type for each in summary.of("/chatter")] == [STRING]
+        reason = (
+            "its summary section declares other channels or types than its messages; its messages"
+            " were read without its indexes"
+        )
+        assert summary.notes == (reason,)
+        found, told = read_on(reader, path)
+        assert found == [*range(20)]
+        assert told == [reason]
+        records = reader.records(path, ["/chatter"], TimeWindow(15, 20))
+        with pytest.raises(BagContradictionError):
+            next(records)
+        assert next(records).channel == right
+        # Where there is nothing else to go by, it is noted all the same.
+        data = path.read_bytes()
+        path.write_bytes(data[:-60] + bytes((data[-60] ^ 1,)) + data[-59:])
+        assert [each.type for each in McapReader().summarize(path).of("/chatter")] == [STRING]
+
+    def test_a_channel_that_two_chunks_declare_in_two_ways_is_noted(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(12), SMALL)
+        assert McapReader().summarize(path).notes == ()
+        data = path.read_bytes()
+        other = write_mcap(tmp_path / "b.mcap", [text(n, "x", "/chattes") for n in range(3)], SMALL)
+        cut = chunks_of(other)[0].chunk_start_offset
+        behind = other.read_bytes()[cut:]
+        last = chunks_of(path)[-1]
+        at = last.chunk_start_offset + last.chunk_length + last.message_index_length
+        path.write_bytes(data[:at] + behind)
+        assert any(
+            "declares a channel or a type in more than one way" in note
+            for note in McapReader().summarize(path).notes
+        )
+
     def test_an_index_that_names_a_message_twice_is_not_believed(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "a.mcap", [text(5, f"{n:0100d}") for n in range(4)])
         (chunk,) = chunks_of(path)

@@ -83,7 +83,7 @@ def test_what_other_bags_declare_is_not_taken_for_what_a_bag_declares(tmp_path: 
         assert {channel.schema.name for channel in summary.channels.values()} == {
             each.type for each in messages[:n]
         }
-        assert summary.resolved
+        assert summary.declarations.resolved
 
 
 def test_a_bag_that_repeats_another_ones_beginning_is_read_to_its_own_end(tmp_path: Path) -> None:

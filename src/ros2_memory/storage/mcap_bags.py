@@ -37,6 +37,7 @@ from ros2_memory.storage.mcap_index import (
     index_from_summary,
     proven_columns,
     require_channels,
+    require_declared,
 )
 from ros2_memory.storage.mcap_records import MESSAGE, RECORD
 from ros2_memory.storage.mcap_scan import index_by_scan
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 
 
 _LARGE_BYTES: Final = 8 << 20
+_CONTRADICTED_BYTES: Final = 1 << 20
 _PROVEN_BYTES: Final = 32 << 20
 """Chunks that take more, together, are not read only to hold their message indexes against them."""
 
@@ -90,6 +92,7 @@ class McapBags:
         self._found: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self._shared: Shared[Channel] = Shared(attrgetter("bytes_held"))
+        self._contradicted: ByteLru[str] = ByteLru(_CONTRADICTED_BYTES)
         self._finished: FileKey | None = None
         self._last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel], int] = {}, {}, 0
 
@@ -294,6 +297,9 @@ class McapBags:
     def _index(self, file: OpenFile) -> McapIndex:
         index = self._found.get(file.key)
         if not isinstance(index, McapIndex):
+            reason = self._contradicted.get(file.key)
+            if reason is not None:
+                return self._keep(file, self._without_indexes(file, reason))
             finished = file.key == self._finished or is_finished(file)
             index = _index_of(file, self._max_chunk_bytes, finished=finished)
             index = self._keep(file, index)
@@ -431,7 +437,8 @@ class McapBags:
             if data is None:
                 continue
             try:
-                self._chunk_columns(file, chunk, chunk.channels, data)
+                columns = self._chunk_columns(file, chunk, chunk.channels, data)
+                _require_declared(index, data, columns)
             except _ContradictedError as error:
                 return self._distrust(file, index, error)
         return index
@@ -440,8 +447,13 @@ class McapBags:
         """The index of the messages themselves, in place of one that was found to be wrong."""
         error.believed = {chunk.offset: chunk for chunk in index.chunks}
         reason = f"{error}; {READ_WITHOUT_INDEXES}"
+        # Kept apart from the index: not every read that takes this anew would find it out again.
+        self._contradicted.put(file.key, reason, len(reason) + len(file.key.path) + 200)
+        return self._keep(file, self._without_indexes(file, reason))
+
+    def _without_indexes(self, file: OpenFile, reason: str) -> McapIndex:
         found = index_by_scan(file, self._max_chunk_bytes, reason)
-        return self._keep(file, found._replace(contradiction=reason))
+        return found._replace(contradiction=reason)
 
     def _chunk_data(self, file: OpenFile, chunk: Chunk) -> bytes:
         key = (file.key, chunk.offset)
@@ -459,6 +471,21 @@ def _index_of(file: OpenFile, max_chunk_bytes: int, *, finished: bool) -> McapIn
         return index_from_summary(file)
     except DoubtError as doubt:
         return index_by_scan(file, max_chunk_bytes, str(doubt))
+
+
+def _require_declared(index: McapIndex, data: bytes, columns: Sequence[Column]) -> None:
+    """Holds what the index takes a chunk's messages for against what the chunk says.
+
+    Raises:
+        _ContradictedError: they differ.
+    """
+    if index.declared is None:
+        return
+    try:
+        with damage():
+            require_declared(index.declared, data, columns)
+    except UnreadableError as error:
+        raise _ContradictedError(reason_of(error)) from error
 
 
 def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:

@@ -49,6 +49,8 @@ _LONG_INDEX: Final = "damaged: a message index holds more than a chunk can"
 _IMPOSSIBLE_TIMES: Final = "damaged: a message index holds impossible log times"
 NOT_THERE: Final = "damaged: a message is not where its index says"
 _MESSAGE_OPCODE: Final = bytes((Opcode.MESSAGE,))
+_MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
+_LENGTH_AT: Final = 1
 _CHANNEL_AT: Final = 9
 _LOG_TIME_AT: Final = 15
 """Where these fields lie in a message record."""
@@ -61,6 +63,7 @@ _time: Final = struct.Struct("<Q").unpack_from
 _FEW: Final = 100
 """So many numbers are sooner looked through one by one than made an array."""
 _EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
+_NOUGHT: Final[Ints] = np.zeros(1, dtype=np.int64)
 
 
 class Column(NamedTuple):
@@ -169,6 +172,43 @@ def require_indexed(data: bytes, channel: int, column: Column) -> None:
         or stated.tobytes() != times.tobytes()
     ):
         raise UnreadableError(NOT_THERE)
+
+
+def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, bytes]]:
+    """The schema and channel records of a chunk: what lies between its messages is walked alone.
+
+    Args:
+        data: the decompressed records of the chunk.
+        columns: all of its messages, held against these records.
+
+    Returns:
+        Opcode and body of each.
+
+    Raises:
+        UnreadableError: there are other messages between them, or too many declarations.
+    """
+    places = np.sort(np.concatenate([column.places for column in columns] or [_EMPTY]))
+    size = len(data)
+    lengths = _EMPTY
+    if places.size:
+        stop = size - RECORD.size + 1
+        lengths = np.ndarray(stop, _INT64, data, _LENGTH_AT, _EVERY_BYTE)[places]
+        if lengths.min() < 0 or lengths.max() > size:
+            raise UnreadableError(NOT_THERE)
+    begins = np.concatenate([_NOUGHT, places + RECORD.size + lengths])
+    ends = np.append(places, size)
+    if bool((begins > ends).any()):
+        raise UnreadableError(NOT_THERE)
+    found: list[tuple[int, bytes]] = []
+    between = begins < ends
+    for begin, end in zip(begins[between].tolist(), ends[between].tolist(), strict=True):
+        walked = walk(data[begin:end])
+        if walked.messages:
+            raise UnreadableError("damaged: a chunk holds messages that its indexes do not")
+        found += walked.declarations
+        if len(found) > MAX_CHUNK_DECLARATIONS:
+            raise UnreadableError(_MANY_DECLARED)
+    return found
 
 
 class Extent(NamedTuple):
@@ -303,7 +343,7 @@ def walk(data: bytes) -> Walked:
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             declarations.append((opcode, data[position + RECORD.size : following]))
             if len(declarations) > MAX_CHUNK_DECLARATIONS:
-                raise UnreadableError(f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things")
+                raise UnreadableError(_MANY_DECLARED)
         position = following
     columns = {channel: column_of(*lists) for channel, lists in found.items()}
     messages = sum(len(times) for times, _ in found.values())

@@ -20,6 +20,7 @@ from ros2_memory.storage.mcap_chunk import (
     Column,
     Extent,
     columns_from_index,
+    declarations_of,
     extents_from_index,
     index_bytes,
     indexed_channels,
@@ -28,7 +29,13 @@ from ros2_memory.storage.mcap_chunk import (
     unpacked,
     unpacked_in_part,
 )
-from ros2_memory.storage.mcap_records import MAGIC_SIZE, RECORD, Opcode, Statistics
+from ros2_memory.storage.mcap_records import (
+    MAGIC_SIZE,
+    RECORD,
+    Declarations,
+    Opcode,
+    Statistics,
+)
 from ros2_memory.storage.mcap_summary import (
     INDEX_OFFSET_BYTES,
     Chunk,
@@ -52,6 +59,7 @@ if TYPE_CHECKING:
 _CHUNK: Final = int(Opcode.CHUNK)
 _INDEXED: Final = frozenset((_CHUNK, int(Opcode.MESSAGE_INDEX)))
 _OTHER_CHUNKS: Final = "its chunk indexes do not agree with its chunks"
+OTHER_DECLARED: Final = "its summary section declares other channels or types than its messages"
 _STATED: Final = struct.Struct("<BQQQ")
 """A chunk record up to its times: opcode, length, first and last log time."""
 _STATED_BYTES: Final = _STATED.size
@@ -77,7 +85,7 @@ class McapIndex(NamedTuple):
     by how much a channel's log times go back from one chunk, or one loose message, to a later one,
     at most; 0 where that is no more than `OUT_OF_ORDER_NS`. `contradiction` says where the file's
     own indexes were found to contradict its messages after they had been believed; else it is
-    empty.
+    empty. `declared` is what the summary section declares, where the index comes from it.
     """
 
     channels: Mapping[int, Channel]
@@ -88,6 +96,7 @@ class McapIndex(NamedTuple):
     notes: tuple[str, ...] = ()
     set_back: Ns = 0
     contradiction: str = ""
+    declared: Declarations | None = None
 
     @property
     def bytes_held(self) -> int:
@@ -150,6 +159,22 @@ def proven_columns(
     for channel, column in columns.items():
         require_indexed(data, channel, column)
     return columns
+
+
+def require_declared(declared: Declarations, data: bytes, columns: Sequence[Column]) -> None:
+    """Holds what a summary section declares against what a chunk declares.
+
+    Args:
+        declared: what the summary section declares.
+        data: the decompressed records of the chunk, which its checksum vouches for.
+        columns: all messages of the chunk, held against these records.
+
+    Raises:
+        UnreadableError: the chunk declares a channel or a schema otherwise, or holds more messages.
+    """
+    for opcode, body in declarations_of(data, columns):
+        if not declared.agrees(opcode, body):
+            raise UnreadableError(OTHER_DECLARED)
 
 
 def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
@@ -228,8 +253,8 @@ def index_from_summary(file: OpenFile) -> McapIndex:
 
 
 def _index_from_summary(file: OpenFile) -> McapIndex:
-    start, channels, resolved, chunks, stated = read_summary(file)
-    if stated is None or not resolved or stated.channels > len(channels):
+    start, channels, declared, chunks, stated = read_summary(file)
+    if stated is None or not declared.resolved or stated.channels > len(channels):
         raise DoubtError
     counts = stated.counts
     if not counts.keys() <= channels.keys() or len(chunks) > MAX_CHUNKS:
@@ -250,7 +275,7 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
         raise DoubtError
     notes = disagreements(stated, totals)
     back = _set_back(file, held)
-    return McapIndex(channels, tuple(held), totals, notes=notes, set_back=back)
+    return McapIndex(channels, tuple(held), totals, notes=notes, set_back=back, declared=declared)
 
 
 def _require_as_stated(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:

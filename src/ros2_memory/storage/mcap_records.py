@@ -129,6 +129,26 @@ class Declarations:
             channel = _channel(body) if _is_short(body) else _channel.__wrapped__(body)
             self._channels[channel.id] = channel
 
+    def agrees(self, opcode: int, body: bytes) -> bool:
+        """Whether a schema or channel record declares what is known of its number, if anything."""
+        other = Declarations()
+        other.add(opcode, body)
+        return not self._differing(other)
+
+    def update(self, other: Declarations) -> bool:
+        """Takes over what another declares; returns whether that replaced something else."""
+        differing = self._differing(other)
+        self._schemas |= other._schemas
+        self._channels |= other._channels
+        return differing
+
+    def _differing(self, other: Declarations) -> bool:
+        return any(
+            self._schemas.get(number, each) != each for number, each in other._schemas.items()
+        ) or any(
+            self._channels.get(number, each) != each for number, each in other._channels.items()
+        )
+
     @property
     def resolved(self) -> bool:
         """Whether every channel's schema is known. Id 0 means a channel without one."""

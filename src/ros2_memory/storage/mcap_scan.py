@@ -33,6 +33,7 @@ from ros2_memory.storage.mcap_chunk import (
 )
 from ros2_memory.storage.mcap_file import closing_of, require_mcap
 from ros2_memory.storage.mcap_index import (
+    OTHER_DECLARED,
     McapIndex,
     Total,
     add_column,
@@ -83,7 +84,11 @@ class _Scan:
     position: int = MAGIC_SIZE
     closed: bool = False
     data_ended: bool = False
-    declarations: Declarations = field(default_factory=Declarations)
+    # By the summary section, by the records before it, and by chunks, which a checksum protects.
+    repeated: Declarations = field(default_factory=Declarations)
+    declared: Declarations = field(default_factory=Declarations)
+    in_chunks: Declarations = field(default_factory=Declarations)
+    redeclared: bool = False
     chunks: list[Chunk] = field(default_factory=list)
     totals: dict[int, Total] = field(default_factory=dict)
     loose: dict[int, tuple[array[int], array[int]]] = field(default_factory=dict)
@@ -129,17 +134,20 @@ class _Scan:
             if opcode == Opcode.CHUNK:
                 self._whole_chunk(end)
             elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS}:
-                self._declare(opcode, self._body(end))
+                self._declare(
+                    opcode, self._body(end), self.repeated if self.data_ended else self.declared
+                )
         except UnreadableError as error:
             # Those behind it may be whole.
             self.damaged.append(str(error))
 
-    def _declare(self, opcode: int, body: bytes) -> None:
+    def _declare(self, opcode: int, body: bytes, among: Declarations) -> None:
         with damage():
             if opcode == Opcode.STATISTICS:
                 self.stated = statistics(body)
-            else:
-                self.declarations.add(opcode, body)
+                return
+            self.redeclared = self.redeclared or not among.agrees(opcode, body)
+            among.add(opcode, body)
 
     def _body(self, end: int) -> bytes:
         start = self.position + RECORD.size
@@ -192,7 +200,7 @@ class _Scan:
     def _take(self, walked: Walked, end: int, usable: int | None) -> None:
         for opcode, body in walked.declarations:
             try:
-                self._declare(opcode, body)
+                self._declare(opcode, body, self.in_chunks)
             except UnreadableError as error:
                 self.damaged.append(str(error))
         self.messages += walked.messages
@@ -228,9 +236,16 @@ class _Scan:
         back = max([self.back, *(_back_in(times) for times, _ in self.loose.values())])
         for channel, column in columns.items():
             add_column(self.totals, channel, column)
-        channels = self.declarations.channels()
+        declarations = self.repeated
+        differing = declarations.update(self.declared)
+        differing = declarations.update(self.in_chunks) or differing
+        channels = declarations.channels()
         known = {channel: total for channel, total in self.totals.items() if channel in channels}
         notes = [note, *self._notes(known)] if note else self._notes(known)
+        if differing and not note.startswith(OTHER_DECLARED):
+            notes.append(OTHER_DECLARED)
+        if self.redeclared:
+            notes.append("it declares a channel or a type in more than one way: the last counts")
         return McapIndex(
             channels,
             tuple(self.chunks),

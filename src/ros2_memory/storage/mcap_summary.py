@@ -77,7 +77,7 @@ class _Declared(NamedTuple):
 
     records: bytes
     channels: Mapping[int, Channel]
-    resolved: bool
+    declarations: Declarations
 
 
 _beginnings: tuple[_Declared, ...] = ()
@@ -89,15 +89,12 @@ class DoubtError(UnreadableError):
 
 
 class Summary(NamedTuple):
-    """What a summary section states, and where in the file it begins.
-
-    `resolved` says whether every channel's schema is there.
-    """
+    """What a summary section states, and where in the file it begins."""
 
     start: int
 
     channels: Mapping[int, Channel]
-    resolved: bool
+    declarations: Declarations
     chunks: list[Chunk]
     statistics: Statistics | None
 
@@ -133,7 +130,7 @@ def read_summary(file: OpenFile) -> Summary:
     if beginning is None or len(declaring) > 1:
         beginning = _declared(b"".join(declaring))
         _remember(beginning, section)
-    return Summary(start, beginning.channels, beginning.resolved, chunks, stated)
+    return Summary(start, beginning.channels, beginning.declarations, chunks, stated)
 
 
 def _section(file: OpenFile) -> tuple[int, bytes]:
@@ -171,11 +168,11 @@ def _numbers(low: bytes, high: bytes) -> frozenset[int]:
 
 
 def _declared(records: bytes) -> _Declared:
-    """The channels of schema and channel records, and whether their schemas are all among them."""
+    """What schema and channel records declare."""
     declarations = Declarations()
     for opcode, body in framed(records):
         declarations.add(opcode, body)
-    return _Declared(records, declarations.channels(), declarations.resolved)
+    return _Declared(records, declarations.channels(), declarations)
 
 
 def _remember(declared: _Declared, section: bytes) -> None:
