@@ -182,6 +182,13 @@ class TestIndexesThatAreWrong:
         assert times(read(reader, path)) == list(range(100, 120))
 
     @pytest.mark.parametrize(
+        ("count", "layout"),
+        [
+            pytest.param(12, SMALL, id="few in a chunk"),
+            pytest.param(120, McapLayout(chunk_size=5000), id="many in a chunk"),
+        ],
+    )
+    @pytest.mark.parametrize(
         ("at", "value"),
         [
             pytest.param(0, 1, id="another time"),
@@ -191,16 +198,16 @@ class TestIndexesThatAreWrong:
         ],
     )
     def test_a_message_index_that_is_wrong_costs_no_message_and_is_named(
-        self, tmp_path: Path, at: int, value: int
+        self, tmp_path: Path, at: int, value: int, count: int, layout: McapLayout
     ) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(12), SMALL)
+        path = write_mcap(tmp_path / "a.mcap", chatter(count), layout)
         wrong = chunks_of(path)[1]
         first = wrong.message_start_time
         change_index(path, wrong, at, first + value if at == 0 else value)
         reason = "damaged: a message is not where its index says; its messages were read without"
         for newest_first in (False, True):
             found, told = read_on(McapReader(), path, newest_first=newest_first)
-            assert found == sorted(range(12), reverse=newest_first)
+            assert found == sorted(range(count), reverse=newest_first)
             assert told == [f"{reason} its indexes"]
         reader = McapReader()
         with pytest.raises(BagContradictionError):
@@ -209,7 +216,7 @@ class TestIndexesThatAreWrong:
         with pytest.raises(BagError):
             reader.newest(path, "/chatter", EVERYTHING)
         found, told = read_on(reader, path)
-        assert found == [*range(12)]
+        assert found == [*range(count)]
         assert len(told) == 1
         assert any("without its indexes" in note for note in reader.summarize(path).notes)
 

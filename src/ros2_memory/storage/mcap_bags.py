@@ -91,10 +91,8 @@ class McapBags:
         self._max_chunk_bytes = max_chunk_mb << 20
         self._found: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
-        self._shared: Shared[Channel] = Shared(attrgetter("bytes_held"))
         self._contradicted: ByteLru[str] = ByteLru(_CONTRADICTED_BYTES)
         self._finished: FileKey | None = None
-        self._last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel], int] = {}, {}, 0
 
     def closing(self, path: Path) -> Closing:
         """Whether the writer has finished the file."""
@@ -306,16 +304,8 @@ class McapBags:
         return index
 
     def _keep(self, file: OpenFile, index: McapIndex) -> McapIndex:
-        """Keeps an index, with one object for all equal channels.
-
-        The next bag mostly has the very channels of the one before.
-        """
-        given, shared, size = self._last_shared
-        if index.channels is not given:
-            given = index.channels
-            shared = {number: self._shared.of(each) for number, each in given.items()}
-            size = channels_bytes(shared)
-            self._last_shared = given, shared, size
+        """Keeps an index, with one object for all equal channels."""
+        shared, size = _sharing(index.channels)
         index = index._replace(channels=shared)
         self._found.put(file.key, index, index.bytes_held + size)
         return index
@@ -462,6 +452,24 @@ class McapBags:
             data = chunk_data(file, chunk, self._max_chunk_bytes)
             self._data.put(key, data, len(data))
         return data
+
+
+_shared: Final[Shared[Channel]] = Shared(attrgetter("bytes_held"))
+_last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel], int] = {}, {}, 0
+
+
+def _sharing(given: Mapping[int, Channel]) -> tuple[Mapping[int, Channel], int]:
+    """The channels as one object for all equal ones, and about how much memory they take.
+
+    The next bag mostly has the very channels of the one before.
+    """
+    global _last_shared  # noqa: PLW0603 - replaced as a whole, so that threads may share it
+    last, shared, size = _last_shared
+    if given is not last:
+        shared = {number: _shared.of(each) for number, each in given.items()}
+        size = channels_bytes(shared)
+        _last_shared = given, shared, size
+    return shared, size
 
 
 def _index_of(file: OpenFile, max_chunk_bytes: int, *, finished: bool) -> McapIndex:

@@ -63,6 +63,7 @@ OTHER_DECLARED: Final = "its summary section declares other channels or types th
 _STATED: Final = struct.Struct("<BQQQ")
 """A chunk record up to its times: opcode, length, first and last log time."""
 _STATED_BYTES: Final = _STATED.size
+_HEAD_BYTES: Final = RECORD.size
 _stating: Final = _STATED.pack
 _USUAL_BYTES: Final = 32 << 10
 _NEVER: Final = 1 << 64
@@ -262,7 +263,8 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     held = [chunk for chunk in chunks if chunk.channels]
     if counts and len(held) < len(chunks):  # some have no index places
         raise DoubtError
-    if not all(each <= channels.keys() for each in {chunk.channels for chunk in held}):
+    known = frozenset(channels)
+    if not all(map(known.issuperset, {chunk.channels for chunk in held})):
         raise DoubtError("its chunk indexes name channels that it does not declare")
     if chunks:
         _require_as_stated(file, start, chunks)
@@ -288,15 +290,15 @@ def _require_as_stated(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> Non
     ordered = sorted(chunks, key=itemgetter(0))
     if ordered[-1].offset >= file.size:
         raise DoubtError(_OTHER_CHUNKS)
-    heads = file.read_each([chunk[0] for chunk in ordered], _STATED_BYTES)
-    at, record_bytes = MAGIC_SIZE, RECORD.size
-    for (offset, length, first, last, _, _, behind, _), head in zip(ordered, heads, strict=True):
-        if head != _stating(_CHUNK, length - record_bytes, first, last):
-            raise DoubtError(_OTHER_CHUNKS)
-        if offset != at:
-            _require_no_content(file, at, offset)
-        at = offset + length + behind
-    _require_no_content(file, at, end)
+    begins = [chunk[0] for chunk in ordered]
+    heads = [_stating(_CHUNK, chunk[1] - _HEAD_BYTES, chunk[2], chunk[3]) for chunk in ordered]
+    if file.read_each(begins, _STATED_BYTES) != heads:
+        raise DoubtError(_OTHER_CHUNKS)
+    ends = [MAGIC_SIZE, *[chunk[0] + chunk[1] + chunk[6] for chunk in ordered]]
+    begins.append(end)
+    for at, following in zip(ends, begins, strict=True):
+        if at != following:
+            _require_no_content(file, at, following)
 
 
 def _require_no_content(file: OpenFile, at: int, end: int) -> None:
@@ -442,8 +444,10 @@ def _add(totals: dict[int, Total], channel: int, extent: Extent) -> None:
     messages, first, last = extent
     total.count += messages
     # Not by min() and max(), which take longer than all the rest.
-    total.first = min(total.first, first)
-    total.last = max(total.last, last)
+    if first < total.first:  # noqa: PLR1730
+        total.first = first
+    if last > total.last:  # noqa: PLR1730
+        total.last = last
 
 
 def disagreements(stated: Statistics, totals: Mapping[int, Total]) -> tuple[str, ...]:
