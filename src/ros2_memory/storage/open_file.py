@@ -100,6 +100,14 @@ class OpenFile:
         return b"".join(pieces)
 
     def read_each(self, offsets: Iterable[int], length: int) -> list[bytes]:
-        """`length` bytes from each of these places, which lie in the file; fewer at its end."""
+        """`length` bytes from each of these places, which lie in the file; fewer at its end.
+
+        Raises:
+            UnreadableError: the file became shorter.
+        """
         read, descriptor = os.pread, self._descriptor
-        return [read(descriptor, length, offset) for offset in offsets]
+        pieces = [(offset, read(descriptor, length, offset)) for offset in offsets]
+        return [
+            piece if len(piece) == length else self.read(offset, min(length, self.size - offset))
+            for offset, piece in pieces
+        ]
