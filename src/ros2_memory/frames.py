@@ -90,10 +90,9 @@ def transform_at(
         raise failure
     session, found = answers[0]
     if not all(_alike(found, other) for _, other in answers):
-        name = min(session).rpartition("/")[2]
         view.note(
             f"{len(answers)} sessions that were recorded then hold different transforms; "
-            f"this is that of {name}"
+            f"this is that of {sessions.names(session, at)}"
         )
     return found
 

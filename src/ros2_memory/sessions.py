@@ -106,6 +106,12 @@ class Sessions:
         holding = (each for each in around if self._kinds(each))
         return [*dict.fromkeys(self._completed(each, moment) for each in holding)]
 
+    def names(self, session: Session, at: Ns) -> str:
+        """The recordings of a session that went on at a moment; all of it where none did."""
+        recordings = sorted(session - {self._carried})
+        around = [each for each in recordings if each in self._folders_around(at)] or recordings
+        return " and ".join(each.rpartition("/")[2] for each in around) or "deleted recordings"
+
     def nearest_to(self, moment: Ns) -> list[Session]:
         """All sessions that hold transforms, the nearest in time first."""
         spans = [span for by_folder in self._spans.values() for span in by_folder.items()]
@@ -139,11 +145,13 @@ class Sessions:
 
     def _around(self, moment: Ns) -> list[Session]:
         """The sessions that were being recorded at a moment."""
+        return [*dict.fromkeys(map(self._of, sorted(self._folders_around(moment))))]
+
+    def _folders_around(self, moment: Ns) -> set[str]:
+        """Where the recordings lie that went on at a moment."""
         start, stop = max(moment - _AROUND_NS, MIN_NS), min(moment + _AROUND_NS + 1, MAX_NS)
         bags = self._view.snapshot.overlapping(TimeWindow(start, stop))
-        folders = dict.fromkeys(self.folder(bag.recording) for bag in bags)
-        folders.pop(self._carried, None)
-        return [*dict.fromkeys(self._of(folder) for folder in sorted(folders))]
+        return {self.folder(bag.recording) for bag in bags} - {self._carried}
 
     def _of(self, folder: str) -> Session:
         if folder == self._carried:

@@ -130,6 +130,20 @@ def test_two_robots_of_one_time_are_not_mixed_and_a_note_says_whose_it_is(
 
 
 @each_way
+def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(
+    tmp_path: Path, recalls: bool
+) -> None:
+    first, second = "rec_20260714T000000Z", "rec_20260714T000001Z"
+    for name, x in ((first, 100.0), (second, 500.0)):
+        record(tmp_path / name, [static(BEGIN, "map", "odom", x), *drive(BEGIN, 20)])
+    memory = remembered(tmp_path, recalls=recalls)
+    found = transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 4 * S)))
+    named = {100.0: first, 500.0: second}[found.transform.translation[0]]
+    [note] = [note for note in found.notes if "2 sessions" in note]
+    assert note.endswith(f"this is that of {named}")
+
+
+@each_way
 def test_a_static_transform_that_changes_holds_from_then_on(tmp_path: Path, recalls: bool) -> None:
     """Also inside one bag: the robot is placed anew while it stands."""
     poses = [odom(BEGIN + nth * S // 5, 0.0, 0.0, 0.0) for nth in range(100)]
