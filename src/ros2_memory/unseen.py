@@ -4,8 +4,8 @@ Named are, the first few of each and the others counted:
 
 - files that were not read at all: damaged, or of a kind that is not read here. Such a file says
   nothing of its times, so it counts where its recording and its own date have it lie (see
-  `recorder.whereabouts`): an old one that nobody removes is not part of every answer for ever. One
-  whose time is unknown counts where the answer is that there is nothing, since it may hold it.
+  `recorder.whereabouts`): an old one that nobody removes is not part of every answer for ever.
+  Where the answer is that there is nothing, it counts unless it is known to lie elsewhere.
 - the file that is still being written, from the end of the split before it on, or, where what is
   whole of it answers, from there on;
 - bags that a crash left open, on to the last time that their files were written to;
@@ -108,11 +108,15 @@ def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> 
 
 
 def lost_in(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> list[SetAside]:
-    """The files of a window that were not read at all; those of unknown time with `nothing`."""
+    """The files that were not read at all and probably hold some of a window.
+
+    With `nothing` all that may.
+    """
+    places = snapshot.bounds if nothing else snapshot.places
     return [
         aside
         for aside in (*snapshot.damaged, *snapshot.unread)
-        if _touches(snapshot.places[aside], window, unknown=nothing)
+        if _touches(places[aside], window, unknown=nothing)
     ]
 
 

@@ -16,7 +16,7 @@ from ros2_memory.errors import QueryTimeoutError
 from ros2_memory.memory import Call, Limits
 from ros2_memory.timebase import Deadline
 from tests.asking import asked
-from tests.bags import McapLayout, Msg, boolean, detections, make, stamp, write_mcap
+from tests.bags import McapLayout, Msg, boolean, detections, make, stamp, write_db3, write_mcap
 from tests.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
 from tests.memories import SettableClock, memory_of
 from tests.recalled import recalling
@@ -196,6 +196,50 @@ def test_a_search_that_could_not_read_a_closed_bag_says_which(
     assert (reply["timestamp"], reply["value"]) == (None, None)
     told = "could not be decoded" if fault == "undecodable" else "rec/rec_1.mcap"
     assert any(told in note for note in reply["notes"])
+
+
+HOUR = 3600 * S
+
+
+@each_search
+@each_way
+@pytest.mark.parametrize("name", ["o_0.mcap", "o_0.db3", "notes.mcap"])
+@pytest.mark.parametrize("before_h", [None, 36])
+def test_a_copy_that_cannot_be_read_may_hold_what_is_older_than_the_copy(
+    tmp_path: Path, tool: str, recalls: bool, name: str, before_h: int | None
+) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [boolean(T0 - 72 * HOUR + n * S, True) for n in (0, 1)])
+    copied = tmp_path / "o" / name
+    copied.parent.mkdir()
+    if name.endswith(".db3"):
+        write_db3(copied, [boolean(T0 - 48 * HOUR, False)])
+    else:
+        write_mcap(copied, [boolean(T0 - 48 * HOUR, False)])
+        copied.write_bytes(b"X" + copied.read_bytes()[1:])
+    for path in tmp_path.rglob("*.*"):
+        os.utime(path, ns=(T0 - HOUR,) * 2)
+    memory = memory_of(tmp_path, clock=SettableClock(T0))
+    memory = recalling(memory, tmp_path) if recalls else memory
+    given: dict[str, Any] = {"condition_type": "equals", "value": False}
+    if before_h is not None:
+        given["before"] = T0_S - before_h * 3600
+    if tool == "find_last_match":
+        given["topic"] = "/bumper"
+    else:
+        given["condition_topic"] = given["value_topic"] = "/bumper"
+    reply = asked(memory, tmp_path, tool, **given)
+    assert (reply["timestamp"], reply["value"]) == (None, None)
+    assert any(f"may hold more: o/{name}" in note for note in reply["notes"])
+
+
+@each_way
+def test_a_split_that_cannot_be_read_bears_on_nothing_before_the_split_before_it(
+    bag_dir: Path, recalls: bool
+) -> None:
+    (bag_dir / "rec" / "rec_2.mcap").write_bytes(b"this was a bag once, and is none any more")
+    never_before = last(bag_dir, recalls, "/rosout", "contains", "never", before=T0_S + 9)
+    assert never_before is None
+    assert last(bag_dir, recalls, "/rosout", "contains", "never", before=T0_S + 14)["notes"]
 
 
 @needs_real

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.model import TimeWindow
 from ros2_memory.recorder.courses import Neighbours
-from ros2_memory.recorder.whereabouts import LONGEST_NS, begun, whereabouts
+from ros2_memory.recorder.whereabouts import LONGEST_NS, begun, bounds, whereabouts
 from ros2_memory.timebase import MAX_NS, MIN_NS
 
 S = 10**9
@@ -98,3 +98,44 @@ def test_a_window_that_is_found_holds_the_neighbouring_ends_and_fits_64_bits(
         assert found.stop == min(max(before, after) + 1, MAX_NS)
     elif not growing:
         assert found.stop - found.start <= LONGEST_NS + 1 or recording == OWN
+
+
+def test_a_copy_of_yesterday_may_hold_anything_from_before_it_was_made() -> None:
+    assert bounds("someones", Neighbours(), NOW - HOUR, NOW) == TimeWindow(
+        MIN_NS, NOW - HOUR + 60 * S
+    )
+    assert bounds("someones", Neighbours(), None, NOW) is None
+    assert bounds("someones", Neighbours(), 5 * S, NOW) is None
+
+
+def test_splits_around_a_file_bound_it_and_so_does_the_name_of_its_recording() -> None:
+    begin = begun(OWN)
+    assert begin is not None
+    assert bounds("rec", Neighbours(100 * S, 200 * S), NOW, NOW) == TimeWindow(100 * S, 200 * S + 1)
+    assert bounds("rec", Neighbours(100 * S), None, NOW) == TimeWindow(100 * S, MAX_NS)
+    assert bounds("rec", Neighbours(after=9 * S), NOW, NOW) == TimeWindow(MIN_NS, 9 * S + 1)
+    assert bounds(OWN, Neighbours(), NOW, NOW) == TimeWindow(begin, NOW + 60 * S)
+
+
+def test_times_that_contradict_each_other_bound_nothing() -> None:
+    assert bounds("rec", Neighbours(200 * S, 100 * S), NOW, NOW) is None
+    assert bounds("rec", Neighbours(NOW), NOW - HOUR, NOW) is None
+
+
+@given(
+    st.sampled_from([OWN, "someones"]),
+    st.none() | MOMENTS,
+    st.none() | MOMENTS,
+    st.none() | MOMENTS,
+    MOMENTS,
+)
+def test_what_may_be_there_includes_all_that_is_likely_up_to_the_last_write(
+    recording: str, before: int | None, after: int | None, written: int | None, now: int
+) -> None:
+    near = Neighbours(before, after)
+    likely = whereabouts(recording, near, written, now)
+    possible = bounds(recording, near, written, now)
+    if possible is not None:
+        assert likely is not None
+        assert MIN_NS <= possible.start <= likely.start
+        assert likely.stop <= possible.stop <= MAX_NS

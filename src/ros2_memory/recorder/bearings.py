@@ -6,9 +6,17 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from ros2_memory.model import BagState, TimeWindow
+from ros2_memory.recorder import whereabouts
 from ros2_memory.recorder.clock_faults import Part, dating_of
-from ros2_memory.recorder.courses import StepBack, neighbours, steps_of
-from ros2_memory.recorder.whereabouts import LONGEST_NS, whereabouts
+from ros2_memory.recorder.courses import (
+    Neighbours,
+    StepBack,
+    is_recording,
+    neighbours,
+    place_of,
+    steps_of,
+)
+from ros2_memory.recorder.whereabouts import LONGEST_NS
 from ros2_memory.timebase import MAX_NS
 
 if TYPE_CHECKING:
@@ -38,11 +46,28 @@ def place(timeline: Timeline, aside: SetAside, now: Ns, *, growing: bool) -> Tim
     """When the messages of a file that do not answer may have been recorded; None: unknown."""
     if aside.until is not None:
         return TimeWindow(min(aside.until + 1, MAX_NS), MAX_NS)
+    near = _near(timeline, aside)
+    return whereabouts.whereabouts(
+        aside.path.parent.name, near, aside.written, now, growing=growing
+    )
+
+
+def bounds(timeline: Timeline, aside: SetAside, now: Ns) -> TimeWindow | None:
+    """The times outside of which a closed file that does not answer has no message; None: unknown.
+
+    Files that are counted, but not as `ros2 bag record` counts splits, may lie in any order.
+    """
+    split = place_of(str(aside.path))
+    is_split = split is not None and is_recording(split[0])
+    near = _near(timeline, aside) if is_split else Neighbours()
+    return whereabouts.bounds(aside.path.parent.name, near, aside.written, now)
+
+
+def _near(timeline: Timeline, aside: SetAside) -> Neighbours:
     folder = str(aside.path.parent)
     runs = [run for run in timeline.runs if folder in run.folders]
     courses = [run.courses for run in runs]
-    near = neighbours(str(aside.path), courses, lambda at: _bags(runs, at))
-    return whereabouts(aside.path.parent.name, near, aside.written, now, growing=growing)
+    return neighbours(str(aside.path), courses, lambda at: _bags(runs, at))
 
 
 def lost_until(bag: BagFile) -> Ns:

@@ -95,6 +95,17 @@ class Snapshot:
             for number, (aside, growing) in enumerate(asides)
         }
 
+    @cached_property
+    def bounds(self) -> Mapping[SetAside, TimeWindow | None]:
+        """Of the closed files that do not answer, outside of which times they hold no message.
+
+        Wider than `places`, which guess how much a file holds. None: they may hold any.
+        """
+        asides = (*self.damaged, *self.unread)
+        placed = asides[-_PLACED:]
+        known = {each: bearings.bounds(self._timeline, each, self.scanned_at) for each in placed}
+        return {**dict.fromkeys(asides), **known}
+
     def topics(self) -> tuple[str, ...]:
         """The topics of which some bag holds a message, sorted."""
         return tuple(self._timeline.types)

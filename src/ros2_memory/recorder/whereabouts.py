@@ -10,6 +10,9 @@ Between two splits that is all there is to know. Where only one side is known, o
 known from outside, the file is taken to hold a day at most: so an old one that nobody removes, or
 one that was copied here later, leaves the answers about all other days alone. Where neither side is
 known, or the file's own date cannot be true, its time is unknown.
+
+That a file holds a day at most is a guess, good enough for a note beside an answer. Where the
+answer is that there is nothing, the file counts wherever it may hold a message: see `bounds`.
 """
 
 from __future__ import annotations
@@ -63,10 +66,31 @@ def whereabouts(
         return TimeWindow(low, min(high + 1, MAX_NS))
     if growing:
         return TimeWindow(max(now - LONGEST_NS, MIN_NS) if start is None else start, MAX_NS)
-    believed = written is not None and FIRST_BAGS_NS <= written <= last_believed(now)
-    end = min(written + FUTURE_NS, MAX_NS) if believed and written is not None else None
+    end = _last_written(written, now)
     if start is None:
         return None if end is None else TimeWindow(end - LONGEST_NS, end)
     longest = min(start + LONGEST_NS, MAX_NS)
     # A file that was last written before it began was recorded by another clock than it lies under.
     return TimeWindow(start, longest if end is None or end <= start else min(end, longest))
+
+
+def bounds(recording: str, near: Neighbours, written: Ns | None, now: Ns) -> TimeWindow | None:
+    """The log times outside of which a closed file can hold no message; None where it may anywhere.
+
+    As `whereabouts`, without the guess how much a file holds. Splits around it of which the clock
+    was set back in between bound nothing.
+    """
+    start = begun(recording) if near.before is None else near.before
+    end = _last_written(written, now) if near.after is None else min(near.after + 1, MAX_NS)
+    if start is not None and end is not None and end <= start:
+        return None
+    if start is None and end is None:
+        return None
+    return TimeWindow(MIN_NS if start is None else start, MAX_NS if end is None else end)
+
+
+def _last_written(written: Ns | None, now: Ns) -> Ns | None:
+    """The end of what a file may hold by its mtime; None where that cannot be true."""
+    if written is None or not FIRST_BAGS_NS <= written <= last_believed(now):
+        return None
+    return min(written + FUTURE_NS, MAX_NS)
