@@ -180,7 +180,7 @@ class Visit:
 
     Attributes:
         arrived: log time of its first pose there; None where it was there before what was searched.
-        departed: of its last one; None where it is there still.
+        departed: of its last one; None where it is there still, by a pose recent enough to know.
         duration: between the first and the last that are known.
         closest_m: distance (m, in the plane) of the recorded pose that is nearest; the robot may
             have been nearer between two messages.

@@ -30,7 +30,7 @@ from ros2_memory.presences import SILENCE_NS
 from ros2_memory.restarts import restarts
 from ros2_memory.sights import Sights
 from ros2_memory.stays import Approach, Stays, Unread
-from ros2_memory.timebase import MAX_NS, MIN_NS, Deadline, Ns
+from ros2_memory.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
 from ros2_memory.unseen import note_unseen
 from ros2_memory.ways import POSES, add_poses, carries_no, leave_out, stops
 
@@ -50,6 +50,8 @@ _COUNTING_S: Final = 5.0
 """For so long visits are counted that are not shown."""
 _ROUNDING_M: Final = 1e-6
 """What may be lost of a distance between doubles."""
+_SPLITS: Final = 3
+"""A pose so many splits old is the newest of a robot that goes on: a split answers when closed."""
 _MOST_TRIED: Final = 1000
 """The newest poses, of which one must be readable."""
 
@@ -84,13 +86,16 @@ def visits(
     place = placing(view, _pose_frame(view, topic), topic, frame_id)
     looking = _Looking(view, topic, place, (x, y, radius))
     latest, newest = view.snapshot.latest, looking.newest_time
+    now = wall if memory.limits.now == "wall" or latest is None else latest
+    stale = _SPLITS * ns_from_unix(memory.limits.split_duration_s)
+    known = newest is not None and newest >= now - stale
     found, total = looking.newest(limit)
     epochs = () if place.is_map or not found else _restarts(view, topic, found[-1][0].arrived)
     note_unseen(view, TimeWindow.everything(), nothing=not found)
     told = tuple(
         Visit(
             arrived=stay.arrived if stay.begun else None,
-            departed=None if stay.departed == newest else stay.departed,
+            departed=None if known and stay.departed == newest else stay.departed,
             duration=stay.departed - stay.arrived,
             closest_m=closest.distance_m,
             closest_at=closest.time,
@@ -98,6 +103,11 @@ def visits(
         )
         for stay, closest in found
     )
+    if newest is not None and any(visit.departed == newest for visit in told):
+        view.note(
+            f"the newest pose, of {moment(newest)}, is too old to know whether the robot is there "
+            "now: departed is that pose"
+        )
     if any(visit.restarts for visit in told):
         view.note(
             "visits with restarts_since are of before odometry began anew: "
@@ -111,7 +121,7 @@ def visits(
         visits=told,
         more=total > len(told),
         total=total,
-        now=wall if memory.limits.now == "wall" or latest is None else latest,
+        now=now,
         notes=view.notes,
     )
 

@@ -154,7 +154,9 @@ def test_a_static_transform_that_changes_holds_from_then_on(tmp_path: Path, reca
     assert [((each.arrived or 0) - BEGIN, (each.departed or 0) - BEGIN) for each in there] == [
         (0, 39 * S // 5)
     ]
-    assert [((each.arrived or 0) - BEGIN, each.departed) for each in later] == [(8 * S, None)]
+    assert [((each.arrived or 0) - BEGIN, (each.departed or 0) - BEGIN) for each in later] == [
+        (8 * S, 99 * S // 5)
+    ]
 
 
 @each_way

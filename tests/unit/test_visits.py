@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -127,8 +127,19 @@ def test_the_demos_robot_was_at_the_kitchen_counter_when_its_lap_says(
     assert all(each.closest_m < 0.01 for each in answer.visits)
 
 
-def test_a_robot_that_is_there_still_has_not_departed(tmp_path: Path) -> None:
+def at(memory: Memory, now: int) -> Memory:
+    """The memory, asked at another time."""
+    return replace(memory, clock=SettableClock(now))
+
+
+@pytest.mark.parametrize("now", ["wall", "latest"])
+def test_a_robot_that_is_there_still_has_not_departed(
+    tmp_path: Path, now: Literal["wall", "latest"]
+) -> None:
     memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
+    memory = replace(memory, limits=replace(memory.limits, now=now))
+    if now == "wall":
+        memory = at(memory, BEGIN + 75 * S)
     answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0)
     shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
     assert shown["there_now"] is True
@@ -136,6 +147,24 @@ def test_a_robot_that_is_there_still_has_not_departed(tmp_path: Path) -> None:
     assert visit["departed"] is None
     assert visit["ago_s"] == 0.0
     assert visit["arrived"] == pytest.approx(BEGIN / S + 18.0, abs=0.21)
+    assert "notes" not in shown
+
+
+def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
+    """A year ago, or minutes: its newest pose is its last one there, and a note says so."""
+    memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
+    newest = BEGIN + round(49.8 * S)
+    for later in (31 * S, 365 * 86_400 * S):
+        answer = visits(at(memory, newest + later), Call(), 10.0, 0.0, radius_m=1.0)
+        shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+        assert shown["there_now"] is False
+        [visit] = shown["visits"]
+        assert visit["departed"] == pytest.approx(newest / S)
+        assert visit["ago_s"] == pytest.approx(later / S)
+        assert "too old to know whether the robot is there now" in shown["notes"][0]
+    elsewhere = visits(at(memory, newest + 365 * 86_400 * S), Call(), 5.0, 0.0, radius_m=1.0)
+    assert elsewhere.visits
+    assert elsewhere.notes == ()
 
 
 def test_a_robot_that_was_outside_for_a_moment_did_not_leave(tmp_path: Path) -> None:
@@ -230,7 +259,7 @@ def test_a_map_that_moves_under_odometry_is_followed(tmp_path: Path, recalls: bo
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=0.3)
     [visit] = answer.visits
     assert answer.frame_id == "map"
-    assert (visit.arrived, visit.departed) == (BEGIN, None)
+    assert (visit.arrived, visit.departed) == (BEGIN, BEGIN + round(39.8 * S))
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.inf, math.nan])
