@@ -13,8 +13,8 @@ spread farther than drift and noise explain is motion, and parts the chain. A st
 out of `LARGEST_M` ends there, and the next one begins.
 
 All of this depends on poses a few slots around alone, and slots and blocks are counted from the
-epoch. So a standstill is the same whatever window is asked about, and where a history is cut into
-bags changes nothing but the rounding of poses at the cut (`_STEP_M`).
+epoch, and all positions are rounded alike (`_STEP_M`). So a standstill is the same whatever window
+is asked about, and however a history is cut into bags.
 
 The noise of a slot is estimated from second differences, which a steady motion leaves at zero: see
 J. von Neumann et al., "The mean square successive difference", Ann. Math. Statist. 12 (1941), for
@@ -54,7 +54,7 @@ _NOISE_FACTOR: Final = 5.5
 _NEAREST_M: Final = 0.0003
 """Poses without noise are at one place where they are no farther apart than this."""
 _STEP_M: Final = 0.0001
-"""What poses at the ends of a bag are rounded to."""
+"""What positions and their means are rounded to."""
 _MOST_IN_SLOT: Final = 1_000
 _EDGE_SLOTS: Final = 3
 
@@ -270,10 +270,12 @@ class _Chain:
         self._found: list[Standstill] = []
         self._parts: list[Standstill] = []  # of the standstill under way: it drifts on
         self._settled: Block | None = None  # the newest
+        self._taken: Ns = 0
 
     def add(self, slot: _Slot) -> None:
-        box = Box3(slot.mean, slot.mean)
-        noise = _noise(slot.bends) / math.sqrt(len(slot.poses))
+        mean = _rounded(slot.mean)
+        box = Box3(mean, mean)
+        noise = round(_noise(slot.bends) / math.sqrt(len(slot.poses)) / _STEP_M) * _STEP_M
         number = slot.number * SLOT_NS // BLOCK_NS
         self.extend([Block(number, slot.first, slot.last, noise, box)])
 
@@ -287,8 +289,13 @@ class _Chain:
             else:
                 self.blocks.append(block)
 
-    def settle(self, keep: int = 1) -> None:
-        """Turn all blocks but the newest, to which slots may be added, into standstills."""
+    def settle(self, taken: Ns, keep: int = 1) -> None:
+        """Turn all blocks but the newest, to which slots may be added, into standstills.
+
+        They begin at `taken` or later, where the standstill of the chain before ends: chains follow
+        poses into each other's slots.
+        """
+        self._taken = taken
         settled = self.blocks[: len(self.blocks) - keep]
         self.blocks = self.blocks[len(settled) :]
         for block in settled:
@@ -300,9 +307,9 @@ class _Chain:
         """Whether a standstill may be in it."""
         return self.start is None or self.end is None or self.end - self.start >= SHORTEST_NS
 
-    def standstills(self) -> list[Standstill]:
-        """Return the standstills of a chain that is over."""
-        self.settle(keep=0)
+    def standstills(self, taken: Ns) -> list[Standstill]:
+        """Return the standstills of a chain that is over, from `taken` on; see `settle`."""
+        self.settle(taken, keep=0)
         if self.end is not None:
             self._finish(self.end)
         return self._found
@@ -326,11 +333,16 @@ class _Chain:
     def _finish(self, end: Ns) -> None:
         """End the standstill under way."""
         parts, self._parts = self._parts, []
-        if len(parts) > 1 and parts[-1].start >= end:
-            parts.pop()
-        if parts and end - parts[0].start >= SHORTEST_NS:
-            parts[-1] = parts[-1]._replace(end=end)
-            self._found += parts
+        if not parts:
+            return
+        begin = max(parts[0].start, self._taken)
+        if end - begin < SHORTEST_NS:
+            return
+        parts[-1] = parts[-1]._replace(end=end)
+        clipped = (
+            Standstill(max(start, begin), min(until, end), box) for start, until, box in parts
+        )
+        self._found += [each for each in clipped if each.start < each.end]
 
 
 class _Linking:
@@ -378,7 +390,7 @@ class StandstillCollector:
 
     def add(self, time: Ns, position: Vector3) -> None:
         """Take the next pose (m), which must be finite."""
-        pose = TimedPosition(time, position)
+        pose = TimedPosition(time, _rounded(position))
         if self._slots and time // SLOT_NS == self._slots[-1].number:
             self._slots[-1].add(pose)
             return
@@ -436,7 +448,7 @@ class StandstillBuilder:
     def add(self, time: Ns, position: Vector3) -> None:
         """Take the next pose (m), which must be finite."""
         self._unpack_tail()
-        self._add(TimedPosition(time, position))
+        self._add(TimedPosition(time, _rounded(position)))
 
     def join(self, bag: StandstillDigest) -> None:
         """Take all poses of a bag that come next, as if they were added one by one."""
@@ -517,7 +529,7 @@ class StandstillBuilder:
     def _go_on(self, chain: _Chain, stored: ChainDigest) -> None:
         """Add a chain of a bag, which is the newest there is, to what it goes on from."""
         chain.extend(unpacked_blocks(stored.blocks))
-        chain.settle()
+        chain.settle(self._taken)
         chain.end = stored.end
         if stored.end is None:
             self._linking.chain = chain
@@ -543,12 +555,27 @@ class StandstillBuilder:
 
     def _close(self, chain: _Chain | None) -> None:
         if chain is not None:
-            self._done += chain.standstills()
+            self._done += chain.standstills(self._taken)
+
+    @property
+    def _taken(self) -> Ns:
+        """Where the newest standstill ends."""
+        return self._done[-1].end if self._done else 0
 
 
 def _opens(bag: StandstillDigest) -> bool:
     """Whether the second and third slot of a bag are linked."""
     return bool(bag.chains) and bag.chains[0].start is None
+
+
+def _rounded(position: Vector3) -> Vector3:
+    """A position as it comes back out of its bytes, so that cuts into bags change nothing."""
+    x, y, z = position
+    return (
+        round(x / _STEP_M) * _STEP_M,
+        round(y / _STEP_M) * _STEP_M,
+        round(z / _STEP_M) * _STEP_M,
+    )
 
 
 def packed_poses(poses: Iterable[TimedPosition]) -> bytes:

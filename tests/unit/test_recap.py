@@ -186,6 +186,36 @@ def test_a_stop_goes_on_where_it_does_after_the_window_or_up_to_the_newest_pose(
     assert goes_on(ended + 20) == [False, True]
 
 
+@each_way
+@pytest.mark.parametrize(("hz", "noise", "toggle"), [(10, 0.02, 0.0), (50, 0.0, 0.05)])
+def test_stops_under_noise_do_not_last_longer_than_the_window(
+    tmp_path: Path, recalls: bool, hz: int, noise: float, toggle: float
+) -> None:
+    draw = random.Random(11)
+    messages = [
+        odom(
+            BEGIN + nth * S // hz,
+            draw.gauss(0, noise) + draw.choice([0.0, toggle]),
+            draw.gauss(0, noise),
+            0.0,
+        )
+        for nth in range(180 * hz)
+    ]
+    for nth, at in enumerate(range(0, len(messages), 9 * hz)):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 9 * hz])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    whole = over(memory, 0, 180)
+    parts = [over(memory, at, at + 30) for at in range(0, 180, 30)]
+    for told in (whole, *parts):
+        assert told.stood is not None
+        assert told.stood <= told.end - told.start
+        stops = [each for each in told.events if each.kind == "stop"]
+        assert all((one.end or 0) <= other.start for one, other in pairwise(stops))
+    assert sum(told.stood or 0 for told in parts) == pytest.approx(whole.stood or 0, abs=0.2 * S)
+
+
 def test_a_window_between_two_poses_of_a_stop_is_a_stop(tmp_path: Path) -> None:
     write_mcap(
         tmp_path / "bag.mcap", [odom(BEGIN + at * S, 1.0, 2.0, 0.0) for at in range(0, 20, 2)]

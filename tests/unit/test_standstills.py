@@ -259,6 +259,53 @@ def test_standstills_are_in_order_apart_and_long(made: World, parts: list[float]
     assert all(one.end <= other.start for one, other in pairwise(found))
 
 
+@st.composite
+def restless(draw: st.DrawFn) -> Poses:
+    """A robot that stands under noise of any size at any rate, whose position may toggle."""
+    rate = draw(st.sampled_from([1, 2, 4, 5, 10, 20, 50]))
+    noise = draw(st.sampled_from([0.0, 0.003, 0.01, 0.015, 0.02, 0.03, 0.2]))
+    toggle = draw(st.sampled_from([0.0, 0.01, 0.03, 0.05]))
+    random_draw = random.Random(draw(st.integers(0, 10_000)))
+    begin = draw(st.integers(100 * S, 101 * S))
+    return [
+        (
+            begin + nth * S // rate,
+            (
+                random_draw.gauss(0, noise) + random_draw.choice([0.0, toggle]),
+                random_draw.gauss(0, noise),
+                0.0,
+            ),
+        )
+        for nth in range(min(60 * rate, 1500))
+    ]
+
+
+def check_disjoint(found: tuple[Standstill, ...], poses: Poses) -> None:
+    assert all(poses[0][0] <= each.start < each.end <= poses[-1][0] for each in found)
+    assert all(one.end <= other.start for one, other in pairwise(found))
+    assert sum(each.end - each.start for each in found) <= poses[-1][0] - poses[0][0]
+
+
+@settings(max_examples=150, deadline=None)
+@given(restless(), CUTS)
+def test_standstills_under_any_noise_are_in_order_and_disjoint(
+    poses: Poses, parts: list[float]
+) -> None:
+    check_disjoint(standstills_of(poses), poses)
+    check_disjoint(from_bags(poses, cuts_of(poses, parts)), poses)
+
+
+@pytest.mark.parametrize("noise", [0.015, 0.02])
+@pytest.mark.parametrize("bag_s", [None, 7])
+def test_a_robot_that_stands_under_noise_does_not_stand_longer_than_there_are_poses(
+    noise: float, bag_s: int | None
+) -> None:
+    poses = world([(1800.0, 0.0)], hz=10, noise=noise).poses
+    found = from_bags(poses, [] if bag_s is None else [*range(bag_s * 10, 18_000, bag_s * 10)])
+    check_disjoint(found, poses)
+    assert stood(found) > 900
+
+
 def test_any_number_of_poses_at_one_time_are_held_as_few() -> None:
     collector = StandstillCollector()
     for nth in range(20_000):
