@@ -227,7 +227,7 @@ def find_last_match(
     found = last_match(view, topic, condition, until)
     if found is None:
         return answers.Match(None, unsearched(view, TimeWindow(MIN_NS, until)))
-    note_unseen(view, _searched(view, found, until, now))
+    note_unseen(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
     if counted_from is not None and found.time > counted_from + FUTURE_NS:
         view.note(f"dated {seconds(found.time - counted_from)} after now: when it was is unknown")
@@ -258,7 +258,7 @@ def value_when(
     found = last_match(view, condition_topic, condition, until)
     if found is None:
         return answers.ValueWhen(None, notes=unsearched(view, TimeWindow(MIN_NS, until)))
-    note_unseen(view, _searched(view, found, until, now))
+    note_unseen(view, _searched(view, found, until, now), search=True)
     matched = _value(view, found, (), None)
     upto = TimeWindow.until(found.time)
     held = view.newest(name, upto)

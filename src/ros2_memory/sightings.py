@@ -109,7 +109,7 @@ def find_matches(
     view.unsay_before(searched.start)
     pose_topic = memory.limits.pose_topic
     found = tuple(_told(view, condition, run, pose_topic) for run in runs.told)
-    note_unseen(view, searched, nothing=not found)
+    note_unseen(view, searched, nothing=not found, search=True)
     return Sightings(
         found,
         more=runs.cut or runs.count > len(found),

@@ -6,6 +6,8 @@ Named are, the first few of each and the others counted:
   nothing of its times, so it counts where its recording and its own date have it lie (see
   `recorder.whereabouts`): an old one that nobody removes is not part of every answer for ever.
   Where the answer is that there is nothing, it counts unless it is known to lie elsewhere.
+- splits that the metadata.yaml of a recording lists and that are not there, beside searches and
+  answers that there is nothing.
 - the file that is still being written, from the end of the split before it on, or, where what is
   whole of it answers, from there on;
 - bags that a crash left open, on to the last time that their files were written to;
@@ -20,6 +22,7 @@ from typing import TYPE_CHECKING
 from ros2_memory.model import BagState, TimeWindow
 from ros2_memory.reading import short_name
 from ros2_memory.recorder.handover import LOG_CLOCK_NOTE
+from ros2_memory.recorder.listed_splits import absent_files
 from ros2_memory.summaries import DOUBTS, MESSAGES_MISSING, READ_WITHOUT_INDEXES
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS, unix_rounded_up
 from ros2_memory.wording import NAMED, counted, listed, shortened
@@ -34,11 +37,18 @@ if TYPE_CHECKING:
     from ros2_memory.timebase import Ns
 
 
-def note_unseen(view: Reading, window: TimeWindow, *, nothing: bool = False) -> None:
-    """Notes what of a window could not be read; `nothing`: the answer is that there is nothing."""
+def note_unseen(
+    view: Reading, window: TimeWindow, *, nothing: bool = False, search: bool = False
+) -> None:
+    """Notes what of a window could not be read.
+
+    `nothing`: the answer is that there is nothing. Then, and after a `search`, splits that are
+    listed and not there count too.
+    """
     if window.empty:
         return
-    for sentence in unseen(view.snapshot, window, nothing=nothing):
+    absent = _absent(view) if nothing or search else ()
+    for sentence in unseen(view.snapshot, window, nothing=nothing, absent=absent):
         view.note(sentence)
 
 
@@ -76,8 +86,12 @@ def is_searched(view: Reading, window: TimeWindow) -> bool:
     That one is being written is no reason to doubt it, or a robot that records would never be told
     that something was not there.
     """
-    lost = lost_in(view.snapshot, window, nothing=True)
+    lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
     return view.complete and not lost and not any(map(_may_lack, view.snapshot.odd(window)))
+
+
+def _absent(view: Reading) -> Sequence[SetAside]:
+    return absent_files(view.snapshot, view.memory.index.bag_dir)
 
 
 def _may_lack(bag: BagFile) -> bool:
@@ -92,9 +106,15 @@ def _is_whole(note: str) -> bool:
     return note.endswith(READ_WITHOUT_INDEXES) or note == LOG_CLOCK_NOTE
 
 
-def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> Iterator[str]:
+def unseen(
+    snapshot: Snapshot,
+    window: TimeWindow,
+    *,
+    nothing: bool = False,
+    absent: Sequence[SetAside] = (),
+) -> Iterator[str]:
     """The sentences for a window; none where all of it was read."""
-    if lost := lost_in(snapshot, window, nothing=nothing):
+    if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
         yield not_read(lost)
     active = _being_written(snapshot, window)
     if active:
@@ -107,15 +127,23 @@ def unseen(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> 
     yield from amiss(snapshot.odd(window))
 
 
-def lost_in(snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False) -> list[SetAside]:
-    """The files that were not read at all and probably hold some of a window.
+def lost_in(
+    snapshot: Snapshot,
+    window: TimeWindow,
+    *,
+    nothing: bool = False,
+    absent: Sequence[SetAside] = (),
+) -> list[SetAside]:
+    """The files, also `absent` ones, that were not read at all and probably hold some of a window.
 
     With `nothing` all that may.
     """
     places = snapshot.bounds if nothing else snapshot.places
+    if absent:
+        places = {**snapshot.bounds_of(absent), **places}
     return [
         aside
-        for aside in (*snapshot.damaged, *snapshot.unread)
+        for aside in (*absent, *snapshot.damaged, *snapshot.unread)
         if _touches(places[aside], window, unknown=nothing)
     ]
 

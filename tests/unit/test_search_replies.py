@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from functools import partial
 from itertools import count
@@ -240,6 +241,66 @@ def test_a_split_that_cannot_be_read_bears_on_nothing_before_the_split_before_it
     never_before = last(bag_dir, recalls, "/rosout", "contains", "never", before=T0_S + 9)
     assert never_before is None
     assert last(bag_dir, recalls, "/rosout", "contains", "never", before=T0_S + 14)["notes"]
+
+
+def list_splits(recording: Path, count: int) -> None:
+    names = "".join(f"  - {recording.name}_{n}.mcap\n" for n in range(count))
+    (recording / "metadata.yaml").write_text(
+        f"rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n{names}"
+    )
+
+
+@each_search
+@each_way
+@pytest.mark.parametrize("gone", [0, 1, 2])
+def test_never_is_not_the_answer_beside_a_split_that_is_listed_and_not_there(
+    bag_dir: Path, tool: str, recalls: bool, gone: int
+) -> None:
+    list_splits(bag_dir / "rec", 3)
+    memory = memory_of(bag_dir)
+    assert never(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool) is None
+    (bag_dir / "rec" / f"rec_{gone}.mcap").unlink()
+    memory = memory_of(bag_dir)
+    reply = never(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool)
+    lacking = (
+        f"1 bag file could not be read and may hold more: rec/rec_{gone}.mcap "
+        "(metadata.yaml lists it, and it is not there)"
+    )
+    assert reply == {"timestamp": None, "value": None, "notes": [lacking]}
+
+
+@each_way
+def test_a_split_that_is_not_there_is_named_only_where_it_may_bear_on_the_answer(
+    bag_dir: Path, recalls: bool
+) -> None:
+    list_splits(bag_dir / "rec", 3)
+    (bag_dir / "rec" / "rec_1.mcap").unlink()
+    assert last(bag_dir, recalls, "/rosout", "contains", "never", before=T0_S + 2) is None
+    assert "notes" not in last(bag_dir, recalls, "/rosout", "contains", "done")
+    found = last(bag_dir, recalls, "/rosout", "contains", "started")
+    assert any("rec/rec_1.mcap" in note for note in found["notes"])
+    memory = memory_of(bag_dir)
+    given = {"topic": "/rosout", "condition_type": "contains", "value": "started"}
+    sightings = asked(memory, bag_dir, "find_matches", **given)
+    assert any("rec/rec_1.mcap" in note for note in sightings["notes"])
+    early = asked(memory, bag_dir, "find_matches", **given, end=T0_S + 2)
+    assert "notes" not in early
+
+
+@each_way
+def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_never(
+    bag_dir: Path, recalls: bool
+) -> None:
+    list_splits(bag_dir / "rec", 3)
+    (bag_dir / "rec" / "rec_0.mcap").unlink()
+    own = bag_dir / ".episodic" / "recordings.jsonl"
+    own.parent.mkdir()
+    inode = (bag_dir / "rec").stat().st_ino
+    mine = json.dumps({"recording": "rec", "inode": inode})
+    own.write_text('{"bag_dir_id": "5f0c"}\n' + mine + "\n")
+    assert last(bag_dir, recalls, "/rosout", "contains", "never") is None
+    (bag_dir / "rec" / "rec_1.mcap").rename(bag_dir / "rec" / "rec_0.mcap")
+    assert last(bag_dir, recalls, "/rosout", "contains", "never")["notes"]
 
 
 @needs_real

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.directories import opened
+from ros2_memory.model import SetAside
 from ros2_memory.recorder.heartbeat import HEARTBEAT_FILE
 from ros2_memory.recorder.layout import HANDOVER_FILE, METADATA_FILE
 from ros2_memory.recorder.ownership import OwnRecordings
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 _AS_IT_IS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
 _READ_AT_MOST: Final = 64 << 20
 _AT_HAND: Final = 1024
+_NOT_THERE: Final = "metadata.yaml lists it, and it is not there"
 _NAME: Final = re.compile(r"^\s*(?:- )?(?:- |path:)\s*['\"]?([^'\"\n]+?)['\"]?\s*$", re.MULTILINE)
 _FILES: Final = re.compile(r"^(\s*)files:\s*$", re.MULTILINE)
 _FIELD: Final = re.compile(r"^\s*(?:- )?(path|message_count):\s*['\"]?([^'\"]+?)['\"]?\s*$")
@@ -100,6 +102,15 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
         if absent.files or absent.messages or absent.unreadable:
             found.append(absent)
     return found
+
+
+def absent_files(snapshot: Snapshot, bag_dir: Path) -> list[SetAside]:
+    """The files that `absent_splits` finds missing, as closed files that cannot be read."""
+    return [
+        SetAside(Path(each.folder) / name, _NOT_THERE)
+        for each in absent_splits(snapshot, bag_dir)
+        for name in each.files
+    ]
 
 
 def _may_be_deleted(own: OwnRecordings, bag_dir: Path, folder: Path) -> bool:

@@ -101,10 +101,13 @@ class Snapshot:
 
         Wider than `places`, which guess how much a file holds. None: they may hold any.
         """
-        asides = (*self.damaged, *self.unread)
-        placed = asides[-_PLACED:]
+        return self.bounds_of((*self.damaged, *self.unread))
+
+    def bounds_of(self, files: Sequence[SetAside]) -> Mapping[SetAside, TimeWindow | None]:
+        """As `bounds`, of any closed files, be they not there any more."""
+        placed = files[-_PLACED:]
         known = {each: bearings.bounds(self._timeline, each, self.scanned_at) for each in placed}
-        return {**dict.fromkeys(asides), **known}
+        return {**dict.fromkeys(files), **known}
 
     def topics(self) -> tuple[str, ...]:
         """The topics of which some bag holds a message, sorted."""
