@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -16,10 +17,12 @@ from hypothesis import strategies as st
 from ros2_memory import cli
 from ros2_memory.health import Health
 from ros2_memory.memory import Call
+from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.recorder.ownership import OwnRecordings
 from ros2_memory.recorder.retention import RetentionLimits
 from ros2_memory.recorder.wipe import clear_bags
 from ros2_memory.status import memory_status
+from ros2_memory.upkeep import claim
 from tests.bags import McapLayout, boolean, odom, write_mcap
 from tests.keeping import PLENTY, files_in, keeper_of, recording_now, size_of
 from tests.kept_moments import NOW, A, B, house_of, in_moments, kept, recording
@@ -35,6 +38,11 @@ Capture = pytest.CaptureFixture[str]
 S = 10**9
 T0 = 1_790_000_000 * S
 LITTLE = 1
+
+
+def late() -> SettableClock:
+    """A clock an hour after the bags here."""
+    return SettableClock(T0 + 3600 * S)
 
 
 def foreign(bag_dir: Path, *names: str, start: int = -86_400) -> list[Path]:
@@ -178,6 +186,30 @@ class TestRetention:
         lost = {path.split("/")[0] for path in {*before} - {*files_in(bag_dir)}}
         listed = {each["recording"] for each in lines(bag_dir) if "recording" in each}
         assert lost <= listed
+
+
+class TestUpgrade:
+    """The first start of a version with the list."""
+
+    def test_a_damaged_copy_of_another_directorys_recordings_outlives_every_limit(
+        self, tmp_path: Path
+    ) -> None:
+        carried = {"recorded_by": "ros2-memory", "bag_dir_id": "1" * 32}
+        for number in range(4):
+            path = tmp_path / A / f"{A}_{number}.mcap"
+            embedding(path, carried, start=T0 + number * 10 * S)
+        first = tmp_path / A / f"{A}_0.mcap"
+        first.write_bytes(first.read_bytes()[:100])
+        write_heartbeat(
+            tmp_path,
+            Heartbeat(1, S, RecorderState.STOPPED, (A,), S, 0, (), (), None, 2.0),
+        )
+        for path in (tmp_path / A).iterdir():
+            os.utime(path, (1, 1))
+        claim(OwnRecordings(tmp_path))
+        before = files_in(tmp_path)
+        keeper_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE, clock=late()).apply(tmp_path)
+        assert files_in(tmp_path) == before
 
 
 class TestRepair:
@@ -330,6 +362,24 @@ class TestAdopt:
         (tmp_path / "a").mkdir()
         assert cli.main(["adopt", "a"]) == 1
         assert "no bag files lie there" in capsys.readouterr().out
+
+    def test_links_are_neither_adopted_nor_counted(self, tmp_path: Path, capsys: Capture) -> None:
+        [target] = foreign(tmp_path, "old/x_0.mcap")
+        for folder in ("a", "b"):
+            (tmp_path / folder).mkdir()
+        (tmp_path / "a" / "x_0.mcap").symlink_to(target)
+        (tmp_path / "a" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
+        (tmp_path / "b" / "old").symlink_to(target.parent)
+        assert cli.main(["adopt", "a", "b"]) == 1
+        said = capsys.readouterr().out
+        assert "no bag files lie there" in said
+        for link in ("a/x_0.mcap", "a/y_0.mcap", "b/old"):
+            assert f"{link} is a symbolic link, which is not followed" in said
+        assert "adopted" not in said
+        (tmp_path / "old" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
+        assert cli.main(["adopt", "old", "a"]) == 0
+        assert "adopted: old (1 bag file, " in capsys.readouterr().out
+        assert [*OwnRecordings(tmp_path).names()] == ["old"]
 
     def test_where_nothing_is_recorded_nothing_is_adopted(
         self, tmp_path: Path, capsys: Capture

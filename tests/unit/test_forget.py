@@ -242,6 +242,27 @@ class TestForeignBags:
         assert forget(0, 100, "--yes") == 1
         assert len(bags(bag_dir)) == 4
 
+    def test_a_copy_without_its_list_of_which_one_file_is_damaged_stays(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        shutil.rmtree(bag_dir / ".episodic")
+        name = "rec_20231114T221320Z"
+        for number in range(2):
+            path = bag_dir / name / f"{name}_{number}.mcap"
+            start = T0 + (200 + 20 * number) * NS_PER_S
+            embedding(path, {**OURS, "bag_dir_id": "1" * 32}, start=start)
+        first = bag_dir / name / f"{name}_0.mcap"
+        first.write_bytes(first.read_bytes()[:20])
+        left(first), left(path)
+        write_heartbeat(
+            bag_dir, Heartbeat(1, T0, RecorderState.STOPPED, (name,), T0, 0, (), (), None, 2.0)
+        )
+        assert forget(190, 300, "--yes") == 1
+        assert path.exists()
+        assert (
+            f"stays: {name}/{path.name}: this recorder did not make it" in capsys.readouterr().out
+        )
+
     def test_one_that_took_the_place_of_another_while_it_was_asked_stays(
         self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -46,6 +46,32 @@ def restored(folder: Path) -> None:
     shutil.rmtree(aside)
 
 
+def spoil(path: Path, fault: str) -> None:
+    """Has a bag file damaged, or of a kind in which nothing that is embedded is looked for."""
+    data = bytearray(path.read_bytes())
+    if fault == "cut":
+        path.write_bytes(data[:40])
+    elif fault == "zeroed":
+        data[30:60] = bytes(30)
+        path.write_bytes(data)
+    elif fault == "flipped":  # the opcode of the record behind the header
+        data[8 + 9 + int.from_bytes(data[9:17], "little")] ^= 4
+        path.write_bytes(data)
+    elif fault == "db3":
+        path.unlink()
+        path.with_suffix(".db3").write_bytes(b"SQLite format 3\0")
+    elif fault == "compressed":
+        path.unlink()
+        path.with_name(path.name + ".zstd").write_bytes(b"\x28\xb5\x2f\xfd" + data[:50])
+    elif fault == "link":
+        path.rename(path.parents[1] / path.name)
+        path.symlink_to(path.parents[1] / path.name)
+    elif fault == "empty":
+        path.write_bytes(b"")
+    else:
+        path.unlink()
+
+
 def told(logs: list[MutableMapping[str, Any]], event: str) -> list[MutableMapping[str, Any]]:
     return [each for each in logs if each["event"] == event]
 
@@ -429,6 +455,83 @@ class TestVersionsBeforeTheList:
         self.hand_over(tmp_path, A, B)
         assert not claimed(tmp_path).names()
 
+    @pytest.mark.parametrize("named_by", ["heartbeat", "handover"])
+    @pytest.mark.parametrize("damaged", [0, 1])
+    @pytest.mark.parametrize("fault", ["cut", "zeroed", "flipped", "db3", "link", "compressed"])
+    def test_a_copy_of_which_one_file_cannot_be_read_is_foreign(
+        self, tmp_path: Path, fault: str, damaged: int, named_by: str
+    ) -> None:
+        for number in range(3):
+            embedding(tmp_path / B / f"{B}_{number}.mcap", {**OURS, "bag_dir_id": "1" * 32})
+        if named_by == "heartbeat":
+            self.beat(tmp_path, B)
+        else:
+            (tmp_path / A).mkdir()
+            self.hand_over(tmp_path, A, B)
+        spoil(tmp_path / B / f"{B}_{damaged}.mcap", fault)
+        assert not claimed(tmp_path).owns(tmp_path / B)
+
+    @pytest.mark.parametrize("fault", ["cut", "zeroed", "flipped", "db3", "link", "compressed"])
+    @pytest.mark.parametrize("embedded", [None, OURS])
+    def test_one_that_is_named_and_cannot_be_read_is_foreign_and_told(
+        self, tmp_path: Path, fault: str, embedded: Mapping[str, str] | None
+    ) -> None:
+        for name in (A, B):
+            embedding(tmp_path / name / f"{name}_0.mcap", embedded)
+            embedding(tmp_path / name / f"{name}_1.mcap", embedded)
+        self.beat(tmp_path, A, B)
+        spoil(tmp_path / A / f"{A}_1.mcap", fault)
+        with structlog.testing.capture_logs() as logs:
+            own = claimed(tmp_path)
+        assert [*own.names()] == [B]
+        [warned] = told(logs, "recordings_not_adopted")
+        assert (warned["recordings"], warned["log_level"]) == (1, "warning")
+        [reason] = warned["reasons"]
+        assert reason.startswith(f"{A}: {A}_1.")
+        assert "cannot be read as far as" in reason
+        assert "ros2-memory adopt" in warned["advice"]
+
+    @pytest.mark.parametrize("embedded", [None, OURS])
+    def test_one_that_ends_in_a_torn_split_is_adopted_as_far_as_it_can_be_read(
+        self, tmp_path: Path, embedded: Mapping[str, str] | None
+    ) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", embedded)
+        torn = embedding(tmp_path / A / f"{A}_1.mcap", embedded)
+        (tmp_path / A / f"{A}_2.mcap").touch()
+        self.beat(tmp_path, A)
+        begins = torn.read_bytes().index(b"/chatter") - 100  # within the first chunk
+        torn.write_bytes(torn.read_bytes()[: begins + 150])
+        assert claimed(tmp_path).owns(tmp_path / A)
+
+    def test_a_named_one_that_carries_another_programs_name_is_foreign(
+        self, tmp_path: Path
+    ) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", {"recorded_by": "someone"})
+        self.beat(tmp_path, A)
+        assert not claimed(tmp_path).owns(tmp_path / A)
+
+    @settings(max_examples=60, deadline=None)
+    @given(
+        faults=st.lists(
+            st.tuples(
+                st.integers(0, 3), st.sampled_from(["cut", "zeroed", "db3", "gone", "empty"])
+            ),
+            max_size=4,
+            unique_by=lambda fault: fault[0],
+        )
+    )
+    def test_no_copy_that_carries_an_id_is_adopted_whatever_was_damaged(
+        self, tmp_path_factory: pytest.TempPathFactory, faults: list[tuple[int, str]]
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        for number in range(4):
+            embedding(bag_dir / A / f"{A}_{number}.mcap", {**OURS, "bag_dir_id": "1" * 32}, size=2)
+        self.beat(bag_dir, A)
+        for number, fault in faults:
+            spoil(bag_dir / A / f"{A}_{number}.mcap", fault)
+        if any(path.stat().st_size for path in (bag_dir / A).iterdir()):
+            assert not claimed(bag_dir).owns(bag_dir / A)
+
     def test_it_happens_once(self, tmp_path: Path) -> None:
         claimed(tmp_path)
         embedding(tmp_path / A / f"{A}_0.mcap", OURS)
@@ -458,7 +561,27 @@ class TestVersionsBeforeTheList:
 
 
 class TestEmbedded:
-    def test_nothing_in_what_is_no_bag(self, tmp_path: Path) -> None:
+    """None where it cannot be known, which is not the same as nothing."""
+
+    @pytest.mark.parametrize("custom", [None, {}])
+    def test_nothing_where_a_file_can_be_read_and_has_none(
+        self, tmp_path: Path, custom: Mapping[str, str] | None
+    ) -> None:
+        assert custom_data(embedding(tmp_path / "a_0.mcap", custom)) == {}
+
+    def test_wherever_a_file_was_cut_it_is_what_was_embedded_or_unknown(
+        self, tmp_path: Path
+    ) -> None:
+        path = embedding(tmp_path / "a_0.mcap", OURS, size=2)
+        data, found = path.read_bytes(), []
+        for length in range(len(data)):
+            path.write_bytes(data[:length])
+            found.append(custom_data(path))
+        known = found.index(OURS)
+        assert found == [None] * known + [OURS] * (len(data) - known)
+        assert data[known - 20 : known].endswith(b"ros_distro: jazzy\n"[-8:])
+
+    def test_unknown_of_what_is_no_bag(self, tmp_path: Path) -> None:
         path = tmp_path / "x.mcap"
         for data in (b"", b"\x89MCAP0\r\n", b"no bag", b"\x89MCAP0\r\n" + b"\x0c" + b"\xff" * 8):
             path.write_bytes(data)

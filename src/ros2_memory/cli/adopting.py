@@ -1,7 +1,9 @@
 """`ros2-memory adopt`: takes recordings that another program made for the recorder's own."""
 
 import os
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +19,7 @@ from ros2_memory.recorder.ownership import (
     folders_with_bags,
     identity_of,
     is_kept_apart,
+    is_regular,
 )
 from ros2_memory.recorder.scan import bag_kind
 from ros2_memory.settings import NullRecorderNode
@@ -24,6 +27,8 @@ from ros2_memory.upkeep import claim
 from ros2_memory.wording import counted
 
 _MB = 1_000_000
+_NAMED = 5
+_INSTEAD = "move or mount the bags into the bag directory"
 
 
 def adopt(
@@ -49,7 +54,8 @@ def adopt(
             )
         root = settings.recording.bag_dir
         own = OwnRecordings(root)
-        found = {name: path for each in directories for name, path in _folders(each, root, own)}
+        places = [_place(each, root) for each in directories]
+        found = {name: path for each in places for name, path in _folders(each, own)}
         _require_list(root, own)
         new = {name: path for name, path in found.items() if not own.owns(path)}
         own.adopt({name: _identity(path) for name, path in new.items()})
@@ -63,15 +69,16 @@ def adopt(
         say("retention deletes them from now on, by its limits, oldest first")
     if not found:
         say("no bag files lie there")
+        for link in islice(_links(places), _NAMED):
+            say(f"{link.relative_to(root)} is a symbolic link, which is not followed: {_INSTEAD}")
         raise typer.Exit(NOT_SO)
 
 
-def _folders(directory: Path, root: Path, own: OwnRecordings) -> list[tuple[str, Path]]:
-    """By name the directories to adopt, given one by its path or by its name in the bag directory.
+def _place(directory: Path, root: Path) -> Path:
+    """The directory to adopt, given by its path or by its name in the bag directory.
 
     Raises:
         InvalidArgumentsError: it is no directory below the bag directory.
-        OSError: it cannot be listed.
     """
     for given in (directory, root / directory):
         place = Path(os.path.abspath(given))  # noqa: PTH100 - follows no link
@@ -82,14 +89,32 @@ def _folders(directory: Path, root: Path, own: OwnRecordings) -> list[tuple[str,
         link = next((each for each in (inside, *inside.parents) if _is_link(each, root)), None)
         if link is not None:
             raise InvalidArgumentsError(f"{link} is a symbolic link, which is not followed")
-        return [
-            (name, path)
-            for path in folders_with_bags(inside)
-            if (name := own.name_of(path)) and not is_kept_apart(name)
-        ]
+        return inside
     raise InvalidArgumentsError(
         f"{directory} is no directory below {root}: move the bags there, then adopt them"
     )
+
+
+def _folders(place: Path, own: OwnRecordings) -> Iterator[tuple[str, Path]]:
+    """By name the directories to adopt.
+
+    Raises:
+        OSError: one cannot be listed.
+    """
+    for path in folders_with_bags(place):
+        name = own.name_of(path)
+        if name and not is_kept_apart(name):
+            yield name, path
+
+
+def _links(places: Iterable[Path]) -> Iterator[Path]:
+    """The links that might lead to bags."""
+    for place in places:
+        for folder, folders, files in os.walk(place):
+            for name in sorted((*folders, *filter(bag_kind, files))):
+                path = Path(folder, name)
+                if path.is_symlink() and not name.startswith("."):
+                    yield path
 
 
 def _is_link(path: Path, root: Path) -> bool:
@@ -124,6 +149,7 @@ def _taken(folder: Path) -> tuple[int, int]:
     for path in folder.iterdir():
         if bag_kind(path.name):
             with suppress(OSError):
-                size += path.lstat().st_size
-                files += 1
+                if is_regular(path):
+                    size += path.lstat().st_size
+                    files += 1
     return files, size

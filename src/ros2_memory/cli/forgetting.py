@@ -54,9 +54,10 @@ def forget(
 ) -> None:
     """Delete the closed bags that lie wholly inside a time window, after asking.
 
-    What reaches beyond it stays, and so do what is being written and bags that this deployment's
-    recorder did not make; all are named. Latched messages (maps, static transforms) that later
-    answers need are carried on. Only where this deployment records.
+    What reaches beyond it stays, and so do what is being written and, unless
+    retention.foreign=delete, bags that this deployment's recorder did not make; all are named.
+    Latched messages (maps, static transforms) that later answers need are carried on. Only where
+    this deployment records.
     """
     with reporting("forget"):
         settings = settings_for(bag_dir, overrides)

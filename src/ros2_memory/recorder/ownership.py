@@ -32,7 +32,6 @@ import time
 import uuid
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -50,7 +49,10 @@ if TYPE_CHECKING:
     from typing import TypeAlias
 
     CustomDataOf: TypeAlias = Callable[[Path], Mapping[str, str] | None]
-    """What `ros2 bag record` embedded in a bag file; None where nothing. May raise OSError."""
+    """What `ros2 bag record` embedded in a bag file; None where that cannot be known.
+
+    May raise OSError.
+    """
 
 RECORDED_BY: Final = "recorded_by"
 BAG_DIR_ID: Final = "bag_dir_id"
@@ -274,13 +276,17 @@ class OwnRecordings:
         """The random id of this bag directory, which recordings carry; None before there is one."""
         return self._content.bag_dir_id
 
-    def former(self, custom_data: CustomDataOf) -> dict[str, Identity]:
+    def former(self, custom_data: CustomDataOf) -> tuple[dict[str, Identity], dict[str, str]]:
         """The recordings that a version from before the list made here, which are adopted once.
 
         Those lie in the bag directory itself, under a name that this program gives, and either
         `recorder.json` or a `handover.json` names them, or every file of them that holds a byte
         carries what our child embedded. One that carries an id is of a version with the list: it
-        was restored or copied, or the list has gone.
+        was restored or copied, or the list has gone. So one is not adopted either of which a file
+        cannot be read so far: it may carry an id.
+
+        Returns:
+            The directories of those, by name, and why others of such a name are not among them.
 
         Raises:
             OSError: the bag directory cannot be listed.
@@ -296,16 +302,19 @@ class OwnRecordings:
             handover = read_handover(folder).handover
             named.update(name for name in (handover.previous, handover.next) if name)
         found: dict[str, Identity] = {}
+        left: dict[str, str] = {}
         for folder in folders:
-            is_named = folder.name in named
-            with suppress(OSError):
+            try:
                 identity = identity_of(folder)
-                embedded = [*_embedded(folder, custom_data, at_most=1 if is_named else None)]
-                if identity is None or any(BAG_DIR_ID in each for each in embedded):
-                    continue
-                if is_named or _all_ours(embedded, None):
-                    found[folder.name] = identity
-        return found
+                reason = _why_not_former(folder, custom_data, is_named=folder.name in named)
+            except OSError as error:
+                left[folder.name] = f"it cannot be looked into: {error.strerror or error}"
+                continue
+            if reason is not None:
+                left[folder.name] = reason
+            elif identity is not None:
+                found[folder.name] = identity
+        return found, left
 
     def suppose(self, custom_data: CustomDataOf) -> None:
         """Knows, where there is no list yet, the recordings that `claim` would adopt.
@@ -315,7 +324,8 @@ class OwnRecordings:
         """
         with self._lock:
             if not self._read():
-                for name, identity in self.former(custom_data).items():
+                found, _ = self.former(custom_data)
+                for name, identity in found.items():
                     self._content.take(_Entry(name, identity, adopted=True))
 
     # What follows is for the recorder, which holds the lock of the bag directory, and for
@@ -336,7 +346,7 @@ class OwnRecordings:
         with self._lock:
             try:
                 there = self._read()
-                adopted = {} if there else self.former(custom_data)
+                adopted, left = ({}, {}) if there else self.former(custom_data)
             except OSError as error:
                 raise _unwritable(self._path, error, "read") from error
             content = self._content
@@ -348,6 +358,11 @@ class OwnRecordings:
             if adopted:
                 names = sorted(adopted)[:_NAMED]
                 _log.info("recordings_adopted", recordings=len(adopted), names=names)
+            if left:
+                reasons = [f"{name}: {left[name]}" for name in sorted(left)[:_NAMED]]
+                _log.warning(
+                    "recordings_not_adopted", recordings=len(left), reasons=reasons, advice=_ADVICE
+                )
             for name, entry in content.entries.items():
                 if entry.identity is None and (self._bag_dir / name).is_dir():
                     _log.warning("recording_not_claimed", recording=name, reason=_UNCLAIMED)
@@ -405,7 +420,8 @@ class OwnRecordings:
                     identity = identity_of(self._bag_dir / name)
                     if identity is None:
                         continue
-                    embedded = [*_embedded(self._bag_dir / name, custom_data)]
+                    files = _held(self._bag_dir / name)
+                    embedded = [custom_data(path) or {} for path in files]
                     if _all_ours(embedded, self._content.bag_dir_id):
                         found[name] = identity
         return found
@@ -514,10 +530,11 @@ _UNCLAIMED: Final = (
     "its recorder was killed before it noted which directory it had made, and what lies there does "
     "not carry the id of this bag directory; it is kept until `ros2-memory adopt` takes it"
 )
+_ADVICE: Final = "they are kept until `ros2-memory adopt` takes them"
 
 
 def folders_with_bags(folder: Path) -> Iterator[Path]:
-    """A directory and those below it in which bag files lie. Links are not followed.
+    """A directory and those below it in which bag files lie. Links are no files, nor followed.
 
     Raises:
         OSError: one of them cannot be listed.
@@ -528,8 +545,20 @@ def folders_with_bags(folder: Path) -> Iterator[Path]:
 
     for root, names, files in os.walk(folder, onerror=fail):
         names[:] = sorted(name for name in names if not name.startswith("."))
-        if any(bag_kind(name) for name in files):
+        if any(bag_kind(name) and is_regular(Path(root, name)) for name in files):
             yield Path(root)
+
+
+def is_regular(path: Path) -> bool:
+    """Whether it is a regular file, and no link to one.
+
+    Raises:
+        OSError: it cannot be looked at.
+    """
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except FileNotFoundError:
+        return False
 
 
 def is_kept_apart(name: str) -> bool:
@@ -537,18 +566,38 @@ def is_kept_apart(name: str) -> bool:
     return name.partition("/")[0] in {MOMENTS_FOLDER, CARRY_FOLDER}
 
 
-def _embedded(
-    folder: Path, custom_data: CustomDataOf, at_most: int | None = None
-) -> Iterator[Mapping[str, str]]:
-    """What was embedded in each bag file that holds a byte; of so many of them at most.
+def _held(folder: Path) -> Iterator[Path]:
+    """The bag files in a directory that hold a byte.
 
     Raises:
-        OSError: the directory cannot be listed, or a file cannot be read.
+        OSError: the directory cannot be listed, or a file not be looked at.
     """
-    files = [path for path in sorted(folder.iterdir()) if bag_kind(path.name)]
-    held = (path for path in files if path.is_symlink() or path.stat().st_size)
-    for path in islice(held, at_most):
-        yield custom_data(path) or {}
+    for path in sorted(folder.iterdir()):
+        if bag_kind(path.name) and (path.is_symlink() or path.stat().st_size):
+            yield path
+
+
+def _why_not_former(folder: Path, custom_data: CustomDataOf, *, is_named: bool) -> str | None:
+    """Why a directory is not taken for a recording of a version from before the list.
+
+    Raises:
+        OSError: it cannot be listed, or a file cannot be read.
+    """
+    without_proof = not is_named
+    for path in _held(folder):
+        embedded = custom_data(path)
+        if embedded is None:
+            return f"{path.name} cannot be read as far as to know which bag directory it is of"
+        if BAG_DIR_ID in embedded:
+            return f"{path.name} carries the id of a bag directory, of which the list is not here"
+        program = embedded.get(RECORDED_BY)
+        if program != PROGRAM and (program is not None or not is_named):
+            said = f"{RECORDED_BY}={PROGRAM}"
+            return f"{path.name} does not carry {said}" + (
+                "" if is_named else ", and no recorder.json or handover.json names the recording"
+            )
+        without_proof = False
+    return "no file of it holds a byte" if without_proof else None
 
 
 def _all_ours(embedded: Collection[Mapping[str, str]], bag_dir_id: str | None) -> bool:

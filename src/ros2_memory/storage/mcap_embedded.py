@@ -22,19 +22,25 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from mcap.records import McapRecord
+
 _NAME: Final = "rosbag2"
 _KEY: Final = "serialized_metadata"
 _MOST_BYTES: Final = 16 << 20
-"""A longer metadata record is not read. It grows by 180 bytes a split."""
+"""A longer record is not read. The metadata record grows by 180 bytes a split."""
+_BEFORE: Final = frozenset(
+    {Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.ATTACHMENT}
+)
+_END: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END})
 # The whole text lists every split: parsing it as YAML takes a thousand times as long.
 _CUSTOM_DATA: Final = re.compile(r"^custom_data:[^\n]*\n(?:[ \t]+[^\n]*(?:\n|$))*", re.MULTILINE)
 
 
 def custom_data(path: Path) -> dict[str, str] | None:
-    """The custom data that `ros2 bag record` embedded in an MCAP file; None where it embedded none.
+    """The custom data that `ros2 bag record` embedded in an MCAP file; empty where there is none.
 
-    Reads up to the first message or chunk, so a file that ends early has it too. None also of a
-    file that is no MCAP file, or is damaged before that.
+    Reads up to the first message or chunk, so a file that ends after that has it too. None where
+    that cannot be known: the file is no MCAP file, ends before it, or is damaged there.
 
     Raises:
         OSError: it cannot be read.
@@ -42,37 +48,51 @@ def custom_data(path: Path) -> dict[str, str] | None:
     try:
         with OpenFile(path) as file:
             require_mcap(file)
-            for body in _metadata_first(file):
-                for record in parsed([(Opcode.METADATA, body)]):
-                    if isinstance(record, Metadata) and record.name == _NAME:
-                        return _custom_data_in(record.metadata.get(_KEY, ""))
-    except UnreadableError:
+            for record in _before_messages(file):
+                if isinstance(record, Metadata) and record.name == _NAME:
+                    return _custom_data_in(record.metadata[_KEY])
+    except (UnreadableError, KeyError):
         return None
-    return None
+    return {}
 
 
-def _metadata_first(file: OpenFile) -> Iterator[bytes]:
-    """The bodies of metadata records before the first message."""
-    position = MAGIC_SIZE
-    while position + RECORD.size <= file.size:
+def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
+    """The records before the first message or chunk.
+
+    Raises:
+        UnreadableError: the file ends before one, or what stands before it is damaged.
+    """
+    position, begins = MAGIC_SIZE, True
+    while True:
         opcode, length = RECORD.unpack(file.read(position, RECORD.size))
-        position += RECORD.size
-        if opcode in {Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END, Opcode.FOOTER}:
+        if begins != (opcode == Opcode.HEADER):
+            raise UnreadableError("damaged: it does not begin with one header")
+        if opcode in _END:
             return
-        if opcode == Opcode.METADATA and length <= _MOST_BYTES:
-            yield file.read(position, length)
-        position += length
+        if opcode not in _BEFORE or length > _MOST_BYTES:
+            raise UnreadableError("damaged: no such record stands before the first message")
+        body = file.read(position + RECORD.size, length)
+        records = [*parsed([(opcode, body)])]
+        if not records:
+            raise UnreadableError("damaged: a record before the first message cannot be read")
+        yield records[0]
+        position += RECORD.size + length
+        begins = False
 
 
 def _custom_data_in(text: str) -> dict[str, str] | None:
     found = _CUSTOM_DATA.search(text)
     if found is None:
-        return None
+        return {}
     try:
         content: object = yaml.safe_load(found[0])
     except (yaml.YAMLError, RecursionError, ValueError):
         return None
-    values = content.get("custom_data") if isinstance(content, dict) else None
+    if not isinstance(content, dict):
+        return None
+    values: object = content.get("custom_data")
+    if values is None:
+        return {}
     if not isinstance(values, dict):
         return None
     return {str(key): str(value) for key, value in values.items()}
