@@ -29,6 +29,7 @@ from ros2_memory.tf_tree import (
     agreeing_clock,
 )
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.wording import Reason
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -46,6 +47,14 @@ _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CA
 
 _LONGER_NS: Final[Ns] = 3600 * NS_PER_S
 """How far around the moment it is looked for frames that were not known then."""
+
+_BORROWED: Final = Reason(
+    "is placed by transforms of another recording of the same time; no handover says that both are "
+    "of one robot",
+    "recording",
+    many="are placed by transforms of others of the same time; no handovers say that they are of "
+    "one robot",
+)
 
 _OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAMES_NOT_CONNECTED})
 
@@ -75,7 +84,8 @@ def transform_at(
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
     sessions = sessions_of(view)
     if recording is not None:
-        return _transform_in(view, sessions.lending_to(recording, at), (parent, child), at)
+        among = lending_to(view, recording, (parent, child), at)
+        return _transform_in(view, among, (parent, child), at)
     holding = sessions.recorded_at(at)
     answers: list[tuple[Session, FoundTransform]] = []
     failure: NoDataError | None = None
@@ -94,7 +104,33 @@ def transform_at(
             f"{len(answers)} sessions that were recorded then hold different transforms; "
             f"this is that of {sessions.names(session, at)}"
         )
+    parts = sessions.parts_of(session)
+    if parts and not any(connected(view, (parent, child), among=each) for each in parts):
+        view.note(
+            f"transforms of {sessions.names(session, at)} are joined, as of one robot: they were "
+            "recorded at the same time, and no handover says whether they are of one"
+        )
     return found
+
+
+def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> Session:
+    """Whose transforms place a message of a recording; a note says where these are borrowed.
+
+    They are where the recording's own do not lead from one frame to the other, and those of the
+    one other session that lends do.
+    """
+    sessions = sessions_of(view)
+    session, own = sessions.lending_to(recording, at), sessions.of(recording)
+    if not session or session == own:
+        return session
+    key = (session, own, frames)
+    if key not in sessions.chosen:
+        borrows = not connected(view, frames, among=own) and connected(view, frames, among=session)
+        sessions.chosen[key] = session if borrows else own
+        if borrows:
+            lender = sessions.names(session - own, at)
+            view.note_thing(_BORROWED, sessions.names(own, at), f"those of {lender}")
+    return sessions.chosen[key]
 
 
 def _alike(one: FoundTransform, other: FoundTransform) -> bool:
@@ -168,6 +204,7 @@ def sessions_of(view: View) -> Sessions:
             view,
             limits.tf_topics,
             limits.tf_static_topics,
+            limits.pose_topic,
             lambda topics, among: {
                 child for _, child in _pairs(view, topics, static=True, among=among)
             },

@@ -18,6 +18,7 @@ from ros2_memory.frames import (
     connected,
     graph_of,
     holding_at,
+    lending_to,
     moving_in,
     sessions_of,
     statics,
@@ -26,6 +27,7 @@ from ros2_memory.geometry import alike, invert, rotate
 from ros2_memory.glimpse import glimpse
 from ros2_memory.model import TimeWindow, Transform
 from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
+from ros2_memory.wording import Reason
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,6 +38,11 @@ if TYPE_CHECKING:
     from ros2_memory.tf_tree import FrameGraph
 
 _LEVEL: Final = 1e-6
+_NOWHERE_IN: Final = Reason(
+    "has no transforms that place its poses: they are left out",
+    "recording",
+    many="have no transforms that place their poses: they are left out",
+)
 _NOWHERE: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -123,13 +130,13 @@ class Placing:
     def _fixed(self, recording: Path, at: Ns) -> Transform | None:
         if self.frame_id == self.pose_frame:
             return _NOWHERE
-        return self._of(sessions_of(self.view).lending_to(recording, at)).fixed
+        return self._of(self._session(recording, at)).fixed
 
     def _pose(self, recording: Path, time: Ns) -> Transform | None:
         """The pose of the poses' frame in that of the places."""
         if self.frame_id == self.pose_frame:
             return _NOWHERE
-        session = sessions_of(self.view).lending_to(recording, time)
+        session = self._session(recording, time)
         known = self._of(session)
         if known.fixed is not None:
             return known.fixed
@@ -145,6 +152,13 @@ class Placing:
             return graph.lookup(self.frame_id, self.pose_frame, time).transform
         except NoDataError:
             return None
+
+    def _session(self, recording: Path, at: Ns) -> Session:
+        """Whose transforms place the poses of a recording; a note says where none do."""
+        session = lending_to(self.view, recording, (self.frame_id, self.pose_frame), at)
+        if not session:
+            self.view.note_thing(_NOWHERE_IN, recording.name)
+        return session
 
     def _of(self, session: Session) -> _Known:
         if session not in self._known:

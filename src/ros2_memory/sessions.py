@@ -4,14 +4,17 @@ A transform holds in the session in which it was published: another robot, or th
 was started anew, has its own. A session is a recording and those that it is joined with by
 handovers, and what was carried of these when their bags were deleted.
 
-Recordings of one time complete each other where one has moving transforms alone and the other
-static ones alone, of other frames, or where one has none at all and one session beside it has some:
-so records whoever starts two recorders for one robot.
+Recordings of one time may be of one robot, for which two recorders were started. So one that has
+moving transforms alone borrows the static ones of other frames of one that has these alone, and
+one that has none borrows from the one session beside it that has some. None is lent where two
+recordings hold poses then: these are two robots. Nothing but a handover proves that two recordings
+are of one robot, so a reply that uses a loan has to say so.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
+from itertools import combinations
 from typing import TYPE_CHECKING, Final, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -47,6 +50,7 @@ class Sessions:
         view: one call's sight of the memory.
         moving: the topics of moving transforms.
         static: those of static ones.
+        poses: the topic of the robot's own poses: two sessions that hold it at once are two robots.
         children: the child frames that a session has on some topics.
     """
 
@@ -55,6 +59,7 @@ class Sessions:
         view: Reading,
         moving: Sequence[str],
         static: Sequence[str],
+        poses: str,
         children: Callable[[Sequence[str], Session], set[str]],
     ) -> None:
         self._view = view
@@ -66,7 +71,10 @@ class Sessions:
         self._spans: dict[str, dict[str, tuple[Ns, Ns]]] = {
             kind: self._spans_of(topics) for kind, topics in self._topics.items()
         }
-        self._joined = self._chains()
+        self._joined = self._chains(poses)
+        self._poses = [*self._spans_of((poses,)).items()]
+        self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
+        self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
 
     def folder(self, recording: Path) -> str:
@@ -92,7 +100,10 @@ class Sessions:
         return self._of(self.folder(recording))
 
     def lending_to(self, recording: Path, at: Ns) -> Session:
-        """Whose transforms hold for a message of a recording; empty where no session's do."""
+        """Whose transforms hold for a message of a recording; empty where no session's do.
+
+        That is more than the recording's own session where another one lends.
+        """
         key = (self.folder(recording), at // _AROUND_NS)
         if key not in self._lending:
             self._lending[key] = self._completed(self._of(key[0]), at)
@@ -112,6 +123,10 @@ class Sessions:
         around = [each for each in recordings if each in self._folders_around(at)] or recordings
         return " and ".join(each.rpartition("/")[2] for each in around) or "deleted recordings"
 
+    def parts_of(self, session: Session) -> tuple[Session, ...]:
+        """The two sessions that one is made of by a loan; none where it is one."""
+        return self._parts.get(session, ())
+
     def nearest_to(self, moment: Ns) -> list[Session]:
         """All sessions that hold transforms, the nearest in time first."""
         spans = [span for by_folder in self._spans.values() for span in by_folder.items()]
@@ -121,16 +136,26 @@ class Sessions:
     def _completed(self, own: Session, at: Ns) -> Session:
         """A session with the one beside it that has what it lacks; empty where it has nothing."""
         kinds = self._kinds(own)
-        if len(kinds) == len(self._topics):
-            return own
+        if len(kinds) == len(self._topics) or self._are_two_robots(at):
+            return own if kinds else frozenset()
         beside = [each for each in self._around(at) if each != own and self._kinds(each)]
         if kinds:
             partners = [each for each in beside if self._complement(own, each)]
         else:
             partners = [*dict.fromkeys(self._completed(each, at) for each in beside)]
         if len(partners) == 1:
-            return own | partners[0]
+            completed = own | partners[0]
+            self._parts[completed] = own, partners[0]
+            return completed
         return own if kinds else frozenset()
+
+    def _are_two_robots(self, at: Ns) -> bool:
+        """Whether two sessions around a moment hold poses of the same time."""
+        near = [each for each in self._poses if _off(each[1], at) <= _AROUND_NS]
+        return any(
+            max(first, begin) <= min(last, end) and self._of(one) != self._of(other)
+            for (one, (first, last)), (other, (begin, end)) in combinations(near, 2)
+        )
 
     def _complement(self, one: Session, other: Session) -> bool:
         """Whether one has moving transforms alone, the other static ones alone, of other frames."""
@@ -167,13 +192,13 @@ class Sessions:
                 spans[folder] = min(first, known[0]), max(last, known[1])
         return spans
 
-    def _chains(self) -> Mapping[str, Session]:
-        """By folder, the recordings that hold transforms and are joined by handovers."""
+    def _chains(self, poses: str) -> Mapping[str, Session]:
+        """By folder, the recordings with transforms or poses that are joined by handovers."""
         timeline = self._view.snapshot.timeline
         known = None if timeline is None else _JOINED.get(timeline)
         if known is None:
             every = [topic for topics in self._topics.values() for topic in topics]
-            recordings = [self._view.snapshot.recordings(topic) for topic in every]
+            recordings = [self._view.snapshot.recordings(topic) for topic in (*every, poses)]
             paths = {self.folder(path): path for some in recordings for path in some}
             chains = _joined(paths) if len(paths) > 1 else {}
             known = {folder: chain | {self._carried} for folder, chain in chains.items()}

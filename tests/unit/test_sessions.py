@@ -184,8 +184,61 @@ def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls:
     record(tmp_path / "moving", moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5))
     record(tmp_path / "sensors", drive(BEGIN, 20))
     memory = remembered(tmp_path, recalls=recalls)
-    assert asked(memory, BEGIN + 4 * S, "map", "base_link") == 9.0
+    at = Moment(unix_from_ns(BEGIN + 4 * S))
+    joined = transform(memory, Call(), "map", "base_link", at)
+    assert joined.transform.translation[0] == pytest.approx(9.0)
+    assert [note for note in joined.notes if "fixed and moving are joined" in note]
+    alone = transform(memory, Call(), "odom", "base_link", at)
+    assert alone.notes == ()
     assert arrivals(memory, 9.0) == [pytest.approx(3.4, abs=0.21)]
+    [note] = visits(memory, Call(), 9.0, 0.0, radius_m=0.3).notes[:1]
+    assert note.startswith("sensors is placed by transforms of another recording")
+    assert note.endswith("those of fixed and moving")
+
+
+@each_way
+@pytest.mark.parametrize("later_s", [0, 30])
+def test_a_loan_is_never_silent(tmp_path: Path, later_s: int, recalls: bool) -> None:
+    """Whether `nav2` is the same robot cannot be known; a day apart it is another."""
+    base = moving(BEGIN, 60, "odom", "base_link", 0.0, 0.5)
+    record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *base])
+    record(tmp_path / "boat", drive(BEGIN + later_s * S, 60))
+    answer = visits(remembered(tmp_path, recalls=recalls), Call(), 105.0, 0.0)
+    assert answer.total == 1
+    assert [note for note in answer.notes if "boat" in note and "those of nav2" in note]
+
+
+@each_way
+@pytest.mark.parametrize("apart", [-DAY, 3600 * S, DAY])
+def test_a_recording_of_another_time_lends_nothing(
+    tmp_path: Path, apart: int, recalls: bool
+) -> None:
+    base = moving(BEGIN, 60, "odom", "base_link", 0.0, 0.5)
+    record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *base])
+    record(tmp_path / "boat", drive(BEGIN + apart, 60))
+    memory = remembered(tmp_path, recalls=recalls)
+    assert visits(memory, Call(), 105.0, 0.0).total == 0
+    assert visits(memory, Call(), 5.0, 0.0).frame_id == "odom"
+
+
+@each_way
+@pytest.mark.parametrize("has_tf", [False, True])
+def test_a_robot_beside_it_that_has_poses_of_its_own_lends_nothing(
+    tmp_path: Path, has_tf: bool, recalls: bool
+) -> None:
+    """A boat without a map was nowhere in that of the other robot, and a note says so."""
+    record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *drive(BEGIN, 20, 0.0)])
+    base = moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5) if has_tf else []
+    record(tmp_path / "boat", [*base, *drive(BEGIN, 20)])
+    memory = remembered(tmp_path, recalls=recalls)
+    answer = visits(memory, Call(), 105.0, 0.0)
+    assert (answer.frame_id, answer.total) == ("map", 0)
+    assert visits(memory, Call(), 100.0, 0.0).total == 1
+    if has_tf:
+        with pytest.raises(NoDataError):
+            asked(memory, BEGIN + 4 * S, "map", "base_link")
+    else:
+        assert [note for note in answer.notes if "boat has no transforms" in note]
 
 
 @each_way
