@@ -10,10 +10,8 @@ from ros2_memory.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.globs import matching
 from ros2_memory.model import TimeWindow
 from ros2_memory.timebase import (
-    AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
     MIN_NS,
-    START_SLACK_NS,
     Ns,
     unix_from_ns,
     unix_rounded_up,
@@ -198,7 +196,7 @@ def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     older = next(view.stream(topics, TimeWindow.until(window.start - 1), newest_first=True), None)
     newer = next(view.stream(topics, TimeWindow(window.stop, TimeWindow.everything().stop)), None)
     names = " or ".join(topics)
-    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
+    start, end = window.asked()
     told = [f"no message of {names} between {moment(start)} and {moment(end)}"]
     if older:
         told.append(f"the last one before is at {moment(older.time)}")

@@ -90,6 +90,14 @@ class TimeWindow:
         """All of time up to and including `end`."""
         return cls(MIN_NS, min(end + 1, MAX_NS))
 
+    def asked(self) -> tuple[Ns, Ns]:
+        """The inclusive bounds that were asked for, without the slack of floats of seconds.
+
+        Of a window that was clamped to less than the slack, its first moment twice.
+        """
+        start = self.start + START_SLACK_NS
+        return start, max(start, self.stop - 1 - AT_OR_BEFORE_SLACK_NS)
+
     def contains(self, moment: Ns) -> bool:
         """Whether the moment lies inside."""
         return self.start <= moment < self.stop

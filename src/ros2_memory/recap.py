@@ -19,7 +19,7 @@ from ros2_memory.presences import united
 from ros2_memory.standstills import SHORTEST_NS
 from ros2_memory.stories import tells
 from ros2_memory.tales import standstills_in, story_in
-from ros2_memory.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS, ns_from_unix
+from ros2_memory.timebase import ns_from_unix
 from ros2_memory.unseen import note_edges, note_unseen
 from ros2_memory.ways import length_notes, way_driven
 from ros2_memory.wording import Reason, counted
@@ -68,7 +68,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         QueryTimeoutError: the call's time is over.
     """
     view, window = open_span(memory, call, span)
-    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
+    start, end = window.asked()
     drive = _drive(view, window)
     events = [] if drive is None else [*_stops(drive)]
     seen: list[Seen] = []

@@ -110,12 +110,16 @@ def find_matches(
     pose_topic = memory.limits.pose_topic
     found = tuple(_told(view, condition, run, pose_topic) for run in runs.told)
     note_unseen(view, searched, nothing=not found, search=True)
+    start = window.start if earliest is None else max(window.start, earliest)
+    end = window.stop if latest is None else min(window.stop, latest)
+    if end < start:  # all of it lies before or behind the memory
+        start, end = window.asked()
     return Sightings(
         found,
         more=runs.cut or runs.count > len(found),
         total=None if runs.cut else runs.count,
-        start=window.start if earliest is None else max(window.start, earliest),
-        end=window.stop if latest is None else min(window.stop, latest),
+        start=start,
+        end=end,
         now=now,
         notes=view.notes,
     )

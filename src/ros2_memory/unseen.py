@@ -55,12 +55,12 @@ def note_unseen(
 def note_edges(view: Reading, window: TimeWindow) -> None:
     """Says where a window was asked to reach past what the memory can answer."""
     snapshot = view.snapshot
-    asked_from, earliest = window.start + START_SLACK_NS, snapshot.earliest
+    asked_from, asked_to = window.asked()
+    earliest = snapshot.earliest
     if earliest is not None and asked_from < earliest:
         before = TimeWindow(asked_from, earliest)
         if not any(before.overlaps(each.bag.start, each.bag.end) for each in snapshot.misdated):
             view.note(f"the memory begins at {_moment(earliest)}")
-    asked_to = window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     if snapshot.latest is None or asked_to <= snapshot.latest:
         return
     if snapshot.active:

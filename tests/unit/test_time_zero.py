@@ -147,3 +147,40 @@ def test_a_window_that_begins_below_zero_is_clamped(bag_dir: Path, recalls: bool
     nothing = asked(memory, bag_dir, "get_position_at", timestamp=-5.0)
     assert (nothing["error"], nothing["reason"]) == ("no_data", "outside_range")
     assert "-5.000000" in nothing["detail"]
+
+
+@each_way
+@each_now
+@pytest.mark.parametrize("begin_s", [0, 1_784_000_000])
+@pytest.mark.parametrize(("start", "end"), [(-50, -10), (-1e300, -1e-6), (-5, -5), (-1, 0)])
+def test_a_window_below_zero_is_clamped_at_both_ends(
+    tmp_path: Path, recalls: bool, now: Now, begin_s: int, start: float, end: float
+) -> None:
+    messages = [odom((begin_s + 1 + n) * S, n * 0.1, 0.0) for n in range(5)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
+    clock = SettableClock((begin_s + 9) * S)
+    memory = memory_of(tmp_path, clock=clock, limits=Limits(now=now))
+    memory = recalling(memory, tmp_path) if recalls else memory
+    window = {"start": start, "end": end}
+    told = asked(memory, tmp_path, "recap", **window)
+    assert (told["start"], told["end"], told["events"]) == (0.0, 0.0, [])
+    told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
+    assert (told["searched_from"], told["searched_to"], told["sightings"]) == (0.0, 0.0, [])
+    for tool in ("get_topic_in_range", "trajectory_summary"):
+        told = asked(memory, tmp_path, tool, topic="/odom", **window)
+        assert "no message of /odom between 0.000000 and 0.000000" in told["detail"]
+
+
+@each_way
+@pytest.mark.parametrize(("start", "end"), [(1.0, 2.0), (1e9, 1e9), (1.9e9, 2e9), (0.0, 2e9)])
+def test_no_span_that_was_searched_ends_before_it_begins(
+    tmp_path: Path, recalls: bool, start: float, end: float
+) -> None:
+    begin = 1_784_000_000 * S
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(begin + n * S, True) for n in range(5)])
+    memory = memory_of(tmp_path)
+    memory = recalling(memory, tmp_path) if recalls else memory
+    window = {"start": start, "end": end}
+    told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
+    assert start <= told["searched_from"] <= told["searched_to"] <= end
+    assert (told["total"] > 0) == (end > begin / S > start)
