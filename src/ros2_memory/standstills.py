@@ -9,8 +9,9 @@ or the noise of their own poses explains, and linked slots form a chain. The end
 then found pose by pose: a slot that is clearly inside gives the place and its noise, and poses are
 followed outwards, through the last slot of the chain and the one beyond, until one lies elsewhere.
 Slow motion that noise hides from two slots shows in blocks of `BLOCK_NS`: a block whose means
-spread farther than drift and noise explain is motion, and parts the chain. A standstill that drifts
-out of `LARGEST_M` ends there, and the next one begins.
+spread farther than drift and noise explain is motion, and parts the chain. So are still blocks that
+lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. A standstill that drifts out of
+`LARGEST_M` in a longer time ends there, and the next one begins.
 
 All of this depends on poses a few slots around alone, and slots and blocks are counted from the
 epoch, and all positions are rounded alike (`_STEP_M`). So a standstill is the same whatever window
@@ -24,6 +25,7 @@ first differences; those of second order have six times the variance of the nois
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -44,11 +46,15 @@ SILENCE_NS: Final[Ns] = 5 * NS_PER_S // 2
 """Poses farther apart say nothing of the time between them: a standstill ends there."""
 SLOT_NS: Final[Ns] = 2 * NS_PER_S // 5
 BLOCK_NS: Final[Ns] = 5 * SLOT_NS
-CONTEXT_NS: Final[Ns] = SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
+CREEP_NS: Final[Ns] = 15 * BLOCK_NS
+"""A robot that gets farther than `LARGEST_M` in this time creeps; a slower one drifts."""
+CONTEXT_NS: Final[Ns] = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
 """Poses so far outside of a window decide whether the robot stood inside of it."""
 DRIFT_MPS: Final = 0.008
 """The mean of a robot that stands may move so fast: odometry drifts."""
 LARGEST_M: Final = 0.1
+CREEP_MPS: Final = LARGEST_M / unix_from_ns(CREEP_NS)
+"""A robot that is slower than this cannot be told from one that stands."""
 
 _NOISE_FACTOR: Final = 5.5
 _NEAREST_M: Final = 0.0003
@@ -57,6 +63,7 @@ _STEP_M: Final = 0.0001
 """What positions and their means are rounded to."""
 _MOST_IN_SLOT: Final = 1_000
 _EDGE_SLOTS: Final = 3
+_CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
 
 
 class TimedPosition(NamedTuple):
@@ -118,6 +125,11 @@ class Block(NamedTuple):
         """Whether drift and noise explain its box."""
         explained = max(DRIFT_MPS * unix_from_ns(BLOCK_NS), 4.5 * self.noise)
         return self.box.diagonal <= min(explained, LARGEST_M)
+
+    def is_far_from(self, other: Block) -> bool:
+        """Whether more than noise lies between them beyond `LARGEST_M`."""
+        apart_m = math.dist(self.box.centre, other.box.centre)
+        return apart_m > LARGEST_M + 2 * (self.noise + other.noise)
 
 
 class ChainDigest(NamedTuple):
@@ -271,6 +283,8 @@ class _Chain:
         self._parts: list[Standstill] = []  # of the standstill under way: it drifts on
         self._settled: Block | None = None  # the newest
         self._taken: Ns = 0
+        self._looked_at: list[Block] = []  # still ones, one after another, as long as a creep
+        self._creeps: deque[tuple[int, int]] = deque()  # the numbers of first and last block
 
     def add(self, slot: _Slot) -> None:
         mean = _rounded(slot.mean)
@@ -289,18 +303,37 @@ class _Chain:
             else:
                 self.blocks.append(block)
 
-    def settle(self, taken: Ns, keep: int = 1) -> None:
-        """Turn all blocks but the newest, to which slots may be added, into standstills.
+    def settle(self, taken: Ns, *, is_over: bool = False) -> None:
+        """Turn blocks into standstills: those that no slot or block to come can change, or all.
 
         They begin at `taken` or later, where the standstill of the chain before ends: chains follow
         poses into each other's slots.
         """
         self._taken = taken
-        settled = self.blocks[: len(self.blocks) - keep]
-        self.blocks = self.blocks[len(settled) :]
+        newest = self.blocks[-1].number if self.blocks else 0
+        for block in self.blocks if is_over else self.blocks[:-1]:
+            if not self._looked_at or block.number > self._looked_at[-1].number:
+                self._look_for_creep(block)
+        many = sum(is_over or newest - each.number >= _CREEP_BLOCKS for each in self.blocks)
+        settled, self.blocks = self.blocks[:many], self.blocks[many:]
         for block in settled:
             self._settle(block)
             self._settled = block
+
+    def _look_for_creep(self, block: Block) -> None:
+        """Mark the blocks of the shortest creep that ends in a block."""
+        oldest = block.number - _CREEP_BLOCKS + 1
+        before = [each for each in self._looked_at if each.is_still and each.number >= oldest]
+        if not block.is_still:
+            before = []
+        since = self._creeps[-1][0] if self._creeps else -1
+        for each in reversed(before):
+            if each.number <= since:
+                break
+            if each.is_far_from(block):
+                self._creeps.append((each.number, block.number))
+                break
+        self._looked_at = [*before, block]
 
     @property
     def is_long(self) -> bool:
@@ -309,14 +342,17 @@ class _Chain:
 
     def standstills(self, taken: Ns) -> list[Standstill]:
         """Return the standstills of a chain that is over, from `taken` on; see `settle`."""
-        self.settle(taken, keep=0)
+        self.settle(taken, is_over=True)
         if self.end is not None:
             self._finish(self.end)
         return self._found
 
     def _settle(self, block: Block) -> None:
         before = self._settled
-        if not block.is_still:
+        while len(self._creeps) > 1 and self._creeps[0][1] < block.number:
+            self._creeps.popleft()
+        creeps = self._creeps and self._creeps[0][0] <= block.number <= self._creeps[0][1]
+        if creeps or not block.is_still:
             if before is not None:
                 self._finish(before.last)
             return

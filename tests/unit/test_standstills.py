@@ -177,12 +177,22 @@ def test_an_hour_of_standing_with_noise_of_a_centimetre_is_one_standstill(
     assert math.dist(found.box.centre, (0, 2, 0)) < 0.01
 
 
-@pytest.mark.parametrize("speed", [0.01, 0.015, 0.02, 0.03, 0.04, 0.05])
+@pytest.mark.parametrize("speed", [0.004, 0.005, 0.0065, 0.008, 0.01, 0.015, 0.02, 0.03, 0.05])
 @pytest.mark.parametrize("hz", [10, 50])
 def test_a_robot_that_creeps_does_not_stand(speed: float, hz: int) -> None:
     poses = world([(361.0, speed)], hz=hz).poses
     assert standstills_of(poses) == ()
     assert from_bags(poses, list(range(77, len(poses), 150))) == ()
+
+
+@pytest.mark.parametrize("speed", [0.004, 0.005, 0.008])
+@pytest.mark.parametrize("noise", [0.0, 0.001])
+def test_a_creep_between_two_stops_is_parted_from_both(speed: float, noise: float) -> None:
+    made = world([(20.0, 0.0), (60.0, speed), (20.0, 0.0)], hz=20, noise=noise)
+    cuts = list(range(77, len(made.poses), 150))
+    for found in (standstills_of(made.poses), from_bags(made.poses, cuts)):
+        assert stood(found) == pytest.approx(40, abs=14)
+        assert all(each.end / S <= 127 or each.start / S >= 173 for each in found)
 
 
 @pytest.mark.parametrize("speed", [0.02, 0.03, 0.05])
