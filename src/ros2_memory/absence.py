@@ -51,13 +51,16 @@ def resolve_topic(view: View, name: str) -> str:
     raise not_recorded(view, name)
 
 
-def resolve_pose_topic(view: View, name: str | None = None, what: str = "position") -> str:
+def resolve_pose_topic(
+    view: View, name: str | None = None, what: str = "position", *, degrees: bool = False
+) -> str:
     """The recorded topic that a question about the robot's motion means.
 
     Args:
         view: what is recorded.
         name: the topic that was asked for; None for `data.pose_topic`.
         what: "position" or "velocity".
+        degrees: whether the latitude and longitude of a satellite receiver answer too.
 
     Raises:
         NoDataError: as `resolve_topic`; where the configured topic is not recorded the sentence
@@ -69,8 +72,17 @@ def resolve_pose_topic(view: View, name: str | None = None, what: str = "positio
     try:
         return resolve_topic(view, configured)
     except NoDataError as error:
-        those = topics_with(view, what) or topics_with(view, "geodetic")
-        if error.reason is not NoDataReason.TOPIC_NOT_RECORDED or not those:
+        if error.reason is not NoDataReason.TOPIC_NOT_RECORDED:
+            raise
+        those = topics_with(view, what)
+        if not those and what == "position" and (fixes := topics_with(view, "geodetic")):
+            told = (
+                f"no topic {configured} is recorded, which data.pose_topic names, nor another with "
+                f"poses in metres; latitude and longitude are on {listed(fixes)}"
+            )
+            advice = "give topic" if degrees else "get_position_at answers them by topic"
+            raise NoDataError(error.reason, f"{told}: {advice}", error.notes) from error
+        if not those:
             raise
         what = {"position": "poses", "velocity": "velocities"}[what]
         which = those[0].partition(" ")[0] if len(those) == 1 else "to one of them"

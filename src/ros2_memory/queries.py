@@ -138,7 +138,7 @@ def position(
     A topic of a satellite receiver gives degrees.
     """
     view, at, now = open_moment(memory, call, moment)
-    name = resolve_pose_topic(view, topic)
+    name = resolve_pose_topic(view, topic, degrees=True)
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
     message, type_name = decoded(view, found), found.record.channel.type

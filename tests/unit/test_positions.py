@@ -213,7 +213,9 @@ def test_a_satellite_fix_is_told_in_degrees(tmp_path: Path, recalls: bool) -> No
     refused = ask(tmp_path, recalls, "find_last_match", **near)
     assert "degrees" in refused["detail"]
     unknown = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 2)
-    assert "poses are on /fix (sensor_msgs/msg/NavSatFix)" in unknown["detail"]
+    assert unknown["detail"].endswith(
+        "latitude and longitude are on /fix (sensor_msgs/msg/NavSatFix): give topic"
+    )
 
 
 ABOUT_POSES: list[tuple[str, dict[str, Any]]] = [
@@ -236,6 +238,29 @@ def test_where_the_pose_topic_is_not_recorded_the_one_with_poses_is_named(
     assert "poses are on /pose (geometry_msgs/msg/PoseStamped)" in told["detail"]
     assert "set data.pose_topic=/pose" in told["detail"]
     assert "/rosout" not in told["detail"]
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),
+        ("visits", {"x": 0.0, "y": 0.0}),
+        ("recap", {"start": T0_S, "end": T0_S + 5}),
+        ("get_velocity_at", {"timestamp": T0_S + 1}),
+    ],
+)
+def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
+    tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
+) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(9)])
+    told = ask(tmp_path, recalls, tool, **given)
+    detail = told["notes"][0] if tool == "recap" else told["detail"]
+    assert "data.pose_topic=/fix" not in detail
+    assert "give topic" not in detail
+    in_degrees = "(sensor_msgs/msg/NavSatFix): get_position_at answers them by topic"
+    assert (in_degrees in detail) == (tool != "get_velocity_at")
+    assert "no topic /odom is recorded" in detail
 
 
 def test_recap_names_the_topic_with_poses(tmp_path: Path) -> None:
