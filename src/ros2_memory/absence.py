@@ -246,6 +246,15 @@ def undecodable(topic: str, type_name: str, error: UndecodableError) -> NoDataEr
     )
 
 
+def undecodable_in(
+    view: View, window: TimeWindow, topic: str, type_name: str, error: UndecodableError
+) -> NoDataError:
+    """As `undecodable`, of all that a window holds, with the notes on what else was not read."""
+    note_unseen(view, window, nothing=True)
+    told = undecodable(topic, type_name, error)
+    return NoDataError(told.reason, told.detail, view.notes)
+
+
 def _answering(view: View) -> bool:
     """Whether what is being written answers, as far as it is on disk."""
     return all(aside.answers for aside in view.snapshot.active)

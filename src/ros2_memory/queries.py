@@ -110,7 +110,7 @@ def topic_range(
     total, chosen = view.pick(name, window, max_samples)
     if not chosen:
         raise nothing_between(view, (name,), window)
-    samples, types = _samples(view, chosen, fields)
+    samples, types = _samples(view, chosen, window, fields)
     if len(types) > 1:
         view.note(f"the topic was recorded under several types: {', '.join(types)}")
     if len(chosen) < total:
@@ -369,7 +369,7 @@ def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> a
 
 
 def _samples(
-    view: View, chosen: Sequence[Found], fields: Sequence[str]
+    view: View, chosen: Sequence[Found], window: TimeWindow, fields: Sequence[str]
 ) -> tuple[tuple[Sample, ...], list[str]]:
     """The samples that can be decoded, and their types in order of appearance.
 
@@ -390,7 +390,8 @@ def _samples(
         for sentence in shown.notes:
             view.note(sentence)
     if failures and not samples:
-        raise NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
+        note_unseen(view, window, nothing=True)
+        raise NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)), view.notes)
     for detail, count in failures.items():
         view.note(f"{count} samples left out: {detail}")
     return tuple(samples), list(types)

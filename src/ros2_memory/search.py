@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from ros2_memory.absence import matching_topics, moment, undecodable
+from ros2_memory.absence import matching_topics, moment, undecodable_in
 from ros2_memory.candidates import Candidates
 from ros2_memory.copies import COPY_HORIZON_NS
 from ros2_memory.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
@@ -75,11 +75,11 @@ class Search:
             if self._back_to is None:
                 raise
             raise self._out_of_time(self._back_to) from error
-        self.close(candidates, found=False)
+        self.close(candidates, TimeWindow(MIN_NS, until), found=False)
         return None
 
-    def close(self, candidates: Candidates, *, found: bool) -> None:
-        """Ends a search that looked everywhere: notes what could not be tested.
+    def close(self, candidates: Candidates, window: TimeWindow, *, found: bool) -> None:
+        """Ends a search that looked everywhere in a window: notes what could not be tested.
 
         Raises:
             InvalidArgumentsError: nothing was found, and no value of the topics can be a match.
@@ -87,7 +87,9 @@ class Search:
         """
         if not found and self._failures and not self._tested and not candidates.ruled_out:
             (topic, type_name), (failure, _) = next(iter(self._failures.items()))
-            raise undecodable(topic, type_name, failure)
+            if len(self._failures) > 1:
+                self.note_undecodable()
+            raise undecodable_in(self._view, window, topic, type_name, failure)
         self.note_undecodable()
         if not found:
             self._require_testable()

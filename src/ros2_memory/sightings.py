@@ -191,7 +191,7 @@ def _gather(
         # As where one message more is read, which the catalogue rules out.
         _leave(search, runs)
     else:
-        search.close(candidates, found=bool(runs.count))
+        search.close(candidates, window, found=bool(runs.count))
 
 
 def _pass_over(view: View, runs: _Runs, gap: TimeWindow) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
-from ros2_memory.absence import topics_with, undecodable
+from ros2_memory.absence import topics_with, undecodable, undecodable_in
 from ros2_memory.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.motion import Stop, is_place
 from ros2_memory.packing import packed_poses, unpacked_poses
@@ -92,7 +92,7 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     if failures:
         error = failures[0]
         if first is None:
-            raise undecodable(error.topic, error.type_name, error) from error
+            raise undecodable_in(view, window, error.topic, error.type_name, error) from error
         view.complete = False
         view.note(f"poses left out, since they cannot be decoded: {len(failures)} ({error.reason})")
     if first is None or last is None:

@@ -72,6 +72,42 @@ def test_hundreds_of_topics_that_are_not_read_hide_no_damaged_file(
 
 
 @each_way
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("find_last_match", {"topic": "/keelson/*", "condition_type": "contains", "value": "x"}),
+        ("find_matches", {"topic": "/keelson/*", "condition_type": "contains", "value": "x"}),
+        (
+            "get_value_when",
+            {
+                "condition_topic": "/keelson/*",
+                "value_topic": "/keelson/000",
+                "condition_type": "contains",
+                "value": "x",
+            },
+        ),
+        ("get_topic_in_range", {"topic": "/keelson/000", "start": T0_S, "end": T0_S + 9}),
+        ("trajectory_summary", {"topic": "/keelson/000", "start": T0_S, "end": T0_S + 9}),
+    ],
+)
+@pytest.mark.parametrize("topics", [1, 3])
+def test_where_nothing_can_be_decoded_damaged_files_are_named_beside_it(
+    tmp_path: Path, recalls: bool, tool: str, given: dict[str, object], topics: int
+) -> None:
+    write_protobuf(tmp_path / "keelson" / "keelson_0.mcap", topics)
+    (tmp_path / "f").mkdir()
+    (tmp_path / "f" / "f_0.mcap").write_bytes(b"this was a bag once, and is none any more")
+    memory = memory_of(tmp_path)
+    reply = asked(recalling(memory, tmp_path) if recalls else memory, tmp_path, tool, **given)
+    assert (reply["error"], reply["reason"]) == ("no_data", "undecodable")
+    assert "(keelson.Envelope) are recorded but cannot be decoded" in reply["detail"]
+    assert any("may hold more: f/f_0.mcap" in note for note in reply["notes"])
+    of_all = "messages of 3 topics could not be decoded"
+    is_search = "condition_type" in given
+    assert any(of_all in note for note in reply["notes"]) == (is_search and topics == 3)
+
+
+@each_way
 @pytest.mark.parametrize("damaged", [[5], [4, 5, 6], [*range(1, 19)], [0, 19], [9, 10]])
 def test_a_message_that_cannot_be_decoded_ends_no_sighting_and_is_none(
     tmp_path: Path, recalls: bool, damaged: list[int]
