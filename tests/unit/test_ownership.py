@@ -11,6 +11,7 @@ import pytest
 import structlog
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 
 from ros2_memory.errors import RecorderError
 from ros2_memory.recorder import ownership
@@ -532,6 +533,20 @@ class TestVersionsBeforeTheList:
         if any(path.stat().st_size for path in (bag_dir / A).iterdir()):
             assert not claimed(bag_dir).owns(bag_dir / A)
 
+    @settings(max_examples=300, deadline=None)
+    @given(at=st.integers(0, 10_000), value=st.integers(1, 255))
+    def test_no_copy_of_a_single_file_is_adopted_whichever_byte_is_wrong(
+        self, tmp_path_factory: pytest.TempPathFactory, at: int, value: int
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        path = bag_dir / A / f"{A}_0.mcap"
+        embedding(path, {**OURS, "bag_dir_id": "1" * 32}, size=2)
+        self.beat(bag_dir, A)
+        data = bytearray(path.read_bytes())
+        data[at % (data.index(b"jazzy") + 5)] ^= value
+        path.write_bytes(data)
+        assert not claimed(bag_dir).owns(bag_dir / A)
+
     def test_it_happens_once(self, tmp_path: Path) -> None:
         claimed(tmp_path)
         embedding(tmp_path / A / f"{A}_0.mcap", OURS)
@@ -568,6 +583,15 @@ class TestEmbedded:
         self, tmp_path: Path, custom: Mapping[str, str] | None
     ) -> None:
         assert custom_data(embedding(tmp_path / "a_0.mcap", custom)) == {}
+
+    def test_nothing_in_a_file_of_humble(self, tmp_path: Path) -> None:
+        path = tmp_path / "a_0.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start("ros2", "libmcap 0.8.0")
+            writer.add_metadata("rosbag2", {"ROS_DISTRO": "humble"})
+            writer.finish()
+        assert custom_data(path) == {}
 
     def test_wherever_a_file_was_cut_it_is_what_was_embedded_or_unknown(
         self, tmp_path: Path

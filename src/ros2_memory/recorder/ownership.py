@@ -590,11 +590,12 @@ def _why_not_former(folder: Path, custom_data: CustomDataOf, *, is_named: bool) 
             return f"{path.name} cannot be read as far as to know which bag directory it is of"
         if BAG_DIR_ID in embedded:
             return f"{path.name} carries the id of a bag directory, of which the list is not here"
-        program = embedded.get(RECORDED_BY)
-        if program != PROGRAM and (program is not None or not is_named):
-            said = f"{RECORDED_BY}={PROGRAM}"
-            return f"{path.name} does not carry {said}" + (
-                "" if is_named else ", and no recorder.json or handover.json names the recording"
+        if embedded and dict(embedded) != {RECORDED_BY: PROGRAM}:
+            return f"{path.name} carries what another program embedded"
+        if not (embedded or is_named):
+            return (
+                f"{path.name} does not carry {RECORDED_BY}={PROGRAM}, and no recorder.json or "
+                "handover.json names the recording"
             )
         without_proof = False
     return "no file of it holds a byte" if without_proof else None

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 _NAME: Final = "rosbag2"
 _KEY: Final = "serialized_metadata"
+_OF_HUMBLE: Final = frozenset({"ROS_DISTRO"})
+"""What Humble's record has instead (seen in its files)."""
+_NEXT_KEY: Final = re.compile(r"[a-z_]+:|\s*\Z")
 _MOST_BYTES: Final = 16 << 20
 """A longer record is not read. The metadata record grows by 180 bytes a split."""
 _BEFORE: Final = frozenset(
@@ -49,9 +52,13 @@ def custom_data(path: Path) -> dict[str, str] | None:
         with OpenFile(path) as file:
             require_mcap(file)
             for record in _before_messages(file):
-                if isinstance(record, Metadata) and record.name == _NAME:
-                    return _custom_data_in(record.metadata[_KEY])
-    except (UnreadableError, KeyError):
+                if isinstance(record, Metadata):
+                    text = record.metadata.get(_KEY)
+                    if text is not None:
+                        return _custom_data_in(text) if record.name == _NAME else None
+                    if record.name == _NAME and record.metadata.keys() - _OF_HUMBLE:
+                        return None
+    except UnreadableError:
         return None
     return {}
 
@@ -82,8 +89,8 @@ def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
 
 def _custom_data_in(text: str) -> dict[str, str] | None:
     found = _CUSTOM_DATA.search(text)
-    if found is None:
-        return {}
+    if found is None or not _NEXT_KEY.match(text, found.end()):
+        return None
     try:
         content: object = yaml.safe_load(found[0])
     except (yaml.YAMLError, RecursionError, ValueError):
