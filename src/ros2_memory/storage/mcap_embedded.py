@@ -36,7 +36,7 @@ _BEFORE: Final = frozenset(
 )
 _END: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END})
 # The whole text lists every split: parsing it as YAML takes a thousand times as long.
-_CUSTOM_DATA: Final = re.compile(r"^custom_data:[^\n]*\n(?:[ \t]+[^\n]*(?:\n|$))*", re.MULTILINE)
+_CUSTOM_DATA: Final = re.compile(r"^custom_data:[^\n]*\n(?: +[^\s#][^\n]*(?:\n|$))*", re.MULTILINE)
 
 
 def custom_data(path: Path) -> dict[str, str] | None:
