@@ -41,6 +41,18 @@ _NEARBY: Final = 8
 MOVED_M: Final = 1.0
 """Odometry that begins anew does so within this of its origin, having been farther from there."""
 
+_RESTART_M: Final = 0.25
+"""A step this long may be a restart of odometry by what its neighbours are alone."""
+_AT_ORIGIN_M: Final = 0.05
+"""Odometry that begins anew is so near its origin, or within two steps of it."""
+_LONGER: Final = 4.0
+_FASTER: Final = 2.0
+"""What led to the origin is so many times longer, and faster, than what is near it."""
+_DENSE_NS: Final[Ns] = 250 * NS_PER_MS
+_HARD_MPS2: Final = (2.0, 10.0)
+"""Accelerations (m/s^2) that such a step must take: among poses that follow closely, where a whole
+start and stop cannot hide between two of them, and among others, more than wheels can transmit."""
+
 FARTHEST_M: Final = 1e12
 """Coordinates beyond this are no place on Earth but memory that nobody filled in."""
 
@@ -63,12 +75,33 @@ class Stop(NamedTuple):
     position: Vector3
 
 
-def link(before: Stop, after: Stop, usual_ns: Ns | None, fastest_mps: float) -> Link:
+class Pace(NamedTuple):
+    """How a robot moves near a pose: its longest step (m) and its highest speed."""
+
+    step_m: float
+    speed_mps: float
+
+    def or_more(self, other: Pace) -> Pace:
+        """The longer step and the higher speed of two."""
+        return Pace(max(self.step_m, other.step_m), max(self.speed_mps, other.speed_mps))
+
+
+STILL: Final = Pace(0.0, 0.0)
+
+
+def link(
+    before: Stop,
+    after: Stop,
+    usual_ns: Ns | None,
+    fastest_mps: float,
+    near: Pace | None = None,
+) -> Link:
     """What lies between two poses in a row.
 
     A jump is faster than is plausible. A gap is time in which nothing was recorded: more than a
     second, and more than five usual periods (ns), where these are known. A jump or a gap to the
-    origin of odometry is a reset.
+    origin of odometry is a reset, and so is a step to it that the robot, by its pace near the step,
+    cannot have driven.
     """
     elapsed = after.time - before.time
     is_gap = elapsed > GAP_NS and usual_ns is not None and elapsed > GAP_PERIODS * usual_ns
@@ -77,7 +110,11 @@ def link(before: Stop, after: Stop, usual_ns: Ns | None, fastest_mps: float) -> 
         return "reset"
     if is_jump:
         return "jump"
-    return "gap" if is_gap else "driven"
+    if is_gap:
+        return "gap"
+    if near is not None and usual_ns is not None and _is_restart(before, after, usual_ns, near):
+        return "reset"
+    return "driven"
 
 
 def _is_jump(before: Stop, after: Stop, fastest_mps: float) -> bool:
@@ -89,6 +126,32 @@ def _is_jump(before: Stop, after: Stop, fastest_mps: float) -> bool:
 def _leads_to_origin(before: Stop, after: Stop) -> bool:
     step_m = distance(before.position, after.position)
     return step_m > MOVED_M and math.hypot(*after.position) <= MOVED_M
+
+
+def _is_restart(before: Stop, after: Stop, usual_ns: Ns, near: Pace) -> bool:
+    step_m = distance(before.position, after.position)
+    if step_m <= max(_RESTART_M, _LONGER * near.step_m):
+        return False
+    if math.hypot(*after.position) > max(_AT_ORIGIN_M, 2 * near.step_m):
+        return False
+    elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
+    # From rest to rest, half of the time faster and half of it slower.
+    hard_mps2 = _HARD_MPS2[usual_ns > _DENSE_NS]
+    return step_m > max(_FASTER * near.speed_mps * elapsed_s, hard_mps2 * elapsed_s * elapsed_s / 4)
+
+
+def _pace(stops: Sequence[Stop]) -> Pace:
+    """The longest step of a few poses in a row, and the highest speed over half of them."""
+    if len(stops) < 2:
+        return STILL
+    half = max(len(stops) // 2, 1)
+    speed_mps = max(
+        distance(here.position, there.position)
+        / unix_from_ns(max(there.time - here.time, ARRIVAL_JITTER_NS))
+        for here, there in zip(stops[:-half], stops[half:], strict=True)
+    )
+    steps = (distance(here.position, there.position) for here, there in pairwise(stops))
+    return Pace(max(steps), speed_mps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +168,8 @@ class Leg:
         head: how it begins.
         tail: how it ends.
         still: one creep from end to end: that of the head and of the tail.
+        setting_out: its pace near its first pose.
+        arriving: its pace near its last pose.
     """
 
     first: Stop
@@ -116,6 +181,8 @@ class Leg:
     head: End
     tail: End
     still: bool
+    setting_out: Pace
+    arriving: Pace
 
     @property
     def total_m(self) -> float:
@@ -137,6 +204,12 @@ class Leg:
             sum_m=self.sum_m + step_m + later.sum_m,
             tail=later.tail,
             still=False,
+            setting_out=self.setting_out
+            if self.poses > _NEARBY
+            else self.setting_out.or_more(later.setting_out),
+            arriving=later.arriving
+            if later.poses > _NEARBY
+            else later.arriving.or_more(self.arriving),
         )
         if (self.poses < FEWEST) != (later.poses < FEWEST):
             return self._bridged(later, whole, step_m)
@@ -300,9 +373,26 @@ class Motion:
         plausible_m = self._fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
         parted: list[int] = []
         begin, before = 0, self.last
-        for index in np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m)).tolist():
+        beside_m = np.maximum(
+            np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
+        )
+        odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
+        for index in np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist():
             here, there = stops[index], stops[index + 1]
-            kind = link(here, there, _usual_ns(apart, index, self._period_ns), self._fastest_mps)
+            usual_ns = _usual_ns(apart, index, self._period_ns)
+            sides = (
+                stops[max(begin, index - _NEARBY) : index + 1],
+                stops[index + 1 : index + 2 + _NEARBY],
+            )
+            known = sum(map(len, sides))
+            near = _pace(sides[0]).or_more(_pace(sides[1]))
+            leg = self.tail or self.head
+            if index < begin + _NEARBY and before is not None and leg is not None:
+                known += leg.poses
+                near = near.or_more(leg.arriving)
+            # Of too few poses nobody knows what is usual.
+            usual = near if known >= _NEARBY else None
+            kind = link(here, there, usual_ns, self._fastest_mps, usual)
             if kind == "driven":
                 continue
             if self._go_on(before, _leg(stops[begin : index + 1])):
@@ -347,7 +437,11 @@ class Motion:
         kind: Link | None = None
         if before is not None:
             periods = [each for each in (self._period_ns, leg.period_ns) if each is not None]
-            kind = link(before, leg.first, max(periods, default=None), self._fastest_mps)
+            last = self.tail or self.head
+            near = None
+            if last is not None and last.poses + leg.poses >= _NEARBY:
+                near = last.arriving.or_more(leg.setting_out)
+            kind = link(before, leg.first, max(periods, default=None), self._fastest_mps, near)
         self.last = leg.last
         if kind == "driven":
             if self.tail is not None:
@@ -396,7 +490,19 @@ def _leg(stops: Sequence[Stop]) -> _MeasuredLeg:
     positions = [stop.position for stop in stops]
     length_m, sum_m, head, tail, still, speed_mps = measured(seconds, positions)
     period_ns = int(np.median(apart)) if len(apart) else None
-    leg = Leg(stops[0], stops[-1], len(stops), period_ns, length_m, sum_m, head, tail, still)
+    leg = Leg(
+        stops[0],
+        stops[-1],
+        len(stops),
+        period_ns,
+        length_m,
+        sum_m,
+        head,
+        tail,
+        still,
+        setting_out=_pace(stops[: _NEARBY + 1]),
+        arriving=_pace(stops[-_NEARBY - 1 :]),
+    )
     step_mps = 0.0
     if len(stops) <= SPEED_STEPS:
         step_mps = max(

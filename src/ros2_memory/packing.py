@@ -12,7 +12,7 @@ import zlib
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.motion import Leg, PoseDigest, Stop
+from ros2_memory.motion import Leg, Pace, PoseDigest, Stop
 from ros2_memory.path_length import Creep, End
 from ros2_memory.presences import Seen
 from ros2_memory.standstills import ChainDigest, StandstillDigest
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.summaries import Shape
 
 _HEAD: Final = struct.Struct("<qqqqqqBdddddddqdddqddd")
-_LEG: Final = struct.Struct("<qdddqdddqqddBdddd")
+_LEG: Final = struct.Struct("<qdddqdddqqddBdddddddd")
 _CREEP: Final = struct.Struct("<ddddddddddd")
 _VERTEX: Final = struct.Struct("<qdddd")
 _STORY: Final = struct.Struct("<qqqqqI")
@@ -89,6 +89,8 @@ def _packed_leg(leg: Leg) -> bytes:
         leg.head.noise_m,
         leg.tail.pace_m,
         leg.tail.noise_m,
+        *leg.setting_out,
+        *leg.arriving,
     )
     return packed + b"".join(
         _CREEP.pack(
@@ -272,6 +274,8 @@ def _unpacked_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
         End(paces[0], paces[1], bool(flags & 2), creeps[0]),
         End(paces[2], paces[3], bool(flags & 4), creeps[0] if still else creeps[1]),
         still,
+        setting_out=Pace(paces[4], paces[5]),
+        arriving=Pace(paces[6], paces[7]),
     )
     return leg, begin
 

@@ -344,6 +344,81 @@ def test_what_is_recorded_after_a_restart_of_odometry_is_a_way_of_its_own(
 
 
 @each_way
+@pytest.mark.parametrize("split", [None, 0, 2, -3], ids=["one bag", "at it", "after", "before"])
+@pytest.mark.parametrize("noise_m", [0.0, 0.003])
+@pytest.mark.parametrize(
+    ("out_m", "pause_s"), [(3.0, 1.0), (3.0, 0.5), (0.8, 0.1), (10.0, 1.0), (3.0, 3.0)]
+)
+def test_a_step_back_to_the_origin_that_nothing_near_it_is_like_is_a_reset(
+    tmp_path: Path, out_m: float, pause_s: float, noise_m: float, split: int | None, recalls: bool
+) -> None:
+    # 1 m/s at 10 Hz; odometry begins at 0 again, within the time and the speed of driving.
+    steps = round(out_m * 10)
+    xs = [*((nth / 10, nth / 10) for nth in range(steps + 1))]
+    xs += [(steps / 10 + pause_s + nth / 10, nth / 10) for nth in range(101)]
+    off = np.random.default_rng(1).normal(0.0, noise_m, (len(xs), 2)).tolist()
+    messages = [
+        odom(BEGIN + round(at * S), x + dx, dy) for (at, x), (dx, dy) in zip(xs, off, strict=True)
+    ]
+    cut = len(xs) if split is None else steps + 1 + split
+    for nth, bag in enumerate((messages[:cut], messages[cut:])):
+        if bag:
+            write_mcap(tmp_path / f"run_{nth}.mcap", bag)
+    for reply in replies(tmp_path, recalls=recalls):
+        assert reply["distance_m"] == pytest.approx(out_m + 10, rel=0.02 if noise_m else 1e-9)
+        assert reply["max_speed"] == pytest.approx(1.0, rel=0.1)
+        assert [note for note in reply["notes"] if "odometry began anew 1 time" in note]
+
+
+def fast(seconds: float, top: float, hertz: float) -> Points:
+    """From rest to rest along x at 1 m/s^2 at most, ending at the origin."""
+    at = np.arange(round(seconds * hertz) + 1) / hertz
+    x = 0.5 * top * seconds * (1 + np.cos(np.pi * np.minimum(at / seconds, 1))) / 2
+    return np.column_stack([x, 0 * x, 0 * x])
+
+
+@pytest.mark.parametrize("hertz", [0.5, 1, 2, 10, 50])
+def test_driving_through_the_origin_and_stopping_there_is_no_reset(hertz: float) -> None:
+    rest = np.zeros((max(round(3 * hertz), 3), 3))
+    home = fast(4.0, 2.0, hertz)
+    stood = rest + home[0]
+    for poses in (
+        line(2.0, hertz, 20) - 20.0 * np.array([1, 0, 0]),
+        through([(-5, 0, 0), (5, 0, 0)] * 4, 1.0, hertz),
+        arc(1.0, hertz, 60, radius=2),
+        np.concatenate([stood, home, rest]),
+        np.concatenate([stood, home, rest, stood, home, rest])[: len(stood) + len(home) + 2],
+        through([(2, 0, 0), (0, 0, 0), (0, 2, 0)], 0.02, hertz),
+    ):
+        for cuts in (None, range(0, len(poses), 7), range(0, len(poses), 40)):
+            found = summarise(poses, hertz, cuts)
+            assert found.resets == ()
+            assert found.distance_m == pytest.approx(plain_sum(poses), rel=1e-6)
+
+
+def test_a_spike_that_comes_back_to_the_origin_is_no_reset() -> None:
+    poses = np.zeros((3000, 3))
+    poses[250::500, 0] = 0.5
+    assert summarise(poses, 50).resets == ()
+    at_zero = np.column_stack([np.full(3000, 0.6), np.zeros((3000, 2))])
+    at_zero[250::500] = 0.0
+    assert summarise(at_zero, 50).resets == ()
+
+
+@pytest.mark.parametrize("lost", [5, 10, 45])
+def test_messages_lost_on_the_way_home_are_no_reset(lost: int) -> None:
+    poses = np.concatenate([line(1.0, 50, 5)[::-1], np.zeros((100, 3))])
+    last = 250 - lost
+    builder = TrajectoryBuilder(10.0)
+    for nth, (x, y, z) in enumerate(poses):
+        if not last < nth < 250:
+            builder.add(BEGIN + nth * S // 50, Pose((float(x), float(y), float(z)), None))
+    found = builder.result()
+    assert found.resets == ()
+    assert found.distance_m == pytest.approx(5.0)
+
+
+@each_way
 def test_the_way_across_a_gap_is_given_apart(tmp_path: Path, recalls: bool) -> None:
     history(tmp_path, [(0, 0.0, 10.0), (50, 13.0, 20.0)])
     for reply in replies(tmp_path, recalls=recalls):
