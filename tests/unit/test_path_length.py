@@ -161,6 +161,26 @@ def test_a_robot_that_stands_and_goes_is_within_3_percent_too() -> None:
         assert summarise(noisy(poses, 0.005), 50).distance_m == pytest.approx(x[-1], rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("leg_m", "speed", "least", "most"), [(0.2, 0.1, -0.075, -0.05), (1.0, 0.5, -0.03, -0.015)]
+)
+def test_short_legs_come_out_as_much_too_short_as_the_docs_say(
+    leg_m: float, speed: float, least: float, most: float
+) -> None:
+    poses = through([(0, 0, 0), (leg_m, 0, 0)] * round(60 * speed / leg_m), speed, 50)
+    for seed in range(5):
+        found = summarise(noisy(poses, 0.005, seed, axes=2), 50)
+        assert least < found.distance_m / plain_sum(poses) - 1 < most
+
+
+def test_short_stops_and_goes_come_out_as_much_too_long_as_the_docs_say() -> None:
+    x = np.cumsum(np.tile(np.repeat([0.0, 0.3], 100), 30)) / 50
+    poses = np.column_stack([x, 0 * x, 0 * x])
+    for seed in range(5):
+        found = summarise(noisy(poses, 0.005, seed, axes=2), 50)
+        assert 0 < found.distance_m / x[-1] - 1 < 0.04
+
+
 def test_turning_on_the_spot_is_no_way() -> None:
     # The pose is that of the middle of the axle: it turns and stays where it is.
     assert summarise(noisy(np.zeros((1500, 3)), 0.003, axes=2), 50).distance_m < 0.01
