@@ -87,7 +87,8 @@ class Recap:
         max_speed: in m/s.
         stood: how long the robot stood in all, in standstills that last `shortest_stop` or longer.
             One that goes on outside of the window counts as far as it is inside, so the times of
-            windows that follow each other add up.
+            windows that follow each other add up. None where poses are there, but too noisy or too
+            few to tell.
         shortest_stop: what stands for less is no standstill.
         frame_id: of the places in texts.
         events: what happened, in order of time.

@@ -16,10 +16,10 @@ from ros2_memory.accounts import Event, Recap
 from ros2_memory.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.moments import open_span
 from ros2_memory.presences import united
-from ros2_memory.standstills import SHORTEST_NS
+from ros2_memory.standstills import CREEP_MPS, SHORTEST_NS
 from ros2_memory.stories import tells
 from ros2_memory.tales import standstills_in, story_in
-from ros2_memory.timebase import ns_from_unix
+from ros2_memory.timebase import ns_from_unix, unix_from_ns
 from ros2_memory.unseen import note_edges, note_unseen
 from ros2_memory.ways import length_notes, way_driven
 from ros2_memory.wording import Reason, counted
@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 MOST_EVENTS: Final = 25
 
 _UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
+_UNTOLD: Final = (
+    "the positions are too noisy, or too few, to tell when the robot stood: stood_s is null"
+)
 _KINDS: Final = ("gap", "error", "stop", "flip", "thing")
 """Kinds of events, the one that matters most first."""
 _PLURALS: Final = {
@@ -57,6 +60,23 @@ class _Drive:
 
     way: Way | None
     stops: tuple[tuple[Standstill, bool], ...]
+
+    def stood(self, length: Ns) -> Ns | None:
+        """How long the robot stood in all, in a window of a length; None where nothing tells.
+
+        So it is where no pose is a place, and where the robot neither moved nor stood for most of
+        the time: noise hides where it stood.
+        """
+        stood = sum(stop.end - stop.start for stop, _ in self.stops)
+        way = None if self.way is None else self.way.trajectory
+        if way is None or not way.is_known:
+            return stood or None
+        if not stood:
+            is_hidden = length >= SHORTEST_NS and way.distance_m <= CREEP_MPS * way.duration_s
+            return None if is_hidden else 0
+        else_s = way.duration_s - unix_from_ns(stood)
+        is_hidden = else_s > way.duration_s / 2 and way.distance_m < CREEP_MPS * else_s
+        return None if is_hidden and not way.gaps and ns_from_unix(else_s) > SHORTEST_NS else stood
 
 
 def recap(memory: Memory, call: Call, span: Span) -> Recap:
@@ -108,13 +128,17 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     trajectory = None if way is None else way.trajectory
     for note in () if trajectory is None else length_notes(trajectory):
         view.note(note)
+    stood = None if drive is None else drive.stood(end - start)
+    if stood is None and trajectory is not None and trajectory.is_known:
+        view.note(_UNTOLD)
+    known = trajectory if trajectory is not None and trajectory.is_known else None
     return Recap(
         start=start,
         end=end,
         now=memory.clock.now() if memory.limits.now == "wall" or latest is None else latest,
-        distance_m=None if trajectory is None else trajectory.distance_m,
-        max_speed=None if trajectory is None else trajectory.max_speed,
-        stood=None if drive is None else sum(stop.end - stop.start for stop, _ in drive.stops),
+        distance_m=None if known is None else known.distance_m,
+        max_speed=None if known is None else known.max_speed,
+        stood=stood,
         shortest_stop=SHORTEST_NS,
         frame_id=None if way is None else way.frames[0],
         events=tuple(told),

@@ -17,7 +17,6 @@ from ros2_memory.fitting import compact, without_constant_zeros
 from ros2_memory.geometry import normalised, yaw
 from ros2_memory.timebase import Ns, unix_rounded_up
 from ros2_memory.ways import length_notes
-from ros2_memory.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -321,7 +320,7 @@ def _no_match(notes: Sequence[str]) -> JsonObject | None:
 @shown.register(answers.TrajectorySummary)
 def _trajectory(answer: answers.TrajectorySummary, _bag_dir: Path) -> JsonObject:
     way = answer.trajectory
-    known = way.poses > 0
+    known = way.is_known
     reply: JsonObject = {
         "distance_m": rounded(way.distance_m, 4) if known else None,
         "avg_speed": rounded(way.avg_speed, 4) if known else None,
@@ -348,9 +347,6 @@ def _trajectory(answer: answers.TrajectorySummary, _bag_dir: Path) -> JsonObject
 
 
 def _notes_of_way(way: Trajectory) -> Iterator[str]:
-    if way.invalid:
-        poses = counted(way.invalid, "pose")
-        yield f"{poses} left out: the coordinates are no place (NaN or beyond)"
     yield from length_notes(way)
     if way.jumps:
         drawn = sum(point.jump for point in way.waypoints)

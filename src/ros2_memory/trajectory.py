@@ -86,6 +86,11 @@ class Trajectory:
     resets: tuple[Ns, ...] = ()
 
     @property
+    def is_known(self) -> bool:
+        """Whether any pose is a place."""
+        return self.poses > 0
+
+    @property
     def is_noisy(self) -> bool:
         """Whether the plain sum is longer by more than 2 %, and by a millimetre."""
         more_m = self.path_sum_m - self.distance_m

@@ -102,15 +102,19 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
 
 def length_notes(way: Trajectory) -> Iterator[str]:
     """What is not in the length of a way, and why it is not the sum of all steps."""
+    if way.invalid:
+        poses = counted(way.invalid, "pose")
+        yield f"{poses} left out: the coordinates are no place (NaN or beyond)"
     if way.is_noisy:
         yield (
             f"the positions are noisy: step by step they sum up to {way.path_sum_m:.2f} m; "
             "distance_m is without what the noise adds"
         )
     if way.gaps:
+        without = "without a valid pose" if way.invalid else "in which nothing was recorded"
         yield (
-            f"{counted(way.gaps, 'gap')} in which nothing was recorded, {way.gap_m:.2f} m across "
-            "in straight lines (gap_m): left out of distance_m"
+            f"{counted(way.gaps, 'gap')} {without}, {way.gap_m:.2f} m across in straight lines "
+            "(gap_m): left out of distance_m"
         )
     if way.jumps:
         yield (

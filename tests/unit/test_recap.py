@@ -20,6 +20,7 @@ from ros2_memory.demo.streams import Timeline
 from ros2_memory.errors import EpisodicError
 from ros2_memory.memory import Call
 from ros2_memory.moments import Span
+from ros2_memory.queries import trajectory_summary
 from ros2_memory.recap import MOST_EVENTS, recap
 from ros2_memory.recorder.counting import CountingReader
 from ros2_memory.replies import Replies
@@ -273,6 +274,70 @@ def test_a_robot_that_creeps_is_not_said_to_stand(
         told = over(memory, *span)
         assert told.stood == 0
         assert told.events == ()
+
+
+@each_way
+@pytest.mark.parametrize(("hz", "noise"), [(10, 0.2), (1, 0.02), (1, 1.0), (1, 0.005)])
+def test_noise_that_hides_where_the_robot_stood_is_named(
+    tmp_path: Path, recalls: bool, hz: int, noise: float
+) -> None:
+    draw = random.Random(3)
+    messages = [
+        odom(BEGIN + nth * S // hz, draw.gauss(0, noise), draw.gauss(0, noise), 0.0)
+        for nth in range(300 * hz)
+    ]
+    for nth, at in enumerate(range(0, len(messages), 60 * hz)):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 60 * hz])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 0, 300)
+    reply = json.loads(Replies(tmp_path, 24_000).answer(told).text)
+    assert reply["stood_s"] is None
+    assert any("too noisy, or too few" in note for note in reply["notes"])
+
+
+def test_a_robot_that_drove_all_the_time_did_not_stand_whatever_the_noise(tmp_path: Path) -> None:
+    draw = random.Random(3)
+    write_mcap(
+        tmp_path / "bag.mcap",
+        [odom(BEGIN + nth * S // 10, nth * 0.05, draw.gauss(0, 0.02), 0.0) for nth in range(300)],
+    )
+    told = over(memory_of(tmp_path), 0, 30)
+    assert told.stood == 0
+    assert not any("stood_s" in note for note in told.notes)
+
+
+@each_way
+def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
+    tmp_path: Path, recalls: bool
+) -> None:
+    write_mcap(
+        tmp_path / "rec" / "rec_0.mcap",
+        [odom(BEGIN + nth * S // 10, math.nan, 0.0, 0.0) for nth in range(100)],
+    )
+    write_mcap(
+        tmp_path / "rec" / "rec_1.mcap",
+        [
+            odom(BEGIN + nth * S // 10, math.nan if 150 <= nth < 180 else nth * 0.05, 0.0, 0.0)
+            for nth in range(100, 300)
+        ],
+    )
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    none = over(memory, 0, 9.95)
+    assert (none.distance_m, none.max_speed, none.stood) == (None, None, None)
+    assert none.notes == ("100 poses left out: the coordinates are no place (NaN or beyond)",)
+    some = over(memory, 10, 30)
+    assert some.distance_m == pytest.approx(0.05 * 168, abs=0.06)
+    assert some.stood == 0
+    assert "30 poses left out: the coordinates are no place (NaN or beyond)" in some.notes
+    assert any("1 gap without a valid pose" in note for note in some.notes)
+    assert not any("nothing was recorded" in note for note in some.notes)
+    summary = trajectory_summary(memory, Call(), Span(start_s=BEGIN / S + 10, end_s=BEGIN / S + 30))
+    shown = json.loads(Replies(tmp_path, 24_000).answer(summary).text)["notes"]
+    assert {note for note in some.notes if "pose" in note} <= set(shown)
 
 
 def test_a_gap_in_the_memory_is_told(tmp_path: Path) -> None:
