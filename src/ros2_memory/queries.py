@@ -36,6 +36,7 @@ from ros2_memory.model import Pose, Sample, TimeWindow
 from ros2_memory.moments import Moment, Span, ns_argument, open_moment, open_span
 from ros2_memory.overview import data_time_range, list_recorded_topics
 from ros2_memory.recorder.clock_faults import FUTURE_NS
+from ros2_memory.robots import note_robots, note_robots_near
 from ros2_memory.sampling import samples_note
 from ros2_memory.search import last_match, unsearched
 from ros2_memory.tf_tree import TF_CACHE_NS
@@ -227,6 +228,7 @@ def find_last_match(
     found = last_match(view, topic, condition, until)
     if found is None:
         return answers.Match(None, unsearched(view, TimeWindow(MIN_NS, until)))
+    note_robots_near(view, found)
     note_unseen(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
     if counted_from is not None and found.time > counted_from + FUTURE_NS:
@@ -259,9 +261,10 @@ def value_when(
     if found is None:
         return answers.ValueWhen(None, notes=unsearched(view, TimeWindow(MIN_NS, until)))
     note_unseen(view, _searched(view, found, until, now), search=True)
+    note_robots_near(view, found)
     matched = _value(view, found, (), None)
     upto = TimeWindow.until(found.time)
-    held = view.newest(name, upto)
+    held = _newest_beside(view, name, upto, found)
     note_unseen(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
     if held is None:
         view.note(f"{name} held no message yet at {moment(found.time)}")
@@ -272,6 +275,26 @@ def value_when(
         view.note(f"the value is {seconds(distance)} older than the match")
     told = _held(view, _value(view, held, fields, None), held, found.time)
     return answers.ValueWhen(matched, told, view.notes)
+
+
+def _newest_beside(view: View, topic: str, window: TimeWindow, match: Found) -> Found | None:
+    """The newest message of a topic in a window: of the match's recording, where it has one there.
+
+    A note says where recordings of several robots may be mixed.
+    """
+    newest = view.newest(topic, window)
+    if newest is None or newest.bag.recording == match.bag.recording:
+        return newest
+    recording = match.bag.recording
+    own = frame_history.own_holdings(view, topic, window, recording) or []
+    if newest.bag not in {each.bag for each in own}:
+        newest = next(view.stream([topic], window, newest_first=True, among=own), None) or newest
+    if not frame_history.sessions_of(view).are_joined(recording, newest.bag.recording):
+        view.note(
+            f"the match is of recording {recording.name}, and the value of "
+            f"{newest.bag.recording.name}: no handover says that both are of one robot"
+        )
+    return newest
 
 
 def trajectory_summary(
@@ -285,6 +308,7 @@ def trajectory_summary(
         raise nothing_between(view, (name,), window)
     if len(way.frames) > 1:
         view.note(f"poses in several frames were joined: {', '.join(way.frames)}")
+    note_robots(view, name, window)
     note_unseen(view, window)
     note_edges(view, window)
     return answers.TrajectorySummary(
@@ -327,6 +351,7 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Foun
             found = None
     if found is None:
         raise nothing_at(view, (topic,), at, tolerance)
+    note_robots_near(view, found)
     note_unseen(view, TimeWindow(found.time, stop))
     return found
 

@@ -16,6 +16,7 @@ from ros2_memory.accounts import Event, Recap
 from ros2_memory.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.moments import open_span
 from ros2_memory.presences import united
+from ros2_memory.robots import note_robots
 from ros2_memory.standstills import CREEP_MPS, SHORTEST_NS
 from ros2_memory.stories import tells
 from ros2_memory.tales import standstills_in, story_in
@@ -157,6 +158,7 @@ def _drive(view: View, window: TimeWindow) -> _Drive | None:
     try:
         topic = resolve_pose_topic(view)
         way = way_driven(view, topic, window)
+        note_robots(view, topic, window)
         stops = standstills_in(view, topic, window)
         if way is None:
             view.note(f"{topic} has no poses in this time: nothing is known of the way")

@@ -99,6 +99,12 @@ class Sessions:
         """The session of a recording."""
         return self._of(self.folder(recording))
 
+    def are_joined(self, one: Path, other: Path) -> bool:
+        """Whether two recordings are of one session, whatever they hold."""
+        if self.of(one) == self.of(other):
+            return True
+        return other.name in _neighbours(one) or one.name in _neighbours(other)
+
     def lending_to(self, recording: Path, at: Ns) -> Session:
         """Whose transforms hold for a message of a recording; empty where no session's do.
 

@@ -9,13 +9,21 @@ import pytest
 
 from ros2_memory.errors import NoDataError
 from ros2_memory.memory import Call
-from ros2_memory.moments import Moment
-from ros2_memory.queries import frames, transform
+from ros2_memory.moments import Moment, Span
+from ros2_memory.queries import (
+    find_last_match,
+    frames,
+    position,
+    trajectory_summary,
+    transform,
+    value_when,
+)
+from ros2_memory.recap import recap
 from ros2_memory.recorder.handover import Handover, write_handover
 from ros2_memory.sightings import find_matches
 from ros2_memory.timebase import unix_from_ns
 from ros2_memory.visits import visits
-from tests.bags import Msg, detections, odom, tf, write_mcap
+from tests.bags import Msg, detections, make, odom, tf, write_mcap
 from tests.bags import transform as stamped
 from tests.memories import memory_of
 from tests.recalled import recalling
@@ -266,6 +274,80 @@ def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
     assert found.thing.position[0] == pytest.approx(103.0)
     assert found.robot is not None
     assert found.robot.position[0] == pytest.approx(2.0)
+
+
+def boolean(at: int, *, on: bool) -> Msg:
+    return Msg("/bumper", "std_msgs/msg/Bool", at, make("std_msgs/msg/Bool", data=on))
+
+
+def two_at_once(root: Path) -> None:
+    """Two robots of one time on the same topics: r1 drives 20 m, r2 stands at 50 m and bumps."""
+    ticks = [BEGIN + nth * S // 5 for nth in range(101)]
+    bumps = [boolean(at + 1, on=False) for at in ticks]
+    record(root / "r1", [*drive(BEGIN, 20, 1.0), *bumps])
+    bumps = [boolean(at + 2, on=at == ticks[50]) for at in ticks]
+    record(root / "r2", [*[odom(at + S // 10, 50.0, 0.0, 0.0) for at in ticks], *bumps])
+
+
+@each_way
+def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path, recalls: bool) -> None:
+    two_at_once(tmp_path)
+    memory = remembered(tmp_path, recalls=recalls)
+    told = value_when(
+        memory, Call(), "/odom", "/bumper", condition_type="equals", value=True, fields=[]
+    )
+    assert told.value is not None
+    assert told.value.sample.time == BEGIN + 49 * S // 5 + S // 10
+    assert [note for note in told.notes if "/bumper" in note and note.endswith(": r1, r2")]
+    assert not [note for note in told.notes if "the match is of" in note]
+
+
+@each_way
+def test_a_value_of_another_recording_than_the_match_is_noted(
+    tmp_path: Path, recalls: bool
+) -> None:
+    record(tmp_path / "r1", [boolean(BEGIN + 4 * S + 1, on=True)])
+    record(tmp_path / "r2", drive(BEGIN, 20))
+    memory = remembered(tmp_path, recalls=recalls)
+    told = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
+    assert told.value is not None
+    assert [note for note in told.notes if "of recording r1" in note and "of r2" in note]
+
+
+@each_way
+def test_two_robots_on_one_topic_are_named(tmp_path: Path, recalls: bool) -> None:
+    two_at_once(tmp_path)
+    memory = remembered(tmp_path, recalls=recalls)
+    begin, end = unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S)
+    at = Moment(unix_from_ns(BEGIN + 5 * S))
+    for answer in (
+        trajectory_summary(memory, Call(), Span(begin, end)),
+        recap(memory, Call(), Span(begin, end)),
+        position(memory, Call(), at),
+        find_last_match(memory, Call(), "/odom", "near_position", {"x": 50, "y": 0}),
+    ):
+        [note] = [note for note in answer.notes if "as of several robots" in note]
+        assert note.startswith("2 recordings hold messages of their own on /odom")
+        assert note.endswith(": r1, r2")
+
+
+@each_way
+@pytest.mark.parametrize("joined", [False, True])
+def test_copies_and_what_a_handover_joins_are_of_one_robot(
+    tmp_path: Path, joined: bool, recalls: bool
+) -> None:
+    first, second = tmp_path / "rec_20260714T000000Z", tmp_path / "rec_20260714T000010Z"
+    record(first, drive(BEGIN, 20))
+    if joined:
+        record(second, drive(BEGIN + 10 * S, 20))
+        write_handover(first, Handover(next=second.name))
+        write_handover(second, Handover(previous=first.name))
+    else:
+        record(second, [each for each in drive(BEGIN, 20) if each.log_time >= BEGIN + 10 * S])
+    memory = remembered(tmp_path, recalls=recalls)
+    span = Span(unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S))
+    answer = trajectory_summary(memory, Call(), span)
+    assert not [note for note in answer.notes if "robots" in note]
 
 
 @each_way
