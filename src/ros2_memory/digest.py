@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
     from ros2_memory.topic_digest import TopicDigest
 
-DIGEST_VERSION: Final = 8
+DIGEST_VERSION: Final = 9
 """Of what is found in a bag and how; another one has every bag digested again."""
 _ALWAYS_READ_BYTES: Final = 64 << 20
 _MESSAGE_BYTES: Final = 200
