@@ -19,7 +19,7 @@ from ros2_memory.timebase import MAX_NS, MIN_NS
 from ros2_memory.wording import Reason
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.memory import Call, Memory
@@ -56,21 +56,32 @@ class Reading:
         self._as_of: int | None = None
         self._notes: dict[str | Reason, None] = {}
         self._things: dict[Reason, dict[str, _Thing]] = {}
+        self._remarks: dict[str, tuple[str, ...]] = {}
         self.complete = True
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What was skipped so far: each thing once, and one sentence for each reason."""
         # In which order bags are found damaged depends on what the catalogue knows.
-        sentences = iter(sorted(map(self._sentence, filter(self._things.get, self._things))))
+        told = {reason: self._told(reason) for reason in self._things}
+        sentences = iter(sorted(reason.sentence(those) for reason, those in told.items() if those))
         return tuple(
             each if isinstance(each, str) else next(sentences)
             for each in self._notes
-            if isinstance(each, str) or self._things[each]
+            if isinstance(each, str) or told[each]
         )
 
-    def _sentence(self, reason: Reason) -> str:
-        return reason.sentence({name: each.detail for name, each in self._things[reason].items()})
+    def _told(self, reason: Reason) -> dict[str, str]:
+        """By name, the details of the things that no remark on their bag gives already."""
+        return {
+            name: each.detail
+            for name, each in self._things[reason].items()
+            if each.detail not in self._remarks.get(name, ())
+        }
+
+    def note_remarks(self, bags: Iterable[BagFile]) -> None:
+        """Remembers that sentences give what the summaries of these bags remark."""
+        self._remarks |= {short_name(bag.path): bag.summary.remarks for bag in bags}
 
     def note(self, sentence: str) -> None:
         """Adds a sentence for the reply."""
@@ -86,6 +97,14 @@ class Reading:
         known = things.get(name)
         if known is None or known.last < last:
             things[name] = _Thing(detail, last)
+
+    def has_noted(self, bag: BagFile) -> bool:
+        """Whether sentences on what was read of a bag give all that its summary remarks."""
+        name = short_name(bag.path)
+        if name in self._remarks:
+            return False
+        told = {things[name].detail for things in self._things.values() if name in things}
+        return told.issuperset(bag.summary.remarks)
 
     def noted_things(self) -> frozenset[tuple[Reason, str]]:
         """The things that sentences are on so far."""

@@ -48,8 +48,12 @@ def note_unseen(
     if window.empty:
         return
     absent = _absent(view) if nothing or search else ()
-    for sentence in unseen(view.snapshot, window, nothing=nothing, absent=absent):
+    odd = [bag for bag in view.snapshot.odd(window) if not _is_noted(view, bag)]
+    for sentence in unseen(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.note(sentence)
+    # Of more than are named a reason is not given for each.
+    if len({bag.summary.remarks for bag in odd}) <= NAMED:
+        view.note_remarks(odd)
 
 
 def note_edges(view: Reading, window: TimeWindow) -> None:
@@ -90,6 +94,11 @@ def is_searched(view: Reading, window: TimeWindow) -> bool:
     return view.complete and not lost and not any(map(_may_lack, view.snapshot.odd(window)))
 
 
+def _is_noted(view: Reading, bag: BagFile) -> bool:
+    """Whether the notes have what is amiss of a bag; that it was left open they have not."""
+    return bag.state is not BagState.INCOMPLETE and view.has_noted(bag)
+
+
 def _absent(view: Reading) -> Sequence[SetAside]:
     return absent_files(view.snapshot, view.memory.index.bag_dir)
 
@@ -112,8 +121,12 @@ def unseen(
     *,
     nothing: bool = False,
     absent: Sequence[SetAside] = (),
+    odd: Sequence[BagFile] | None = None,
 ) -> Iterator[str]:
-    """The sentences for a window; none where all of it was read."""
+    """The sentences for a window; none where all of it was read.
+
+    `odd`: the bags to name of those of which something is amiss; all where it is not given.
+    """
     if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
         yield not_read(lost)
     active = _being_written(snapshot, window)
@@ -124,7 +137,7 @@ def unseen(
     ]
     if faults and not nothing:
         yield misdated(faults)
-    yield from amiss(snapshot.odd(window))
+    yield from amiss(snapshot.odd(window) if odd is None else odd)
 
 
 def lost_in(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 import pytest
@@ -11,7 +13,7 @@ from mcap.writer import Writer
 
 from ros2_memory.wording import Reason
 from tests.asking import asked
-from tests.bags import McapLayout, Msg, detections, write_mcap
+from tests.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
 from tests.mcap_surgery import spoil_chunk
 from tests.memories import memory_of
 from tests.recalled import recalling
@@ -152,6 +154,36 @@ def test_a_slow_detector_is_not_silent_while_its_messages_cannot_be_decoded(
     sightings = asked(memory, tmp_path, "find_matches", **CUP)["sightings"]
     spans = [(each["first_seen"] - T0_S, each["last_seen"] - T0_S) for each in sightings]
     assert spans == [(40, 40), (0, 16)]
+
+
+@pytest.mark.parametrize("bags", [1, 3])
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("get_topic_at_time", {"topic": "/bumper", "timestamp": T0_S + 5}),
+        ("get_topic_in_range", {"topic": "/bumper", "start": T0_S, "end": T0_S + 9}),
+        ("find_last_match", {"topic": "/bumper", "condition_type": "equals", "value": True}),
+        ("find_matches", {"topic": "/bumper", "condition_type": "equals", "value": True}),
+        ("recap", {"start": T0_S, "end": T0_S + 9}),
+    ],
+)
+def test_what_is_wrong_with_a_bag_is_told_once(
+    tmp_path: Path, tool: str, given: dict[str, object], bags: int
+) -> None:
+    for name in "abc"[:bags]:
+        messages = [boolean(T0 + n * S, n % 2 == 0) for n in range(6)]
+        path = write_db3(tmp_path / name / f"{name}_0.db3", messages)
+        with closing(sqlite3.connect(path)) as base:
+            base.execute("PRAGMA writable_schema = 1")
+            base.execute(
+                "UPDATE sqlite_master SET sql = replace(sql, 'ASC', 'DESC') WHERE type = 'index'"
+            )
+            base.commit()
+    memory = memory_of(tmp_path, storage="rosbag2")
+    notes = asked(memory, tmp_path, tool, **given)["notes"]
+    damaged = [note for note in notes if "index by time is damaged" in note]
+    assert len(damaged) == 1
+    assert "a/a_0.db3" in damaged[0]
 
 
 @given(st.dictionaries(st.text(min_size=1), st.text(max_size=3), min_size=1))
