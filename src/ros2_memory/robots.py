@@ -37,12 +37,16 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
     if view.snapshot.is_transient_local(topic):
         return
     apart: set[Path] = set()
+    said = view.noted_things()
     try:
         for pair, both in _at_once(view, topic, window):
             if not apart.issuperset(pair) and _are_apart(view, topic, pair, both):
                 apart.update(pair)
     except QueryTimeoutError:
         return
+    finally:
+        # The answer itself needed nothing of what was read here.
+        view.unsay_before(MAX_NS, said)
     if apart:
         names = sorted(each.name for each in apart)
         view.note(
