@@ -129,7 +129,7 @@ def test_a_chunk_damaged_before_the_match_is_told_neither_with_a_catalogue_nor_w
     plain = overlapping(tmp_path)
     found = queries.find_last_match(plain, Call(), "/*", "contains", "person", before_s=10.0)
     assert found.found is not None
-    assert found.notes == ()
+    assert not any("could not be read" in note for note in found.notes)
     recalled = recalling(plain, tmp_path)
     again = queries.find_last_match(recalled, Call(), "/*", "contains", "person", before_s=10.0)
     assert repr(again) == repr(found)
