@@ -56,6 +56,9 @@ start and stop cannot hide between two of them, and among others, more than whee
 FARTHEST_M: Final = 1e12
 """Coordinates beyond this are no place on Earth but memory that nobody filled in."""
 
+_DOUBTFUL: Final = 0.25
+"""Noise of this share of the mean step makes a way longer by some 3 %."""
+
 _MOST_RESETS: Final = 1000
 _UNCERTAIN: Final = 4.0
 """Standard deviations by which a step must exceed what its neighbours are to count as more."""
@@ -189,6 +192,14 @@ class Leg:
         """Its length, if nothing more is joined to it."""
         ends = (self.head,) if self.still else (self.head, self.tail)
         return self.length_m + sum(end.creep.length_m for end in ends if end.creep is not None)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether noise may be much of its length: poses too seldom to tell it from turns."""
+        if self.poses < FEWEST or self.period_ns is None or self.period_ns <= _DENSE_NS:
+            return False
+        noise_m = max(self.head.noise_m, self.tail.noise_m)
+        return self.total_m > MOVED_M and noise_m > _DOUBTFUL * self.sum_m / (self.poses - 1)
 
     def joined(self, later: Leg) -> Leg:
         """This leg driven on, without a break, as a later one."""
@@ -353,6 +364,11 @@ class Motion:
     def path_sum_m(self) -> float:
         """The sum of the distances between poses of all that was driven."""
         return self.sum_m + sum(leg.sum_m for leg in (self.head, self.tail) if leg is not None)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether noise may be much of the length of its first or last leg."""
+        return any(leg.in_doubt for leg in (self.head, self.tail) if leg is not None)
 
     @property
     def duration_s(self) -> float:

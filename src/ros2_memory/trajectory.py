@@ -67,6 +67,7 @@ class Trajectory:
         gaps: times in which nothing was recorded.
         gap_m: the way across them in straight lines, left out of distance.
         resets: the first poses after odometry began anew; what led there is left out.
+        in_doubt: noise may be much of the length: the poses come too seldom to tell it from turns.
     """
 
     distance_m: float
@@ -84,6 +85,7 @@ class Trajectory:
     gaps: int = 0
     gap_m: float = 0.0
     resets: tuple[Ns, ...] = ()
+    in_doubt: bool = False
 
     @property
     def is_known(self) -> bool:
@@ -215,6 +217,7 @@ class TrajectoryBuilder(_Poses):
             gaps=motion.gaps,
             gap_m=motion.gap_m,
             resets=tuple(motion.resets),
+            in_doubt=motion.in_doubt,
         )
 
 

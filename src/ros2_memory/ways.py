@@ -110,6 +110,11 @@ def length_notes(way: Trajectory) -> Iterator[str]:
             f"the positions are noisy: step by step they sum up to {way.path_sum_m:.2f} m; "
             "distance_m is without what the noise adds"
         )
+    if way.in_doubt:
+        yield (
+            "the positions come more than 0.25 s apart, and noise or sharp turns are much of the "
+            "steps between them: distance_m may be too long, since noise cannot be taken off"
+        )
     if way.gaps:
         without = "without a valid pose" if way.invalid else "in which nothing was recorded"
         yield (

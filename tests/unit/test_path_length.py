@@ -353,6 +353,20 @@ def test_the_noise_of_a_standing_robot_is_said_and_not_driven(
 
 
 @each_way
+@pytest.mark.parametrize(("noise_m", "doubted"), [(1.0, True), (0.02, False)])
+def test_noise_that_cannot_be_taken_off_is_noted(
+    tmp_path: Path, noise_m: float, doubted: bool, recalls: bool
+) -> None:
+    poses = noisy(line(1.0, 1, 300), noise_m, axes=2).tolist()
+    messages = [odom(BEGIN + nth * S, x + 50, y) for nth, (x, y, _) in enumerate(poses)]
+    for nth in range(3):
+        write_mcap(tmp_path / f"bag_{nth}.mcap", messages[nth * 101 : nth * 101 + 101])
+    for reply in replies(tmp_path, recalls=recalls):
+        notes = [each for each in reply.get("notes", []) if "distance_m may be too long" in each]
+        assert bool(notes) == doubted
+
+
+@each_way
 def test_what_is_recorded_after_a_restart_of_odometry_is_a_way_of_its_own(
     tmp_path: Path, recalls: bool
 ) -> None:
