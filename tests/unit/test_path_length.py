@@ -162,7 +162,8 @@ def test_a_robot_that_stands_and_goes_is_within_3_percent_too() -> None:
 
 
 @pytest.mark.parametrize(
-    ("leg_m", "speed", "least", "most"), [(0.2, 0.1, -0.075, -0.05), (1.0, 0.5, -0.03, -0.015)]
+    ("leg_m", "speed", "least", "most"),
+    [(0.1, 0.1, -0.14, -0.12), (0.2, 0.1, -0.075, -0.05), (1.0, 0.5, -0.03, -0.015)],
 )
 def test_short_legs_come_out_as_much_too_short_as_the_docs_say(
     leg_m: float, speed: float, least: float, most: float
