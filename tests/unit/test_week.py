@@ -38,6 +38,7 @@ class Still:
 
     def __init__(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
+        self.bag_dir = BAG_DIR
 
     def snapshot(self, reach: int | None = None) -> Snapshot:
         return self._snapshot
