@@ -378,7 +378,8 @@ class TestAPlaceThatComesUp:
 
     def test_one_that_is_none_of_this_version_is_not_taken_along(self, tmp_path: Path) -> None:
         beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
-        assert Catalogue([cache], "config").put(KEY, DIGEST)
+        with closing(Catalogue([cache], "config")) as older:
+            assert older.put(KEY, DIGEST)
         with closing(sqlite3.connect(cache)) as base:
             base.execute("PRAGMA user_version = 1")
         before = cache.read_bytes()
