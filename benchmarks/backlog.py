@@ -22,7 +22,7 @@ from benchmarks.timing import Timed
 
 if TYPE_CHECKING:
     from benchmarks.bags import History
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
 
 _ASKED: Final = 1_000
 _ROUNDS: Final = 10

@@ -22,7 +22,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from benchmarks import payloads
-from ros2_memory.recorder.handover import Handover, Overlap, write_handover
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -10,10 +10,7 @@ from typing import TYPE_CHECKING
 from benchmarks import ours
 from benchmarks.bags import ODOM
 from benchmarks.report import Figure
-from ros2_memory.bootstrap import build_filler
-from ros2_memory.digest import Digester
-from ros2_memory.indexing import fill
-from ros2_memory.standstills import (
+from ros2_memory.analysis.standstills import (
     BLOCK_NS,
     ChainDigest,
     packed_blocks,
@@ -21,17 +18,20 @@ from ros2_memory.standstills import (
     unpacked_blocks,
     unpacked_poses,
 )
+from ros2_memory.bootstrap import build_filler
+from ros2_memory.catalogue.digest import Digester
+from ros2_memory.cli.index import fill
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
-    from ros2_memory.digest import Digest
-    from ros2_memory.memory import Memory
-    from ros2_memory.model import BagSummary
-    from ros2_memory.motion import Leg, PoseDigest, Stop
+    from ros2_memory.analysis.odometry import Leg, PoseDigest, Stop
+    from ros2_memory.analysis.standstills import StandstillDigest, TimedPosition
+    from ros2_memory.analysis.topic_events import Story
+    from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.catalogue.topic_digest import TopicDigest
+    from ros2_memory.core.model import BagSummary
+    from ros2_memory.history.context import Memory
     from ros2_memory.settings import Settings
-    from ros2_memory.standstills import StandstillDigest, TimedPosition
-    from ros2_memory.stories import Story
-    from ros2_memory.topic_digest import TopicDigest
 
 _MAX_MS = 10.0
 

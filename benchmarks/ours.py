@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, cast
 from ros2_memory import queries
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
+from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.endpoint import build_server
-from ros2_memory.logs import configure_logging
-from ros2_memory.memory import Call
-from ros2_memory.model import TimeWindow
-from ros2_memory.moments import Moment, Span
-from ros2_memory.timebase import unix_from_ns
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Moment, Span
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from mcp.types import TextContent
 
     from benchmarks.bags import Split
-    from ros2_memory.memory import Memory
-    from ros2_memory.model import JsonValue
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.context import Memory
     from ros2_memory.settings import Settings
 
 

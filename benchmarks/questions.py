@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from benchmarks.bags import History, Split
     from benchmarks.timing import Ask, Side
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
     from ros2_memory.settings import Settings
 
 _SAMPLES: Final = 100

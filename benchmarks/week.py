@@ -18,23 +18,23 @@ from benchmarks.payloads import NEVER_SEEN
 from benchmarks.questions import Question, Target
 from benchmarks.timing import FLOOR, OURS
 from ros2_memory.bootstrap import build_filler
-from ros2_memory.catalogue import BagKey, relative
-from ros2_memory.memory import Call
-from ros2_memory.moments import Span
-from ros2_memory.recap import recap
-from ros2_memory.sightings import find_matches
-from ros2_memory.status import memory_status
-from ros2_memory.visits import visits
+from ros2_memory.catalogue.store import BagKey, relative
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.insights.recap import recap
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.insights.status import memory_status
+from ros2_memory.insights.visits import visits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from benchmarks.copies import Copies
     from benchmarks.timing import Ask
-    from ros2_memory.catalogue import Catalogue
-    from ros2_memory.digest import Digest
-    from ros2_memory.memory import Memory
-    from ros2_memory.model import JsonValue
+    from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.catalogue.store import Catalogue
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.context import Memory
     from ros2_memory.settings import Settings
 
 RECORDINGS: Final = WEEK // HOUR

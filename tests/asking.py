@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from ros2_memory.errors import EpisodicError
-from ros2_memory.memory import Call
-from ros2_memory.replies import Replies, Reply
-from ros2_memory.tools import build_tools
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.history.context import Call
+from ros2_memory.tools.replies import Replies, Reply
+from ros2_memory.tools.spec_tools import build_tools
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
 
 
 def asked(memory: Memory, bag_dir: Path, name: str, **given: object) -> Any:

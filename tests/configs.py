@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.config import load_settings
-from ros2_memory.errors import ConfigError
+from ros2_memory.core.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
 MCAP = "ros2_memory.storage.mcap_reader.McapReader"

@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING, Final
 
 import anyio
 
-from ros2_memory.bootstrap import limits_of
-from ros2_memory.config import load_settings
-from ros2_memory.endpoint import build_server
-from ros2_memory.recorder.handover import Handover, Overlap, write_handover
-from ros2_memory.recorder.heartbeat import (
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
+from ros2_memory.bag_dir.heartbeat import (
     HEARTBEAT_FILE,
     Heartbeat,
     RecorderState,
     write_heartbeat,
 )
-from ros2_memory.recorder.keepsake import Keepsake, write_keepsake
-from ros2_memory.recorder.layout import HANDOVER_FILE, MOMENT_FILE
-from ros2_memory.timebase import NS_PER_S
+from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
+from ros2_memory.bag_dir.moment_file import Keepsake, write_keepsake
+from ros2_memory.bootstrap import limits_of
+from ros2_memory.config import load_settings
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.endpoint import build_server
 from tests.bags import McapLayout, Msg, detections, odom, text, tf, transform, write_mcap
 from tests.keeping import recorder_at_work
 from tests.memories import SettableClock, memory_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from ros2_memory.errors import BagError, BagVanishedError, UndecodableError
-from ros2_memory.model import BagSummary, TopicSummary
+from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
+from ros2_memory.core.model import BagSummary, TopicSummary
 from ros2_memory.storage.base import BagReader, Channel, Closing, Record, Schema
 from tests.bags import typestore
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import TimeWindow
+    from ros2_memory.core.model import TimeWindow
     from tests.bags import Msg
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from mcap.exceptions import McapError
 from mcap.writer import Writer
 
-from ros2_memory.recorder.handover import Handover, Overlap, write_handover
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from tests.bags import (
     McapLayout,
     Msg,

@@ -8,24 +8,24 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from ros2_memory.recorder.counting import CountingReader
-from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
-from ros2_memory.recorder.retention import RetentionLimits
-from ros2_memory.recorder.time_sync import TimeSync
+from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.retention.time_sync import TimeSync
+from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.storage.mcap_writer import McapWriter
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from ros2_memory.timebase import NS_PER_S
 from tests.memories import SettableClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from ros2_memory.core.timebase import Clock
     from ros2_memory.storage.base import BagReader
     from ros2_memory.storage.writing import BagWriter
-    from ros2_memory.timebase import Clock
 
 PLENTY = 10**15
 HOUR = 3600 * NS_PER_S

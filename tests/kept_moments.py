@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-from ros2_memory.recorder.layout import MOMENT_FILE
-from ros2_memory.recorder.mailbox import Slot
+from ros2_memory.bag_dir.layout import MOMENT_FILE
+from ros2_memory.bag_dir.request_queue import Slot
 from tests.bags import McapLayout, odom, write_mcap
 from tests.keeping import keeper_of
 from tests.memories import SettableClock
@@ -14,8 +14,8 @@ from tests.memories import SettableClock
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.bag_dir.request_queue import Outcome
     from ros2_memory.recorder.housekeeping import Housekeeping
-    from ros2_memory.recorder.mailbox import Outcome
 
 S = 10**9
 T0 = 1_790_000_000 * S

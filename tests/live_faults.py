@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
-from ros2_memory.errors import BagError
-from ros2_memory.model import TimeWindow
-from ros2_memory.recorder.counting import CountingReader
-from ros2_memory.recorder.heartbeat import RecorderState
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.closed_form import position
 from tests.live_recorder import (

@@ -24,10 +24,14 @@ import anyio
 from mcp import Client
 from mcp.client.sse import sse_client
 
-from ros2_memory.errors import BagError
-from ros2_memory.model import TimeWindow
-from ros2_memory.recorder.counting import CountingReader
-from ros2_memory.recorder.heartbeat import HeartbeatReading, RecorderState, read_heartbeat
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.heartbeat import (
+    HeartbeatReading,
+    RecorderState,
+    read_heartbeat,
+)
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_server_process import Served, serving

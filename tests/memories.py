@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import yaml
 
+from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
-from ros2_memory.memory import Limits, Memory
+from ros2_memory.history.context import Limits, Memory
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from ros2_memory.timebase import NS_PER_S, Clock
 
 if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from ros2_memory.errors import BagError, BagVanishedError
-from ros2_memory.model import BagSummary, TopicSummary
+from ros2_memory.core.errors import BagError, BagVanishedError
+from ros2_memory.core.model import BagSummary, TopicSummary
 from ros2_memory.storage.base import BagReader, Channel, Closing, Record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import TimeWindow
+    from ros2_memory.core.model import TimeWindow
 
 
 def plain(

@@ -10,20 +10,35 @@ from functools import cache
 from itertools import groupby, pairwise, takewhile
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.demo import judges, robot, streams
-from ros2_memory.demo.checking import at, items, near, near_angle, number, one_of, same, text
-from ros2_memory.demo.flat import THINGS
+from ros2_memory.core.timebase import (
+    NS_PER_S,
+    Ns,
+    ns_from_unix,
+    unix_from_ns,
+    unix_rounded_up,
+)
+from ros2_memory.demo import judges, published_topics, robot
+from ros2_memory.demo.answer_checks import (
+    at,
+    items,
+    near,
+    near_angle,
+    number,
+    one_of,
+    same,
+    text,
+)
+from ros2_memory.demo.floor_plan import THINGS
 from ros2_memory.demo.messages import description
+from ros2_memory.demo.published_topics import STREAMS
 from ros2_memory.demo.robot import Planar
-from ros2_memory.demo.streams import STREAMS
-from ros2_memory.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns, unix_rounded_up
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from ros2_memory.demo.checking import Asked
-    from ros2_memory.demo.streams import Message, Stream
-    from ros2_memory.model import JsonValue
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.demo.answer_checks import Asked
+    from ros2_memory.demo.published_topics import Message, Stream
 
 Replies: TypeAlias = "Sequence[JsonValue]"
 Arguments: TypeAlias = "Mapping[str, JsonValue]"
@@ -45,11 +60,11 @@ SAME_S: Final = 2e-3
 OBJECTS: Final = "/vision/*/scene_objects"
 DOCK: Final = robot.MAP_TO_ODOM
 _BY_TOPIC: Final = {stream.topic: stream for stream in STREAMS}
-ODOM: Final = _BY_TOPIC[streams.ODOM]
-SEEN: Final = _BY_TOPIC[streams.SCENE_OBJECTS]
-CLEAR: Final = _BY_TOPIC[streams.PATH_CLEAR]
-SAID: Final = _BY_TOPIC[streams.SCENE_DESCRIPTION]
-BATTERY: Final = _BY_TOPIC[streams.BATTERY]
+ODOM: Final = _BY_TOPIC[published_topics.ODOM]
+SEEN: Final = _BY_TOPIC[published_topics.SCENE_OBJECTS]
+CLEAR: Final = _BY_TOPIC[published_topics.PATH_CLEAR]
+SAID: Final = _BY_TOPIC[published_topics.SCENE_DESCRIPTION]
+BATTERY: Final = _BY_TOPIC[published_topics.BATTERY]
 
 
 # What is true
@@ -326,7 +341,7 @@ def seen_there(place: Planar) -> Judge:
 def flips_of_path(replies: Replies, asked: Asked) -> None:
     told = [
         (number(event, "timestamp"), text(event, "text").rsplit(" ", 1)[1] == "true")
-        for event in _of_kind(replies[-1], streams.PATH_CLEAR)
+        for event in _of_kind(replies[-1], published_topics.PATH_CLEAR)
     ]
     some = _messages(asked, CLEAR, ASKED_AT_S - 60)
     pairs = pairwise(some)
@@ -408,7 +423,7 @@ def lowest_charge(last_s: float) -> Judge:
 
 def nearest_wall(last_s: float) -> Judge:
     def judge(replies: Replies, asked: Asked) -> None:
-        scans = _messages(asked, _BY_TOPIC[streams.SCAN], ASKED_AT_S - last_s)
+        scans = _messages(asked, _BY_TOPIC[published_topics.SCAN], ASKED_AT_S - last_s)
         nearest = min(float(robot.scan(message.t).min()) for message in scans)
         near("distance", number(replies[-1], "extremes", "ranges", "min"), nearest, PLACE_M)
 

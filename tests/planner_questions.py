@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.demo import judges, robot, streams
+from ros2_memory.demo import judges, published_topics, robot
 from tests.planner_judges import (
     ASKED_AT_S,
     BATTERY,
@@ -52,8 +52,8 @@ from tests.planner_judges import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.demo.robot import Planar
-    from ros2_memory.model import JsonValue
     from tests.planner_judges import Arguments, Judge, Replies
 
 
@@ -93,7 +93,7 @@ def _spot(place: Planar) -> JsonValue:
 
 
 _BLOCKED: Final[Arguments] = {
-    "topic": streams.PATH_CLEAR,
+    "topic": published_topics.PATH_CLEAR,
     "condition_type": "equals",
     "value": False,
     "limit": 1,
@@ -112,8 +112,8 @@ QUESTIONS: Final = (
     _asked(
         "How many odometry messages do you have?",
         "list_recorded_topics",
-        {"pattern": streams.ODOM},
-        counted(streams.ODOM),
+        {"pattern": published_topics.ODOM},
+        counted(published_topics.ODOM),
     ),
     _asked(
         "Where was I 10 s ago?",
@@ -239,8 +239,8 @@ QUESTIONS: Final = (
         "What objects did you see at the front door?",
         "get_value_when",
         {
-            "value_topic": streams.SCENE_OBJECTS,
-            "condition_topic": streams.ODOM,
+            "value_topic": published_topics.SCENE_OBJECTS,
+            "condition_topic": published_topics.ODOM,
             "condition_type": "near_position",
             "value": _spot(_DOOR),
         },
@@ -249,7 +249,7 @@ QUESTIONS: Final = (
     _asked(
         "When was the path last clear?",
         "find_last_match",
-        {"topic": streams.PATH_CLEAR, "condition_type": "equals", "value": True},
+        {"topic": published_topics.PATH_CLEAR, "condition_type": "equals", "value": True},
         only(judges.path_clear),
     ),
     _asked(
@@ -268,7 +268,7 @@ QUESTIONS: Final = (
         "How full was the battery half a minute ago?",
         "get_topic_seconds_ago",
         {
-            "topic": streams.BATTERY,
+            "topic": published_topics.BATTERY,
             "seconds_ago": 30,
             "tolerance_s": 1.5,
             "fields": ["percentage"],
@@ -279,7 +279,7 @@ QUESTIONS: Final = (
         "How full was the battery when you last saw the table?",
         "get_value_when",
         {
-            "value_topic": streams.BATTERY,
+            "value_topic": published_topics.BATTERY,
             "condition_topic": OBJECTS,
             "condition_type": "contains",
             "value": "table",
@@ -291,7 +291,7 @@ QUESTIONS: Final = (
         "When did the battery last fall below 85 %, and where?",
         "find_matches",
         {
-            "topic": streams.BATTERY,
+            "topic": published_topics.BATTERY,
             "condition_type": "below",
             "value": 0.85,
             "field": "percentage",
@@ -303,7 +303,7 @@ QUESTIONS: Final = (
         "When did you last drive faster than 1 m/s?",
         "find_matches",
         {
-            "topic": streams.ODOM,
+            "topic": published_topics.ODOM,
             "condition_type": "above",
             "value": 1.0,
             "field": "linear_velocity.x",
@@ -315,7 +315,7 @@ QUESTIONS: Final = (
         "How low was the battery in the last minute, and when?",
         "get_topic_in_last",
         {
-            "topic": streams.BATTERY,
+            "topic": published_topics.BATTERY,
             "seconds": 60,
             "max_samples": 1,
             "fields": ["percentage"],
@@ -325,7 +325,7 @@ QUESTIONS: Final = (
     _asked(
         "How near was the nearest wall in the last 20 s?",
         "get_topic_in_last",
-        {"topic": streams.SCAN, "seconds": 20, "max_samples": 1, "fields": ["ranges"]},
+        {"topic": published_topics.SCAN, "seconds": 20, "max_samples": 1, "fields": ["ranges"]},
         nearest_wall(20),
     ),
     Planned(
@@ -344,7 +344,7 @@ QUESTIONS: Final = (
         "When were you last in the kitchen, and for how long?",
         "find_matches",
         {
-            "topic": streams.SCENE_DESCRIPTION,
+            "topic": published_topics.SCENE_DESCRIPTION,
             "condition_type": "contains",
             "value": "in the kitchen",
             "limit": 1,
@@ -354,13 +354,13 @@ QUESTIONS: Final = (
     _asked(
         "What did you last say you saw?",
         "get_topic_in_last",
-        {"topic": streams.SCENE_DESCRIPTION, "seconds": 20, "max_samples": 1},
+        {"topic": published_topics.SCENE_DESCRIPTION, "seconds": 20, "max_samples": 1},
         said_last,
     ),
     _asked(
         "What were you told to do 20 s ago?",
         "get_topic_seconds_ago",
-        {"topic": streams.CMD_VEL, "seconds_ago": 20},
+        {"topic": published_topics.CMD_VEL, "seconds_ago": 20},
         commanded(20),
     ),
     _asked("Can I trust what you remember just now?", "memory_status", {}, trusted),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mcp.types import TextContent
 
-from ros2_memory.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S
 from tests.bags import boolean, detections, odom, tf, transform, write_mcap
 
 if TYPE_CHECKING:

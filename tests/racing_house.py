@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ros2_memory.timebase import WallClock
+from ros2_memory.core.timebase import WallClock
 from tests.keeping import keeper_of
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from ros2_memory.model import StampedTransform, Transform
+from ros2_memory.core.model import StampedTransform, Transform
 from tests.shared_bags import REAL
 
 if TYPE_CHECKING:

@@ -6,15 +6,15 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ros2_memory.catalogue import FILE, FOLDER, BagKey, Catalogue
-from ros2_memory.digest import Digester
-from ros2_memory.errors import BagError
-from ros2_memory.recall import Recall, bags_without_entry
+from ros2_memory.catalogue.digest import Digester
+from ros2_memory.catalogue.lookup import Recall, bags_without_entry
+from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
+from ros2_memory.core.errors import BagError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
 
 
 def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:

@@ -11,14 +11,14 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from ros2_memory.errors import RecorderError
-from ros2_memory.model import TimeWindow
-from ros2_memory.recorder.counting import CountingReader
-from ros2_memory.recorder.heartbeat import HEARTBEAT_FILE
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.ports import NoHousekeeping
 from ros2_memory.recorder.supervisor import Orders, Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.timebase import NS_PER_S, Clock
 from tests.bags import McapLayout, boolean, write_mcap
 
 if TYPE_CHECKING:

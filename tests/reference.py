@@ -18,8 +18,8 @@ from pydantic import TypeAdapter
 
 from ros2_memory.cli.app import COMMANDS
 from ros2_memory.cli.exits import EVERYWHERE, EXITS
-from ros2_memory.recorder import journal
-from ros2_memory.recorder.output import Said
+from ros2_memory.recorder import event_log
+from ros2_memory.recorder.process.output import Said
 from ros2_memory.settings import Ros2BagNode, Rosbag2Node, Settings
 from tests.documented import CALLS
 from tests.memories import ROOT
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
-    from ros2_memory.entries import Tool
+    from ros2_memory.tools.declaration import Tool
 
 SOURCE: Final = ROOT / "src" / "ros2_memory"
 LEVELS: Final = {
@@ -242,9 +242,9 @@ def events() -> list[Event]:
     }
     found |= {
         Event(name, "info", ("recording", *(("topic",) if said is Said.SUBSCRIBED else ())))
-        for said, name in journal._INFORM.items()
+        for said, name in event_log._INFORM.items()
     }
-    found |= {Event(said.value, "warning", ("reason", "recording")) for said in journal._ADVICE}
+    found |= {Event(said.value, "warning", ("reason", "recording")) for said in event_log._ADVICE}
     return sorted(found)
 
 

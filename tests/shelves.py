@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import zstandard
 from mcap.writer import CompressionType, IndexType
 
-from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.bags import McapLayout, Msg, write_db3, write_mcap

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 from mcap.writer import CompressionType
 
-from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.timebase import NS_PER_S, WallClock
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.core.timebase import NS_PER_S, WallClock
 from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 
 if TYPE_CHECKING:

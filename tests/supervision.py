@@ -6,7 +6,7 @@ from collections.abc import Collection, MutableMapping
 from pathlib import Path
 from typing import Any
 
-from ros2_memory.errors import RecorderError
+from ros2_memory.core.errors import RecorderError
 from tests.recorder_world import PERIOD, World
 
 

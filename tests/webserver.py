@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import uvicorn
 
-from ros2_memory.connections import ACCEPTED_AT_ONCE, BoundedConnection
+from ros2_memory.serving.connection_limits import (
+    ACCEPTED_AT_ONCE,
+    BoundedConnection,
+)
 from tests.waiting import PATIENCE_S
 
 if TYPE_CHECKING:

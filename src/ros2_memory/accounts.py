@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
-    from ros2_memory.model import Pose, Vector3
-    from ros2_memory.timebase import Ns
+    from ros2_memory.core.model import Pose, Vector3
+    from ros2_memory.core.timebase import Ns
 
 
 @dataclass(frozen=True, slots=True)

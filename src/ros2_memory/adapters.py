@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 
-from ros2_memory.errors import ConfigError
+from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.recorder.base import Recorder
-from ros2_memory.recorder.retention import RetentionLimits
+from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.base import BagReader
-from ros2_memory.timebase import ns_from_unix
 
 if TYPE_CHECKING:
     from ros2_memory.settings import AdapterNode, Settings

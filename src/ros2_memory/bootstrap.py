@@ -10,35 +10,35 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ros2_memory import directories
 from ros2_memory.adapters import build_reader, retention_limits
-from ros2_memory.catalogue import FILE, FOLDER, Catalogue
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.layout import has_recorded
+from ros2_memory.bag_dir.stand_in import StandInReader
+from ros2_memory.catalogue.digest import DIGEST_VERSION, Digester
+from ros2_memory.catalogue.lookup import Recall
+from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.config import load_message_schemas
-from ros2_memory.digest import DIGEST_VERSION, Digester
-from ros2_memory.dispatch import Dispatcher
-from ros2_memory.errors import ConfigError
+from ros2_memory.core import directories
+from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.release import PACKAGE, package_version
+from ros2_memory.core.telemetry import SILENT, Telemetry
+from ros2_memory.core.timebase import WallClock
 from ros2_memory.extract import SchemaExtractor
-from ros2_memory.filling import Filler
-from ros2_memory.measures import Measuring
-from ros2_memory.memory import Limits, Memory
-from ros2_memory.recall import Recall
-from ros2_memory.recorder.confined import ConfinedReader
-from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.history.context import Limits, Memory
+from ros2_memory.observability.gauges import Measuring
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.recorder.layout import has_recorded
-from ros2_memory.recorder.stand_in import StandInReader
-from ros2_memory.release import PACKAGE, package_version
-from ros2_memory.replies import Replies
+from ros2_memory.serving.backfill import Filler
+from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.settings import NullRecorderNode
-from ros2_memory.telemetry import SILENT, Telemetry
-from ros2_memory.timebase import WallClock
-from ros2_memory.tools import build_tools, readable_tools
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.spec_tools import build_tools, readable_tools
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from ros2_memory.core.telemetry import Observer
     from ros2_memory.settings import Settings
-    from ros2_memory.telemetry import Observer
 
 
 def build_memory(settings: Settings) -> Memory:
@@ -159,14 +159,16 @@ def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
                 "/metrics; choose server.transport=sse or leave it out"
             )
         with _optional("server.metrics"):
-            from ros2_memory.observability.metrics import Metrics  # noqa: PLC0415 - an extra
+            from ros2_memory.observability.prometheus import Metrics  # noqa: PLC0415 - an extra
         metrics = Metrics(Measuring(memory), package_version())
         observers.append(metrics)
         exposition = metrics.exposition
     if settings.server.traces:
         with _optional("server.traces"):
-            from ros2_memory.observability import traces  # noqa: PLC0415 - an extra
-        observers.append(traces.traces_from_environment(arguments=settings.logging.arguments))
+            from ros2_memory.observability import opentelemetry  # noqa: PLC0415 - an extra
+        observers.append(
+            opentelemetry.traces_from_environment(arguments=settings.logging.arguments)
+        )
     return Telemetry(tuple(observers), exposition)
 
 

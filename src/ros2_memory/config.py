@@ -25,9 +25,9 @@ from omegaconf import ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from ros2_memory.errors import ConfigError
-from ros2_memory.origins import GROUPS, Asked, Sources
-from ros2_memory.refusals import validated
+from ros2_memory.config_errors import validated
+from ros2_memory.config_sources import GROUPS, Asked, Sources
+from ros2_memory.core.errors import ConfigError
 from ros2_memory.settings import MessageSchemas, Settings
 
 if TYPE_CHECKING:

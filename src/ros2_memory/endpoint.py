@@ -8,15 +8,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.instructions import instructions
-from ros2_memory.protocol import EpisodicServer
-from ros2_memory.release import package_version
-from ros2_memory.telemetry import SILENT
+from ros2_memory.core.release import package_version
+from ros2_memory.core.telemetry import SILENT
+from ros2_memory.serving.mcp_server import EpisodicServer
+from ros2_memory.tools.instructions import instructions
 
 if TYPE_CHECKING:
-    from ros2_memory.memory import Memory
+    from ros2_memory.core.telemetry import Telemetry
+    from ros2_memory.history.context import Memory
     from ros2_memory.settings import Settings
-    from ros2_memory.telemetry import Telemetry
 
 
 def build_server(

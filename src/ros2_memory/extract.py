@@ -18,11 +18,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.errors import ConfigError, InvalidArgumentsError
-from ros2_memory.messages import ABSENT, Route, Segments, descend, names_of, parse_path
-from ros2_memory.model import Geodetic, JsonValue, Pose, StampedTransform, Transform, Twist
-from ros2_memory.rendering import MAX_SQUEEZE, Exact, Rendering, Shown
-from ros2_memory.views import (
+from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
+from ros2_memory.core.model import (
+    Geodetic,
+    JsonValue,
+    Pose,
+    StampedTransform,
+    Transform,
+    Twist,
+)
+from ros2_memory.messages.conversions import (
     Kind,
     Metric,
     euler,
@@ -34,12 +39,21 @@ from ros2_memory.views import (
     xyz,
     xyzw,
 )
+from ros2_memory.messages.fields import (
+    ABSENT,
+    Route,
+    Segments,
+    descend,
+    names_of,
+    parse_path,
+)
+from ros2_memory.messages.to_json import MAX_SQUEEZE, Exact, Rendering, Shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from ros2_memory.model import Quaternion, Vector3
-    from ros2_memory.timebase import Ns
+    from ros2_memory.core.model import Quaternion, Vector3
+    from ros2_memory.core.timebase import Ns
 
 MAX_SHOWN_CHARS: Final = 20_000
 """A shown value longer than this would fill a reply alone, and is thinned harder."""

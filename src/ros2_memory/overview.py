@@ -4,26 +4,26 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory import answers
-from ros2_memory.absence import require_bags
-from ros2_memory.history import View
-from ros2_memory.model import BagState, SetAside, TimeWindow
-from ros2_memory.recorder.listed_splits import absence_told, absent_splits
-from ros2_memory.timebase import Ns, ns_from_unix
-from ros2_memory.unseen import amiss, by_remark, misdated
-from ros2_memory.wording import counted
+from ros2_memory import results
+from ros2_memory.core.model import BagState, SetAside, TimeWindow
+from ros2_memory.core.timebase import Ns, ns_from_unix
+from ros2_memory.core.wording import counted
+from ros2_memory.history.coverage import require_bags
+from ros2_memory.history.unseen import amiss, by_remark, misdated
+from ros2_memory.history.view import View
+from ros2_memory.index.listed_splits import absence_told, absent_splits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.memory import Call, Memory
-    from ros2_memory.model import BagFile
-    from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.index.snapshot import Snapshot
 
 _ODD_BAGS: Final = 5
 
 
-def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, ...]:
+def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
     """Every topic that was heard, under each of its types; empty for an empty memory.
 
     A row has notes where its numbers are of bags that are not whole, or that a wrong clock dated.
@@ -40,7 +40,7 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, 
         reasons = _undecodable_types(view, topic)
         for type_name, census in sorted(view.census(topic).items()):
             rows.append(
-                answers.TopicRow(
+                results.TopicRow(
                     topic,
                     type_name,
                     census.first,
@@ -53,7 +53,7 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[answers.TopicRow, 
     return tuple(rows)
 
 
-def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
+def data_time_range(memory: Memory, call: Call) -> results.TimeRange:
     """What the memory spans, where it has holes, and which files do not answer.
 
     Bags that a wrong clock dated are listed, and neither begin nor end the span or a hole in it.
@@ -72,7 +72,7 @@ def data_time_range(memory: Memory, call: Call) -> answers.TimeRange:
     for sentence in absence_told(absent_splits(snapshot, memory.index.bag_dir)):
         view.note(sentence)
     undecodable = undecodable_topics(view)
-    return answers.TimeRange(
+    return results.TimeRange(
         earliest=snapshot.dating.earliest,
         latest=snapshot.dating.latest,
         now=now,
@@ -122,10 +122,10 @@ def clock_faults(snapshot: Snapshot) -> tuple[SetAside, ...]:
     return tuple(SetAside(fault.bag.path, fault.reason) for fault in snapshot.dating.faults)
 
 
-def undecodable_topics(view: View) -> tuple[answers.Undecodable, ...]:
+def undecodable_topics(view: View) -> tuple[results.Undecodable, ...]:
     """The topics of which messages are recorded that cannot be decoded, under which types."""
     return tuple(
-        answers.Undecodable(topic, type_name, reason)
+        results.Undecodable(topic, type_name, reason)
         for topic in view.snapshot.topics()
         for type_name, reason in sorted(_undecodable_types(view, topic).items())
     )
@@ -181,18 +181,18 @@ def _note_odd_bags(view: View) -> None:
         view.note(sentence)
 
 
-def _gaps(view: View) -> tuple[answers.Gap, ...]:
+def _gaps(view: View) -> tuple[results.Gap, ...]:
     """Holes of more than two splits between one bag's end and the next one's start."""
     longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
     return tuple(_holes(view.snapshot, longest))
 
 
-def _holes(snapshot: Snapshot, longest: Ns) -> Iterator[answers.Gap]:
+def _holes(snapshot: Snapshot, longest: Ns) -> Iterator[results.Gap]:
     reach: Ns | None = None
     left_out = snapshot.dating.misdated
     for bag in snapshot.bags:
         if bag.file in left_out:
             continue
         if reach is not None and bag.start - reach > longest:
-            yield answers.Gap(reach, bag.start)
+            yield results.Gap(reach, bag.start)
         reach = bag.end if reach is None else max(reach, bag.end)

@@ -13,9 +13,25 @@ from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ros2_memory import answers
-from ros2_memory import frames as frame_history
-from ros2_memory.absence import (
+from ros2_memory import results
+from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.analysis.transform_tree import TF_CACHE_NS
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+)
+from ros2_memory.core.model import Pose, Sample, TimeWindow
+from ros2_memory.core.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
+    MIN_NS,
+    START_SLACK_NS,
+    Ns,
+    ns_from_unix,
+)
+from ros2_memory.history import transforms as frame_history
+from ros2_memory.history.coverage import (
     moment,
     nothing_at,
     nothing_between,
@@ -24,40 +40,34 @@ from ros2_memory.absence import (
     resolve_topic,
     seconds,
 )
-from ros2_memory.conditions import parse_condition
-from ros2_memory.errors import (
-    InvalidArgumentsError,
-    NoDataError,
-    NoDataReason,
+from ros2_memory.history.driven_path import carries_no, decoded, way_driven
+from ros2_memory.history.reverse_search import last_match, unsearched
+from ros2_memory.history.robots import note_robots, note_robots_near
+from ros2_memory.history.time_arguments import (
+    Moment,
+    Span,
+    ns_argument,
+    open_moment,
+    open_span,
 )
-from ros2_memory.extremes import MOST_MESSAGES, TOO_MANY, extremes_of
-from ros2_memory.history import View
-from ros2_memory.model import Pose, Sample, TimeWindow
-from ros2_memory.moments import Moment, Span, ns_argument, open_moment, open_span
+from ros2_memory.history.unseen import note_edges, note_unseen
+from ros2_memory.history.view import View
+from ros2_memory.index.clock_faults import FUTURE_NS
+from ros2_memory.insights.field_extremes import (
+    MOST_MESSAGES,
+    TOO_MANY,
+    extremes_of,
+)
+from ros2_memory.messages.downsample import samples_note
 from ros2_memory.overview import data_time_range, list_recorded_topics
-from ros2_memory.recorder.clock_faults import FUTURE_NS
-from ros2_memory.robots import note_robots, note_robots_near
-from ros2_memory.sampling import samples_note
-from ros2_memory.search import last_match, unsearched
-from ros2_memory.tf_tree import TF_CACHE_NS
-from ros2_memory.timebase import (
-    AT_OR_BEFORE_SLACK_NS,
-    MAX_NS,
-    MIN_NS,
-    START_SLACK_NS,
-    Ns,
-    ns_from_unix,
-)
-from ros2_memory.unseen import note_edges, note_unseen
-from ros2_memory.ways import carries_no, decoded, way_driven
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.copies import Found
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import Extracted
-    from ros2_memory.memory import Call, Memory
-    from ros2_memory.model import JsonValue
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.duplicates import Found
 
 __all__ = [
     "data_time_range",
@@ -82,7 +92,7 @@ def topic_value(
     *,
     tolerance_s: float | None = None,
     fields: Sequence[str] = (),
-) -> answers.TopicValue:
+) -> results.TopicValue:
     """The newest message of a topic at or before a moment, within the tolerance.
 
     A latched topic has no tolerance unless one is given: its newest message holds.
@@ -101,7 +111,7 @@ def topic_range(
     *,
     max_samples: int = 100,
     fields: Sequence[str] = (),
-) -> answers.TopicRange:
+) -> results.TopicRange:
     """Samples of a topic, evenly spaced over all its messages in a window.
 
     Of `fields` that hold numbers the extremes are told, unless the messages are too many.
@@ -118,12 +128,12 @@ def topic_range(
         view.note(samples_note(len(chosen), total))
     note_unseen(view, window)
     note_edges(view, window)
-    extremes: tuple[answers.Extremes, ...] = ()
+    extremes: tuple[results.Extremes, ...] = ()
     if fields and total > MOST_MESSAGES:
         view.note(TOO_MANY)
     elif fields:
         extremes = extremes_of(view, name, window, fields)
-    return answers.TopicRange(name, types[-1], total, samples, view.notes, extremes)
+    return results.TopicRange(name, types[-1], total, samples, view.notes, extremes)
 
 
 def position(
@@ -133,7 +143,7 @@ def position(
     *,
     topic: str | None = None,
     tolerance_s: float | None = None,
-) -> answers.Position:
+) -> results.Position:
     """Where the robot was: the newest pose at or before a moment, within the tolerance.
 
     A topic of a satellite receiver gives degrees.
@@ -151,14 +161,14 @@ def position(
         if not (math.isfinite(place.latitude) and math.isfinite(place.longitude)):
             view.note("the recorded position is not a number")
         nowhere = Pose((math.nan,) * 3, None, place.frame_id)
-        return answers.Position(
+        return results.Position(
             name, found.time, nowhere, view.notes, _age(found, now), geodetic=place
         )
     if not all(map(math.isfinite, pose.position)):
         view.note("the recorded position is not a number")
     if pose.orientation is None:
         view.note("the recorded orientation is not a rotation")
-    return answers.Position(name, found.time, pose, view.notes, _age(found, now))
+    return results.Position(name, found.time, pose, view.notes, _age(found, now))
 
 
 def velocity(
@@ -168,7 +178,7 @@ def velocity(
     *,
     topic: str | None = None,
     tolerance_s: float | None = None,
-) -> answers.Velocity:
+) -> results.Velocity:
     """How fast the robot moved: the newest twist at or before a moment, within the tolerance."""
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic, "velocity")
@@ -177,12 +187,12 @@ def velocity(
     twist = memory.extractor.twist(decoded(view, found), found.record.channel.type)
     if twist is None:
         raise InvalidArgumentsError(carries_no(view, "velocity", found))
-    return answers.Velocity(name, found.time, twist, view.notes, _age(found, now))
+    return results.Velocity(name, found.time, twist, view.notes, _age(found, now))
 
 
 def transform(
     memory: Memory, call: Call, parent: str, child: str, moment: Moment
-) -> answers.TransformAt:
+) -> results.TransformAt:
     """The pose of `child` in `parent` at a moment, interpolated by tf2's rules."""
     view, at, now = open_moment(memory, call, moment)
     try:
@@ -192,18 +202,18 @@ def transform(
         raise NoDataError(error.reason, error.detail, view.notes) from error
     note_unseen(view, _around(at, found.reach))
     age = None if now is None else now - at
-    return answers.TransformAt(
+    return results.TransformAt(
         parent, child, at, found.lookup.transform, found.clock, view.notes, age
     )
 
 
-def frames(memory: Memory, call: Call) -> answers.Frames:
+def frames(memory: Memory, call: Call) -> results.Frames:
     """Every frame and parent-child pair that was recorded."""
     view = View(memory, call, memory.clock.now())
     require_bags(view)
     edges = frame_history.edges(view)
     note_unseen(view, TimeWindow.everything(), nothing=True)
-    return answers.Frames(edges, view.notes)
+    return results.Frames(edges, view.notes)
 
 
 def find_last_match(
@@ -216,7 +226,7 @@ def find_last_match(
     field: str | None = None,
     fields: Sequence[str] = (),
     before_s: float | None = None,
-) -> answers.Match:
+) -> results.Match:
     """The newest message of a topic, or of all topics of a glob, that meets a condition.
 
     With `before_s` (Unix seconds) only messages up to and including then are searched.
@@ -227,14 +237,14 @@ def find_last_match(
     until = _before(before_s)
     found = last_match(view, topic, condition, until)
     if found is None:
-        return answers.Match(None, unsearched(view, TimeWindow(MIN_NS, until)))
+        return results.Match(None, unsearched(view, TimeWindow(MIN_NS, until)))
     note_robots_near(view, found)
     note_unseen(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
     if counted_from is not None and found.time > counted_from + FUTURE_NS:
         view.note(f"dated {seconds(found.time - counted_from)} after now: when it was is unknown")
         counted_from = None
-    return answers.Match(_value(view, found, fields, counted_from), view.notes)
+    return results.Match(_value(view, found, fields, counted_from), view.notes)
 
 
 def value_when(
@@ -248,7 +258,7 @@ def value_when(
     field: str | None = None,
     fields: Sequence[str] = (),
     before_s: float | None = None,
-) -> answers.ValueWhen:
+) -> results.ValueWhen:
     """What one topic held when another last met a condition: its value at or before the match.
 
     With `before_s` (Unix seconds) the condition is looked for up to and including then.
@@ -259,7 +269,7 @@ def value_when(
     name = resolve_topic(view, value_topic)
     found = last_match(view, condition_topic, condition, until)
     if found is None:
-        return answers.ValueWhen(None, notes=unsearched(view, TimeWindow(MIN_NS, until)))
+        return results.ValueWhen(None, notes=unsearched(view, TimeWindow(MIN_NS, until)))
     note_unseen(view, _searched(view, found, until, now), search=True)
     note_robots_near(view, found)
     matched = _value(view, found, (), None)
@@ -268,13 +278,13 @@ def value_when(
     note_unseen(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
     if held is None:
         view.note(f"{name} held no message yet at {moment(found.time)}")
-        return answers.ValueWhen(matched, None, view.notes)
+        return results.ValueWhen(matched, None, view.notes)
     distance = found.time - held.time
     latched = memory.limits.latching.holds(view.snapshot, held)
     if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
         view.note(f"the value is {seconds(distance)} older than the match")
     told = _held(view, _value(view, held, fields, None), held, found.time)
-    return answers.ValueWhen(matched, told, view.notes)
+    return results.ValueWhen(matched, told, view.notes)
 
 
 def _newest_beside(view: View, topic: str, window: TimeWindow, match: Found) -> Found | None:
@@ -299,7 +309,7 @@ def _newest_beside(view: View, topic: str, window: TimeWindow, match: Found) -> 
 
 def trajectory_summary(
     memory: Memory, call: Call, span: Span, *, topic: str | None = None
-) -> answers.TrajectorySummary:
+) -> results.TrajectorySummary:
     """The way driven in a window, from one pose topic in log-time order."""
     view, window = open_span(memory, call, span)
     name = resolve_pose_topic(view, topic)
@@ -311,7 +321,7 @@ def trajectory_summary(
     note_robots(view, name, window)
     note_unseen(view, window)
     note_edges(view, window)
-    return answers.TrajectorySummary(
+    return results.TrajectorySummary(
         name, way.frames[0], way.first, way.last, way.trajectory, view.notes
     )
 
@@ -356,7 +366,7 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Foun
     return found
 
 
-def _held(view: View, value: answers.TopicValue, found: Found, at: Ns) -> answers.TopicValue:
+def _held(view: View, value: results.TopicValue, found: Found, at: Ns) -> results.TopicValue:
     """A value with whether it is latched, and then how old it is."""
     if not view.memory.limits.latching.holds(view.snapshot, found):
         return value
@@ -380,11 +390,11 @@ def _extracted(view: View, found: Found, fields: Sequence[str]) -> Extracted:
     return shown
 
 
-def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> answers.TopicValue:
+def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> results.TopicValue:
     """A message as a reply shows it, with the notes of the whole view so far."""
     shown = _extracted(view, found, fields)
     channel = found.record.channel
-    return answers.TopicValue(
+    return results.TopicValue(
         channel.topic,
         channel.type,
         Sample(found.time, shown.value),

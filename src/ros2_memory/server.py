@@ -17,22 +17,25 @@ from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 import anyio
 import uvicorn
 
-from ros2_memory.api_token import take_token
 from ros2_memory.bootstrap import (
     build_filler,
     build_memory,
     build_telemetry,
 )
 from ros2_memory.config import exit_on_config_error, load_settings
-from ros2_memory.connections import ACCEPTED_AT_ONCE, BoundedConnection
+from ros2_memory.core.logging_setup import configure_logging, get_logger
+from ros2_memory.core.release import package_version
+from ros2_memory.core.sd_notify import READY, STOPPING, ServiceManager
 from ros2_memory.endpoint import build_server
-from ros2_memory.filling import keep_filled
-from ros2_memory.health import Health, keep_fresh
-from ros2_memory.http import STREAM_PATH, web_app
-from ros2_memory.listening import BACKLOG, CannotListenError, bound, resolved
-from ros2_memory.logs import configure_logging, get_logger
-from ros2_memory.recorder.notify import READY, STOPPING, ServiceManager
-from ros2_memory.release import package_version
+from ros2_memory.serving.api_token import take_token
+from ros2_memory.serving.backfill import keep_filled
+from ros2_memory.serving.connection_limits import (
+    ACCEPTED_AT_ONCE,
+    BoundedConnection,
+)
+from ros2_memory.serving.health import Health, keep_fresh
+from ros2_memory.serving.listen import BACKLOG, CannotListenError, bound, resolved
+from ros2_memory.serving.web_app import STREAM_PATH, web_app
 
 if TYPE_CHECKING:
     import socket
@@ -41,11 +44,11 @@ if TYPE_CHECKING:
 
     from pydantic import SecretStr
 
-    from ros2_memory.filling import Filler
-    from ros2_memory.http import Background, WebApp
-    from ros2_memory.listening import Address
-    from ros2_memory.memory import Memory
-    from ros2_memory.protocol import EpisodicServer
+    from ros2_memory.history.context import Memory
+    from ros2_memory.serving.backfill import Filler
+    from ros2_memory.serving.listen import Address
+    from ros2_memory.serving.mcp_server import EpisodicServer
+    from ros2_memory.serving.web_app import Background, WebApp
     from ros2_memory.settings import ServerSettings
 
 PROGRAM: Final = "ros2-memory-server"

@@ -22,8 +22,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from ros2_memory import directories
-from ros2_memory.errors import ConfigError
+from ros2_memory.core import directories
+from ros2_memory.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

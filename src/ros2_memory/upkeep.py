@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory.adapters import GB, retention_limits
-from ros2_memory.recorder.counting import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
-from ros2_memory.recorder.ownership import OwnRecordings
-from ros2_memory.recorder.repair import Repairer
 from ros2_memory.recorder.time_sync import SystemTimeSync
-from ros2_memory.storage.mcap_embedded import custom_data
+from ros2_memory.retention.repair import Repairer
+from ros2_memory.storage.mcap.embedded import custom_data
+from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.storage.mcap_writer import McapWriter
-from ros2_memory.timebase import WallClock
 
 if TYPE_CHECKING:
     from pathlib import Path

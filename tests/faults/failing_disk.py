@@ -17,7 +17,7 @@ OPEN: Final = frozenset({"open", "fstat", "pread"})
 LOOK: Final = frozenset({"stat", "lstat", "scandir"})
 """What is called to see which bag files there are."""
 
-_ROOMS: Final = ("ros2_memory.storage.open_file", "ros2_memory.recorder.scan")
+_ROOMS: Final = ("ros2_memory.storage.file_io", "ros2_memory.index.scan")
 
 
 class Disk:

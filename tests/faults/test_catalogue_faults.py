@@ -15,12 +15,18 @@ import anyio
 import pytest
 import structlog
 
-from ros2_memory.catalogue import FILE, FOLDER
-from ros2_memory.catalogue_base import RETRY_S
-from ros2_memory.digest import Digester
-from ros2_memory.errors import BagError
-from ros2_memory.filling import AGAIN_NS, BACKLOG, Filler, Progress, keep_filled
-from ros2_memory.recall import Recall
+from ros2_memory.catalogue.database import RETRY_S
+from ros2_memory.catalogue.digest import Digester
+from ros2_memory.catalogue.lookup import Recall
+from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.core.errors import BagError
+from ros2_memory.serving.backfill import (
+    AGAIN_NS,
+    BACKLOG,
+    Filler,
+    Progress,
+    keep_filled,
+)
 from tests.faults.world import NOW, fill_up, plainly, served, told, write_bag, write_bags
 from tests.memories import SettableClock
 from tests.waiting import PATIENCE_S
@@ -28,7 +34,7 @@ from tests.waiting import PATIENCE_S
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from ros2_memory.digest import Digest
+    from ros2_memory.catalogue.digest import Digest
 
 
 def delete(path: Path) -> None:

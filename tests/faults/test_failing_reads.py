@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING
 import pytest
 import zstandard
 
-from ros2_memory.errors import BagError, BagUnreachableError, BagVanishedError
-from ros2_memory.health import Health
-from ros2_memory.recorder.standing import RETRY_SOON_NS
+from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
+from ros2_memory.index.file_state import RETRY_SOON_NS
+from ros2_memory.serving.health import Health
 from ros2_memory.storage.base import BagReader
-from ros2_memory.storage.faults import reading
+from ros2_memory.storage.errors import reading
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.bags import odom, write_db3
@@ -34,7 +34,7 @@ from tests.memories import SettableClock, memory_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
 
 READS = int(os.environ.get("FAULTS_READS", "8"))
 COUNT = 3

@@ -8,12 +8,17 @@ from typing import TYPE_CHECKING, NoReturn
 
 import pytest
 
-from ros2_memory.errors import BagUnreachableError, RecorderError
-from ros2_memory.model import TimeWindow
-from ros2_memory.recorder import handover as handovers
-from ros2_memory.recorder.counting import CountingReader
-from ros2_memory.recorder.handover import Counting, Handover, read_handover, write_handover
-from ros2_memory.recorder.settle import settle, settle_all
+from ros2_memory.bag_dir import handover_file as handovers
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.handover_file import (
+    Counting,
+    Handover,
+    read_handover,
+    write_handover,
+)
+from ros2_memory.core.errors import BagUnreachableError, RecorderError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.recorder.handover.recovery import settle, settle_all
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.faults.world import write_bag
 
@@ -54,7 +59,7 @@ def test_a_handover_is_not_settled_from_what_a_failing_disk_hides(
     write_handover(old, begun)
     write_handover(new, Handover(state=Counting.PENDING, previous="rec"))
     with monkeypatch.context() as patched:
-        patched.setattr("ros2_memory.storage.open_file.os.open", fails_to_open)
+        patched.setattr("ros2_memory.storage.file_io.os.open", fails_to_open)
         with pytest.raises(RecorderError, match="Input/output error"):
             settle(old, new, McapReader())
         settle_all(tmp_path, McapReader())

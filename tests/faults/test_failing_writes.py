@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import pytest
 import structlog
 
-from ros2_memory.catalogue import FILE, FOLDER
-from ros2_memory.recorder.sync import write_all_durably, write_durably
+from ros2_memory.bag_dir.durable_write import write_all_durably, write_durably
+from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.faults.test_catalogue_faults import assert_sound, trouble_of
 from tests.faults.world import fill_up, plainly, served, told, write_bags
 

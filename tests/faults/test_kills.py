@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.catalogue import FILE, FOLDER
+from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.faults.running import children_of, is_alive, load, serving, start, stop
 from tests.faults.world import write_bags
 from tests.waiting import until

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ros2_memory.catalogue import FILE, FOLDER
+from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.faults import test_catalogue_faults as faults
 from tests.faults.running import Running, serving
 from tests.faults.small_disk import filled, mount, needs_mounts, small_disk, unmount

@@ -7,7 +7,7 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING
 
-from ros2_memory.catalogue import FILE, FOLDER
+from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.faults.running import load, serving
 from tests.faults.test_catalogue_faults import assert_sound
 from tests.faults.world import write_bag, write_bags

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 
 from ros2_memory import queries
 from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.cli.index import fill
 from ros2_memory.config import load_settings
-from ros2_memory.errors import EpisodicError
-from ros2_memory.indexing import fill
-from ros2_memory.memory import Call
-from ros2_memory.moments import Moment, Span
-from ros2_memory.recap import recap
-from ros2_memory.sightings import find_matches
-from ros2_memory.timebase import NS_PER_S, FixedClock
-from ros2_memory.visits import visits
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.timebase import NS_PER_S, FixedClock
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.insights.recap import recap
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.insights.visits import visits
 from tests.bags import McapLayout, detections, odom, tf, transform, write_mcap
 from tests.keeping import recorded_before
 from tests.memories import memory_of
@@ -27,8 +27,8 @@ from tests.memories import memory_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ros2_memory.filling import Filler
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
+    from ros2_memory.serving.backfill import Filler
 
 T0_S = 1_700_000_000
 T0 = T0_S * NS_PER_S

@@ -12,7 +12,7 @@ from tests.fuzz.good import AFTER_S, BASE_S, BEFORE_S, LENGTH_S, TOPICS
 if TYPE_CHECKING:
     from random import Random
 
-    from ros2_memory.protocol import EpisodicServer
+    from ros2_memory.serving.mcp_server import EpisodicServer
 
 Asked = tuple[str, dict[str, Any]]
 

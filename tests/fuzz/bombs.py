@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
-from ros2_memory.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S
 from tests.bags import Msg, definition, write_db3
 from tests.fuzz.good import BASE_S, goods
 from tests.fuzz.mutant import Mutant, mutant_file, mutant_of

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from ros2_memory.timebase import MAX_NS, NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 from tests.bags import Msg, definition, write_db3, write_mcap
 from tests.fuzz.good import BASE_S, mcaps, run_of, sqlites
 from tests.fuzz.mutant import Mutant, mutant_of

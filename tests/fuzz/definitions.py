@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S
 from tests.bags import Msg
 from tests.fuzz.content import db3_with
 from tests.fuzz.good import BASE_S

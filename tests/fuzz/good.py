@@ -14,7 +14,7 @@ import numpy as np
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from ros2_memory.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S
 from tests.bags import (
     McapLayout,
     Msg,

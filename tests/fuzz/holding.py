@@ -6,9 +6,9 @@ import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
-from ros2_memory.history import View
-from ros2_memory.memory import Call
-from ros2_memory.model import TimeWindow
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import View
 from tests.bags import typestore
 from tests.fuzz.asking import ask
 from tests.fuzz.oracle import readable_db3, readable_mcap
@@ -16,9 +16,9 @@ from tests.fuzz.oracle import readable_db3, readable_mcap
 if TYPE_CHECKING:
     from random import Random
 
-    from ros2_memory.memory import Memory
-    from ros2_memory.model import BagFile
-    from ros2_memory.protocol import EpisodicServer
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.history.context import Memory
+    from ros2_memory.serving.mcp_server import EpisodicServer
     from tests.fuzz.good import Good
     from tests.fuzz.mutant import Mutant
     from tests.fuzz.oracle import Readable

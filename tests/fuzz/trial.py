@@ -17,12 +17,12 @@ import structlog
 
 from ros2_memory import cli
 from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.cli.index import Bar, fill
+from ros2_memory.cli.recovery import recover
 from ros2_memory.config import load_settings
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.endpoint import build_server
-from ros2_memory.errors import EpisodicError
-from ros2_memory.indexing import Bar, fill
-from ros2_memory.model import BagState, TimeWindow
-from ros2_memory.recovery import recover
 from tests.fuzz.asking import OF_GOOD, ask, comparable, of_mutant
 from tests.fuzz.good import neighbours
 from tests.fuzz.holding import hold, truth_of
@@ -32,8 +32,8 @@ from tests.fuzz.traps import sprung
 if TYPE_CHECKING:
     from collections.abc import Mapping, MutableMapping
 
-    from ros2_memory.memory import Memory
-    from ros2_memory.protocol import EpisodicServer
+    from ros2_memory.history.context import Memory
+    from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.settings import Settings
     from tests.fuzz.classes import Job
     from tests.fuzz.good import Good

@@ -20,16 +20,16 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import cli
-from ros2_memory.recorder.keepsake import held_in
-from ros2_memory.recorder.mailbox import Slot
-from ros2_memory.recorder.ownership import OwnRecordings, identity_of
+from ros2_memory.bag_dir.moment_file import held_in
+from ros2_memory.bag_dir.own_recordings import OwnRecordings, identity_of
+from ros2_memory.bag_dir.request_queue import Slot
 from tests.bags import odom, write_mcap
 from tests.keeping import size_of
 from tests.memories import ROOT
 from tests.waiting import until
 
 if TYPE_CHECKING:
-    from ros2_memory.recorder.mailbox import Outcome
+    from ros2_memory.bag_dir.request_queue import Outcome
 
 S = 10**9
 ROUNDS = 24 if os.environ.get("EPISODIC_LONG") == "1" else 8

@@ -16,17 +16,17 @@ import pytest
 
 from ros2_memory import queries
 from ros2_memory.bootstrap import build_filler, build_memory
-from ros2_memory.catalogue import FILE, FOLDER
+from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.config import load_settings
-from ros2_memory.memory import Call
-from ros2_memory.timebase import NS_PER_S, FixedClock
+from ros2_memory.core.timebase import NS_PER_S, FixedClock
+from ros2_memory.history.context import Call
 from tests.bags import detections, odom, tf, transform, write_mcap
 from tests.keeping import recorded_before
 from tests.memories import memory_of
 from tests.waiting import until
 
 if TYPE_CHECKING:
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
 
 BAGS = 60
 T0 = 1_700_000_000 * NS_PER_S

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, cast
 import anyio
 import pytest
 
-from ros2_memory.dispatch import Dispatcher
-from ros2_memory.entries import Tool
-from ros2_memory.errors import QueryTimeoutError
-from ros2_memory.http import web_app
-from ros2_memory.protocol import EpisodicServer
-from ros2_memory.replies import Replies
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.serving.mcp_server import EpisodicServer
+from ros2_memory.serving.web_app import web_app
+from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.replies import Replies
 from tests.soak.clients import modern, opening
 from tests.soak.wire import call, connected, head, posted
 from tests.webserver import BOUND_S, listening
@@ -25,7 +25,7 @@ from tests.webserver import BOUND_S, listening
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from ros2_memory.memory import Call, Memory
+    from ros2_memory.history.context import Call, Memory
 
 
 class Endless:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from ros2_memory.recorder.heartbeat import Heartbeat, RecorderState
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
 from tests.live_recorder import (
     NS_PER_S,
     LiveRecorder,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from ros2_memory.model import TimeWindow
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.closed_form import position
 from tests.live_recorder import (

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from ros2_memory.timebase import unix_rounded_up
+from ros2_memory.core.timebase import unix_rounded_up
 from tests.closed_form import position
 from tests.live_recorder import (
     NS_PER_S,

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 import pytest
 from mcp import Client
 
-from ros2_memory.catalogue import FILE, FOLDER
-from ros2_memory.recorder.heartbeat import HEARTBEAT_FILE
+from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
+from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.bags import McapLayout, odom, write_db3, write_mcap
 from tests.integration.test_retention_process import state
 from tests.integration.test_server_process import serving

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.recorder.heartbeat import write_heartbeat
-from ros2_memory.timebase import NS_PER_S
+from ros2_memory.bag_dir.heartbeat import write_heartbeat
+from ros2_memory.core.timebase import NS_PER_S
 from tests.bags import boolean, detections, odom, text, write_mcap
 from tests.browser import ENTER, TAB, Browser, browsing, needs_chromium
 from tests.documented import heartbeat

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.errors import RecorderError
-from ros2_memory.recorder.child import (
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.process.child import (
     MAX_LINE,
     MAX_LINES,
     Child,
@@ -330,7 +330,7 @@ def test_it_is_interrupted_when_the_process_that_started_it_is_killed(tmp_path: 
         "open(sys.argv[1] + '/up', 'w').write(str(os.getpid()))\nidle()",
     )
     daemon = (
-        "import sys, time\nfrom ros2_memory.recorder.child import Child\n"
+        "import sys, time\nfrom ros2_memory.recorder.process.child import Child\n"
         "Child.start(sys.argv[1:], {})\ntime.sleep(600)\n"
     )
     with subprocess.Popen([sys.executable, "-c", daemon, recorder, str(tmp_path)]) as process:
@@ -342,7 +342,7 @@ def test_it_is_interrupted_when_the_process_that_started_it_is_killed(tmp_path: 
 
 
 def test_a_parent_that_died_before_is_noticed(tmp_path: Path) -> None:
-    launcher = ROOT / "src/ros2_memory/recorder/launch.py"
+    launcher = ROOT / "src/ros2_memory/recorder/process/launch.py"
     ran = subprocess.run(
         [sys.executable, "-IS", launcher, "1", program(tmp_path, "print('ran')")],
         check=False,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.errors import ConfigError, RecorderError
+from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.recorder.null import NullRecorder
 from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader

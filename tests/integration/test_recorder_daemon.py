@@ -19,11 +19,11 @@ from typing import Any
 
 import pytest
 
-from ros2_memory.model import TimeWindow
-from ros2_memory.recorder.counting import CountingReader
-from ros2_memory.recorder.handover import read_handover
-from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
-from ros2_memory.recorder.layout import LIST_FILE
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.bag_dir.layout import LIST_FILE
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests import stub_ros2

@@ -9,9 +9,13 @@ from pathlib import Path
 import pytest
 from structlog.testing import capture_logs
 
-from ros2_memory.errors import RecorderError
-from ros2_memory.recorder import environment
-from ros2_memory.recorder.environment import find_ros2, robot_environment, without_ours
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.process import environment
+from ros2_memory.recorder.process.environment import (
+    find_ros2,
+    robot_environment,
+    without_ours,
+)
 
 BASE = {"PATH": os.defpath, "ROS_DOMAIN_ID": "7", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
 LOGS = Path("/somewhere/logs")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.recorder.keepsake import Held, held_in
-from ros2_memory.recorder.layout import REQUESTS_FOLDER
+from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
+from ros2_memory.bag_dir.moment_file import Held, held_in
 from tests.integration.test_recorder_daemon import Site, at_a_site, sited
 from tests.integration.test_server_process import serving
 from tests.live_recorder import answer

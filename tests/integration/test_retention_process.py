@@ -20,13 +20,13 @@ import pytest
 from mcp import Client
 
 from ros2_memory import queries
-from ros2_memory.errors import NoDataError
-from ros2_memory.memory import Call, Limits
-from ros2_memory.moments import Moment, Span
-from ros2_memory.recorder.heartbeat import read_heartbeat
-from ros2_memory.recorder.layout import is_carried
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.timebase import NS_PER_S, WallClock
+from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.time_arguments import Moment, Span
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.timebase import NS_PER_S, WallClock
 from tests.bags import McapLayout, odom, write_mcap
 from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving
@@ -36,7 +36,7 @@ from tests.memories import memory_of
 from tests.owned import own_all
 from tests.questions import ask_everything, write_run
 from tests.split_writer import DOCK
-from tests.unit.test_deep_directories import DEEP, within
+from tests.unit.core.test_deep_directories import DEEP, within
 from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:

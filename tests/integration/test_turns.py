@@ -12,10 +12,10 @@ import pytest
 from mcp import Client
 from mcp.client.sse import sse_client
 
-from ros2_memory.dispatch import Dispatcher
-from ros2_memory.http import web_app
-from ros2_memory.protocol import EpisodicServer
-from ros2_memory.replies import Replies, Reply
+from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.serving.mcp_server import EpisodicServer
+from ros2_memory.serving.web_app import web_app
+from ros2_memory.tools.replies import Replies, Reply
 from tests.soak.wire import call, posted
 from tests.waiting import PATIENCE_S
 from tests.webserver import listening
@@ -23,7 +23,7 @@ from tests.webserver import listening
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Hashable, Mapping
 
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
 
 
 class Listening(Dispatcher):

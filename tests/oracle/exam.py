@@ -18,8 +18,8 @@ import numpy as np
 import yaml
 
 from ros2_memory.bootstrap import build_dispatcher, build_filler, build_memory
+from ros2_memory.cli.index import fill
 from ros2_memory.config import load_settings
-from ros2_memory.indexing import fill
 from tests.oracle.truth import SLACK_NS, History, Row, Topic, path_of, planar
 
 if TYPE_CHECKING:

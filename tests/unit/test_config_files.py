@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.config import config_dir, load_message_schemas, load_settings
-from ros2_memory.errors import ConfigError
+from ros2_memory.core.errors import ConfigError
 from tests.configs import ROOT, copied, edit, refusal
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.errors import ConfigError, InvalidArgumentsError
+from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.extract import SchemaExtractor
 from tests import bags
 from tests.schemas import shipped_extractor

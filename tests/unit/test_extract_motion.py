@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from ros2_memory import geometry
-from ros2_memory.model import Pose, Twist
+from ros2_memory.core import geometry
+from ros2_memory.core.model import Pose, Twist
 from tests import bags
 from tests.schemas import shipped_extractor
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from ros2_memory.memory import Limits
+from ros2_memory.history.context import Limits
 from tests.asking import asked
 from tests.bags import (
     Msg,

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.errors import InvalidArgumentsError, NoDataError, NoDataReason
-from ros2_memory.groups import groups_of
-from ros2_memory.history import View
-from ros2_memory.memory import Call
-from ros2_memory.model import TimeWindow
-from ros2_memory.moments import Moment, Span
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.bag_groups import groups_of
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.view import View
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.bags import (
     McapLayout,
@@ -31,7 +35,7 @@ from tests.memories import SettableClock, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.model import JsonValue
+    from ros2_memory.core.model import JsonValue
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9

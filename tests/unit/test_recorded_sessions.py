@@ -11,9 +11,9 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import queries
-from ros2_memory.memory import Call, Limits
-from ros2_memory.moments import Moment, Span
-from ros2_memory.timebase import unix_from_ns, unix_rounded_up
+from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
+from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.time_arguments import Moment, Span
 from tests.bags import typestore
 from tests.closed_form import (
     CAMERA,
@@ -31,7 +31,7 @@ from tests.memories import memory_of
 from tests.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
-    from ros2_memory.memory import Memory
+    from ros2_memory.history.context import Memory
 
 sessions = pytest.mark.parametrize(
     "session",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from ros2_memory.errors import ConfigError
+from ros2_memory.core.errors import ConfigError
 from ros2_memory.typestore import (
     MAX_CACHED_BYTES,
     MAX_MEMBERS,

@@ -11,9 +11,9 @@ import typer
 from typer.main import get_command
 
 from ros2_memory.cli.deferred import Deferred
-from ros2_memory.release import package_version
-from ros2_memory.withheld import withheld_warnings
-from ros2_memory.wording import counted, listed
+from ros2_memory.core.release import package_version
+from ros2_memory.core.withheld import withheld_warnings
+from ros2_memory.core.wording import counted, listed
 
 if TYPE_CHECKING:
     from typer.core import TyperGroup
@@ -28,18 +28,18 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
-    "ask": ("asking.ask", "ask any tool of the server, in process"),
-    "topics": ("telling.topics", "every recorded topic, with its rate"),
-    "info": ("telling.info", "range, gaps, budget and how long it lasts"),
-    "watch": ("watching.watch", "what is being recorded just now"),
+    "ask": ("ask.ask", "ask any tool of the server, in process"),
+    "topics": ("info.topics", "every recorded topic, with its rate"),
+    "info": ("info.info", "range, gaps, budget and how long it lasts"),
+    "watch": ("watch.watch", "what is being recorded just now"),
     "doctor": ("doctor.doctor", "look for what is wrong, and say what to do"),
-    "export": ("exporting.export", "a time window as MCAP or Parquet"),
-    "forget": ("forgetting.forget", "delete a time window, after asking"),
-    "adopt": ("adopting.adopt", "let the recorder delete bags that it did not make"),
-    "demo": ("demonstrating.demo", "a simulated robot, asked questions with known answers"),
-    "index": ("filling.index", "look into every bag once, so that answers take milliseconds"),
-    "recover": ("recovering.recover", "repair MCAP files that were left unfinished"),
-    "config": ("configuring.config", "the configuration as it is composed"),
+    "export": ("export.export", "a time window as MCAP or Parquet"),
+    "forget": ("forget.forget", "delete a time window, after asking"),
+    "adopt": ("adopt.adopt", "let the recorder delete bags that it did not make"),
+    "demo": ("demo.demo", "a simulated robot, asked questions with known answers"),
+    "index": ("fill.index", "look into every bag once, so that answers take milliseconds"),
+    "recover": ("recover.recover", "repair MCAP files that were left unfinished"),
+    "config": ("config_show.config", "the configuration as it is composed"),
 }
 """By name: where it is in this package, imported when it is asked for, and what it is for."""
 

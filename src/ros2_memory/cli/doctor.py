@@ -13,12 +13,12 @@ from ros2_memory.cli import findings
 from ros2_memory.cli.extras import of_extras
 from ros2_memory.cli.findings import Finding, Level
 from ros2_memory.cli.opening import opened
+from ros2_memory.cli.output import plain
 from ros2_memory.cli.running import AsJson, BagDir, Overrides, Verbose, busy, output, reporting, say
 from ros2_memory.cli.server_finding import of_server
 from ros2_memory.cli.settling import settings_for
-from ros2_memory.cli.showing import plain
 from ros2_memory.config import config_dir
-from ros2_memory.errors import ConfigError
+from ros2_memory.core.errors import ConfigError
 
 _STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
 

@@ -14,35 +14,35 @@ from difflib import get_close_matches
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory import directories
 from ros2_memory.adapters import GB, build_recorder
+from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bootstrap import limits_of
 from ros2_memory.cli.oddities import counted_as_active, merged
-from ros2_memory.errors import BagError, EpisodicError
-from ros2_memory.memory import Call
+from ros2_memory.core import directories
+from ros2_memory.core.errors import BagError, EpisodicError
+from ros2_memory.core.timebase import NS_PER_S, iso_local, unix_from_ns
+from ros2_memory.core.wording import NAMED, counted, listed
+from ros2_memory.history.context import Call
+from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
+from ros2_memory.index.listed_splits import absence_told, absent_splits
 from ros2_memory.overview import data_time_range, nothing_here, odd_bags
-from ros2_memory.recorder.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.recorder.daemon import Ticking
-from ros2_memory.recorder.heartbeat import RecorderState, read_heartbeat
-from ros2_memory.recorder.listed_splits import absence_told, absent_splits
-from ros2_memory.recorder.topics import TopicSelection, load_topics
+from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.settings import NullRecorderNode
 from ros2_memory.storage.base import Closing
-from ros2_memory.timebase import NS_PER_S, iso_local, unix_from_ns
-from ros2_memory.wording import NAMED, counted, listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.latching import Latching
-    from ros2_memory.memory import Memory
-    from ros2_memory.model import JsonValue, SetAside
-    from ros2_memory.recorder.heartbeat import Heartbeat
-    from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.core.model import JsonValue, SetAside
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Memory
+    from ros2_memory.history.latching import Latching
+    from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.settings import Settings
     from ros2_memory.storage.base import BagReader
-    from ros2_memory.timebase import Ns
 
 LATELY_NS: Final = 3600 * NS_PER_S
 """A topic that is not in the newest data of this length is not recorded just now."""

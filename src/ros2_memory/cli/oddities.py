@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ros2_memory.core.timebase import Ns, ns_from_unix
+from ros2_memory.index.overlaps import named, overlapping_recordings
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
-from ros2_memory.recorder.overlaps import named, overlapping_recordings
-from ros2_memory.timebase import Ns, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.memory import Memory
-    from ros2_memory.recorder.snapshot import Snapshot
+    from ros2_memory.history.context import Memory
+    from ros2_memory.index.snapshot import Snapshot
 
 
 @dataclass(frozen=True, slots=True)

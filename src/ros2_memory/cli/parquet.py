@@ -19,15 +19,15 @@ from urllib.parse import quote
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ros2_memory.errors import InvalidArgumentsError, UndecodableError
-from ros2_memory.timebase import NS_PER_S
+from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
-    from ros2_memory.copies import Found
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.history.duplicates import Found
     from ros2_memory.storage.base import BagReader
 
 SCHEMA: Final = pa.schema(

@@ -13,7 +13,7 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 
-from ros2_memory.errors import EpisodicError
+from ros2_memory.core.errors import EpisodicError
 
 NOT_SO: Final = 1
 """Exit code: it ran, and the answer is no: an error reply, something left undone."""

@@ -8,14 +8,14 @@ import os
 import time
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.api_token import api_token
 from ros2_memory.cli.findings import Finding, Level
-from ros2_memory.errors import EpisodicError
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.serving.api_token import api_token
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from ros2_memory.model import JsonValue
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.settings import Settings
 
 _SERVER_PATIENCE_S: Final = 5.0

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ros2_memory.config import load_explained, quoted
-from ros2_memory.origins import Sources
+from ros2_memory.config_sources import Sources
 from ros2_memory.settings import Settings
 
 

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from ros2_memory.errors import InvalidArgumentsError
-from ros2_memory.memory import Memory
-from ros2_memory.model import TimeWindow
-from ros2_memory.recorder.snapshot import Snapshot
-from ros2_memory.timebase import MAX_NS, MIN_NS, unix_from_ns
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
+from ros2_memory.history.context import Memory
+from ros2_memory.index.snapshot import Snapshot
 
 Start = Annotated[
     str | None,

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.demo import robot, streams
-from ros2_memory.demo.checking import (
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, ns_from_unix
+from ros2_memory.demo import published_topics, robot
+from ros2_memory.demo.answer_checks import (
     METRES,
     Asked,
     at,
@@ -24,17 +25,16 @@ from ros2_memory.demo.checking import (
     told_of,
     within,
 )
-from ros2_memory.demo.flat import room_at
+from ros2_memory.demo.floor_plan import room_at
 from ros2_memory.demo.messages import description
+from ros2_memory.demo.published_topics import STREAMS
 from ros2_memory.demo.robot import Planar
-from ros2_memory.demo.streams import STREAMS
-from ros2_memory.timebase import NS_PER_MS, NS_PER_S, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.demo.streams import Message
-    from ros2_memory.model import JsonValue
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.demo.published_topics import Message
 
 Judge: TypeAlias = "Callable[[JsonValue, Asked], str]"
 
@@ -45,7 +45,7 @@ _MPS: Final = 1e-3
 _SHARE_OF_PATH: Final = 1e-3
 _INTERPOLATED_M: Final = 5e-3
 _BY_TOPIC: Final = {stream.topic: stream for stream in STREAMS}
-_ODOM: Final = _BY_TOPIC[streams.ODOM]
+_ODOM: Final = _BY_TOPIC[published_topics.ODOM]
 
 
 def in_odom(place: Planar) -> Planar:
@@ -81,7 +81,8 @@ def topics(reply: JsonValue, asked: Asked) -> str:
         counts[stream.topic] = asked.timeline.count(stream, newest.log_time)
         same(f"count of {stream.topic}", number(row, "count"), counts[stream.topic])
     total = sum(counts.values())
-    return f"{total:,} messages on {len(counts)} topics, {counts[streams.ODOM]:,} on /odom."
+    of_odom = counts[published_topics.ODOM]
+    return f"{total:,} messages on {len(counts)} topics, {of_odom:,} on /odom."
 
 
 def position(seconds_ago: float) -> Judge:
@@ -114,7 +115,7 @@ def seen_near(place: Planar) -> Judge:
     def judge(reply: JsonValue, asked: Asked) -> str:
         moment = number(reply, "timestamp")
         match = told_of(moment, asked.last_where(_ODOM, _near(spot)))
-        then = _held(reply, asked, streams.SCENE_OBJECTS, match)
+        then = _held(reply, asked, published_topics.SCENE_OBJECTS, match)
         labels = [text(found, "label") for found in items(reply, "value", "detections")]
         same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(then.t)))
         return f"{_listed(labels).capitalize()}, at {asked.when(moment)}."
@@ -138,7 +139,7 @@ def last_near(place: Planar) -> Judge:
 def path_clear(reply: JsonValue, asked: Asked) -> str:
     """When the path was last clear."""
     moment = number(reply, "timestamp")
-    told_of(moment, asked.last_where(_BY_TOPIC[streams.PATH_CLEAR], robot.path_clear))
+    told_of(moment, asked.last_where(_BY_TOPIC[published_topics.PATH_CLEAR], robot.path_clear))
     same("value", at(reply, "value", "value"), expected=True)
     return f"At {asked.when(moment)}."
 
@@ -148,9 +149,9 @@ def last_seen(label: str) -> Judge:
 
     def judge(reply: JsonValue, asked: Asked) -> str:
         moment = number(reply, "timestamp")
-        sighting = asked.last_where(_BY_TOPIC[streams.SCENE_OBJECTS], _sees(label))
+        sighting = asked.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
         message = told_of(moment, sighting)
-        same("topic", text(reply, "topic"), streams.SCENE_OBJECTS)
+        same("topic", text(reply, "topic"), published_topics.SCENE_OBJECTS)
         labels = [text(found, "label") for found in items(reply, "value", "detections")]
         same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(message.t)))
         return f"At {asked.when(moment)}; in view: {_listed(labels)}."
@@ -163,8 +164,8 @@ def where_seen(label: str) -> Judge:
 
     def judge(reply: JsonValue, asked: Asked) -> str:
         moment = number(reply, "timestamp")
-        sighting = asked.last_where(_BY_TOPIC[streams.SCENE_OBJECTS], _sees(label))
-        message = _held(reply, asked, streams.ODOM, told_of(moment, sighting))
+        sighting = asked.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
+        message = _held(reply, asked, published_topics.ODOM, told_of(moment, sighting))
         return f"{_at_place(at(reply, 'value', 'position'), message)}, at {asked.when(moment)}."
 
     return judge
@@ -235,7 +236,7 @@ def battery(seconds_ago: float) -> Judge:
     """The charge so long ago."""
 
     def judge(reply: JsonValue, asked: Asked) -> str:
-        stream = _BY_TOPIC[streams.BATTERY]
+        stream = _BY_TOPIC[published_topics.BATTERY]
         message = told_of(number(reply, "timestamp"), asked.ago(stream, seconds_ago))
         charge = number(reply, "value", "percentage")
         near("charge", charge, robot.battery(message.t), 1e-6)
@@ -249,7 +250,7 @@ def told(seconds: float, at_most: int) -> Judge:
     window = ns_from_unix(seconds)
 
     def judge(reply: JsonValue, asked: Asked) -> str:
-        stream = _BY_TOPIC[streams.SCENE_DESCRIPTION]
+        stream = _BY_TOPIC[published_topics.SCENE_DESCRIPTION]
         samples = items(reply, "samples")
         total = int(number(reply, "total"))
         same("samples", len(samples), min(total, at_most))

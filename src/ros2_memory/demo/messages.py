@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Final, Protocol, cast
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ros2_memory.demo import robot, streams
-from ros2_memory.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.demo import published_topics, robot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from rosbags.typesys.store import Typestore
 
+    from ros2_memory.core.model import Vector3
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.demo.published_topics import Message
     from ros2_memory.demo.robot import Planar, Thing
-    from ros2_memory.demo.streams import Message
-    from ros2_memory.model import Vector3
-    from ros2_memory.timebase import Ns
 
 VISION_DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/VisionDetection": (
@@ -250,14 +250,14 @@ def _described(message: Message) -> object:
 
 
 _BODIES: Final[Mapping[str, Callable[[Message], object]]] = {
-    streams.ODOM: _odometry,
-    streams.TF: _moving_frames,
-    streams.TF_STATIC: _fixed_frames,
-    streams.CMD_VEL: _command,
-    streams.SCAN: _scan,
-    streams.PATH_CLEAR: _path_clear,
-    streams.BATTERY: _battery,
-    streams.SCENE_OBJECTS: _scene_objects,
-    streams.FOUND: _found,
-    streams.SCENE_DESCRIPTION: _described,
+    published_topics.ODOM: _odometry,
+    published_topics.TF: _moving_frames,
+    published_topics.TF_STATIC: _fixed_frames,
+    published_topics.CMD_VEL: _command,
+    published_topics.SCAN: _scan,
+    published_topics.PATH_CLEAR: _path_clear,
+    published_topics.BATTERY: _battery,
+    published_topics.SCENE_OBJECTS: _scene_objects,
+    published_topics.FOUND: _found,
+    published_topics.SCENE_DESCRIPTION: _described,
 }

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.demo import judges, robot, streams
-from ros2_memory.demo.checking import WrongAnswerError, parsed
+from ros2_memory.demo import judges, published_topics, robot
+from ros2_memory.demo.answer_checks import WrongAnswerError, parsed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from ros2_memory.demo.checking import Asked
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.demo.answer_checks import Asked
     from ros2_memory.demo.judges import Judge
     from ros2_memory.demo.robot import Planar
-    from ros2_memory.model import JsonValue
 
 LOOK_BACK_S: Final = 60
 """The longest of the windows that are asked about."""
@@ -76,8 +76,8 @@ QUESTIONS: Final = (
         "What objects did you see at the front door?",
         "get_value_when",
         {
-            "value_topic": streams.SCENE_OBJECTS,
-            "condition_topic": streams.ODOM,
+            "value_topic": published_topics.SCENE_OBJECTS,
+            "condition_topic": published_topics.ODOM,
             "condition_type": "near_position",
             "value": _spot(robot.FRONT_DOOR),
         },
@@ -86,7 +86,7 @@ QUESTIONS: Final = (
     Question(
         "When was the path last clear?",
         "find_last_match",
-        {"topic": streams.PATH_CLEAR, "condition_type": "equals", "value": True},
+        {"topic": published_topics.PATH_CLEAR, "condition_type": "equals", "value": True},
         judges.path_clear,
     ),
     Question(
@@ -109,8 +109,8 @@ QUESTIONS: Final = (
         "And where were you then?",
         "get_value_when",
         {
-            "value_topic": streams.ODOM,
-            "condition_topic": streams.SCENE_OBJECTS,
+            "value_topic": published_topics.ODOM,
+            "condition_topic": published_topics.SCENE_OBJECTS,
             "condition_type": "contains",
             "value": "scissors",
         },
@@ -120,7 +120,7 @@ QUESTIONS: Final = (
         "When were you last at the kitchen counter?",
         "find_last_match",
         {
-            "topic": streams.ODOM,
+            "topic": published_topics.ODOM,
             "condition_type": "near_position",
             "value": _spot(robot.KITCHEN_COUNTER),
         },
@@ -137,7 +137,7 @@ QUESTIONS: Final = (
         "How full was the battery half a minute ago?",
         "get_topic_seconds_ago",
         {
-            "topic": streams.BATTERY,
+            "topic": published_topics.BATTERY,
             "seconds_ago": 30,
             "tolerance_s": 1.5,
             "fields": ["percentage"],
@@ -147,7 +147,7 @@ QUESTIONS: Final = (
     Question(
         "What did you say you saw in the last 20 s?",
         "get_topic_in_last",
-        {"topic": streams.SCENE_DESCRIPTION, "seconds": 20, "max_samples": 4},
+        {"topic": published_topics.SCENE_DESCRIPTION, "seconds": 20, "max_samples": 4},
         judges.told(20, 4),
     ),
     Question(

@@ -16,18 +16,18 @@ from typing import IO, TYPE_CHECKING, Final, Self
 import yaml
 from mcap.writer import CompressionType, Writer
 
+from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix, unix_from_ns
 from ros2_memory.demo.messages import definition, payload
-from ros2_memory.demo.streams import STREAMS
-from ros2_memory.timebase import Ns, WallClock, ns_from_unix, unix_from_ns
+from ros2_memory.demo.published_topics import STREAMS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
     from types import TracebackType
 
-    from ros2_memory.demo.streams import Message, Stream, Timeline
-    from ros2_memory.model import JsonValue
-    from ros2_memory.timebase import Clock
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.timebase import Clock
+    from ros2_memory.demo.published_topics import Message, Stream, Timeline
 
 _CHUNK_BYTES: Final = 16 * 1024
 _FOR_EVER: Final[dict[str, JsonValue]] = {"sec": 9223372036, "nsec": 854775807}

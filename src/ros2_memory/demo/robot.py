@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.demo.flat import THINGS, room_at, wall_distances
+from ros2_memory.demo.floor_plan import THINGS, room_at, wall_distances
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ros2_memory.model import Vector3
+    from ros2_memory.core.model import Vector3
 
 
 def wrapped(angle: float) -> float:

@@ -15,15 +15,15 @@ from mcp import Client, MCPError
 from mcp.client.sse import sse_client
 from mcp.types import TextContent
 
-from ros2_memory.demo.checking import Asked
+from ros2_memory.core.errors import ConfigError, EpisodicError
+from ros2_memory.core.timebase import NS_PER_S, WallClock, ns_from_unix
+from ros2_memory.demo.answer_checks import Asked
+from ros2_memory.demo.output import invitation, shown
+from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.questions import QUESTIONS, Exchange, judged
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.demo.robot import LAP_S
-from ros2_memory.demo.serving import HOST, free_port, served
-from ros2_memory.demo.showing import invitation, shown
-from ros2_memory.demo.streams import Timeline
-from ros2_memory.errors import ConfigError, EpisodicError
-from ros2_memory.timebase import NS_PER_S, WallClock, ns_from_unix
+from ros2_memory.demo.server_process import HOST, free_port, served
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

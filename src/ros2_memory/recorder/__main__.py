@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.adapters import build_reader, build_recorder
+from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.config import exit_on_config_error, load_settings
-from ros2_memory.errors import ConfigError, EpisodicError
-from ros2_memory.logs import configure_logging
-from ros2_memory.recorder.confined import ConfinedReader
+from ros2_memory.core.errors import ConfigError, EpisodicError
+from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.sd_notify import ServiceManager
 from ros2_memory.recorder.daemon import (
     Ticking,
     Upkeep,
@@ -20,9 +22,7 @@ from ros2_memory.recorder.daemon import (
     put_in_order,
     record_until_told,
 )
-from ros2_memory.recorder.notify import ServiceManager
-from ros2_memory.recorder.ownership import OwnRecordings
-from ros2_memory.recorder.topics import load_topics
+from ros2_memory.recorder.process.topics import load_topics
 from ros2_memory.settings import NullRecorderNode
 from ros2_memory.upkeep import build_housekeeper, claim
 

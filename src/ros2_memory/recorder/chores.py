@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.errors import EpisodicError
+from ros2_memory.core.errors import EpisodicError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
 
-    from ros2_memory.recorder.journal import Journal
+    from ros2_memory.recorder.event_log import Journal
     from ros2_memory.recorder.ports import Housekeeper
 
 HOUSE_S: Final = 10.0

@@ -11,20 +11,25 @@ from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
 
 import structlog
 
-from ros2_memory.errors import EpisodicError, RecorderError
-from ros2_memory.recorder.heartbeat import read_heartbeat
-from ros2_memory.recorder.lock import BagDirLock
-from ros2_memory.recorder.notify import READY, STOPPING, WATCHDOG, watchdog_interval_s
-from ros2_memory.recorder.settle import settle_all
-from ros2_memory.recorder.wipe import clear_bags, refuse_homes
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.lock import BagDirLock
+from ros2_memory.core.errors import EpisodicError, RecorderError
+from ros2_memory.core.sd_notify import (
+    READY,
+    STOPPING,
+    WATCHDOG,
+    watchdog_interval_s,
+)
+from ros2_memory.recorder.handover.recovery import settle_all
+from ros2_memory.retention.clear import clear_bags, refuse_homes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
     from types import FrameType
 
-    from ros2_memory.recorder.notify import ServiceManager
-    from ros2_memory.recorder.ownership import OwnRecordings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.core.sd_notify import ServiceManager
     from ros2_memory.recorder.ports import Housekeeper
     from ros2_memory.storage.base import BagReader
 

@@ -15,37 +15,37 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory import directories
-from ros2_memory.errors import BagError, BagVanishedError, EpisodicError
-from ros2_memory.model import BagState
-from ros2_memory.recorder.disk import free_bytes
-from ros2_memory.recorder.disposal import Disposal
-from ros2_memory.recorder.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.layout import METADATA_FILE
+from ros2_memory.bag_dir.own_recordings import OwnRecordings, has_own_name
+from ros2_memory.core import directories
+from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
+from ros2_memory.core.model import BagState
+from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
+from ros2_memory.core.wording import counted
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
-from ros2_memory.recorder.keeper import Keeper
-from ros2_memory.recorder.kept_names import KeptNames
-from ros2_memory.recorder.latched import Carrier
-from ros2_memory.recorder.layout import METADATA_FILE
-from ros2_memory.recorder.ownership import OwnRecordings, has_own_name
-from ros2_memory.recorder.recorded_time import RecordedTime
-from ros2_memory.recorder.removal import left_by_repair, remove_emptied
-from ros2_memory.recorder.repair import Repairer, open_files
-from ros2_memory.timebase import NS_PER_S, ms_from_ns, ns_from_unix
-from ros2_memory.wording import counted
+from ros2_memory.retention.collect import Disposal
+from ros2_memory.retention.delete import left_by_repair, remove_emptied
+from ros2_memory.retention.disk import free_bytes
+from ros2_memory.retention.latched_carry import Carrier
+from ros2_memory.retention.recorded_time import RecordedTime
+from ros2_memory.retention.repair import Repairer, open_files
+from ros2_memory.retention.saved_moments import Keeper
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
-    from ros2_memory.recorder.disposal import Disposed
+    from ros2_memory.core.timebase import Clock
+    from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.recorder.ports import Housekeeper
-    from ros2_memory.recorder.repair import Repaired
-    from ros2_memory.recorder.retention import RetentionLimits
-    from ros2_memory.recorder.snapshot import Snapshot
-    from ros2_memory.recorder.time_sync import TimeSync
+    from ros2_memory.retention.collect import Disposed
+    from ros2_memory.retention.policy import RetentionLimits
+    from ros2_memory.retention.repair import Repaired
+    from ros2_memory.retention.time_sync import TimeSync
     from ros2_memory.storage.base import BagReader
     from ros2_memory.storage.writing import BagWriter
-    from ros2_memory.timebase import Clock
 
 REFRESH_S: Final = 60.0
 MOST_REPAIRED_BYTES: Final = 1 << 30

@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory.model import BagState
-from ros2_memory.recorder.disposal import Disposed
-from ros2_memory.recorder.foreign import ForeignBags
-from ros2_memory.recorder.heartbeat import read_heartbeat
-from ros2_memory.recorder.snapshot import Snapshot
-from ros2_memory.recorder.standing import Scene
-from ros2_memory.recorder.survey import Survey
-from ros2_memory.timebase import ms_from_ns, ns_from_unix
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.core.model import BagState
+from ros2_memory.core.timebase import ms_from_ns, ns_from_unix
+from ros2_memory.index.bag_table import Survey
+from ros2_memory.index.file_state import Scene
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.retention.collect import Disposed
+from ros2_memory.retention.foreign import ForeignBags
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
     from structlog.typing import FilteringBoundLogger
 
-    from ros2_memory.recorder.disposal import Disposal
-    from ros2_memory.recorder.foreign import Foreign
-    from ros2_memory.recorder.heartbeat import Heartbeat
-    from ros2_memory.recorder.standing import FormerFile
-    from ros2_memory.recorder.survey import Change
+    from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.core.timebase import Clock, Ns
+    from ros2_memory.index.bag_table import Change
+    from ros2_memory.index.file_state import FormerFile
+    from ros2_memory.retention.collect import Disposal
+    from ros2_memory.retention.foreign import Foreign
     from ros2_memory.storage.base import BagReader
-    from ros2_memory.timebase import Clock, Ns
 
 __all__ = ["IndexManager", "Snapshot"]
 

@@ -6,32 +6,37 @@ from contextlib import suppress
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.errors import RecorderError
+from ros2_memory.bag_dir.durable_write import write_durably
+from ros2_memory.bag_dir.layout import (
+    QOS_FILE,
+    ROS_LOG_DIR,
+    STORAGE_FILE,
+    node_name,
+)
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.base import Recorder
-from ros2_memory.recorder.child import Child, run_bounded
-from ros2_memory.recorder.command import (
+from ros2_memory.recorder.ports import NoHousekeeping
+from ros2_memory.recorder.process.child import Child, run_bounded
+from ros2_memory.recorder.process.command import (
     HELP_ARGV,
     options_in_help,
     qos_overrides,
     record_argv,
     storage_config,
 )
-from ros2_memory.recorder.environment import find_ros2, robot_environment
-from ros2_memory.recorder.layout import QOS_FILE, ROS_LOG_DIR, STORAGE_FILE, node_name
-from ros2_memory.recorder.ownership import OwnRecordings
-from ros2_memory.recorder.ports import NoHousekeeping
+from ros2_memory.recorder.process.environment import find_ros2, robot_environment
+from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.recorder.supervisor import Orders, Supervisor
-from ros2_memory.recorder.sync import write_durably
-from ros2_memory.recorder.topics import TopicSelection, load_topics
-from ros2_memory.timebase import WallClock
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.ports import Housekeeper
     from ros2_memory.storage.base import BagReader
-    from ros2_memory.timebase import Clock
 
 __all__ = ["Ros2BagRecorder", "record_argv"]
 

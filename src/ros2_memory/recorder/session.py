@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.recorder.output import Said, parse_line
+from ros2_memory.recorder.process.output import Said, parse_line
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.recorder.output import Line
+    from ros2_memory.recorder.handover.plan import Moment
     from ros2_memory.recorder.ports import RecorderProcess
-    from ros2_memory.recorder.rotation import Moment
-    from ros2_memory.recorder.splits import Splits
+    from ros2_memory.recorder.process.output import Line
+    from ros2_memory.recorder.split_watcher import Splits
 
 MAX_DISTINCT: Final = 200
 """Warnings that differ in more than their numbers and are told for one recording; no more."""

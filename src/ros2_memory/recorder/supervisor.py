@@ -11,25 +11,30 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.errors import RecorderError
+from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.chores import QUIET_HOUSE_S, Chores
-from ros2_memory.recorder.crew import Crew
-from ros2_memory.recorder.disk import HomeDisk, device_of, free_bytes
-from ros2_memory.recorder.heartbeat import RecorderState
-from ros2_memory.recorder.journal import Journal
-from ros2_memory.recorder.ownership import OwnRecordings
-from ros2_memory.recorder.plan import Backoff, SilenceWatch, session_over
-from ros2_memory.recorder.pulse import Pulse
-from ros2_memory.recorder.rotation import BOTH_S, SUBSCRIBE_TIMEOUT_S, Moment, Step
+from ros2_memory.recorder.event_log import Journal
+from ros2_memory.recorder.handover.plan import (
+    BOTH_S,
+    SUBSCRIBE_TIMEOUT_S,
+    Moment,
+    Step,
+)
+from ros2_memory.recorder.heartbeat_writer import Pulse
+from ros2_memory.recorder.policies import Backoff, SilenceWatch, session_over
+from ros2_memory.recorder.sessions import Crew
 from ros2_memory.recorder.watchdog import Space, resume_bytes, space, time_was_set_back
+from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.ports import Housekeeper, RecorderProcess
     from ros2_memory.storage.base import BagReader
-    from ros2_memory.timebase import Clock
 
 LOOK_S: Final = 0.5
 SPACE_S: Final = 1.0

@@ -1,18 +1,14 @@
-"""Whether the system clock is synchronised with a time server.
-
-Nothing else makes its dates fit to delete by: a clock that was set by hand, or that starts wrong
-for want of a battery, looks like any other.
-"""
+"""Asks the operating system whether its clock is synchronised with a time server."""
 
 from __future__ import annotations
 
 import ctypes
 import os
-from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.errors import RecorderError
-from ros2_memory.recorder.child import run_bounded
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.process.child import run_bounded
+from ros2_memory.retention.time_sync import TimeSync
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -24,17 +20,6 @@ MAX_ERROR_US: Final = 16_000_000
 
 _ASK: Final = ("timedatectl", "show", "--property=NTPSynchronized", "--value")
 _PASSED_ON: Final = ("PATH", "DBUS_SYSTEM_BUS_ADDRESS")
-
-
-class TimeSync(ABC):
-    """Knows whether the system clock is synchronised."""
-
-    @abstractmethod
-    def is_synchronised(self) -> bool:
-        """Whether the clock is reported synchronised now; False also where nobody can say.
-
-        It may take some seconds. Raises nothing.
-        """
 
 
 class SystemTimeSync(TimeSync):

@@ -5,13 +5,13 @@ from __future__ import annotations
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.recorder.rotation import set_back
-from ros2_memory.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.recorder.handover.plan import set_back
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from ros2_memory.recorder.rotation import Moment
+    from ros2_memory.recorder.handover.plan import Moment
 
 RESUME_FACTOR: Final = 1.2
 """Recording that was paused resumes when this many times the least free space is free again."""

@@ -1,1 +1,1 @@
-"""Reading bag files: the port, and one adapter for each backend."""
+"""The ports `BagReader` and `BagWriter`, their adapters, and decoding."""

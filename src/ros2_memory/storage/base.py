@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import BagSummary, TimeWindow
-    from ros2_memory.timebase import Ns
+    from ros2_memory.core.model import BagSummary, TimeWindow
+    from ros2_memory.core.timebase import Ns
 
 
 ROS2_PROFILE: Final = "ros2"

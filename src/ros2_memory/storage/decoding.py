@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING
 
-from ros2_memory.errors import UndecodableError
-from ros2_memory.storage.cdr import MOST_ELEMENTS, holds_too_many, layout_of
-from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.storage.cdr_layout import MOST_ELEMENTS, holds_too_many, layout_of
+from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.zstd import FRAME_MAGIC
 from ros2_memory.typestore import Typestores, full_name
 

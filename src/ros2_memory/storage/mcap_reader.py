@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.faults import reading, whole
+from ros2_memory.storage.errors import reading, whole
 from ros2_memory.storage.limits import MAX_CHUNK_MB
-from ros2_memory.storage.mcap_bags import McapBags
+from ros2_memory.storage.mcap.bag_file import McapBags
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import BagSummary, TimeWindow
+    from ros2_memory.core.model import BagSummary, TimeWindow
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel, Closing, Layout, Record
-    from ros2_memory.storage.faults import LostError
-    from ros2_memory.timebase import Ns
+    from ros2_memory.storage.errors import LostError
 
 
 class McapReader(BagReader):

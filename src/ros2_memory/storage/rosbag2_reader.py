@@ -8,26 +8,26 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.faults import LostError, UnreadableError, reading, whole
+from ros2_memory.storage.errors import LostError, UnreadableError, reading, whole
+from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.limits import MAX_CHUNK_MB
-from ros2_memory.storage.mcap_bags import McapBags
-from ros2_memory.storage.open_file import OpenFile
-from ros2_memory.storage.scratch import Scratch
-from ros2_memory.storage.sqlite_file import (
+from ros2_memory.storage.mcap.bag_file import McapBags
+from ros2_memory.storage.sqlite_bag import (
     SqliteBags,
     closing_of_db3,
     journals_beside,
     settled_copy,
 )
-from ros2_memory.storage.zstd_file import closing_of_zstd, unpack
+from ros2_memory.storage.temp_files import Scratch
+from ros2_memory.storage.zstd_bag import closing_of_zstd, unpack
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.model import BagSummary, TimeWindow
+    from ros2_memory.core.model import BagSummary, TimeWindow
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel, Closing, Layout, Record
-    from ros2_memory.timebase import Ns
 
 _KINDS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 

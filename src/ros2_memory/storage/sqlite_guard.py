@@ -10,7 +10,7 @@ import json
 import sqlite3
 from typing import Final
 
-from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.errors import UnreadableError
 
 _STEP: Final = 10_000
 """Instructions of sqlite's machine between two looks at how many there were."""

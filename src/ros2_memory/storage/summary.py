@@ -6,13 +6,13 @@ from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.summaries import BagSummary, Heading, shared_shape
+from ros2_memory.core.bag_summary import BagSummary, Heading, shared_shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel
-    from ros2_memory.timebase import Ns
 
 
 class Held(NamedTuple):

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Final
 
 import zstandard
 
-from ros2_memory.storage.faults import UnreadableError
+from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.limits import too_large
 
 if TYPE_CHECKING:
-    from ros2_memory.storage.open_file import OpenFile
+    from ros2_memory.storage.file_io import OpenFile
 
 FRAME_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 _SKIPPABLE: Final = b"\x2a\x4d\x18"

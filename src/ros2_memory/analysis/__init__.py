@@ -1,0 +1,1 @@
+"""Pure mathematics and folds over messages: transforms, odometry, paths, intervals, conditions."""

@@ -1,0 +1,449 @@
+"""Conditions on one extracted value: `contains`, `equals`, `above`, `below`, `near_position`.
+
+They are tested on the whole value, before anything in it is downsampled or rounded. NaN and null
+match nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.geometry import distance
+from ros2_memory.core.text import glimpse
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.analysis.zone_map import Evidence
+    from ros2_memory.core.model import JsonValue, Vector3
+
+Scalar: TypeAlias = bool | int | float | str
+
+POSITION_KEYS: Final = ("position", "point", "translation")
+"""Keys under which a value holds a place; x and y under other keys may be a velocity or an axis."""
+
+# Bounded, since int() refuses texts of thousands of digits.
+_WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
+_DECIMAL: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
+_EXAMPLES: Final = {
+    "contains": 'condition_type "contains", value "scissors"',
+    "equals": 'condition_type "equals", value true',
+    "above": 'condition_type "above", value 0.5, field "linear_velocity.x"',
+    "below": 'condition_type "below", value 0.2, field "percentage"',
+    "near_position": 'condition_type "near_position", value {"x": 1.5, "y": -0.2}',
+}
+_SIDES: Final = {"above": True, "below": False}
+"""Conditions on a number, and whether it is to be above the limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contains:
+    """Part of a text, or an element of a list.
+
+    A text is found inside any string at any depth (not in the keys), without regard to case; a
+    boolean wherever one is equal. A number is a whole value, never a part of one, and is looked
+    for only where a field leads (`has_element`): in a whole message every size, level and
+    coordinate would match. Elsewhere its digits are a text like any other.
+    """
+
+    needle: Scalar
+    equal: Equals = field(init=False, repr=False)
+    _folded: str | None = field(init=False, repr=False)
+    _boolean: bool | None = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        meant = _spelled(self.needle) if isinstance(self.needle, str) else self.needle
+        text = _text_of(self.needle)
+        object.__setattr__(self, "equal", Equals(self.needle))
+        object.__setattr__(self, "_folded", None if text is None else text.casefold())
+        object.__setattr__(self, "_boolean", meant if isinstance(meant, bool) else None)
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the needle is a number or spells one."""
+        meant = _spelled(self.needle) if isinstance(self.needle, str) else self.needle
+        return isinstance(meant, int | float) and not isinstance(meant, bool)
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether some text of the value contains the needle, or some boolean is equal to it."""
+        for leaf in leaves(value):
+            if isinstance(leaf, str):
+                if self._folded is not None and self._folded in leaf.casefold():
+                    return True
+            elif isinstance(leaf, bool) and leaf is self._boolean:
+                return True
+        return False
+
+    def has_element(self, target: JsonValue) -> bool:
+        """Whether the target of a field is equal to the needle, or is a list with such an element.
+
+        Elements of lists in it count too, what stands in an object does not.
+        """
+        return any(self.equal.is_leaf(each) for each in elements(target))
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may contain the needle."""
+        if self._folded is not None and evidence.may_hold_text(self._folded):
+            return True
+        return self._boolean is not None and evidence.may_hold_boolean(self._boolean)
+
+
+@dataclass(frozen=True, slots=True)
+class Equals:
+    """A boolean, number or string that some leaf of the value is equal to.
+
+    1 and 0 are equal to true and false. A number is equal to itself and to its float32 rounding,
+    which is what a float32 field holds of it. A string is compared to the letter; one that spells
+    a boolean or a number is equal to that, too, since planners put values in quotes.
+    """
+
+    value: Scalar
+    _boolean: bool | None = field(init=False, repr=False, compare=False)
+    _numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        meant = _spelled(self.value) if isinstance(self.value, str) else self.value
+        boolean = bool(meant) if meant is not None and meant in (0, 1) else None
+        numbers = () if meant is None else (meant, _float32(meant))
+        object.__setattr__(self, "_boolean", boolean)
+        object.__setattr__(self, "_numbers", numbers)
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether any leaf at any depth is equal."""
+        return any(self.is_leaf(leaf) for leaf in leaves(value))
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may have such a leaf."""
+        if isinstance(self.value, str) and evidence.may_hold_text(self.value.casefold()):
+            return True
+        if self._boolean is not None and evidence.may_hold_boolean(self._boolean):
+            return True
+        return any(evidence.may_hold_number(number) for number in self._numbers)
+
+    def is_leaf(self, leaf: JsonValue) -> bool:
+        """Whether this leaf is equal."""
+        if isinstance(leaf, bool):
+            return leaf is self._boolean
+        if isinstance(leaf, int | float):
+            return any(leaf == number for number in self._numbers)
+        return isinstance(leaf, str) and leaf == self.value
+
+
+@dataclass(frozen=True, slots=True)
+class Beyond:
+    """A number on one side of a limit, which is not part of it; a boolean is no number."""
+
+    limit: int | float
+    above: bool
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether any number at any depth is on that side."""
+        return any(
+            self._is_beyond(leaf)
+            for leaf in leaves(value)
+            if isinstance(leaf, int | float) and not isinstance(leaf, bool)
+        )
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may hold such a number."""
+        return evidence.open or self._is_beyond(evidence.high if self.above else evidence.low)
+
+    def _is_beyond(self, number: float) -> bool:
+        return number > self.limit if self.above else number < self.limit
+
+
+@dataclass(frozen=True, slots=True)
+class NearPosition:
+    """A place (m) within `tolerance_m`, inclusive; in the plane where `z` is None.
+
+    The frame is the value's own. A position without a finite x and y (and z, where one is asked)
+    is near nothing.
+    """
+
+    x: float
+    y: float
+    z: float | None
+    tolerance_m: float
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether any position in the value is near."""
+        return any(self.is_near(x, y, z) for x, y, z in positions(value))
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may hold a position that is near."""
+        return evidence.may_hold_place(self.x, self.y, self.z, self.tolerance_m)
+
+    def may_match_elsewhere(self, evidence: Evidence) -> bool:
+        """As `may_match`, for positions that stand where only a field leads to."""
+        axes = (self.x, self.y) if self.z is None else (self.x, self.y, self.z)
+        return all(evidence.may_hold_number_near(axis, self.tolerance_m) for axis in axes)
+
+    def is_near(self, x: float, y: float, z: float) -> bool:
+        """Whether this position (m) is near; its z may be NaN where none is asked."""
+        here: Vector3 = (x, y, 0.0 if self.z is None else z)
+        return distance(here, (self.x, self.y, self.z or 0.0)) <= self.tolerance_m
+
+
+Test: TypeAlias = Contains | Equals | Beyond | NearPosition
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """A test, and the dot-path of the part of the value that it is put to (None: all of it)."""
+
+    test: Test
+    field: str | None = None
+
+    def matches(self, value: JsonValue) -> bool:
+        """Whether the value, or any target of the field in it, meets the test."""
+        if self.field is None:
+            return self.test.matches(value)
+        return any(self._meets(target) for target in at_field(value, self.field))
+
+    def _meets(self, target: JsonValue) -> bool:
+        if isinstance(self.test, Contains) and self.test.has_element(target):
+            return True
+        return self.test.matches(target)
+
+    def may_match(self, evidence: Evidence) -> bool:
+        """Whether some value of which this is the evidence may match; False rules all of them out.
+
+        What a field leads to is part of the value, so what the whole value rules out is out.
+        """
+        if self.field is not None and isinstance(self.test, NearPosition):
+            return self.test.may_match_elsewhere(evidence)
+        if self.field is not None and isinstance(self.test, Contains):
+            return self.test.may_match(evidence) or self.test.equal.may_match(evidence)
+        return self.test.may_match(evidence)
+
+    @property
+    def place(self) -> NearPosition | None:
+        """The place that alone decides what may match; None where something else does."""
+        return self.test if self.field is None and isinstance(self.test, NearPosition) else None
+
+
+def parse_condition(
+    condition_type: str, value: JsonValue, tolerance_m: float, field: str | None = None
+) -> Condition:
+    """The condition that a planner's arguments mean.
+
+    Args:
+        condition_type: `contains`, `equals`, `above`, `below` or `near_position`.
+        value: a text, number or boolean; for `above` and `below` a number; for `near_position` an
+            object with x, y and perhaps z.
+        tolerance_m: how near `near_position` is.
+        field: dot-path in the value that narrows the test; None or blank for all of it. `above`
+            and `below` need one: most messages hold numbers of many kinds.
+
+    Raises:
+        InvalidArgumentsError: the sentence says what is wrong and gives an example.
+    """
+    path = (field or "").strip() or None
+    test = _parse_test(condition_type, value, tolerance_m)
+    if isinstance(test, Beyond) and path is None:
+        raise InvalidArgumentsError(
+            f"'{condition_type}' needs field, the dot-path of the number that is meant;"
+            f" for example {_EXAMPLES[condition_type]}"
+        )
+    return Condition(test, path)
+
+
+def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
+    """What stands at a dot-path in an extracted value; empty where there is nothing.
+
+    Over a list the path goes on in every element, unless the segment is a whole number: that one
+    element (negative: from the end). `detections.label` gives every label, `detections.0.label`
+    the first.
+    """
+    found: list[JsonValue] = [value]
+    for segment in dot_path.split("."):
+        found = [target for held in found for target in _step(held, segment)]
+    return found
+
+
+def positions(value: JsonValue) -> Iterator[Vector3]:
+    """The positions (m) in a value, with NaN for a coordinate that is missing or null.
+
+    The value itself where it is an object with x and y, or the elements of a list of those;
+    else the objects found at any depth under `position`, `point` or `translation`.
+    """
+    own = list(_own_positions(value))
+    if own:
+        yield from own
+        return
+    waiting: list[JsonValue] = [value]
+    while waiting:
+        held = waiting.pop()
+        if isinstance(held, list):
+            waiting.extend(reversed(held))
+        elif isinstance(held, dict):
+            for key in POSITION_KEYS:
+                inner = held.get(key)
+                if isinstance(inner, dict | list):
+                    yield from _own_positions(inner)
+            waiting.extend(reversed(held.values()))
+
+
+def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Test:
+    if condition_type == "near_position":
+        return _parse_near(value, tolerance_m)
+    if condition_type not in _EXAMPLES:
+        raise InvalidArgumentsError(
+            f"condition_type '{condition_type}' is not one of {', '.join(_EXAMPLES)};"
+            f" for example {_EXAMPLES['contains']}"
+        )
+    example = f"for example {_EXAMPLES[condition_type]}"
+    if condition_type in _SIDES:
+        limit = _spelled(value) if isinstance(value, str) else value
+        if isinstance(limit, int | float) and not isinstance(limit, bool) and _is_limit(limit):
+            return Beyond(limit, _SIDES[condition_type])
+        raise InvalidArgumentsError(
+            f"'{condition_type}' takes a number as value, not {_kind(value)}; {example}"
+        )
+    if not isinstance(value, bool | int | float | str):
+        raise InvalidArgumentsError(
+            f"'{condition_type}' takes a text, a number or a boolean as value,"
+            f" not {_kind(value)}; {example}"
+        )
+    if isinstance(value, float) and math.isnan(value):
+        raise InvalidArgumentsError(f"the value is NaN, which nothing is equal to; {example}")
+    if condition_type == "equals":
+        return Equals(value)
+    if isinstance(value, str) and not value.strip():
+        raise InvalidArgumentsError(f"'contains' takes a text that is not blank; {example}")
+    return Contains(value)
+
+
+def _is_limit(number: float) -> bool:
+    return isinstance(number, int) or not math.isnan(number)
+
+
+def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
+    example = f"for example {_EXAMPLES['near_position']}"
+    if not isinstance(value, dict):
+        raise InvalidArgumentsError(
+            f"'near_position' takes an object with x and y (and z) in metres as value,"
+            f" not {_kind(value)}; {example}"
+        )
+    if unknown := sorted(value.keys() - {"x", "y", "z"}):
+        raise InvalidArgumentsError(
+            f"'near_position' knows x, y and z only, not {glimpse(unknown)}; {example}"
+        )
+    for axis in ("x", "y", "z") if value.get("z") is not None else ("x", "y"):
+        if not math.isfinite(_coordinate(value.get(axis))):
+            raise InvalidArgumentsError(
+                f"'{axis}' of 'near_position' must be a finite number of metres,"
+                f" not {_kind(value.get(axis))}; {example}"
+            )
+    if not (math.isfinite(tolerance_m) and tolerance_m >= 0):
+        raise InvalidArgumentsError(
+            f"the tolerance must be a finite number of metres, 0 or more, not {tolerance_m}"
+        )
+    z = value.get("z")
+    return NearPosition(
+        _coordinate(value["x"]),
+        _coordinate(value["y"]),
+        None if z is None else _coordinate(z),
+        float(tolerance_m),
+    )
+
+
+def _kind(value: JsonValue) -> str:
+    """A value as it is named in a sentence."""
+    if isinstance(value, list):
+        return "a list"
+    return "an object" if isinstance(value, dict) else glimpse(value)
+
+
+def _step(held: JsonValue, segment: str) -> Iterator[JsonValue]:
+    if isinstance(held, dict):
+        if segment in held:
+            yield held[segment]
+    elif isinstance(held, list):
+        if _INDEX.fullmatch(segment):
+            index = int(segment)
+            if -len(held) <= index < len(held):
+                yield held[index]
+        else:
+            for element in held:
+                yield from _step(element, segment)
+
+
+def leaves(value: JsonValue) -> Iterator[JsonValue]:
+    """Everything at any depth that is neither a list nor an object."""
+    waiting = [value]
+    while waiting:
+        held = waiting.pop()
+        if isinstance(held, dict):
+            waiting.extend(held.values())
+        elif isinstance(held, list):
+            waiting.extend(held)
+        else:
+            yield held
+
+
+def elements(value: JsonValue) -> Iterator[JsonValue]:
+    """The value itself or, where it is a list, its elements and those of the lists in it."""
+    waiting = [value]
+    while waiting:
+        held = waiting.pop()
+        if isinstance(held, list):
+            waiting.extend(held)
+        elif not isinstance(held, dict):
+            yield held
+
+
+def _own_positions(value: JsonValue) -> Iterator[Vector3]:
+    for held in value if isinstance(value, list) else (value,):
+        # Null is a coordinate that was NaN; texts and lists are not coordinates at all.
+        if isinstance(held, dict) and all(
+            axis in held and isinstance(held[axis], int | float | None) for axis in ("x", "y")
+        ):
+            x, y = _coordinate(held["x"]), _coordinate(held["y"])
+            yield (x, y, _coordinate(held.get("z")))
+
+
+def _coordinate(value: JsonValue) -> float:
+    """The number as metres; NaN for anything else, so that it is near nothing."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _spelled(text: str) -> bool | int | float | None:
+    """The boolean or number that a text spells."""
+    word = text.strip().casefold()
+    if word in {"true", "false"}:
+        return word == "true"
+    if _WHOLE.fullmatch(word):
+        return int(word)
+    return float(word) if _DECIMAL.fullmatch(word) else None
+
+
+def _text_of(needle: Scalar) -> str | None:
+    """The needle as a text: JSON's where it is none; None for a number too long to be one."""
+    if isinstance(needle, str):
+        return needle
+    try:
+        return json.dumps(needle)
+    except ValueError:
+        return None
+
+
+def _float32(number: float) -> float:
+    """The number rounded to a float32; itself where a float32 cannot hold it."""
+    try:
+        rounded: float = struct.unpack("<f", struct.pack("<f", number))[0]
+    except (OverflowError, struct.error):
+        return number
+    return rounded

@@ -1,0 +1,303 @@
+"""When things were in view: message by message, or whole bags at once as columns of numbers.
+
+A thing stays in view from one message that has it to the next where these follow each other on its
+topic within `SILENCE_NS`, or lie within `FLICKER_NS` whatever is between them: detectors miss
+things now and then. Where a history is cut into bags changes nothing.
+
+Many detectors publish only what they see, so a presence alone does not show that the thing was seen
+all the time. It was seen where its messages follow each other at the detector's own usual rate: no
+farther apart than `USUAL_PERIODS` times their mean distance, or `SHORT_NS`.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+SILENCE_NS: Final[Ns] = 10 * NS_PER_S
+"""After so long without a message a thing counts as gone: many detectors speak only of what is."""
+FLICKER_NS: Final[Ns] = 3 * NS_PER_S
+"""A thing that is missed for less did not leave."""
+USUAL_PERIODS: Final = 3
+SHORT_NS: Final[Ns] = NS_PER_S
+
+_ROW: Final = np.dtype(
+    [
+        ("first", "<i8"),
+        ("last", "<i8"),
+        ("label", "<u4"),
+        ("ends", "u1"),
+        ("count", "<u4"),
+        ("longest", "<i8"),
+    ]
+)
+Rows: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.void]]"
+
+_FROM_START: Final = 1
+_TO_END: Final = 2
+
+
+class Presence(NamedTuple):
+    """A thing in view: log times of the first and last message that has it (inclusive)."""
+
+    label: str
+    first: Ns
+    last: Ns
+
+
+class Seen(NamedTuple):
+    """Presences, by the time of their first message, then by label; a week of bags has many.
+
+    Attributes:
+        labels: the names of the things, sorted.
+        rows: of each presence its first and last time, the place of its label, whether the first
+            and the last message of all have it, how many messages have it, and the longest time
+            between two of these.
+    """
+
+    labels: tuple[str, ...] = ()
+    rows: bytes = b""
+
+    @property
+    def size(self) -> int:
+        """How many presences there are."""
+        return len(self.rows) // _ROW.itemsize
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether every row is of one of the labels; what is read from a file may not be."""
+        if len(self.rows) % _ROW.itemsize:
+            return False
+        return not self.rows or int(_rows(self.rows)["label"].max()) < len(self.labels)
+
+    def presences(self) -> tuple[Presence, ...]:
+        """Each of them."""
+        told = _rows(self.rows).tolist()
+        return tuple(Presence(self.labels[label], first, last) for first, last, label, *_ in told)
+
+    def most_lasting(self, at_most: int) -> Seen:
+        """So many of them, those that lasted longest; of equal ones the earliest."""
+        if self.size <= at_most:
+            return self
+        rows = _rows(self.rows)
+        rows = rows[np.sort(_by_length(rows)[:at_most])]
+        kept, rows["label"] = np.unique(rows["label"], return_inverse=True)
+        return Seen(tuple(self.labels[place] for place in kept.tolist()), rows.tobytes())
+
+    def throughout(self, start: Ns, end: Ns) -> list[str]:
+        """The things that were seen all the time between two moments, at their usual rate."""
+        rows = _rows(self.rows)
+        pause = _longest_pause(rows)
+        chosen = (rows["longest"] <= pause) & (rows["count"] > 1)
+        chosen &= (rows["first"] <= start + pause) & (rows["last"] >= end - pause)
+        return self._named(rows[chosen])
+
+    def at_end(self, last: Ns, known_to: Ns) -> list[str]:
+        """The things of the last message, at `last`, that may be in view still at `known_to`."""
+        rows = _rows(self.rows)
+        return self._named(rows[(rows["last"] == last) & (known_to - last <= _longest_pause(rows))])
+
+    def _named(self, rows: Rows) -> list[str]:
+        return [self.labels[place] for place in rows["label"].tolist()]
+
+    def without(self, labels: Collection[str]) -> Seen:
+        """The presences of all other things."""
+        places = [place for place, label in enumerate(self.labels) if label in labels]
+        if not places:
+            return self
+        rows = _rows(self.rows)
+        return Seen(self.labels, rows[~np.isin(rows["label"], places)].tobytes())
+
+    def longest(self, at_most: int) -> tuple[Presence, ...]:
+        """Those that lasted longest, the longest first; of equal ones the earliest."""
+        rows = _rows(self.rows)
+        return Seen(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).presences()
+
+    def moved(self, by: Ns) -> Seen:
+        """The same so many nanoseconds later."""
+        rows = _rows(self.rows).copy()
+        rows["first"] += by
+        rows["last"] += by
+        return Seen(self.labels, rows.tobytes())
+
+
+class Part(NamedTuple):
+    """Messages of one topic that follow each other: first and last log time, what was in view."""
+
+    first: Ns
+    last: Ns
+    seen: Seen
+
+
+class Watcher:
+    """Takes the messages of one topic in log-time order.
+
+    Args:
+        at_most: how many presences are held; what is beyond is counted.
+
+    Attributes:
+        left_out: how many there were beyond.
+    """
+
+    def __init__(self, at_most: int) -> None:
+        self.left_out = 0
+        self._at_most = at_most
+        self._first: Ns | None = None
+        self._last: Ns = 0
+        self._nth = 0
+        self._open: dict[str, _Open] = {}
+        self._over: list[tuple[str, _Open]] = []
+
+    def add(self, time: Ns, labels: Iterable[str]) -> None:
+        """Takes the next message, which has these things."""
+        if self._first is None:
+            self._first = time
+        elif time - self._last > SILENCE_NS:
+            self._nth += 1  # as if a message without anything came between
+        self._nth += 1
+        self._last = time
+        for label in labels:
+            known = self._open.get(label)
+            if known is None:
+                self._open[label] = _Open(time, self._nth)
+            elif known.nth >= self._nth - 1 or time - known.last <= FLICKER_NS:
+                known.add(time, self._nth)
+            else:
+                if len(self._over) < self._at_most:
+                    self._over.append((label, known))
+                else:
+                    self.left_out += 1
+                self._open[label] = _Open(time, self._nth)
+
+    def part(self) -> Part | None:
+        """What was seen so far; None without a message."""
+        if self._first is None:
+            return None
+        told = sorted([*self._over, *self._open.items()], key=lambda each: (each[1].first, each[0]))
+        labels = tuple(sorted({label for label, _ in told}))
+        place = {label: at for at, label in enumerate(labels)}
+        rows = [
+            (
+                each.first,
+                each.last,
+                place[label],
+                (each.began == 1) * _FROM_START | (each.nth == self._nth) * _TO_END,
+                each.count,
+                each.longest,
+            )
+            for label, each in told
+        ]
+        return Part(self._first, self._last, Seen(labels, np.array(rows, _ROW).tobytes()))
+
+
+class _Open:
+    """A presence that may go on; `began` and `nth` are its first and last message's number."""
+
+    __slots__ = ("began", "count", "first", "last", "longest", "nth")
+
+    def __init__(self, time: Ns, nth: int) -> None:
+        self.first = self.last = time
+        self.began = self.nth = nth
+        self.count = 1
+        self.longest = 0
+
+    def add(self, time: Ns, nth: int) -> None:
+        self.longest = max(self.longest, time - self.last)
+        self.last, self.nth = time, nth
+        self.count += 1
+
+
+def joined(parts: Sequence[Part]) -> Part:
+    """Parts that follow each other as one: a thing may stay in view from one to the next."""
+    follow = [after.first - before.last <= SILENCE_NS for before, after in pairwise(parts)]
+    seen = _merged([part.seen for part in parts], np.array([False, *follow]))
+    return Part(parts[0].first, parts[-1].last, seen)
+
+
+def united(seen: Sequence[Seen]) -> Seen:
+    """What several topics saw in the same time: a thing is in view while one of them has it."""
+    return _merged(seen, np.zeros(len(seen), np.bool_))
+
+
+def _merged(seen: Sequence[Seen], follow: NDArray[np.bool_]) -> Seen:
+    """All presences, those of one thing joined that overlap or go on in the part that follows."""
+    rows = _rows(b"".join([each.rows for each in seen]))
+    if not rows.size:
+        return Seen()
+    part = np.repeat(np.arange(len(seen)), [each.size for each in seen])
+    labels, label = _shared_labels(seen, part, rows["label"])
+    order = np.lexsort((part, rows["first"], label))
+    rows, part, label = rows[order], part[order], label[order]
+    first, ends, reach = rows["first"], rows["ends"], _reach(label, rows["last"])
+    goes_on = (ends[:-1] & _TO_END > 0) & (ends[1:] & _FROM_START > 0)
+    goes_on &= (part[1:] - part[:-1] == 1) & follow[part[1:]]
+    goes_on |= first[1:] <= np.minimum(reach[:-1], MAX_NS - FLICKER_NS) + FLICKER_NS
+    goes_on &= label[1:] == label[:-1]
+    begins = np.flatnonzero(np.append(True, ~goes_on))
+    stops = np.append(begins[1:], len(rows)) - 1
+    found = np.empty(len(begins), _ROW)
+    found["first"], found["last"], found["label"] = first[begins], reach[stops], label[begins]
+    found["count"] = np.add.reduceat(rows["count"], begins)
+    # Times below may be as far apart as any two can be: only those of one presence are told.
+    pauses = np.append(0, np.where(goes_on, np.maximum(first[1:] - reach[:-1], 0), 0))
+    found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
+    found["ends"] = (ends[begins] & _FROM_START) * (part[begins] == 0)
+    found["ends"] |= (ends[stops] & _TO_END) * (part[stops] == len(seen) - 1)
+    return Seen(labels, found[np.lexsort((found["label"], found["first"]))].tobytes())
+
+
+def _shared_labels(
+    seen: Sequence[Seen], part: NDArray[np.intp], label: NDArray[np.uint32]
+) -> tuple[tuple[str, ...], NDArray[np.intp]]:
+    """The labels of all, sorted, and of each row the place of its own among them."""
+    labels = tuple(sorted({label for each in seen for label in each.labels}))
+    place = {label: at for at, label in enumerate(labels)}
+    places: list[int] = []
+    begins: dict[tuple[str, ...], int] = {}
+    for each in seen:
+        if each.labels not in begins:
+            begins[each.labels] = len(places)
+            places += [place[label] for label in each.labels]
+    begin = np.array([begins[each.labels] for each in seen], np.intp)
+    return labels, np.array(places, np.intp)[begin[part] + label]
+
+
+def _reach(label: NDArray[np.intp], last: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Of rows sorted by label the latest time of each and those of its label before it."""
+    if bool(((last[1:] >= last[:-1]) | (label[1:] != label[:-1])).all()):
+        return last
+    by_time = np.argsort(last, kind="stable")
+    rank = np.empty(len(last), np.intp)
+    rank[by_time] = np.arange(len(last))
+    # In whole labels apart, so that the greatest so far is of the same one.
+    far = label * len(last)
+    latest: NDArray[np.int64] = last[by_time[np.maximum.accumulate(rank + far) - far]]
+    return latest
+
+
+def _longest_pause(rows: Rows) -> NDArray[np.int64]:
+    """Of each row the longest time between two of its messages at the detector's usual rate."""
+    spans = rows["last"] - rows["first"]
+    # How often a thing is seen that is seen once is not known: it is missed for a moment, at most.
+    usual = USUAL_PERIODS * spans // np.maximum(rows["count"].astype(np.int64) - 1, 1)
+    pause = np.where(rows["count"] > 1, np.maximum(usual, SHORT_NS), FLICKER_NS)
+    longest: NDArray[np.int64] = np.minimum(pause, SILENCE_NS)
+    return longest
+
+
+def _by_length(rows: Rows) -> NDArray[np.intp]:
+    """The places of the rows, that which lasted longest first; of equal ones the earliest."""
+    return np.argsort(rows["first"] - rows["last"], kind="stable")
+
+
+def _rows(packed: bytes) -> Rows:
+    return np.frombuffer(packed, _ROW)

@@ -1,0 +1,555 @@
+"""Distance, speed, gaps, jumps and resets along poses in log-time order.
+
+Everything can be put together from parts: what a bag's poses amount to is a `PoseDigest`, and
+digests joined in order give what all their poses together give. Lengths so joined differ a little
+from those of the same poses in other parts, since noise is judged in each part for itself; where
+positions carry no noise they do not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from statistics import median_low
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ros2_memory.analysis.path_length import FEWEST, SPEED_STEPS, End, measured
+from ros2_memory.core.geometry import distance
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.core.model import Quaternion, Vector3
+
+ARRIVAL_JITTER_NS: Final[Ns] = 100 * NS_PER_MS
+"""What an arrival may be off: the shortest time that the distance of two poses is divided by.
+
+Log time is the time of arrival. Transports and a busy recorder deliver in bursts: public bags
+hold poses 3 ms apart that lie 0.2 m apart, which is GNSS noise and not 72 m/s.
+"""
+
+GAP_NS: Final[Ns] = NS_PER_S
+"""Poses are consecutive up to this far apart, or up to `GAP_PERIODS` of their usual periods."""
+GAP_PERIODS: Final = 5
+_NEARBY: Final = 8
+"""The usual period around a pair of poses is the median of so many intervals on either side."""
+
+MOVED_M: Final = 1.0
+"""Odometry that begins anew does so within this of its origin, having been farther from there."""
+
+_RESTART_M: Final = 0.25
+"""A step this long may be a restart of odometry by what its neighbours are alone."""
+_AT_ORIGIN_M: Final = 0.05
+"""Odometry that begins anew is so near its origin, or within two steps of it."""
+_LONGER: Final = 4.0
+_FASTER: Final = 2.0
+"""What led to the origin is so many times longer, and faster, than what is near it."""
+_DENSE_NS: Final[Ns] = 250 * NS_PER_MS
+_HARD_MPS2: Final = (2.0, 10.0)
+"""Accelerations (m/s^2) that such a step must take: among poses that follow closely, where a whole
+start and stop cannot hide between two of them, and among others, more than wheels can transmit."""
+
+FARTHEST_M: Final = 1e12
+"""Coordinates beyond this are no place on Earth but memory that nobody filled in."""
+
+_DOUBTFUL: Final = 0.25
+"""Noise of this share of the mean step makes a way longer by some 3 %."""
+
+_MOST_RESETS: Final = 1000
+_UNCERTAIN: Final = 4.0
+"""Standard deviations by which a step must exceed what its neighbours are to count as more."""
+
+Vertex: TypeAlias = "tuple[Ns, Vector3, Quaternion | float | None]"
+"""A pose on a drawn path: its orientation as a quaternion or as a heading (rad) about Z."""
+
+Times: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
+Link: TypeAlias = Literal["driven", "gap", "jump", "reset"]
+"""What lies between two poses in a row; only what is driven counts as driven."""
+
+
+class Stop(NamedTuple):
+    """Where the robot was (m), and when."""
+
+    time: Ns
+    position: Vector3
+
+
+class Pace(NamedTuple):
+    """How a robot moves near a pose: its longest step (m) and its highest speed."""
+
+    step_m: float
+    speed_mps: float
+
+    def or_more(self, other: Pace) -> Pace:
+        """The longer step and the higher speed of two."""
+        return Pace(max(self.step_m, other.step_m), max(self.speed_mps, other.speed_mps))
+
+
+STILL: Final = Pace(0.0, 0.0)
+
+
+def link(
+    before: Stop,
+    after: Stop,
+    usual_ns: Ns | None,
+    fastest_mps: float,
+    near: Pace | None = None,
+) -> Link:
+    """What lies between two poses in a row.
+
+    A jump is faster than is plausible. A gap is time in which nothing was recorded: more than a
+    second, and more than five usual periods (ns), where these are known. A jump or a gap to the
+    origin of odometry is a reset, and so is a step to it that the robot, by its pace near the step,
+    cannot have driven.
+    """
+    elapsed = after.time - before.time
+    is_gap = elapsed > GAP_NS and usual_ns is not None and elapsed > GAP_PERIODS * usual_ns
+    is_jump = _is_jump(before, after, fastest_mps)
+    if (is_gap or is_jump) and _leads_to_origin(before, after):
+        return "reset"
+    if is_jump:
+        return "jump"
+    if is_gap:
+        return "gap"
+    if near is not None and usual_ns is not None and _is_restart(before, after, usual_ns, near):
+        return "reset"
+    return "driven"
+
+
+def _is_jump(before: Stop, after: Stop, fastest_mps: float) -> bool:
+    # A burst squeezes the time between two poses to nothing; it does not make a jump of them.
+    elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
+    return distance(before.position, after.position) > fastest_mps * elapsed_s * (1 + 1e-9)
+
+
+def _leads_to_origin(before: Stop, after: Stop) -> bool:
+    step_m = distance(before.position, after.position)
+    return step_m > MOVED_M and math.hypot(*after.position) <= MOVED_M
+
+
+def _is_restart(before: Stop, after: Stop, usual_ns: Ns, near: Pace) -> bool:
+    step_m = distance(before.position, after.position)
+    if step_m <= max(_RESTART_M, _LONGER * near.step_m):
+        return False
+    if math.hypot(*after.position) > max(_AT_ORIGIN_M, 2 * near.step_m):
+        return False
+    elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
+    # From rest to rest, half of the time faster and half of it slower.
+    hard_mps2 = _HARD_MPS2[usual_ns > _DENSE_NS]
+    return step_m > max(_FASTER * near.speed_mps * elapsed_s, hard_mps2 * elapsed_s * elapsed_s / 4)
+
+
+def _pace(stops: Sequence[Stop]) -> Pace:
+    """The longest step of a few poses in a row, and the highest speed over half of them."""
+    if len(stops) < 2:
+        return STILL
+    half = max(len(stops) // 2, 1)
+    speed_mps = max(
+        distance(here.position, there.position)
+        / unix_from_ns(max(there.time - here.time, ARRIVAL_JITTER_NS))
+        for here, there in zip(stops[:-half], stops[half:], strict=True)
+    )
+    steps = (distance(here.position, there.position) for here, there in pairwise(stops))
+    return Pace(max(steps), speed_mps)
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """A path driven in one go: no gap, no jump and no reset in it.
+
+    Attributes:
+        first: its first pose.
+        last: its last pose.
+        poses: how many it has.
+        period_ns: the usual time between two of them; None for one alone.
+        length_m: its length but for the creeps at its ends (see `path_length`).
+        sum_m: the sum of the distances between its poses.
+        head: how it begins.
+        tail: how it ends.
+        still: one creep from end to end: that of the head and of the tail.
+        setting_out: its pace near its first pose.
+        arriving: its pace near its last pose.
+    """
+
+    first: Stop
+    last: Stop
+    poses: int
+    period_ns: Ns | None
+    length_m: float
+    sum_m: float
+    head: End
+    tail: End
+    still: bool
+    setting_out: Pace
+    arriving: Pace
+
+    @property
+    def total_m(self) -> float:
+        """Its length, if nothing more is joined to it."""
+        ends = (self.head,) if self.still else (self.head, self.tail)
+        return self.length_m + sum(end.creep.length_m for end in ends if end.creep is not None)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether noise may be much of its length: poses too seldom to tell it from turns."""
+        if self.poses < FEWEST or self.period_ns is None or self.period_ns <= _DENSE_NS:
+            return False
+        noise_m = max(self.head.noise_m, self.tail.noise_m)
+        return self.total_m > MOVED_M and noise_m > _DOUBTFUL * self.sum_m / (self.poses - 1)
+
+    def joined(self, later: Leg) -> Leg:
+        """This leg driven on, without a break, as a later one."""
+        step_m = distance(self.last.position, later.first.position)
+        whole = replace(
+            self,
+            last=later.last,
+            poses=self.poses + later.poses,
+            period_ns=(self if self.poses >= later.poses else later).period_ns
+            or self.period_ns
+            or later.period_ns,
+            length_m=self.length_m + later.length_m,
+            sum_m=self.sum_m + step_m + later.sum_m,
+            tail=later.tail,
+            still=False,
+            setting_out=self.setting_out
+            if self.poses > _NEARBY
+            else self.setting_out.or_more(later.setting_out),
+            arriving=later.arriving
+            if later.poses > _NEARBY
+            else later.arriving.or_more(self.arriving),
+        )
+        if (self.poses < FEWEST) != (later.poses < FEWEST):
+            return self._bridged(later, whole, step_m)
+        before, after = self.tail.creep, later.head.creep
+        if before is not None and after is not None:
+            creep = before.joined(after)
+            if self.still and later.still:
+                return replace(
+                    whole,
+                    head=self.head._replace(creep=creep),
+                    tail=later.tail._replace(creep=creep),
+                    still=True,
+                )
+            if self.still:
+                return replace(whole, head=self.head._replace(creep=creep))
+            if later.still:
+                return replace(whole, tail=later.tail._replace(creep=creep))
+            return replace(whole, length_m=whole.length_m + creep.length_m)
+        inner_m = _step_m(self.tail, later.head, 1, step_m, step_m)
+        # A creep that filled its leg reaches but one end of the whole.
+        if self.still:
+            whole = replace(whole, head=self.head)
+        elif before is not None:
+            inner_m += before.length_m
+        if after is not None and not later.still:
+            inner_m += after.length_m
+        return replace(whole, length_m=whole.length_m + inner_m)
+
+    def _bridged(self, later: Leg, whole: Leg, step_m: float) -> Leg:
+        """Joined where one of the two is too short to be judged by itself."""
+        if later.poses < FEWEST:
+            net_m = distance(self.last.position, later.last.position)
+            end, short, long = self.tail, later, self
+        else:
+            net_m = distance(self.first.position, later.first.position)
+            end, short, long = later.head, self, later
+        added_m = _step_m(end, end, short.poses, net_m, step_m + short.sum_m)
+        kept = replace(whole, length_m=long.length_m + added_m, head=long.head, tail=long.tail)
+        return replace(kept, still=long.still)
+
+
+def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -> float:
+    """The length of some steps between two ends: what their paces are, unless it is clearly more.
+
+    `net_m`: the distance from end to end; `plain_m`: the sum of the distances between.
+    """
+    if before.plain and after.plain:
+        return plain_m
+    expected_m = steps * (before.pace_m + after.pace_m) / 2
+    variance = before.noise_m**2 + after.noise_m**2
+    if net_m <= expected_m + _UNCERTAIN * math.sqrt(variance):
+        return expected_m
+    return math.sqrt(max(net_m**2 - variance, expected_m**2))
+
+
+@dataclass(frozen=True, slots=True)
+class PoseDigest:
+    """What the poses of one bag amount to; a coordinate that is no place makes a pose invalid.
+
+    Attributes:
+        poses: valid poses.
+        invalid: the others.
+        first: the first valid pose; None without one, and then nothing below counts.
+        last: the last valid pose.
+        head: the first leg; None where there are few poses: then `vertices` are all of them, and
+            who joins them measures them anew.
+        tail: the last leg; None where the first is the only one.
+        length_m: of the legs between these.
+        sum_m: the sum of the distances between poses, of the legs between these.
+        jumps: steps that were faster than is plausible; some of them are resets too.
+        jumped_m: their total length.
+        gaps: times in which nothing was recorded.
+        gap_m: the way across them in straight lines.
+        resets: the first poses of odometry that began anew; the earliest, of very many.
+        speed_mps: the highest speed measured; None where the poses are too few.
+        twist: the highest speed (m/s) that a message states; None where none states one.
+        frames: the frames of all poses, in order of appearance.
+        vertices: the drawn path, first and last pose among them; parted where the robot jumped
+            (see `paths.PARTED`).
+        error_m: no valid pose lies farther than this from the drawn path.
+    """
+
+    poses: int
+    invalid: int
+    first: Stop | None
+    last: Stop | None
+    head: Leg | None
+    tail: Leg | None
+    length_m: float
+    sum_m: float
+    jumps: int
+    jumped_m: float
+    gaps: int
+    gap_m: float
+    resets: tuple[Ns, ...]
+    speed_mps: float | None
+    twist: float | None
+    frames: tuple[str, ...]
+    vertices: tuple[Vertex, ...]
+    error_m: float
+
+
+class Motion:
+    """Distance, speed, gaps, jumps and resets of poses that come in order, many at a time.
+
+    Attributes:
+        first: the first pose; None without one.
+        last: the last pose.
+        head: the first leg; None without a pose.
+        tail: the last leg, if it is another one.
+        length_m: of the legs between these.
+        sum_m: of the legs between these.
+        jumps, jumped_m, gaps, gap_m, resets, speed_mps: see `PoseDigest`.
+        step_mps: the highest speed from one pose to the next where these were too few to measure
+            a speed.
+    """
+
+    def __init__(self, max_plausible_speed_mps: float) -> None:
+        self._fastest_mps = max_plausible_speed_mps
+        self.first: Stop | None = None
+        self.last: Stop | None = None
+        self.head: Leg | None = None
+        self.tail: Leg | None = None
+        self.length_m = 0.0
+        self.sum_m = 0.0
+        self.jumps = 0
+        self.jumped_m = 0.0
+        self.gaps = 0
+        self.gap_m = 0.0
+        self.resets: list[Ns] = []
+        self.speed_mps: float | None = None
+        self.step_mps = 0.0
+
+    @property
+    def distance_m(self) -> float:
+        """The length of all that was driven."""
+        legs = (self.head, self.tail)
+        return self.length_m + sum(leg.total_m for leg in legs if leg is not None)
+
+    @property
+    def path_sum_m(self) -> float:
+        """The sum of the distances between poses of all that was driven."""
+        return self.sum_m + sum(leg.sum_m for leg in (self.head, self.tail) if leg is not None)
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether noise may be much of the length of its first or last leg."""
+        return any(leg.in_doubt for leg in (self.head, self.tail) if leg is not None)
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first pose to the last."""
+        if self.first is None or self.last is None:
+            return 0.0
+        return unix_from_ns(self.last.time - self.first.time)
+
+    def add(self, stops: Sequence[Stop]) -> list[int]:
+        """Takes the poses that come next; gives the indices of those that a jump or reset led to.
+
+        The more at a time, the better noise is told from driving.
+        """
+        times = np.array([stop.time for stop in stops], dtype=np.int64)
+        positions = np.array([stop.position for stop in stops], dtype=np.float64)
+        apart = np.diff(times)
+        steps_m = np.sqrt((np.diff(positions, axis=0) ** 2).sum(axis=1))
+        plausible_m = self._fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
+        parted: list[int] = []
+        begin, before = 0, self.last
+        beside_m = np.maximum(
+            np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
+        )
+        odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
+        for index in np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist():
+            here, there = stops[index], stops[index + 1]
+            usual_ns = _usual_ns(apart, index, self._period_ns)
+            sides = (
+                stops[max(begin, index - _NEARBY) : index + 1],
+                stops[index + 1 : index + 2 + _NEARBY],
+            )
+            known = sum(map(len, sides))
+            near = _pace(sides[0]).or_more(_pace(sides[1]))
+            leg = self.tail or self.head
+            if index < begin + _NEARBY and before is not None and leg is not None:
+                known += leg.poses
+                near = near.or_more(leg.arriving)
+            # Of too few poses nobody knows what is usual.
+            usual = near if known >= _NEARBY else None
+            kind = link(here, there, usual_ns, self._fastest_mps, usual)
+            if kind == "driven":
+                continue
+            if self._go_on(before, _leg(stops[begin : index + 1])):
+                parted.append(begin)
+            self._break(kind, here, there)
+            begin, before = index + 1, None
+            if kind != "gap":
+                parted.append(begin)
+        if self._go_on(before, _leg(stops[begin:])):
+            parted.append(begin)
+        return parted
+
+    def join(self, whole: PoseDigest) -> bool:
+        """Takes the legs of a digest that come next; gives whether a jump or reset led to them."""
+        if whole.head is None:
+            return False
+        parted = self._go_on(self.last, (whole.head, whole.speed_mps, 0.0))
+        self.jumps += whole.jumps
+        self.jumped_m += whole.jumped_m
+        self.gaps += whole.gaps
+        self.gap_m += whole.gap_m
+        self.resets += whole.resets[: _MOST_RESETS - len(self.resets)]
+        if whole.tail is not None:
+            self._end_leg()
+            self.length_m += whole.length_m
+            self.sum_m += whole.sum_m
+            self.tail = whole.tail
+            self.last = whole.tail.last
+        return parted
+
+    @property
+    def _period_ns(self) -> Ns | None:
+        leg = self.tail or self.head
+        return None if leg is None else leg.period_ns
+
+    def _go_on(self, before: Stop | None, measured_leg: _MeasuredLeg) -> bool:
+        """Takes the leg that comes next; gives whether a jump or reset led to it from `before`."""
+        leg, speed_mps, step_mps = measured_leg
+        if speed_mps is not None:
+            self.speed_mps = max(self.speed_mps or 0.0, speed_mps)
+        self.step_mps = max(self.step_mps, step_mps)
+        kind: Link | None = None
+        if before is not None:
+            periods = [each for each in (self._period_ns, leg.period_ns) if each is not None]
+            last = self.tail or self.head
+            near = None
+            if last is not None and last.poses + leg.poses >= _NEARBY:
+                near = last.arriving.or_more(leg.setting_out)
+            kind = link(before, leg.first, max(periods, default=None), self._fastest_mps, near)
+        self.last = leg.last
+        if kind == "driven":
+            if self.tail is not None:
+                self.tail = self.tail.joined(leg)
+            elif self.head is not None:
+                self.head = self.head.joined(leg)
+            return False
+        if before is not None and kind is not None:
+            self._break(kind, before, leg.first)
+        if self.head is None:
+            self.head, self.first = leg, leg.first
+        else:
+            self._end_leg()
+            self.tail = leg
+        return kind in ("jump", "reset")
+
+    def _end_leg(self) -> None:
+        """Adds the last leg to those between."""
+        if self.tail is not None:
+            self.length_m += self.tail.total_m
+            self.sum_m += self.tail.sum_m
+            self.tail = None
+
+    def _break(self, kind: Link, before: Stop, after: Stop) -> None:
+        """Counts what ends a leg."""
+        step_m = distance(before.position, after.position)
+        if kind == "gap":
+            self.gaps += 1
+            self.gap_m += step_m
+            return
+        if _is_jump(before, after, self._fastest_mps):
+            self.jumps += 1
+            self.jumped_m += step_m
+        if kind == "reset" and len(self.resets) < _MOST_RESETS:
+            self.resets.append(after.time)
+
+
+_MeasuredLeg: TypeAlias = "tuple[Leg, float | None, float]"
+
+
+def _leg(stops: Sequence[Stop]) -> _MeasuredLeg:
+    """A leg, the highest speed on it if its poses are enough, else that from one to the next."""
+    times = np.array([stop.time for stop in stops], dtype=np.int64)
+    apart = np.diff(times)
+    seconds = (times - times[0]) / NS_PER_S
+    positions = [stop.position for stop in stops]
+    length_m, sum_m, head, tail, still, speed_mps = measured(seconds, positions)
+    period_ns = int(np.median(apart)) if len(apart) else None
+    leg = Leg(
+        stops[0],
+        stops[-1],
+        len(stops),
+        period_ns,
+        length_m,
+        sum_m,
+        head,
+        tail,
+        still,
+        setting_out=_pace(stops[: _NEARBY + 1]),
+        arriving=_pace(stops[-_NEARBY - 1 :]),
+    )
+    step_mps = 0.0
+    if len(stops) <= SPEED_STEPS:
+        step_mps = max(
+            (
+                distance(here.position, there.position) / unix_from_ns(there.time - here.time)
+                for here, there in pairwise(stops)
+                if there.time - here.time >= ARRIVAL_JITTER_NS
+            ),
+            default=0.0,
+        )
+    return leg, speed_mps, step_mps
+
+
+def _usual_ns(
+    apart: np.ndarray[tuple[int], np.dtype[np.int64]], index: int, known: Ns | None
+) -> Ns:
+    """The usual time between poses around an interval, which itself says least."""
+    near: list[Ns] = apart[max(index - _NEARBY, 0) : index + 1 + _NEARBY].tolist()
+    own = near.pop(min(index, _NEARBY))
+    return median_low(near or [known or own])
+
+
+def is_place(position: Vector3) -> bool:
+    """Whether these are coordinates of a place: finite, and not beyond any."""
+    x, y, z = position
+    # A comparison with NaN is false, so this one refuses all three kinds.
+    return abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and abs(z) < FARTHEST_M
+
+
+def faster(stated: float | None, speed_mps: float | None) -> float | None:
+    """The higher of two speeds that messages state; one that is no number states nothing."""
+    if speed_mps is None or not math.isfinite(speed_mps):
+        return stated
+    return max(stated or 0.0, abs(speed_mps))

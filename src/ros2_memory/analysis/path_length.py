@@ -1,0 +1,333 @@
+"""How far a robot drove, by positions that carry noise.
+
+The sum of the distances between noisy positions grows with their number, also where the robot
+stands: 10 mm of noise at 50 Hz are 1.1 m a second. So the length of each step is taken from the
+slope of a line fitted to the positions around it, over as few of them as the noise allows:
+
+- The noise of each axis comes from the positions themselves, by their fourth differences, which a
+  smooth path hardly has (difference-based variance estimation: Gasser, Sroka and Jennen-Steinmetz,
+  Biometrika 73, 1986; Hall, Kay and Titterington, Biometrika 77, 1990). These are averaged by
+  their square roots, so that a corner does not count as noise.
+- A least-squares slope over n positions has the variance 12 s^2 / (n (n^2 - 1)). Of the widths 2,
+  4, 8, 16 and 32 each step takes the smallest one at which the slopes around it are clear of their
+  noise (Lepski's rule: Theory of Probability and its Applications 36, 1991). Width 2 is the plain
+  distance of two positions: paths without noise keep their plain length.
+- Noise across the path makes a slope longer, by its variance over twice the slope at first order:
+  that is taken off the square (Gudbjartsson and Patz, Magnetic Resonance in Medicine 34, 1995).
+- Positions more than 0.25 s apart say nothing of turns between them: they keep their plain length,
+  but where they scatter around one place as their noise does (von Neumann's ratio, Annals of
+  Mathematical Statistics 12, 1941).
+- Where not even the widest slope is clear of the noise for long, the robot stands or creeps: only
+  when the mean of 33 positions leaves the last such place by more than noise does is that a way.
+
+Noise that is slow, as a drift over seconds, cannot be told from driving and counts as that.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from ros2_memory.core.geometry import distance
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.core.model import Vector3
+
+Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+Rows: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
+Marks: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
+
+FEWEST: Final = 16
+"""Positions that a noise is estimated from; of fewer the plain sum counts."""
+
+_WIDTHS: Final = (2, 4, 8, 16, 32)
+_ORDER: Final = 4
+_NOISE_SPAN: Final = 32
+"""Fourth differences on either side of a position whose mean is the noise there."""
+_SLOPE_SPAN: Final = 6
+"""Slopes on either side of a step whose mean square is held against their noise."""
+_CLEAR: Final = 12.0
+"""A mean square slope is clear of noise from so many times the variance of a slope on."""
+_STANDING: Final = 9.0
+"""The widest slopes below so many times their variance are those of a standing robot.
+
+Of noise alone they are above it once in some 10^5 independent windows (chi-square, 3 degrees).
+"""
+_PLAIN: Final = 0.002
+"""Where noise adds less than this share, the distance of two positions stays as it is."""
+_STAND_STEPS: Final = _WIDTHS[-1]
+_PLACE_SPAN: Final = 16
+_DENSE_S: Final = 0.25
+"""Fourth differences of positions farther apart in time tell turns of the robot as noise."""
+_SPREAD: Final = (0.6, 2.0)
+"""How far positions that far apart spread around a place, in units of their noise."""
+_LEFT: Final = 6.0
+"""A robot left a place when the distance is more than so many standard deviations."""
+_ROOT_MEAN: Final = (2**0.25 * math.gamma(0.75) / math.sqrt(math.pi)) ** 2
+"""The squared mean square root of a standard normal variable's magnitude."""
+_GROWTH: Final = math.sqrt(math.comb(2 * _ORDER, _ORDER))
+"""The standard deviation of a difference of this order of independent unit noise."""
+
+SPEED_WINDOW_S: Final = 1.0
+SPEED_STEPS: Final = 8
+_JITTER_S: Final = 0.1
+_SLACK_S: Final = 1e-6
+
+
+class Creep(NamedTuple):
+    """The way of a robot that stands or creeps: from place to place that it clearly left.
+
+    Attributes:
+        start: the first place.
+        second: the next one; None where it never left the first.
+        middle_m: length from the second place to the last.
+        end: the last place.
+        reach_m: how far off a place must be to count.
+    """
+
+    start: Vector3
+    second: Vector3 | None
+    middle_m: float
+    end: Vector3
+    reach_m: float
+
+    @property
+    def length_m(self) -> float:
+        """Length from the first place to the last."""
+        return 0.0 if self.second is None else distance(self.start, self.second) + self.middle_m
+
+    def to(self, place: Vector3) -> Creep:
+        """With one more place, if it is off the last one."""
+        step = distance(self.end, place)
+        if step <= self.reach_m:
+            return self
+        if self.second is None:
+            return self._replace(second=place, end=place)
+        return self._replace(middle_m=self.middle_m + step, end=place)
+
+    def joined(self, later: Creep) -> Creep:
+        """This creep gone on with a later one."""
+        reach_m = max(self.reach_m, later.reach_m)
+        whole = self._replace(reach_m=reach_m).to(later.start)
+        if later.second is None:
+            return whole
+        step = distance(whole.end, later.second)
+        if whole.second is None:
+            return whole._replace(second=later.second, middle_m=later.middle_m, end=later.end)
+        return whole._replace(middle_m=whole.middle_m + step + later.middle_m, end=later.end)
+
+
+class End(NamedTuple):
+    """How a path begins or ends, for what is joined to it there.
+
+    Attributes:
+        pace_m: the length of the step at this end.
+        noise_m: the standard deviation of a position.
+        plain: the step is the plain distance of its positions.
+        creep: the standing or creeping that reaches this end; its length is not counted yet.
+    """
+
+    pace_m: float
+    noise_m: float
+    plain: bool
+    creep: Creep | None
+
+
+class Measured(NamedTuple):
+    """What a path in one piece comes to.
+
+    Attributes:
+        length_m: its length but for the creeps at its ends.
+        sum_m: the sum of the distances between its positions.
+        head: how it begins.
+        tail: how it ends.
+        still: one creep from end to end: that of the head and of the tail.
+        speed_mps: the highest speed over a second and eight steps; None for too few positions.
+    """
+
+    length_m: float
+    sum_m: float
+    head: End
+    tail: End
+    still: bool
+    speed_mps: float | None
+
+
+def measured(seconds: Numbers, positions: Sequence[Vector3]) -> Measured:
+    """The length of a path and the highest speed on it.
+
+    Args:
+        seconds: when each position was taken, ascending.
+        positions: at least one; metres.
+    """
+    points: Rows = np.array(positions, dtype=np.float64)
+    points -= points[0].copy()
+    plain = np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1))
+    total = math.fsum(plain.tolist())
+    apart = np.diff(seconds)
+    if len(points) < FEWEST:
+        speed_mps = _sparse_speed(plain, apart)
+        ends = (
+            [End(float(step), 0.0, plain=True, creep=None) for step in plain[[0, -1]]]
+            if len(plain)
+            else [End(0.0, 0.0, plain=True, creep=None)] * 2
+        )
+        return Measured(total, total, ends[0], ends[1], still=False, speed_mps=speed_mps)
+    noise = _noise(points)
+    lengths, as_plain, standing = _steps(points, plain, noise)
+    if np.median(apart) > _DENSE_S:
+        standing &= _scatters(points, noise)
+        lengths, as_plain = plain, ~standing
+    creeps = [
+        (begin, end, _creep(points, noise, begin, end, positions[0]))
+        for begin, end in _rows(standing)
+        if end - begin >= _STAND_STEPS or end - begin == len(plain)
+    ]
+    moved = lengths.copy()
+    for begin, end, _ in creeps:
+        moved[begin:end] = 0.0
+    before = next((creep for begin, _, creep in creeps if begin == 0), None)
+    after = next((creep for _, end, creep in creeps if end == len(plain)), None)
+    inside = [creep.length_m for begin, end, creep in creeps if begin > 0 and end < len(plain)]
+    spread = np.sqrt((noise**2).sum(axis=1))
+    return Measured(
+        total if as_plain.all() else math.fsum([*moved.tolist(), *inside]),
+        total,
+        End(float(moved[0]), float(spread[0]), bool(as_plain[0]), before),
+        End(float(moved[-1]), float(spread[-1]), bool(as_plain[-1]), after),
+        still=bool(creeps) and creeps[0][:2] == (0, len(plain)),
+        speed_mps=_highest_speed(seconds, moved),
+    )
+
+
+def _noise(points: Rows) -> Rows:
+    """The standard deviation of each axis at each position."""
+    roots = np.sqrt(np.abs(np.diff(points, _ORDER, axis=0)))
+    means = _moving_mean(roots, _NOISE_SPAN) ** 2 / (_ROOT_MEAN * _GROWTH)
+    at = np.clip(np.arange(len(points)) - _ORDER // 2, 0, len(means) - 1)
+    return means[at]
+
+
+def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, Marks]:
+    """The length of each step, whether it is the plain one, and whether it drowns in noise."""
+    variance = (noise[1:] ** 2 + noise[:-1] ** 2) / 2
+    whole = variance.sum(axis=1)
+    lengths = np.zeros(len(plain))
+    as_plain = np.zeros(len(plain), dtype=bool)
+    open_yet = np.ones(len(plain), dtype=bool)
+    energy = share = np.zeros(len(plain))
+    for width in _WIDTHS:
+        if width > len(points) or not open_yet.any():
+            break
+        slopes = np.diff(points, axis=0) if width == 2 else _slopes(points, width)
+        square = (slopes**2).sum(axis=1)
+        energy = _moving_mean(square[:, None], _SLOPE_SPAN)[:, 0]
+        share = 12 / (width * (width * width - 1)) * whole
+        along = (variance * slopes**2).sum(axis=1) / np.where(square > 0, square, 1.0)
+        across = 12 / (width * (width * width - 1)) * (whole - along)
+        settled = open_yet & (energy >= _CLEAR * share)
+        if width == 2:
+            as_plain = settled & (share <= 2 * _PLAIN * energy)
+        # What is open yet at the widest keeps the length by that.
+        lengths[open_yet] = np.sqrt(np.maximum(square - across, 0.0))[open_yet]
+        open_yet &= ~settled
+    lengths[as_plain] = plain[as_plain]
+    # A wide slope beside a sudden start has some of what the steps after it have already.
+    for begin, end in _rows(~as_plain):
+        most, found = plain[begin:end].sum(), lengths[begin:end].sum()
+        if found > most:
+            lengths[begin:end] *= most / found
+    return lengths, as_plain, open_yet & (energy < _STANDING * share)
+
+
+def _scatters(points: Rows, noise: Rows) -> Marks:
+    """At which steps the positions spread around one place as far as their noise makes them."""
+    places = _moving_mean(points, _PLACE_SPAN)
+    spread = _moving_mean(points**2, _PLACE_SPAN) - places**2
+    ratio = spread.sum(axis=1) / np.maximum((noise**2).sum(axis=1), 1e-300)
+    low, high = _SPREAD
+    around: Marks = (low * low <= ratio) & (ratio <= high * high)
+    both: Marks = around[1:] & around[:-1]
+    return both
+
+
+def _slopes(points: Rows, width: int) -> Rows:
+    """For each step the slope of the line fitted to the `width` positions around it.
+
+    Where the path ends too near it is fitted to the first or last ones.
+    """
+    weights = np.arange(width) - (width - 1) / 2
+    weights /= weights @ weights
+    fits = np.column_stack([np.correlate(axis, weights, "valid") for axis in points.T])
+    at = np.clip(np.arange(len(points) - 1) - (width // 2 - 1), 0, len(fits) - 1)
+    return fits[at]
+
+
+def _moving_mean(rows: Rows, span: int) -> Rows:
+    """Means over a row and `span` ones to either side; over as many at the ends."""
+    width = min(2 * span + 1, len(rows))
+    sums = np.zeros((len(rows) + 1, rows.shape[1]))
+    np.cumsum(rows, axis=0, out=sums[1:])
+    means = (sums[width:] - sums[:-width]) / width
+    return means[np.clip(np.arange(len(rows)) - span, 0, len(means) - 1)]
+
+
+def _rows(marks: Marks) -> Iterator[tuple[int, int]]:
+    """The half-open ranges in which marks are set."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], marks, [False])).astype(np.int8)))
+    return iter([(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)])
+
+
+def _creep(points: Rows, noise: Rows, begin: int, end: int, origin: Vector3) -> Creep:
+    """The places that a robot left from one position to another (inclusive)."""
+    places = _moving_mean(points, _PLACE_SPAN)[begin : end + 1]
+    width = min(2 * _PLACE_SPAN + 1, len(points))
+    reach = _LEFT * math.sqrt(2 / width) * noise[begin : end + 1].max(axis=1)
+    found = [0]
+    while True:
+        at = found[-1]
+        off = np.sqrt(((places[at:] - places[at]) ** 2).sum(axis=1)) > reach[at:]
+        if not off.any():
+            break
+        found.append(at + int(off.argmax()))
+    x, y, z = origin
+    left = [(float(a) + x, float(b) + y, float(c) + z) for a, b, c in places[found]]
+    middle_m = math.fsum(distance(here, there) for here, there in pairwise(left[1:]))
+    second = left[1] if len(left) > 1 else None
+    return Creep(left[0], second, middle_m, left[-1], float(reach.max()))
+
+
+def _highest_speed(seconds: Numbers, lengths: Numbers) -> float:
+    """The highest speed over windows of a second, and of eight steps at least."""
+    # A single step that is far longer than those around it is a correction of the position.
+    usual = _moving_mean(np.sqrt(lengths)[:, None], SPEED_STEPS)[:, 0] ** 2
+    gone = np.concatenate(([0.0], np.cumsum(np.minimum(lengths, 2 * usual))))
+    begin = np.arange(len(lengths) - SPEED_STEPS + 1)
+    end = np.searchsorted(seconds, seconds[begin] + SPEED_WINDOW_S - _SLACK_S)
+    dense = (end > begin + SPEED_STEPS) & (end < len(seconds))
+    begin, end = begin[dense], end[dense]
+    sparse_mps = _sparse_speed(lengths, np.diff(seconds))
+    if len(begin):
+        highest = float(((gone[end] - gone[begin]) / (seconds[end] - seconds[begin])).max())
+        return max(highest, sparse_mps or 0.0)
+    if sparse_mps is not None:
+        return sparse_mps
+    # The path takes less than a second.
+    return float(gone[-1] / max(seconds[-1] - seconds[0], _JITTER_S))
+
+
+def _sparse_speed(lengths: Numbers, apart: Numbers) -> float | None:
+    """The highest median speed of eight steps that take a second or longer; None without any."""
+    if len(lengths) < SPEED_STEPS:
+        return None
+    long = sliding_window_view(apart, SPEED_STEPS).sum(axis=1) >= SPEED_WINDOW_S - _SLACK_S
+    if not long.any():
+        return None
+    windows = sliding_window_view(lengths / np.maximum(apart, _JITTER_S), SPEED_STEPS)[long]
+    return float(np.median(windows, axis=1).max())

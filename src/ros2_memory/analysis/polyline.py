@@ -1,0 +1,182 @@
+"""The drawn path of a robot: few vertices, no pose far from them, and no line where it jumped.
+
+It is drawn in space and time: where the robot turned back, or stopped, is a vertex too.
+
+Built vertex by vertex in bounded memory. Where a robot jumped (a localisation that was corrected,
+a simulator that was reset) the path is parted: both ends of the jump are kept, and nothing is drawn
+between them.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.core.geometry import distance, simplify_to
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from ros2_memory.analysis.odometry import Vertex
+
+PARTED: Final[Vertex] = (0, (math.nan, math.nan, math.nan), None)
+"""Stands between two pieces of a path where both stand in one row; no pose is nowhere."""
+
+_BLOCK: Final = 4096
+_MOST_VERTICES: Final = 20_000
+_MOST_PIECES: Final = 1000
+_STAY_NS: Final[Ns] = NS_PER_S
+"""Of a longer stay on a spot the end is drawn too."""
+
+
+class Drawn(NamedTuple):
+    """The pieces of a path, none empty, and how far (m) any pose lies from them at most."""
+
+    pieces: list[list[Vertex]]
+    error_m: float
+
+    def row(self) -> tuple[Vertex, ...]:
+        """All vertices in one row, `PARTED` between the pieces."""
+        row: list[Vertex] = []
+        for piece in self.pieces:
+            row += [PARTED, *piece] if row else piece
+        return tuple(row)
+
+
+class DrawnPath:
+    """Vertices that are enough, and how far any pose may lie off them.
+
+    A simplification of a simplification: the deviations add and do no more, since a vertex that
+    the second drops lies beside the same kept segment as its neighbours. A quarter of the
+    tolerance goes to merging small steps, a quarter to the blocks, and what is left to the whole;
+    paths that are kept of bags have taken an eighth of it. Where that keeps too many vertices the
+    first two quarters are doubled.
+    """
+
+    def __init__(self, tolerance_m: float) -> None:
+        self._tolerance_m = tolerance_m
+        self._stage_m = tolerance_m / 4
+        self._done: list[list[Vertex]] = []
+        self._kept: list[Vertex] = []
+        self._block: list[Vertex] = []
+        self._merged: Vertex | None = None
+        self._merged_m = 0.0
+        self._dropped_m = 0.0
+        self._given_m = 0.0
+
+    @property
+    def size(self) -> int:
+        """How many vertices are held."""
+        return sum(map(len, self._done)) + len(self._kept) + len(self._block)
+
+    def add(self, vertex: Vertex) -> None:
+        """Takes the next pose."""
+        if self._block:
+            off = distance(self._block[-1][1], vertex[1])
+            if off <= self._stage_m:
+                self._merged_m = max(self._merged_m, off)
+                self._merged = vertex
+                return
+        if self._merged is not None and self._merged[0] - self._block[-1][0] > _STAY_NS:
+            self._block.append(self._merged)  # where a stop ends
+        self._merged = None
+        self._block.append(vertex)
+        if len(self._block) >= _BLOCK:
+            self._block = self._close_block()[-1:]
+            self._kept.pop()
+
+    def part(self) -> None:
+        """Ends a piece: the robot jumps from the last pose to the next one.
+
+        Of a path in very many pieces the later jumps are drawn as if they were ways.
+        """
+        if not self._block or len(self._done) >= _MOST_PIECES:
+            return
+        self._close_block()
+        if self._merged is not None:
+            self._kept.append(self._merged)
+        self._done.append(self._kept)
+        self._kept, self._block, self._merged = [], [], None
+
+    def extend(self, row: Iterable[Vertex], error_m: float) -> None:
+        """Takes a path that is drawn already, from which poses lie `error_m` off at most."""
+        self._given_m = max(self._given_m, error_m)
+        for vertex in row:
+            if math.isnan(vertex[1][0]):
+                self.part()
+            else:
+                self.add(vertex)
+
+    def drawn(self, at_most: int) -> Drawn:
+        """The path with at most so many vertices; then only the longest jumps may part it."""
+        last = [*self._kept, *self._block]
+        if self._merged is not None:
+            last.append(self._merged)
+        pieces = _joined([*self._done, last] if last else self._done, at_most)
+        so_far = self._given_m + self._merged_m + self._dropped_m
+        tolerance_m = max(self._tolerance_m - so_far, self._tolerance_m / 4)
+        kept, error_m = _drawn(pieces, tolerance_m, at_most)
+        return Drawn(kept, so_far + error_m)
+
+    def _close_block(self) -> list[Vertex]:
+        """Keeps the vertices that draw the block, and gives them."""
+        kept, error = _thinned(self._block, self._stage_m, _BLOCK)
+        self._dropped_m = max(self._dropped_m, error)
+        self._kept += kept
+        while self.size - len(self._block) > _MOST_VERTICES:
+            self._thin_all()
+        return kept
+
+    def _thin_all(self) -> None:
+        while self.size - len(self._block) > _MOST_VERTICES // 2:
+            self._stage_m *= 2
+            thinned = [
+                _thinned(piece, self._stage_m, len(piece)) for piece in (*self._done, self._kept)
+            ]
+            *self._done, self._kept = (kept for kept, _ in thinned)
+            self._dropped_m += max(error for _, error in thinned)
+
+
+def _joined(pieces: Sequence[list[Vertex]], at_most: int) -> list[list[Vertex]]:
+    """The pieces, joined across the shortest jumps until two vertices for each are not too many."""
+    jumps = [
+        (distance(before[-1][1], after[0][1]), number)
+        for number, (before, after) in enumerate(pairwise(pieces), 1)
+    ]
+    parted = {number for _, number in sorted(jumps, reverse=True)[: at_most // 2 - 1]}
+    joined: list[list[Vertex]] = []
+    for number, piece in enumerate(pieces):
+        if number in parted or not joined:
+            joined.append([*piece])
+        else:
+            joined[-1] += piece
+    return joined
+
+
+def _drawn(
+    pieces: Sequence[list[Vertex]], tolerance_m: float, at_most: int
+) -> tuple[list[list[Vertex]], float]:
+    """Each piece thinned; all to one tolerance, widened until they fit."""
+    if len(pieces) == 1:
+        kept, error = _thinned(pieces[0], tolerance_m, at_most)
+        return [kept], error
+    while True:
+        thinned = [_thinned(piece, tolerance_m, max(len(piece), 2)) for piece in pieces]
+        if sum(len(kept) for kept, _ in thinned) <= at_most:
+            return [kept for kept, _ in thinned], max((error for _, error in thinned), default=0.0)
+        tolerance_m *= 1.5
+
+
+def _thinned(
+    vertices: list[Vertex], tolerance_m: float, at_most: int
+) -> tuple[list[Vertex], float]:
+    since = vertices[0][0] if vertices else 0
+    indices, error = simplify_to(
+        [vertex[1] for vertex in vertices],
+        tolerance_m,
+        max(at_most, 2),
+        [unix_from_ns(vertex[0] - since) for vertex in vertices],
+    )
+    return [vertices[index] for index in indices], error

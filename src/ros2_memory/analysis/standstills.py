@@ -1,0 +1,685 @@
+"""Where the robot stood still: pose by pose, or a whole bag at once.
+
+A standstill is a time of at least `SHORTEST_NS` in which the robot stays in a box that does not
+grow with time. It begins with the first pose at that place and ends with the last.
+
+Poses are averaged in slots of `SLOT_NS`, counted from the epoch, so that noise averages out. Slots
+that follow each other are linked where their means are no farther apart than a drift of `DRIFT_MPS`
+or the noise of their own poses explains, and linked slots form a chain. The ends of a chain are
+then found pose by pose: a slot that is clearly inside gives the place and its noise, and poses are
+followed outwards, through the last slot of the chain and the one beyond, until one lies elsewhere.
+Slow motion that noise hides from two slots shows in blocks of `BLOCK_NS`: a block whose means
+spread farther than drift and noise explain is motion, and parts the chain. So are still blocks that
+lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. A standstill that drifts out of
+`LARGEST_M` in a longer time ends there, and the next one begins.
+
+All of this depends on poses a few slots around alone, and slots and blocks are counted from the
+epoch, and all positions are rounded alike (`_STEP_M`). So a standstill is the same whatever window
+is asked about, and however a history is cut into bags.
+
+The noise of a slot is estimated from second differences, which a steady motion leaves at zero: see
+J. von Neumann et al., "The mean square successive difference", Ann. Math. Statist. 12 (1941), for
+first differences; those of second order have six times the variance of the noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.core.model import Vector3
+
+SHORTEST_NS: Final[Ns] = 3 * NS_PER_S
+"""A robot that stands for less is turning round, or minding its step."""
+SILENCE_NS: Final[Ns] = 5 * NS_PER_S // 2
+"""Poses farther apart say nothing of the time between them: a standstill ends there."""
+SLOT_NS: Final[Ns] = 2 * NS_PER_S // 5
+BLOCK_NS: Final[Ns] = 5 * SLOT_NS
+CREEP_NS: Final[Ns] = 15 * BLOCK_NS
+"""A robot that gets farther than `LARGEST_M` in this time creeps; a slower one drifts."""
+CONTEXT_NS: Final[Ns] = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
+"""Poses so far outside of a window decide whether the robot stood inside of it."""
+DRIFT_MPS: Final = 0.008
+"""The mean of a robot that stands may move so fast: odometry drifts."""
+LARGEST_M: Final = 0.1
+CREEP_MPS: Final = LARGEST_M / unix_from_ns(CREEP_NS)
+"""A robot that is slower than this cannot be told from one that stands."""
+
+_NOISE_FACTOR: Final = 5.5
+_NEAREST_M: Final = 0.0003
+"""Poses without noise are at one place where they are no farther apart than this."""
+_STEP_M: Final = 0.0001
+"""What positions and their means are rounded to."""
+_MOST_IN_SLOT: Final = 1_000
+_EDGE_SLOTS: Final = 3
+_CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
+
+
+class TimedPosition(NamedTuple):
+    """Where the robot was (m), and when."""
+
+    time: Ns
+    position: Vector3
+
+
+class Box3(NamedTuple):
+    """The smallest box (m) around places."""
+
+    low: Vector3
+    high: Vector3
+
+    @property
+    def centre(self) -> Vector3:
+        """Its middle."""
+        (a, b, c), (d, e, f) = self
+        return ((a + d) / 2, (b + e) / 2, (c + f) / 2)
+
+    @property
+    def diagonal(self) -> float:
+        """The distance of its far corners."""
+        return math.dist(self.low, self.high)
+
+    def united(self, other: Box3) -> Box3:
+        """The box around both."""
+        (a, b, c), (d, e, f) = self
+        (g, h, i), (j, k, m) = other
+        return Box3((min(a, g), min(b, h), min(c, i)), (max(d, j), max(e, k), max(f, m)))
+
+
+class Standstill(NamedTuple):
+    """A time in which the robot stood: from its first pose there to its last (inclusive).
+
+    `box` is around the mean positions of its slots.
+    """
+
+    start: Ns
+    end: Ns
+    box: Box3
+
+
+class Block(NamedTuple):
+    """The linked slots of one block of time: their first and last pose, the box of their means.
+
+    `noise` is the highest standard deviation (m) of these means that the noise of poses explains.
+    """
+
+    number: int
+    first: Ns
+    last: Ns
+    noise: float
+    box: Box3
+
+    @property
+    def is_still(self) -> bool:
+        """Whether drift and noise explain its box."""
+        explained = max(DRIFT_MPS * unix_from_ns(BLOCK_NS), 4.5 * self.noise)
+        return self.box.diagonal <= min(explained, LARGEST_M)
+
+    def is_far_from(self, other: Block) -> bool:
+        """Whether more than noise lies between them beyond `LARGEST_M`."""
+        apart_m = math.dist(self.box.centre, other.box.centre)
+        return apart_m > LARGEST_M + 2 * (self.noise + other.noise)
+
+
+class ChainDigest(NamedTuple):
+    """Linked slots of one bag; an end that the poses of other bags decide is None.
+
+    `blocks` are packed; see `packed_blocks`.
+    """
+
+    start: Ns | None
+    end: Ns | None
+    blocks: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class StandstillDigest:
+    """The standstills among the poses of one bag, to be joined with those before and after.
+
+    The first and the last slot may have more poses in the bags before and after, so `chains` are of
+    the slots between them; those with two known ends last at least `SHORTEST_NS`.
+
+    Attributes:
+        head: poses of the first three slots; of all where there are fewer than five. Packed; see
+            `packed_poses`.
+        head_until: the log time of the last of these.
+        tail: poses of the last three slots; empty where `head` holds all.
+        tail_since: the log time of the first of these.
+        chains: in order. The first one's start is None where it holds the second slot, the last
+            one's end where it holds the last slot but one.
+    """
+
+    head: bytes
+    head_until: Ns
+    tail: bytes = b""
+    tail_since: Ns = 0
+    chains: tuple[ChainDigest, ...] = ()
+
+
+class _Slot:
+    """The poses of one slot of time."""
+
+    __slots__ = ("_bends", "_mean", "number", "poses")
+
+    def __init__(self, pose: TimedPosition) -> None:
+        self.number = pose.time // SLOT_NS
+        self.poses = [pose]
+        self._mean: Vector3 | None = None
+        self._bends: list[float] | None = None
+
+    def add(self, pose: TimedPosition) -> None:
+        self._mean = self._bends = None
+        if len(self.poses) < _MOST_IN_SLOT:
+            self.poses.append(pose)
+        else:
+            self.poses[-1] = pose
+
+    @property
+    def first(self) -> Ns:
+        return self.poses[0].time
+
+    @property
+    def last(self) -> Ns:
+        return self.poses[-1].time
+
+    @property
+    def mean(self) -> Vector3:
+        if self._mean is None:
+            x, y, z = zip(*(position for _, position in self.poses), strict=True)
+            many = len(self.poses)
+            self._mean = (math.fsum(x) / many, math.fsum(y) / many, math.fsum(z) / many)
+        return self._mean
+
+    @property
+    def bends(self) -> list[float]:
+        """Squares of the second differences of its positions (m2)."""
+        if self._bends is None:
+            places = [position for _, position in self.poses]
+            self._bends = [
+                (a - 2 * b + c) ** 2 + (d - 2 * e + f) ** 2 + (g - 2 * h + i) ** 2
+                for (a, d, g), (b, e, h), (c, f, i) in zip(
+                    places, places[1:], places[2:], strict=False
+                )
+            ]
+        return self._bends
+
+    def reach(self) -> float:
+        """How far (m) from its mean a pose may lie and be at the same place."""
+        farthest = max(math.dist(position, self.mean) for _, position in self.poses)
+        return max(_NEAREST_M, 4.5 * _noise(self.bends), 1.5 * farthest)
+
+
+def _noise(bends: Sequence[float]) -> float:
+    """Standard deviation (m) of poses in space: a median, since a robot that stops bends once."""
+    if not bends:
+        return 0.0
+    middle = sorted(bends)[(len(bends) - 1) // 2]
+    # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
+    return math.sqrt(middle / 6 / 0.6)
+
+
+def _linked(slot: _Slot, after: _Slot) -> bool:
+    """Whether the robot may have stood from one slot to the next that has poses."""
+    if not _follows(slot, after):
+        return False
+    allowed = DRIFT_MPS * unix_from_ns((after.number - slot.number) * SLOT_NS)
+    bends = [*slot.bends, *after.bends]
+    if bends:
+        spread = math.sqrt(1 / len(slot.poses) + 1 / len(after.poses))
+        # Few of them may show much less noise than there is.
+        allowed = max(allowed, _NOISE_FACTOR * (1 + 4 / len(bends)) * _noise(bends) * spread)
+    return math.dist(slot.mean, after.mean) <= allowed
+
+
+def _follows(slot: _Slot, after: _Slot) -> bool:
+    return after.first - slot.last <= SILENCE_NS
+
+
+def _begin(before: _Slot | None, first: _Slot, inside: _Slot) -> Ns:
+    """The first pose of a chain's standstill; `inside` is the second slot of the chain."""
+    slots = [inside, first]
+    if before is not None and _follows(before, first):
+        slots.append(before)
+    return _followed(inside, (pose for slot in slots for pose in reversed(slot.poses)), inside.last)
+
+
+def _end(inside: _Slot, last: _Slot, after: _Slot | None) -> Ns:
+    """The last pose of a chain's standstill; `inside` is the last slot of the chain but one."""
+    slots = [inside, last]
+    if after is not None and _follows(last, after):
+        slots.append(after)
+    return _followed(inside, (pose for slot in slots for pose in slot.poses), inside.first)
+
+
+def _followed(inside: _Slot, poses: Iterable[TimedPosition], until: Ns) -> Ns:
+    """The last of the poses up to which all are at the place of a slot."""
+    place, reach = inside.mean, inside.reach()
+    for time, position in poses:
+        if math.dist(position, place) > reach:
+            break
+        until = time
+    return until
+
+
+class _Chain:
+    """Linked slots, and the standstills among them; `start` is None where it is not known."""
+
+    def __init__(self, start: Ns | None, blocks: Iterable[Block] = ()) -> None:
+        self.start = start
+        self.end: Ns | None = None
+        self.blocks = [*blocks]  # that are not settled
+        self._found: list[Standstill] = []
+        self._parts: list[Standstill] = []  # of the standstill under way: it drifts on
+        self._settled: Block | None = None  # the newest
+        self._taken: Ns = 0
+        self._looked_at: list[Block] = []  # still ones, one after another, as long as a creep
+        self._creeps: deque[tuple[int, int]] = deque()  # the numbers of first and last block
+
+    def add(self, slot: _Slot) -> None:
+        mean = _rounded(slot.mean)
+        box = Box3(mean, mean)
+        noise = round(_noise(slot.bends) / math.sqrt(len(slot.poses)) / _STEP_M) * _STEP_M
+        number = slot.number * SLOT_NS // BLOCK_NS
+        self.extend([Block(number, slot.first, slot.last, noise, box)])
+
+    def extend(self, blocks: Iterable[Block]) -> None:
+        for block in blocks:
+            if self.blocks and self.blocks[-1].number == block.number:
+                known = self.blocks[-1]
+                box = known.box.united(block.box)
+                noise = max(known.noise, block.noise)
+                self.blocks[-1] = Block(known.number, known.first, block.last, noise, box)
+            else:
+                self.blocks.append(block)
+
+    def settle(self, taken: Ns, *, is_over: bool = False) -> None:
+        """Turn blocks into standstills: those that no slot or block to come can change, or all.
+
+        They begin at `taken` or later, where the standstill of the chain before ends: chains follow
+        poses into each other's slots.
+        """
+        self._taken = taken
+        newest = self.blocks[-1].number if self.blocks else 0
+        for block in self.blocks if is_over else self.blocks[:-1]:
+            if not self._looked_at or block.number > self._looked_at[-1].number:
+                self._look_for_creep(block)
+        many = sum(is_over or newest - each.number >= _CREEP_BLOCKS for each in self.blocks)
+        settled, self.blocks = self.blocks[:many], self.blocks[many:]
+        for block in settled:
+            self._settle(block)
+            self._settled = block
+
+    def _look_for_creep(self, block: Block) -> None:
+        """Mark the blocks of the shortest creep that ends in a block."""
+        oldest = block.number - _CREEP_BLOCKS + 1
+        before = [each for each in self._looked_at if each.is_still and each.number >= oldest]
+        if not block.is_still:
+            before = []
+        since = self._creeps[-1][0] if self._creeps else -1
+        for each in reversed(before):
+            if each.number <= since:
+                break
+            if each.is_far_from(block):
+                self._creeps.append((each.number, block.number))
+                break
+        self._looked_at = [*before, block]
+
+    @property
+    def is_long(self) -> bool:
+        """Whether a standstill may be in it."""
+        return self.start is None or self.end is None or self.end - self.start >= SHORTEST_NS
+
+    def standstills(self, taken: Ns) -> list[Standstill]:
+        """Return the standstills of a chain that is over, from `taken` on; see `settle`."""
+        self.settle(taken, is_over=True)
+        if self.end is not None:
+            self._finish(self.end)
+        return self._found
+
+    def _settle(self, block: Block) -> None:
+        before = self._settled
+        while len(self._creeps) > 1 and self._creeps[0][1] < block.number:
+            self._creeps.popleft()
+        creeps = self._creeps and self._creeps[0][0] <= block.number <= self._creeps[0][1]
+        if creeps or not block.is_still:
+            if before is not None:
+                self._finish(before.last)
+            return
+        start = block.first if before is not None or self.start is None else self.start
+        here = Standstill(start, block.last, block.box)
+        part = self._parts[-1] if self._parts else here
+        box = part.box.united(block.box)
+        if box.diagonal <= LARGEST_M:
+            self._parts[-1:] = [Standstill(part.start, block.last, box)]
+        else:
+            self._parts[-1] = part._replace(end=start)
+            self._parts.append(here)
+
+    def _finish(self, end: Ns) -> None:
+        """End the standstill under way."""
+        parts, self._parts = self._parts, []
+        if not parts:
+            return
+        begin = max(parts[0].start, self._taken)
+        if end - begin < SHORTEST_NS:
+            return
+        parts[-1] = parts[-1]._replace(end=end)
+        clipped = (
+            Standstill(max(start, begin), min(until, end), box) for start, until, box in parts
+        )
+        self._found += [each for each in clipped if each.start < each.end]
+
+
+class _Linking:
+    """Takes complete slots in order, and gives the chains among them."""
+
+    def __init__(self) -> None:
+        self.before: _Slot | None = None
+        self.newest: _Slot | None = None
+        self.chain: _Chain | None = None
+
+    def take(self, slot: _Slot) -> _Chain | None:
+        """Take the next slot; a chain that it ends is returned."""
+        before, newest, over = self.before, self.newest, None
+        if newest is not None:
+            if _linked(newest, slot):
+                if self.chain is None:
+                    self.chain = _Chain(_begin(before, newest, slot))
+                    self.chain.add(newest)
+                self.chain.add(slot)
+            else:
+                over = self.end(slot)
+        self.before, self.newest = newest, slot
+        return over
+
+    def end(self, after: _Slot | None) -> _Chain | None:
+        """End the chain under way, if there is one, with the newest slot."""
+        chain, self.chain = self.chain, None
+        if chain is not None and self.before is not None and self.newest is not None:
+            chain.end = _end(self.before, self.newest, after)
+        return chain
+
+    def resume(self, before: _Slot, newest: _Slot) -> None:
+        """Go on after slots that were taken elsewhere."""
+        self.before, self.newest = before, newest
+
+
+class StandstillCollector:
+    """Makes the digest of one bag's poses, which come in log-time order."""
+
+    def __init__(self) -> None:
+        self._slots: list[_Slot] = []  # the first three and the newest three
+        self._linking = _Linking()
+        self._chains: list[_Chain] = []
+        self._first: _Chain | None = None  # holds the second slot
+
+    def add(self, time: Ns, position: Vector3) -> None:
+        """Take the next pose (m), which must be finite."""
+        pose = TimedPosition(time, _rounded(position))
+        if self._slots and time // SLOT_NS == self._slots[-1].number:
+            self._slots[-1].add(pose)
+            return
+        if len(self._slots) > 1:
+            self._take(self._slots[-1])
+        self._slots.append(_Slot(pose))
+        if len(self._slots) > 2 * _EDGE_SLOTS:
+            del self._slots[_EDGE_SLOTS]
+
+    def digest(self) -> StandstillDigest | None:
+        """Return what the poses amount to; None without a pose."""
+        slots = self._slots
+        if not slots:
+            return None
+        if len(slots) < _EDGE_SLOTS + 2:
+            return StandstillDigest(packed_poses(_poses(slots)), slots[-1].last)
+        under_way = self._linking.chain
+        chains = self._chains if under_way is None else [*self._chains, under_way]
+        head, tail = slots[:_EDGE_SLOTS], slots[-_EDGE_SLOTS:]
+        return StandstillDigest(
+            packed_poses(_poses(head)),
+            head[-1].last,
+            packed_poses(_poses(tail)),
+            tail[0].first,
+            tuple(
+                ChainDigest(
+                    None if chain is self._first else chain.start,
+                    chain.end,
+                    packed_blocks(chain.blocks),
+                )
+                for chain in chains
+                if chain is self._first or chain.is_long
+            ),
+        )
+
+    def _take(self, slot: _Slot) -> None:
+        """Take a slot that is neither the first nor the last one."""
+        second = self._linking.newest is not None and self._linking.before is None
+        over = self._linking.take(slot)
+        if second:
+            self._first = self._linking.chain
+        if over is not None:
+            self._chains.append(over)
+
+
+class StandstillBuilder:
+    """Takes poses, or whole bags of them, in log-time order, and finds where the robot stood."""
+
+    def __init__(self) -> None:
+        self._linking = _Linking()
+        self._open: _Slot | None = None
+        self._tail: tuple[bytes, Ns] | None = None
+        self._done: list[Standstill] = []
+
+    def add(self, time: Ns, position: Vector3) -> None:
+        """Take the next pose (m), which must be finite."""
+        self._unpack_tail()
+        self._add(TimedPosition(time, _rounded(position)))
+
+    def join(self, bag: StandstillDigest) -> None:
+        """Take all poses of a bag that come next, as if they were added one by one."""
+        if not bag.tail:
+            self._unpack_tail()
+            for pose in unpacked_poses(bag.head):
+                self._add(pose)
+            return
+        chains = [*bag.chains]
+        if self._may_stand_into(bag):
+            chain = self._stand_across(bag)
+            if chain is None:
+                self._unpack_tail()
+                chain = self._cross(bag)
+            if chain is not None:
+                self._go_on(chain, chains.pop(0))
+        for each in chains:
+            self._go_on(_Chain(each.start), each)
+        self._tail = (bag.tail, bag.tail_since)
+
+    def standstills(self) -> tuple[Standstill, ...]:
+        """Return the standstills of all poses, in order; no pose may be added after."""
+        self._unpack_tail()
+        if self._open is not None:
+            self._close(self._linking.take(self._open))
+        self._close(self._linking.end(None))
+        return tuple(self._done)
+
+    @property
+    def last(self) -> Ns | None:
+        """The log time of the last pose, once all standstills were returned."""
+        newest = self._linking.newest
+        return None if newest is None else newest.last
+
+    def _may_stand_into(self, bag: StandstillDigest) -> bool:
+        """Whether a standstill that is long enough may lie where a bag begins."""
+        if _opens(bag) or self._linking.chain is not None or self._tail is None:
+            return True
+        return bag.head_until - self._tail[1] >= SHORTEST_NS
+
+    def _stand_across(self, bag: StandstillDigest) -> _Chain | None:
+        """Return the chain that surely goes on into a bag; looks at no single pose."""
+        chain = self._linking.chain
+        if chain is None or self._tail is None or not _opens(bag):
+            return None
+        rows = np.hstack([_columns(self._tail[0], 4), _columns(bag.head, 4)])
+        low, high = rows[1:].min(axis=1) * _STEP_M, rows[1:].max(axis=1) * _STEP_M
+        times = rows[0]
+        if math.dist(low, high) > DRIFT_MPS * unix_from_ns(SLOT_NS):
+            return None
+        if int(np.diff(times).max()) > SILENCE_NS:
+            return None
+        numbers = times // SLOT_NS
+        parts = sorted(set(numbers.tolist()))
+        a, b, c = ((low + high) / 2).tolist()
+        # All but the last slot but one of the bag before, and the second one of this, are new.
+        for number in parts[2:-2]:
+            here = times[numbers == number].tolist()
+            box = Box3((a, b, c), (a, b, c))
+            chain.extend([Block(number * SLOT_NS // BLOCK_NS, here[0], here[-1], 0.0, box)])
+        self._linking.chain = self._tail = None
+        return chain
+
+    def _cross(self, bag: StandstillDigest) -> _Chain | None:
+        """Take the first two slots of a bag; a chain that goes on from there is returned."""
+        first, second, third = _slots(unpacked_poses(bag.head))
+        for pose in first.poses:
+            self._add(pose)
+        first, self._open = self._open or first, None
+        self._close(self._linking.take(first))
+        self._close(self._linking.take(second))
+        if not _opens(bag):
+            self._close(self._linking.end(third))
+            return None
+        chain, self._linking.chain = self._linking.chain, None
+        return chain or _Chain(_begin(first, second, third))
+
+    def _go_on(self, chain: _Chain, stored: ChainDigest) -> None:
+        """Add a chain of a bag, which is the newest there is, to what it goes on from."""
+        chain.extend(unpacked_blocks(stored.blocks))
+        chain.settle(self._taken)
+        chain.end = stored.end
+        if stored.end is None:
+            self._linking.chain = chain
+        else:
+            self._close(chain)
+
+    def _unpack_tail(self) -> None:
+        """Take the last slots of the bag before."""
+        if self._tail is None:
+            return
+        before, newest, self._open = _slots(unpacked_poses(self._tail[0]))
+        self._linking.resume(before, newest)
+        self._tail = None
+
+    def _add(self, pose: TimedPosition) -> None:
+        if self._open is None:
+            self._open = _Slot(pose)
+        elif pose.time // SLOT_NS == self._open.number:
+            self._open.add(pose)
+        else:
+            slot, self._open = self._open, _Slot(pose)
+            self._close(self._linking.take(slot))
+
+    def _close(self, chain: _Chain | None) -> None:
+        if chain is not None:
+            self._done += chain.standstills(self._taken)
+
+    @property
+    def _taken(self) -> Ns:
+        """Where the newest standstill ends."""
+        return self._done[-1].end if self._done else 0
+
+
+def _opens(bag: StandstillDigest) -> bool:
+    """Whether the second and third slot of a bag are linked."""
+    return bool(bag.chains) and bag.chains[0].start is None
+
+
+def _rounded(position: Vector3) -> Vector3:
+    """A position as it comes back out of its bytes, so that cuts into bags change nothing."""
+    x, y, z = position
+    return (
+        round(x / _STEP_M) * _STEP_M,
+        round(y / _STEP_M) * _STEP_M,
+        round(z / _STEP_M) * _STEP_M,
+    )
+
+
+def packed_poses(poses: Iterable[TimedPosition]) -> bytes:
+    """Return poses as bytes, rounded to `_STEP_M`; their log times stay exact."""
+    return _packed(
+        [(time, *(round(each / _STEP_M) for each in position)) for time, position in poses]
+    )
+
+
+def unpacked_poses(packed: bytes) -> list[TimedPosition]:
+    """Return the poses that these bytes are of."""
+    return [
+        TimedPosition(time, (x * _STEP_M, y * _STEP_M, z * _STEP_M))
+        for time, x, y, z in _unpacked(packed, 4)
+    ]
+
+
+def packed_blocks(blocks: Iterable[Block]) -> bytes:
+    """Return blocks as bytes, their boxes rounded to `_STEP_M`."""
+    return _packed(
+        [
+            (number, first, last, *(round(each / _STEP_M) for each in (noise, *box.low, *box.high)))
+            for number, first, last, noise, box in blocks
+        ]
+    )
+
+
+def unpacked_blocks(packed: bytes) -> list[Block]:
+    """Return the blocks that these bytes are of."""
+    return [
+        Block(
+            number,
+            first,
+            last,
+            noise * _STEP_M,
+            Box3((a * _STEP_M, b * _STEP_M, c * _STEP_M), (d * _STEP_M, e * _STEP_M, f * _STEP_M)),
+        )
+        for number, first, last, noise, a, b, c, d, e, f in _unpacked(packed, 10)
+    ]
+
+
+def _poses(slots: Iterable[_Slot]) -> list[TimedPosition]:
+    return [pose for slot in slots for pose in slot.poses]
+
+
+def _packed(rows: Sequence[tuple[int, ...]]) -> bytes:
+    """Rows of whole numbers, column by column as differences."""
+    if not rows:
+        return b""
+    columns: NDArray[np.int64] = np.diff(np.array(rows, "<i8").T, prepend=0)
+    return columns.tobytes()
+
+
+def _unpacked(packed: bytes, columns: int) -> list[list[int]]:
+    rows: list[list[int]] = _columns(packed, columns).T.tolist()
+    return rows
+
+
+def _columns(packed: bytes, columns: int) -> NDArray[np.int64]:
+    return np.frombuffer(packed, np.dtype("<i8")).reshape(columns, -1).cumsum(axis=1)
+
+
+def _slots(poses: Iterable[TimedPosition]) -> list[_Slot]:
+    """The slots of poses in order."""
+    slots: list[_Slot] = []
+    for pose in poses:
+        if slots and slots[-1].number == pose.time // SLOT_NS:
+            slots[-1].add(pose)
+        else:
+            slots.append(_Slot(pose))
+    return slots

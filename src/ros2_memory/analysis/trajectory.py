@@ -1,0 +1,274 @@
+"""The way driven, summed up pose by pose in bounded memory.
+
+Poses are measured many at a time (see `motion` and `path_length`). The drawn path is simplified on
+the way (see `paths`); the deviations of all stages add up to at most the tolerance, unless a limit
+on count widens it. Where the robot jumped the path is parted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from ros2_memory.analysis.odometry import (
+    Motion,
+    PoseDigest,
+    Stop,
+    Vertex,
+    faster,
+    is_place,
+)
+from ros2_memory.analysis.path_length import SPEED_STEPS
+from ros2_memory.analysis.polyline import DrawnPath
+from ros2_memory.core.geometry import normalised, yaw
+
+if TYPE_CHECKING:
+    from ros2_memory.core.model import Pose, Quaternion, Vector3
+    from ros2_memory.core.timebase import Ns
+
+TOLERANCE_M: Final = 0.05
+"""How far a pose may lie from the drawn path, unless a limit on count widens it."""
+
+_BAG_VERTICES: Final = 32
+"""Vertices of the path that is kept of one bag; all of its poses, where they are no more."""
+
+_NOISY_SHARE: Final = 0.02
+_NOISY_M: Final = 0.001
+
+_AT_ONCE: Final = 2048
+"""Poses that are measured together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """One vertex of the drawn path: a pose as recorded (m, rad; no yaw without orientation).
+
+    `jump`: the robot jumped here from the waypoint before it, and did not drive.
+    """
+
+    time: Ns
+    position: Vector3
+    yaw_rad: float | None
+    jump: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """What is said of the way driven.
+
+    Attributes:
+        distance_m: path length in 3D in log-time order, by what its noise allows (see
+            `path_length`); gaps, jumps and resets left out.
+        duration_s: from the first to the last valid pose.
+        avg_speed: `distance_m / duration_s` (m/s); 0 where there is no duration.
+        max_speed: the highest speed (m/s), from `max_speed_from`.
+        max_speed_from: `twist`: the messages' own; `positions`: over a second and eight poses.
+        waypoints: vertices of the path drawn in space and time: first and last pose, corners,
+            turning points, ends of stops, and both ends of the longest jumps.
+        waypoint_error_m: no pose lies farther than this from the drawn path.
+        poses: valid poses counted.
+        invalid: poses left out, since a coordinate is NaN, infinite or beyond any place.
+        jumps: steps faster than is plausible, left out of distance and speed.
+        jumped_m: their total length.
+        path_sum_m: the sum of the distances between the poses of `distance_m`, noise and all.
+        gaps: times in which nothing was recorded.
+        gap_m: the way across them in straight lines, left out of distance.
+        resets: the first poses after odometry began anew; what led there is left out.
+        in_doubt: noise may be much of the length: the poses come too seldom to tell it from turns.
+    """
+
+    distance_m: float
+    duration_s: float
+    avg_speed: float
+    max_speed: float
+    max_speed_from: Literal["twist", "positions"]
+    waypoints: tuple[Waypoint, ...]
+    waypoint_error_m: float
+    poses: int
+    invalid: int
+    jumps: int
+    jumped_m: float
+    path_sum_m: float = 0.0
+    gaps: int = 0
+    gap_m: float = 0.0
+    resets: tuple[Ns, ...] = ()
+    in_doubt: bool = False
+
+    @property
+    def is_known(self) -> bool:
+        """Whether any pose is a place."""
+        return self.poses > 0
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether the plain sum is longer by more than 2 %, and by a millimetre."""
+        more_m = self.path_sum_m - self.distance_m
+        return more_m > max(_NOISY_SHARE * self.distance_m, _NOISY_M)
+
+
+class _Poses:
+    """Takes poses in log-time order, and measures and draws many of them at a time."""
+
+    def __init__(self, max_plausible_speed_mps: float, tolerance_m: float) -> None:
+        self._motion = Motion(max_plausible_speed_mps)
+        self._path = DrawnPath(tolerance_m)
+        self._waiting: list[Vertex] = []
+        self._poses = 0
+        self._invalid = 0
+        self._twist: float | None = None
+        self._frames: dict[str, None] = {}
+
+    def add(self, time: Ns, pose: Pose, speed_mps: float | None = None) -> None:
+        """Takes the next pose, and the speed that its message states, if it states one."""
+        self._frames[pose.frame_id] = None
+        if not is_place(pose.position):
+            self._invalid += 1
+            return
+        self._twist = faster(self._twist, speed_mps)
+        self._add((time, pose.position, pose.orientation))
+
+    def _add(self, vertex: Vertex) -> None:
+        self._poses += 1
+        self._waiting.append(vertex)
+        if len(self._waiting) == _AT_ONCE:
+            self._measure()
+
+    def _measure(self) -> None:
+        """Measures and draws the poses that wait."""
+        waiting, self._waiting = self._waiting, []
+        if not waiting:
+            return
+        parted = {*self._motion.add([Stop(time, position) for time, position, _ in waiting])}
+        for index, vertex in enumerate(waiting):
+            if index in parted:
+                self._path.part()
+            self._path.add(vertex)
+
+
+class TrajectoryBuilder(_Poses):
+    """Takes poses in log-time order, one at a time, and holds a bounded number of them.
+
+    A step that would take more than `max_plausible_speed_mps` (m/s) is a jump. The path is drawn
+    with at most `max_waypoints`, within `tolerance_m` (m) where these are enough.
+
+    Raises:
+        ValueError: `max_waypoints` is below 2, or a limit is not positive.
+    """
+
+    def __init__(
+        self,
+        max_plausible_speed_mps: float,
+        max_waypoints: int = 50,
+        tolerance_m: float = TOLERANCE_M,
+    ) -> None:
+        if max_waypoints < 2 or not (max_plausible_speed_mps > 0 and tolerance_m > 0):
+            raise ValueError(
+                f"a trajectory needs 2 or more waypoints ({max_waypoints}), a plausible speed"
+                f" ({max_plausible_speed_mps} m/s) and a tolerance ({tolerance_m} m) above 0"
+            )
+        super().__init__(max_plausible_speed_mps, tolerance_m)
+        self._max_waypoints = max_waypoints
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frames of all poses so far, valid or not, in order of appearance."""
+        return tuple(self._frames)
+
+    def join(self, whole: PoseDigest) -> None:
+        """Takes all poses of a bag that come next."""
+        self._frames.update(dict.fromkeys(whole.frames))
+        self._invalid += whole.invalid
+        self._twist = faster(self._twist, whole.twist)
+        if whole.head is None:
+            for vertex in whole.vertices:
+                self._add(vertex)
+            return
+        self._measure()
+        self._poses += whole.poses
+        if self._motion.join(whole):
+            self._path.part()
+        self._path.extend(whole.vertices, whole.error_m)
+
+    @property
+    def vertices(self) -> int:
+        """How many poses are held, to measure them and to draw the path: about 25,000 at most."""
+        return self._path.size + len(self._waiting)
+
+    def result(self) -> Trajectory:
+        """The trajectory so far; more poses may be added after."""
+        self._measure()
+        motion = self._motion
+        duration_s = motion.duration_s
+        avg_speed = motion.distance_m / duration_s if duration_s > 0 else 0.0
+        # Drivers that know no twist leave it zero: then it says nothing of a robot that moved.
+        stated = self._twist if self._twist or not motion.distance_m else None
+        measured = motion.speed_mps or (motion.step_mps if self._poses <= SPEED_STEPS else 0.0)
+        drawn = self._path.drawn(self._max_waypoints)
+        return Trajectory(
+            distance_m=motion.distance_m,
+            duration_s=duration_s,
+            avg_speed=avg_speed,
+            max_speed=max(measured, avg_speed) if stated is None else stated,
+            max_speed_from="positions" if stated is None else "twist",
+            waypoints=tuple(
+                Waypoint(time, position, _heading(turn), jump=place == 0 and number > 0)
+                for number, piece in enumerate(drawn.pieces)
+                for place, (time, position, turn) in enumerate(piece)
+            ),
+            waypoint_error_m=drawn.error_m,
+            poses=self._poses,
+            invalid=self._invalid,
+            jumps=motion.jumps,
+            jumped_m=motion.jumped_m,
+            path_sum_m=motion.path_sum_m,
+            gaps=motion.gaps,
+            gap_m=motion.gap_m,
+            resets=tuple(motion.resets),
+            in_doubt=motion.in_doubt,
+        )
+
+
+class PoseCollector(_Poses):
+    """Makes the digest of one bag's poses, which come in log-time order.
+
+    `max_plausible_speed_mps` must be that of the trajectories which join the digest.
+    """
+
+    def __init__(self, max_plausible_speed_mps: float) -> None:
+        super().__init__(max_plausible_speed_mps, TOLERANCE_M / 8)
+
+    def digest(self) -> PoseDigest:
+        """What the poses amount to."""
+        few = self._waiting if self._poses <= _BAG_VERTICES else None
+        self._measure()
+        motion = self._motion
+        drawn = self._path.drawn(_BAG_VERTICES)
+        vertices = drawn.row() if few is None else few
+        return PoseDigest(
+            poses=self._poses,
+            invalid=self._invalid,
+            first=motion.first,
+            last=motion.last,
+            head=motion.head if few is None else None,
+            tail=motion.tail if few is None else None,
+            length_m=motion.length_m,
+            sum_m=motion.sum_m,
+            jumps=motion.jumps,
+            jumped_m=motion.jumped_m,
+            gaps=motion.gaps,
+            gap_m=motion.gap_m,
+            resets=tuple(motion.resets),
+            speed_mps=motion.speed_mps,
+            twist=self._twist,
+            frames=tuple(self._frames),
+            vertices=tuple((time, position, _heading(turn)) for time, position, turn in vertices),
+            error_m=drawn.error_m if few is None else 0.0,
+        )
+
+
+def _heading(turn: Quaternion | float | None) -> float | None:
+    """The heading (rad) of a vertex; None where it has none."""
+    if turn is None or isinstance(turn, float):
+        return turn
+    unit = normalised(turn)
+    return None if unit is None else yaw(unit)

@@ -1,0 +1,1 @@
+"""The bag directory: the contract between the two programs, and the reader that applies it."""

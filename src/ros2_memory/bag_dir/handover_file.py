@@ -1,0 +1,295 @@
+"""`handover.json` in a recording's directory: which of its messages count.
+
+While one recording takes over from another both run for some seconds, and what arrives then stands
+in both. The recorder, which alone knows that they overlapped, writes down a cut in publish time: a
+message published before it counts in the old recording, any other in the new one. Publish time is
+the same in both, to the nanosecond; log time is not. Nothing may be inferred from times alone,
+since clocks step: so a cut holds only in the files that were open, and for messages whose log time
+lies in the overlap. Everywhere else every message counts.
+
+    rec_A: {"format": 1, "state": "counts", "clock": "publish", "next": "rec_B",
+            "counts_until_ns": 1795150000500000000,
+            "end": {"log_from_ns": ..., "log_until_ns": ..., "files": ["rec_A_59.mcap"]}, ...}
+    rec_B: {"format": 1, "state": "counts", "clock": "publish", "previous": "rec_A",
+            "counts_from_ns": 1795150000500000000,
+            "begin": {"log_from_ns": ..., "log_until_ns": ..., "files": ["rec_B_0.mcap"]}, ...}
+
+Latched messages are received again by every recording, long after they were published. A cut does
+not tell them apart; they are recognised by what they are (topic, publish time, payload), so do not
+apply `Exclusion` to a latched channel.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.bag_dir.durable_write import read_small_file, write_all_durably
+from ros2_memory.bag_dir.layout import HANDOVER_FILE
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from ros2_memory.core.timebase import Ns
+
+FORMAT: Final = 1
+LOG_CLOCK_NOTE: Final = (
+    "publish times equal log times in this recording, so the cut is by log time: "
+    "a message received within a millisecond of it may count twice or not at all"
+)
+
+
+class Counting(StrEnum):
+    """Whether a recording counts."""
+
+    COUNTS = "counts"
+    PENDING = "pending"  # its handover is under way: until then the previous one has all of it
+    VOID = "void"  # its handover failed: the previous one, which went on, has all of it
+
+
+class CutClock(StrEnum):
+    """What the cut was made by. The rule is one: where the two are equal, so are their cuts."""
+
+    PUBLISH = "publish"
+    LOG = "log"
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """Where a cut holds: in these files, for log times in the half-open `[log_from, log_until)`.
+
+    A bound that is None does not bind: log times of a simulated clock cannot be foreseen.
+    """
+
+    log_from: Ns | None
+    log_until: Ns | None
+    files: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Handover:
+    """What `handover.json` says. The default says that everything counts.
+
+    `previous` and `next` are names of recordings beside this one. Messages published before
+    `counts_from` (in `begin`), and at or after `counts_until` (in `end`), count elsewhere. A
+    `next` without `counts_until` is a handover that was begun and not brought to its end.
+    """
+
+    state: Counting = Counting.COUNTS
+    clock: CutClock = CutClock.PUBLISH
+    previous: str | None = None
+    counts_from: Ns | None = None
+    begin: Overlap | None = None
+    next: str | None = None
+    counts_until: Ns | None = None
+    end: Overlap | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def hides_all(self) -> bool:
+        """Whether no message of the recording counts."""
+        return self.state is not Counting.COUNTS
+
+    def exclusions(self, file_name: str) -> tuple[Exclusion, ...]:
+        """What of one bag file does not count, where `hides_all` is not so; mostly nothing."""
+        found: list[Exclusion] = []
+        if self.begin is not None and self.counts_from is not None:
+            found += _exclusion(self.begin, file_name, MIN_NS, self.counts_from)
+        if self.end is not None and self.counts_until is not None:
+            found += _exclusion(self.end, file_name, self.counts_until, MAX_NS)
+        return tuple(found)
+
+
+class Exclusion(NamedTuple):
+    """Messages of one file that count in another recording; both windows are half-open."""
+
+    publish_from: Ns
+    publish_until: Ns
+    log_from: Ns
+    log_until: Ns
+
+    def excludes(self, publish_time: Ns, log_time: Ns) -> bool:
+        """Whether a message with these times counts in another recording."""
+        return (
+            self.publish_from <= publish_time < self.publish_until
+            and self.log_from <= log_time < self.log_until
+        )
+
+
+_LASTING: Final = frozenset({errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG})
+"""Of a sidecar that cannot be read because of what it is, however often that is tried."""
+
+
+class HandoverReading(NamedTuple):
+    """What was read, and what was wrong with it: then everything counts."""
+
+    handover: Handover
+    problem: str | None
+
+
+def read_handover(recording: Path) -> HandoverReading:
+    """What the sidecar of a recording says; without one everything counts. Raises nothing."""
+    try:
+        return sure_handover(recording)
+    except OSError as error:
+        return HandoverReading(Handover(), _unreadable(error))
+
+
+def sure_handover(recording: Path) -> HandoverReading:
+    """As `read_handover`, where it must not be taken for missing because a disk fails.
+
+    Raises:
+        OSError: the disk fails, or the machine lacks something.
+    """
+    try:
+        text = read_small_file(recording / HANDOVER_FILE)
+        return HandoverReading(_parsed(text), None)
+    except (FileNotFoundError, NotADirectoryError):
+        return HandoverReading(Handover(), None)
+    except OSError as error:
+        if error.errno not in _LASTING:
+            raise
+        reason = _unreadable(error)
+    # json raises RecursionError for a file of nothing but brackets.
+    except (ValueError, RecursionError) as error:
+        reason = f"{HANDOVER_FILE} is no sidecar of a recording: {error}"
+    return HandoverReading(Handover(), reason)
+
+
+def standing_handover(recording: Path) -> Handover:
+    """What the sidecar of a recording says, to be written anew with a change.
+
+    Raises:
+        RecorderError: the disk fails: what would be written would lose what stands there.
+    """
+    try:
+        return sure_handover(recording).handover
+    except OSError as error:
+        raise RecorderError(f"{recording}: {_unreadable(error)}") from error
+
+
+def _unreadable(error: OSError) -> str:
+    return f"{HANDOVER_FILE} cannot be read: {error.strerror or error}"
+
+
+def write_handover(recording: Path, handover: Handover) -> None:
+    """Replaces the sidecar at once, and has it on disk when it returns.
+
+    Raises:
+        RecorderError: it cannot be written; the one before stands.
+    """
+    write_handovers({recording: handover})
+
+
+def write_handovers(handovers: Mapping[Path, Handover]) -> None:
+    """Replaces the sidecars of recordings, in this order; where the disk is full none of them.
+
+    Raises:
+        RecorderError: one cannot be written.
+    """
+    texts = {
+        recording / HANDOVER_FILE: _text(handover) for recording, handover in handovers.items()
+    }
+    try:
+        write_all_durably(texts)
+    except OSError as error:
+        targets = ", ".join(str(target) for target in texts)
+        raise RecorderError(f"{targets} cannot be written: {error.strerror or error}") from error
+
+
+def _text(handover: Handover) -> str:
+    content = {
+        "format": FORMAT,
+        "state": handover.state,
+        "clock": handover.clock,
+        "previous": handover.previous,
+        "counts_from_ns": handover.counts_from,
+        "begin": _written(handover.begin),
+        "next": handover.next,
+        "counts_until_ns": handover.counts_until,
+        "end": _written(handover.end),
+        "notes": list(handover.notes),
+    }
+    return json.dumps(content, indent=1) + "\n"
+
+
+def _exclusion(overlap: Overlap, file_name: str, start: Ns, stop: Ns) -> list[Exclusion]:
+    if file_name not in overlap.files:
+        return []
+    log_from = MIN_NS if overlap.log_from is None else overlap.log_from
+    log_until = MAX_NS if overlap.log_until is None else overlap.log_until
+    return [Exclusion(start, stop, log_from, log_until)]
+
+
+def _written(overlap: Overlap | None) -> dict[str, object] | None:
+    if overlap is None:
+        return None
+    return {
+        "log_from_ns": overlap.log_from,
+        "log_until_ns": overlap.log_until,
+        "files": list(overlap.files),
+    }
+
+
+def _parsed(text: str) -> Handover:
+    fields = _object(json.loads(text), "it")
+    if fields.get("format") != FORMAT:
+        raise ValueError(f"its format is {fields.get('format')!r}, and {FORMAT} is what is known")
+    return Handover(
+        state=Counting(str(fields.get("state"))),
+        clock=CutClock(str(fields.get("clock"))),
+        previous=_name(fields, "previous"),
+        counts_from=_moment(fields, "counts_from_ns"),
+        begin=_overlap(fields, "begin"),
+        next=_name(fields, "next"),
+        counts_until=_moment(fields, "counts_until_ns"),
+        end=_overlap(fields, "end"),
+        notes=_strings(fields, "notes"),
+    )
+
+
+def _object(value: object, what: str) -> dict[object, object]:
+    if isinstance(value, dict):
+        return value
+    raise ValueError(f"{what} must be a JSON object")
+
+
+def _name(fields: dict[object, object], key: str) -> str | None:
+    value = fields.get(key)
+    if value is not None and (
+        not isinstance(value, str) or "/" in value or value in {"", ".", ".."}
+    ):
+        raise ValueError(f"{key} must be the name of a recording, or null")
+    return value
+
+
+def _moment(fields: dict[object, object], key: str) -> Ns | None:
+    value = fields.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int) or not MIN_NS <= value <= MAX_NS:
+        raise ValueError(f"{key} must be nanoseconds, or null")
+    return value
+
+
+def _strings(fields: dict[object, object], key: str) -> tuple[str, ...]:
+    value = fields.get(key)
+    if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+        raise ValueError(f"{key} must be a list of strings")
+    return tuple(value)
+
+
+def _overlap(fields: dict[object, object], key: str) -> Overlap | None:
+    value = fields.get(key)
+    if value is None:
+        return None
+    inner = _object(value, key)
+    return Overlap(
+        _moment(inner, "log_from_ns"), _moment(inner, "log_until_ns"), _strings(inner, "files")
+    )

@@ -1,0 +1,318 @@
+"""Digests as the bytes and texts that the catalogue keeps, and back. Exact: floats stay bit by bit.
+
+All integers and floats are little-endian. The layouts belong to the catalogue's schema version.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import zlib
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.analysis.intervals import Seen
+from ros2_memory.analysis.odometry import Leg, Pace, PoseDigest, Stop
+from ros2_memory.analysis.path_length import Creep, End
+from ros2_memory.analysis.standstills import ChainDigest, StandstillDigest
+from ros2_memory.analysis.topic_events import Fault, Flip, Known, Story
+from ros2_memory.core.bag_summary import BagSummary, Heading, shared_shape
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.analysis.odometry import Vertex
+    from ros2_memory.core.bag_summary import Shape
+    from ros2_memory.core.model import JsonValue
+
+_HEAD: Final = struct.Struct("<qqqqqqBdddddddqdddqddd")
+_LEG: Final = struct.Struct("<qdddqdddqqddBdddddddd")
+_CREEP: Final = struct.Struct("<ddddddddddd")
+_VERTEX: Final = struct.Struct("<qdddd")
+_STORY: Final = struct.Struct("<qqqqqI")
+_SHORT_TEXT: Final = 256
+"""A text of so many bytes is not worth compressing."""
+_NOWHERE: Final = Stop(0, (math.nan, math.nan, math.nan))
+
+
+def packed_poses(poses: PoseDigest) -> bytes:
+    """A digest of poses as bytes."""
+    legs = [leg for leg in (poses.head, poses.tail) if leg is not None]
+    first, last = (_NOWHERE if stop is None else stop for stop in (poses.first, poses.last))
+    head = _HEAD.pack(
+        poses.poses,
+        poses.invalid,
+        poses.jumps,
+        poses.gaps,
+        len(poses.resets),
+        len(poses.vertices),
+        len(legs),
+        poses.length_m,
+        poses.sum_m,
+        poses.jumped_m,
+        poses.gap_m,
+        math.nan if poses.speed_mps is None else poses.speed_mps,
+        math.nan if poses.twist is None else poses.twist,
+        poses.error_m,
+        first.time,
+        *first.position,
+        last.time,
+        *last.position,
+    )
+    vertices = b"".join(
+        _VERTEX.pack(time, *position, turn if isinstance(turn, float) else math.nan)
+        for time, position, turn in poses.vertices
+    )
+    resets = struct.pack(f"<{len(poses.resets)}q", *poses.resets)
+    frames = json.dumps(poses.frames).encode()
+    return b"".join((head, *map(_packed_leg, legs), resets, vertices, frames))
+
+
+def _packed_leg(leg: Leg) -> bytes:
+    ends = (leg.head,) if leg.still else (leg.head, leg.tail)
+    creeps = [end.creep for end in ends]
+    flags = leg.still | leg.head.plain << 1 | leg.tail.plain << 2
+    for place, creep in enumerate(creeps):
+        flags |= (creep is not None) << 3 + place
+    packed = _LEG.pack(
+        leg.first.time,
+        *leg.first.position,
+        leg.last.time,
+        *leg.last.position,
+        leg.poses,
+        -1 if leg.period_ns is None else leg.period_ns,
+        leg.length_m,
+        leg.sum_m,
+        flags,
+        leg.head.pace_m,
+        leg.head.noise_m,
+        leg.tail.pace_m,
+        leg.tail.noise_m,
+        *leg.setting_out,
+        *leg.arriving,
+    )
+    return packed + b"".join(
+        _CREEP.pack(
+            *creep.start,
+            *((math.nan,) * 3 if creep.second is None else creep.second),
+            creep.middle_m,
+            *creep.end,
+            creep.reach_m,
+        )
+        for creep in creeps
+        if creep is not None
+    )
+
+
+def unpacked_poses(packed: bytes) -> PoseDigest:
+    """The digest that these bytes are of.
+
+    Raises:
+        ValueError: they are of none.
+    """
+    try:
+        return _unpacked_poses(packed)
+    except struct.error as error:
+        raise ValueError(f"not a digest of poses: {error}") from error
+
+
+def packed_standstills(digest: StandstillDigest) -> bytes:
+    """A digest of standstills as bytes."""
+    chains = [[each.start, each.end, len(each.blocks)] for each in digest.chains]
+    head, tail = digest.head, digest.tail
+    sizes = json.dumps([len(head), digest.head_until, len(tail), digest.tail_since, chains])
+    parts = (sizes.encode(), b"\n", head, tail, *(each.blocks for each in digest.chains))
+    return zlib.compress(b"".join(parts))
+
+
+def unpacked_standstills(packed: bytes) -> StandstillDigest:
+    """The digest that these bytes are of.
+
+    Raises:
+        ValueError: they are of none.
+    """
+    try:
+        sizes, _, body = zlib.decompress(packed).partition(b"\n")
+        head, head_until, tail, tail_since, chains = json.loads(sizes)
+        at = head + tail
+        unpacked = []
+        for start, end, size in chains:
+            unpacked.append(ChainDigest(start, end, body[at : at + size]))
+            at += size
+    except (TypeError, zlib.error) as error:
+        raise ValueError(f"not a digest of standstills: {error}") from error
+    if at != len(body):
+        raise ValueError("not a digest of standstills: some of it is missing")
+    return StandstillDigest(
+        body[:head], head_until, body[head : head + tail], tail_since, tuple(unpacked)
+    )
+
+
+def packed_story(story: Story) -> bytes:
+    """A story as bytes."""
+    counts = (story.first, story.last, story.left_out, story.undecodable, story.beyond)
+    # Many booleans have the same paths, and times counted from the first message, in every bag.
+    known = [
+        [each.path for each in story.known],
+        [each.at - story.first for each in story.known],
+        "".join(str(each.first + 2 * each.last) for each in story.known),
+    ]
+    rest = json.dumps(
+        [story.seen.labels, known, story.flips, story.faults],
+        ensure_ascii=False,
+        separators=(",", ":"),
+    )
+    rows = story.seen.rows
+    # Half a pair of surrogates is no UTF-8, and is kept all the same.
+    text = rest.encode("utf-8", "surrogatepass")
+    shorter = zlib.compress(text) if len(text) > _SHORT_TEXT else text
+    return _STORY.pack(*counts, len(rows)) + rows + shorter
+
+
+def unpacked_story(packed: bytes) -> Story:
+    """The story that these bytes are of.
+
+    Raises:
+        ValueError: they are of none.
+    """
+    try:
+        first, last, left_out, undecodable, beyond, size = _STORY.unpack_from(packed)
+        end = _STORY.size + size
+        labels, (paths, after, values), flips, faults = _told(packed[end:])
+        known = tuple(
+            Known(path, first + at, value in "13", value in "23")
+            for path, at, value in zip(paths, after, values, strict=True)
+        )
+    except (TypeError, struct.error, zlib.error) as error:
+        raise ValueError(f"not a story: {error}") from error
+    seen = Seen(labels, packed[_STORY.size : end])
+    if not seen.is_sound:
+        raise ValueError("not a story: it tells of things without a name")
+    return Story(first, last, seen, known, flips, faults, left_out, undecodable, beyond)
+
+
+@lru_cache(2048)
+def _told(
+    text: bytes,
+) -> tuple[tuple[str, ...], tuple[list[str], list[int], str], tuple[Flip, ...], tuple[Fault, ...]]:
+    """What a story says in words: of many bags the same, and asked of an hour again and again."""
+    plain = text if text.startswith(b"[") else zlib.decompress(text)
+    labels, (paths, after, values), flips, faults = json.loads(
+        plain.decode("utf-8", "surrogatepass")
+    )
+    return (
+        tuple(labels),
+        (paths, after, values),
+        tuple(Flip(*each) for each in flips),
+        tuple(Fault(*each) for each in faults),
+    )
+
+
+def _unpacked_poses(packed: bytes) -> PoseDigest:
+    poses, invalid, jumps, gaps, reset, count, legs, *numbers = _HEAD.unpack_from(packed)
+    length_m, sum_m, jumped_m, gap_m, speed_mps, twist, error_m, *ends_of_all = numbers
+    first, last = _stops(ends_of_all)
+    begin = _HEAD.size
+    ends: list[Leg] = []
+    for _ in range(legs):
+        leg, begin = _unpacked_leg(packed, begin)
+        ends.append(leg)
+    resets = struct.unpack_from(f"<{reset}q", packed, begin)
+    begin += 8 * len(resets)
+    end = begin + count * _VERTEX.size
+    vertices: list[Vertex] = [
+        (time, (x, y, z), None if math.isnan(heading) else heading)
+        for time, x, y, z, heading in _VERTEX.iter_unpack(packed[begin:end])
+    ]
+    return PoseDigest(
+        poses=poses,
+        invalid=invalid,
+        first=first if poses else None,
+        last=last if poses else None,
+        head=ends[0] if ends else None,
+        tail=ends[1] if len(ends) > 1 else None,
+        length_m=length_m,
+        sum_m=sum_m,
+        jumps=jumps,
+        jumped_m=jumped_m,
+        gaps=gaps,
+        gap_m=gap_m,
+        resets=resets,
+        speed_mps=None if math.isnan(speed_mps) else speed_mps,
+        twist=None if math.isnan(twist) else twist,
+        frames=_frames(packed[end:]),
+        vertices=tuple(vertices),
+        error_m=error_m,
+    )
+
+
+def _stops(numbers: Sequence[float]) -> tuple[Stop, Stop]:
+    first, ax, ay, az, last, bx, by, bz = numbers
+    return Stop(int(first), (ax, ay, az)), Stop(int(last), (bx, by, bz))
+
+
+def _unpacked_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
+    """The leg that begins at a byte, and where it ends."""
+    numbers = _LEG.unpack_from(packed, begin)
+    poses, period_ns, length_m, sum_m, flags, *paces = numbers[8:]
+    begin += _LEG.size
+    creeps: list[Creep | None] = [None, None]
+    for place in (0, 1):
+        if flags >> 3 + place & 1:
+            a, b, c, d, e, f, middle_m, g, h, i, reach_m = _CREEP.unpack_from(packed, begin)
+            second = None if math.isnan(d) else (d, e, f)
+            creeps[place] = Creep((a, b, c), second, middle_m, (g, h, i), reach_m)
+            begin += _CREEP.size
+    still = bool(flags & 1)
+    leg = Leg(
+        *_stops(numbers[:8]),
+        poses,
+        None if period_ns < 0 else period_ns,
+        length_m,
+        sum_m,
+        End(paces[0], paces[1], bool(flags & 2), creeps[0]),
+        End(paces[2], paces[3], bool(flags & 4), creeps[0] if still else creeps[1]),
+        still,
+        setting_out=Pace(paces[4], paces[5]),
+        arriving=Pace(paces[6], paces[7]),
+    )
+    return leg, begin
+
+
+@lru_cache(256)
+def _frames(text: bytes) -> tuple[str, ...]:
+    """The frames that this text lists: those of nearly all bags are the same."""
+    return tuple(json.loads(text))
+
+
+def shape_text(shape: Shape) -> str:
+    """A shape as a text, the same for equal ones."""
+    topics: JsonValue = [[*heading] for heading in shape.topics]
+    return json.dumps([topics, [*shape.silent], shape.complete, [*shape.notes], shape.set_back])
+
+
+def shape_of_text(text: str) -> Shape:
+    """The shape that this text is of.
+
+    Raises:
+        ValueError: it is of none.
+        TypeError: likewise.
+    """
+    topics, silent, complete, notes, set_back = json.loads(text)
+    headings = (
+        Heading(topic, type_name, encoding, bool(latched))
+        for topic, type_name, encoding, latched in topics
+    )
+    return shared_shape(tuple(headings), tuple(silent), bool(complete), tuple(notes), int(set_back))
+
+
+def filled(shape: Shape, counts: bytes) -> BagSummary:
+    """The summary of a bag of this shape.
+
+    Raises:
+        ValueError: the counts are of another shape.
+    """
+    if len(counts) != shape.layout.size:
+        raise ValueError(f"not the counts of a bag: {len(counts)} bytes")
+    return BagSummary.packed(shape, counts)

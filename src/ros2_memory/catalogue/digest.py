@@ -1,0 +1,108 @@
+"""One closed bag read once: what it holds of each topic, short enough to be kept of every bag.
+
+A digest answers a question about the bag, or rules the bag out, without opening it. What it
+cannot say for sure it leaves open: then the bag is read. Pure: reads through the port, keeps
+nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.catalogue.topic_digest import TopicCollector
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import TimeWindow
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.catalogue.topic_digest import TopicDigest
+    from ros2_memory.core.model import BagSummary
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import BagReader
+
+DIGEST_VERSION: Final = 9
+"""Of what is found in a bag and how; another one has every bag digested again."""
+_ALWAYS_READ_BYTES: Final = 64 << 20
+_MESSAGE_BYTES: Final = 200
+"""What a message is counted as besides its payload: looking at it takes time too."""
+_MOST_TIMES_PACKED: Final = 100
+"""A bag whose messages unpack to more times its size is left to be read when it is asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Digest:
+    """What one closed bag holds."""
+
+    summary: BagSummary
+    topics: tuple[TopicDigest, ...]
+
+
+class Digester:
+    """Makes digests, the same from the same bag.
+
+    Args:
+        reader: gives the messages that count.
+        extractor: gives the values that conditions are tested on.
+        max_plausible_speed_mps: what makes a jump of a step of the robot.
+    """
+
+    def __init__(
+        self, reader: BagReader, extractor: SchemaExtractor, max_plausible_speed_mps: float
+    ) -> None:
+        self._reader = reader
+        self._extractor = extractor
+        self._max_plausible_speed_mps = max_plausible_speed_mps
+
+    def digest(self, path: Path) -> Digest:
+        """What the bag holds.
+
+        Raises:
+            BagVanishedError: the file is not there any more.
+            BagError: some of it cannot be read.
+        """
+        summary = self._reader.summarize(path)
+        latched: dict[str, bool] = {}
+        counts: dict[str, int] = {}
+        for each in summary.topics:
+            latched[each.topic] = latched.get(each.topic, False) or each.latched
+            counts[each.topic] = counts.get(each.topic, 0) + each.count
+        collectors = {
+            topic: TopicCollector(
+                topic,
+                self._reader,
+                self._extractor,
+                self._max_plausible_speed_mps,
+                latched=latched[topic],
+                count=count,
+            )
+            for topic, count in counts.items()
+        }
+        left = _ALWAYS_READ_BYTES + _MOST_TIMES_PACKED * _size(path)
+        for record in self._reader.records(path, tuple(counts), TimeWindow.everything()):
+            left -= len(record.payload) + _MESSAGE_BYTES
+            if left < 0:
+                raise BagError(str(path), "its messages unpack to more than they can be worth")
+            collectors[record.channel.topic].add(record)
+        reasons = self._reasons(path)
+        return Digest(
+            summary,
+            tuple(each.digest(reasons.get(topic, {})) for topic, each in collectors.items()),
+        )
+
+    def _reasons(self, path: Path) -> dict[str, dict[str, str]]:
+        """By topic and type, why messages cannot be decoded."""
+        reasons: dict[str, dict[str, str]] = {}
+        for channel in self._reader.channels(path):
+            reason = self._reader.undecodable(channel)
+            if reason:
+                reasons.setdefault(channel.topic, {})[channel.type] = reason
+        return reasons
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0

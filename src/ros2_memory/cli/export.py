@@ -1,0 +1,236 @@
+"""`ros2-memory export`: a time window as an MCAP file, or as rows of Parquet."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from itertools import chain, islice
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from ros2_memory.cli.opening import opened
+from ros2_memory.cli.running import NOT_SO, BagDir, Overrides, Verbose, reporting, say
+from ros2_memory.cli.settling import settings_for
+from ros2_memory.cli.windows import End, Last, Start, window_of
+from ros2_memory.core.errors import (
+    BagError,
+    ConfigError,
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    UndecodableError,
+)
+from ros2_memory.core.globs import matching
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.core.wording import counted
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.duplicates import Found
+from ros2_memory.history.unseen import lost_in, note_unseen
+from ros2_memory.history.view import View
+from ros2_memory.storage.base import ROS2_PROFILE, Record
+from ros2_memory.storage.mcap.writer import McapWriter
+
+_TELL_EVERY: Final = 512
+
+
+def export(
+    overrides: Overrides = None,
+    *,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="An MCAP file to make, for Foxglove, ros2 bag and rosbags."
+        ),
+    ] = None,
+    parquet: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="A folder of Parquet, by recording and date, for DuckDB or Spark."
+        ),
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(metavar="GLOB", help="Only these topics, such as /vision/*; repeatable."),
+    ] = None,
+    start: Start = None,
+    end: End = None,
+    last: Last = None,
+    latched: Annotated[
+        bool,
+        typer.Option(
+            "--latched",
+            help="Also what latched messages held when the window begins: maps, static transforms.",
+        ),
+    ] = False,
+    robot: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Parquet by robot, too: one dataset for a fleet."),
+    ] = None,
+    bag_dir: BagDir = None,
+    verbose: Verbose = False,
+) -> None:
+    """Copy a time window out of the memory, each message once.
+
+    MCAP has the original messages, definitions, log and publish times. Parquet has one row for a
+    message: what it says as JSON, and its pose in columns. Needs ros2-memory[parquet].
+    """
+    with reporting("export"):
+        if (mcap is None) == (parquet is None):
+            raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
+        settings = settings_for(bag_dir, overrides)
+        memory = opened(settings, verbose=verbose)
+        view = View(memory, Call())
+        window = window_of(memory, view.snapshot, start, end, last)
+        topics = _topics(view, topic or ())
+        note_unseen(view, window)
+        with _progress(view, window) as tell:
+            held = _held(view, topics, window.start) if latched else []
+            within = view.stream(topics, window)
+            first = list(islice(within, 1))
+            if held and not first:
+                view.note("no message lies in the window: what latched ones held is all there is")
+            found = _told(chain(held, first, within), tell)
+            if mcap is not None:
+                done = as_mcap(mcap, found, _profile(view, topics, window, held))
+            elif parquet is not None:
+                done = _as_parquet(parquet, found, memory, robot)
+    say(done)
+    for note in view.notes:
+        typer.echo(f"note: {note}", err=True)
+    if not view.complete or lost_in(view.snapshot, window):
+        raise typer.Exit(NOT_SO)
+
+
+def _topics(view: View, globs: Sequence[str]) -> list[str]:
+    """The recorded topics that are asked for.
+
+    Raises:
+        NoDataError: there is none.
+    """
+    names = view.snapshot.topics()
+    chosen = [name for glob in globs or ("*",) for name in matching(names, glob)]
+    if not chosen:
+        asked = f"no recorded topic matches {', '.join(globs)}" if globs else "nothing is recorded"
+        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{asked}; see ros2-memory topics")
+    return sorted(set(chosen))
+
+
+def _held(view: View, topics: Sequence[str], start: Ns) -> list[Found]:
+    """The latched messages of before that hold at a moment, with their own times.
+
+    That is the newest of a topic; and of transforms the newest of each child frame, since every
+    broadcaster publishes only its own.
+    """
+    before = TimeWindow(MIN_NS, start)
+    latching = view.memory.limits.latching
+    held: dict[tuple[str, str], Found] = {}
+    for topic in topics:
+        if not latching.may_hold(view.snapshot, topic):
+            continue
+        if any(each.endswith("/TFMessage") for each in view.snapshot.types_of(topic)):
+            if not latching.is_latched(view.snapshot, topic):
+                continue
+            for found in view.stream([topic], before):
+                held.update(((topic, frame), found) for frame in _frames(view.memory, found))
+        elif (newest := view.newest(topic, before)) is not None and latching.holds(
+            view.snapshot, newest
+        ):
+            held[topic, ""] = newest
+    once = {id(found): found for found in held.values()}
+    return sorted(once.values(), key=lambda found: found.time)
+
+
+def _frames(memory: Memory, found: Found) -> set[str]:
+    """The child frames of a message of transforms; none where it cannot be decoded."""
+    try:
+        message = memory.reader.decode(found.record)
+    except UndecodableError:
+        return set()
+    edges = memory.extractor.transforms(message, found.time, static=True)
+    return {edge.child for edge in edges}
+
+
+def _profile(view: View, topics: Sequence[str], window: TimeWindow, held: Sequence[Found]) -> str:
+    """The MCAP profile of all the bags that hold the messages; empty where they differ."""
+    chosen = frozenset(topics)
+    within = view.snapshot.overlapping(window)
+    bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.shape.places)}
+    bags.update(found.bag.path for found in held)
+    profiles: set[str] = set()
+    for path in bags:
+        # What cannot be read is reported where its messages are.
+        with suppress(BagError):
+            profiles.add(view.memory.reader.profile(path))
+    return profiles.pop() if len(profiles) == 1 else ""
+
+
+def as_mcap(path: Path, found: Iterator[Found], profile: str = ROS2_PROFILE) -> str:
+    """Writes the file, which is there when it is whole; what was done, in a sentence.
+
+    Raises:
+        BagError: it cannot be written.
+        InvalidArgumentsError: there is such a file.
+        NoDataError: there is no message.
+    """
+    if path.exists():
+        raise InvalidArgumentsError(f"{path} exists; name another file, or delete it first")
+    first = next(found, None)
+    if first is None:
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, "no message lies in the window")
+    written = 0
+
+    def records() -> Iterator[Record]:
+        nonlocal written
+        for each in chain((first,), found):
+            written += 1
+            yield each.record
+
+    beside = path.with_name(f".{path.name}.tmp")
+    try:
+        beside.unlink(missing_ok=True)
+        McapWriter().write(beside, records(), profile=profile)
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+    return f"{counted(written, 'message')} in {path}"
+
+
+def _as_parquet(path: Path, found: Iterator[Found], memory: Memory, robot: str | None) -> str:
+    """Writes the rows; what was done, in a sentence.
+
+    Raises:
+        ConfigError: the optional dependency is missing.
+    """
+    try:
+        from ros2_memory.cli.parquet import Dataset  # noqa: PLC0415 - an extra that few install
+    except ImportError as error:
+        raise ConfigError(
+            f"Parquet needs the optional part of this package (no {error.name}): "
+            "pip install 'ros2-memory[parquet]'"
+        ) from error
+    with Dataset(path, memory.reader, memory.extractor, robot) as dataset:
+        for each in found:
+            dataset.add(each)
+    return f"{counted(dataset.rows, 'message')} in {counted(dataset.files, 'file')} below {path}"
+
+
+def _told(found: Iterator[Found], tell: Callable[[Ns], None]) -> Iterator[Found]:
+    for number, each in enumerate(found):
+        if number % _TELL_EVERY == 0:
+            tell(each.time)
+        yield each
+
+
+@contextmanager
+def _progress(view: View, window: TimeWindow) -> Iterator[Callable[[Ns], None]]:
+    """A bar along the window on a terminal, and nothing elsewhere."""
+    bags = view.snapshot.overlapping(window)
+    first = max(window.start, min((bag.start for bag in bags), default=0))
+    last = min(window.stop, max((bag.end for bag in bags), default=0) + 1)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("exporting", total=max(last - first, 1))
+        yield lambda at: bar.update(task, completed=max(at - first, 0))

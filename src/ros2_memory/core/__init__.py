@@ -1,0 +1,1 @@
+"""Errors, times, the domain model, geometry, text, logging: what every room may use."""

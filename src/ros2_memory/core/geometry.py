@@ -1,0 +1,312 @@
+"""Rotations, rigid transforms and paths in plain floats.
+
+Quaternions are (x, y, z, w), Hamilton's product, and taken to be of unit length unless a function
+says otherwise: `normalised` is the door. A `Transform` is the pose of a child in its parent.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+
+from ros2_memory.core.model import Quaternion, Transform, Vector3
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+Columns: TypeAlias = "tuple[Numbers, Numbers, Numbers]"
+Clock: TypeAlias = "tuple[Sequence[float], Numbers]"
+"""The same times twice: one by one the numbers of an array take longer to get."""
+
+IDENTITY: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+_GIMBAL_LOCK_SINE: Final = 1 - 1e-14
+"""Beyond this sine of pitch, roll and yaw turn about one axis to within 1.5e-7 rad."""
+
+_PARALLEL_COSINE: Final = 1 - 1e-10
+"""Beyond this, slerp divides two tiny sines, and a lerp differs from it by less than 1e-14."""
+
+_SCANS_PER_POINT: Final = 64
+"""How often, on average, path refinement may look at a point before it halves intervals."""
+
+_BACK: Final = 0.5**2
+_LATE: Final = 0.1**2
+"""What a way back along a segment, and a distance in time, count in squares of deviations."""
+
+_MANY_POINTS: Final = 48
+"""From so many on, looking through points as arrays is faster than one by one."""
+
+_SAME_M: Final = 1e-6
+
+
+def normalised(q: Quaternion) -> Quaternion | None:
+    """The unit quaternion of the same rotation; None for a zero, NaN or infinite one."""
+    largest = max(abs(part) for part in q)
+    if not all(math.isfinite(part) for part in q) or largest == 0:
+        return None
+    # Scaled first: the squares of very large and very small parts leave the range of a float.
+    x, y, z, w = (part / largest for part in q)
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    return (x / length, y / length, z / length, w / length)
+
+
+def rpy(q: Quaternion) -> tuple[float, float, float]:
+    """Roll, pitch and yaw (rad) about the fixed axes X, Y, Z in that order (REP-103).
+
+    At gimbal lock (pitch of plus or minus a right angle) only one sum of roll and yaw is
+    determined: it is given as yaw, and roll is 0.
+    """
+    x, y, z, w = q
+    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
+    pitch = math.asin(sine)
+    if abs(sine) > _GIMBAL_LOCK_SINE:
+        return 0.0, pitch, math.remainder(2 * math.atan2(z, w), math.tau)
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def yaw(q: Quaternion) -> float:
+    """The heading about Z (rad, in [-pi, pi]), as `rpy` gives it."""
+    return rpy(q)[2]
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """The rotation `b` followed, about the fixed axes, by `a` (Hamilton's product a b)."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """The rotation backwards."""
+    x, y, z, w = q
+    return (-x, -y, -z, w)
+
+
+def rotate(q: Quaternion, v: Vector3) -> Vector3:
+    """`v` turned by `q`."""
+    x, y, z, w = q
+    vx, vy, vz = v
+    cx = 2 * (y * vz - z * vy)
+    cy = 2 * (z * vx - x * vz)
+    cz = 2 * (x * vy - y * vx)
+    return (
+        vx + w * cx + y * cz - z * cy,
+        vy + w * cy + z * cx - x * cz,
+        vz + w * cz + x * cy - y * cx,
+    )
+
+
+def compose(a: Transform, b: Transform) -> Transform:
+    """`a`, then `b` from there: the pose of b's child in a's parent."""
+    x, y, z = rotate(a.rotation, b.translation)
+    ax, ay, az = a.translation
+    return Transform((ax + x, ay + y, az + z), multiply(a.rotation, b.rotation))
+
+
+def invert(t: Transform) -> Transform:
+    """The pose of the parent in the child."""
+    back = conjugate(t.rotation)
+    x, y, z = rotate(back, t.translation)
+    return Transform((-x, -y, -z), back)
+
+
+def alike(one: Transform, other: Transform) -> bool:
+    """Whether two transforms differ by less than a micrometre, and by hardly an angle."""
+    apart = compose(invert(one), other)
+    off = distance(apart.translation, (0.0, 0.0, 0.0))
+    return off < _SAME_M and abs(apart.rotation[3]) > 1 - _SAME_M
+
+
+def slerp(a: Quaternion, b: Quaternion, ratio: float) -> Quaternion:
+    """The rotation `ratio` (0 to 1) of the way from `a` to `b`, the shorter way, at even speed."""
+    cosine = sum(p * q for p, q in zip(a, b, strict=True))
+    sign = -1.0 if cosine < 0 else 1.0
+    cosine *= sign
+    if cosine > _PARALLEL_COSINE:
+        from_a, from_b = 1 - ratio, ratio * sign
+    else:
+        angle = math.acos(cosine)
+        from_a = math.sin((1 - ratio) * angle) / math.sin(angle)
+        from_b = math.sin(ratio * angle) / math.sin(angle) * sign
+    x, y, z, w = (from_a * p + from_b * q for p, q in zip(a, b, strict=True))
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    return (x / length, y / length, z / length, w / length)
+
+
+def interpolate(a: Transform, b: Transform, ratio: float) -> Transform:
+    """The transform `ratio` (0 to 1) of the way: translation linear, rotation by `slerp` (tf2)."""
+    x, y, z = (p + (q - p) * ratio for p, q in zip(a.translation, b.translation, strict=True))
+    return Transform((x, y, z), slerp(a.rotation, b.rotation, ratio))
+
+
+def distance(a: Vector3, b: Vector3) -> float:
+    """Metres between two points, in a straight line."""
+    return math.dist(a, b)
+
+
+def off_segment(
+    point: tuple[float, float], start: tuple[float, float], end: tuple[float, float]
+) -> float:
+    """How far a point of the plane is from a segment; NaN where a coordinate is NaN."""
+    (px, py), (ax, ay) = point, start
+    dx, dy = end[0] - ax, end[1] - ay
+    along = ((px - ax) * dx + (py - ay) * dy) * _scale(dx, dy, 0.0)
+    if math.isnan(along):
+        return math.nan
+    along = min(max(along, 0.0), 1.0)
+    return math.hypot(px - ax - along * dx, py - ay - along * dy)
+
+
+def simplify_to(
+    points: Sequence[Vector3],
+    tolerance_m: float,
+    at_most: int,
+    seconds: Sequence[float] | None = None,
+) -> tuple[list[int], float]:
+    """The vertices that are enough to draw a path (Ramer, Douglas and Peucker), and no more.
+
+    Both ends are kept, and every point that is dropped lies within `tolerance_m` of the kept
+    segment that spans it, unless that takes more than `at_most` vertices: then as near as these
+    allow. Points must be finite. Cost is bounded: where the splits stay lopsided, intervals are
+    halved instead, which keeps some vertices more than needed.
+
+    With `seconds`, the time of each point, the path is drawn in space and time. A point is then
+    also off by half the way that it lies back along its segment from a point before it, so that a
+    turning point stays; and by a tenth of its distance from where the segment has the robot at
+    that time, so that a stop stays (the synchronised distance of Meratnia and de By,
+    Spatiotemporal Compression Techniques for Moving Point Objects, EDBT 2004).
+
+    Returns:
+        Their indices, ascending, and how far (m) a dropped point is off the kept segment that
+        spans it, at most.
+
+    Raises:
+        ValueError: `at_most` is below 2: both ends are always kept.
+    """
+    if at_most < 2:
+        raise ValueError(f"a path cannot be drawn with {at_most} vertices; allow 2 or more")
+    last = len(points) - 1
+    if last < 2:
+        return list(range(last + 1)), 0.0
+    # From the chord of the whole path the worst interval is split again and again. Splitting the
+    # worst first makes the limits on tolerance and on count one loop: with no limit on count the
+    # kept set is that of the recursive algorithm, in another order.
+    kept = [0, last]
+    columns = _columns(points)
+    clock = None if seconds is None else (seconds, np.array(seconds, dtype=np.float64))
+    worst = [_farthest(points, columns, 0, last, clock)]
+    scans_left = _SCANS_PER_POINT * len(points)
+    while worst and -worst[0][0] > tolerance_m and len(kept) < at_most:
+        _, split, start, end = heapq.heappop(worst)
+        if scans_left < 0:
+            split = (start + end) // 2
+        kept.append(split)
+        for low, high in ((start, split), (split, end)):
+            if high - low > 1:
+                scans_left -= high - low
+                heapq.heappush(worst, _farthest(points, columns, low, high, clock))
+    return sorted(kept), -worst[0][0] if worst else 0.0
+
+
+def _columns(points: Sequence[Vector3]) -> Columns | None:
+    """The coordinates as arrays; None for few points, for which these cost more than they save."""
+    if len(points) < _MANY_POINTS:
+        return None
+    xs, ys, zs = np.array(points, dtype=np.float64).T.copy()
+    return xs, ys, zs
+
+
+def _farthest(
+    points: Sequence[Vector3],
+    columns: Columns | None,
+    start: int,
+    end: int,
+    clock: Clock | None = None,
+) -> tuple[float, int, int, int]:
+    """The point between `start` and `end` that is farthest off the segment between them.
+
+    Returns:
+        (minus how far in metres, its index, start, end): ready for a heap.
+    """
+    if columns is not None and end - start >= _MANY_POINTS:
+        most, where = _farthest_in(columns, start, end, None if clock is None else clock[1])
+        if math.isfinite(most):
+            return -math.sqrt(most), where, start, end
+    ax, ay, az = points[start]
+    bx, by, bz = points[end]
+    dx, dy, dz = bx - ax, by - ay, bz - az
+    scale = _scale(dx, dy, dz)
+    squared = dx * dx + dy * dy + dz * dz
+    seconds = None if clock is None else clock[0]
+    since, rate = (0.0, 0.0) if seconds is None else (seconds[start], _rate(seconds, start, end))
+    most, where, reach = -1.0, start + 1, 0.0
+    for index in range(start + 1, end):
+        x, y, z = points[index]
+        x -= ax
+        y -= ay
+        z -= az
+        along = (x * dx + y * dy + z * dz) * scale
+        along = min(along, 1.0) if along > 0 else 0.0
+        ox, oy, oz = x - along * dx, y - along * dy, z - along * dz
+        off = ox * ox + oy * oy + oz * oz
+        if seconds is not None:
+            reach = max(reach, along)
+            back = (reach - along) * (reach - along) * squared * _BACK
+            at = (seconds[index] - since) * rate
+            lx, ly, lz = x - at * dx, y - at * dy, z - at * dz
+            off = max(off, back, (lx * lx + ly * ly + lz * lz) * _LATE if rate else 0.0)
+        if off > most:
+            most, where = off, index
+    return -math.sqrt(most), where, start, end
+
+
+def _farthest_in(
+    columns: Columns, start: int, end: int, seconds: Numbers | None
+) -> tuple[float, int]:
+    """The same of many points: the square of how far it is off, and its index."""
+    (ax, dx), (ay, dy), (az, dz) = (
+        (float(column[start]), float(column[end]) - float(column[start])) for column in columns
+    )
+    xs, ys, zs = columns
+    with np.errstate(all="ignore"):  # what is not finite the caller works out point by point
+        x, y, z = xs[start + 1 : end] - ax, ys[start + 1 : end] - ay, zs[start + 1 : end] - az
+        along = ((x * dx + y * dy + z * dz) * _scale(dx, dy, dz)).clip(0.0, 1.0)
+        ox, oy, oz = x - along * dx, y - along * dy, z - along * dz
+        off = ox * ox + oy * oy + oz * oz
+        if seconds is not None:
+            back = np.maximum.accumulate(along) - along
+            np.maximum(off, back * back * (dx * dx + dy * dy + dz * dz) * _BACK, out=off)
+            rate = _rate(seconds, start, end)
+            if rate:
+                at = (seconds[start + 1 : end] - seconds[start]) * rate
+                x -= at * dx
+                y -= at * dy
+                z -= at * dz
+                np.maximum(off, (x * x + y * y + z * z) * _LATE, out=off)
+    where = int(off.argmax())
+    return float(off[where]), start + 1 + where
+
+
+def _rate(seconds: Sequence[float] | Numbers, start: int, end: int) -> float:
+    """One over the time from one point to another; 0 where there is none."""
+    lasted = float(seconds[end]) - float(seconds[start])
+    return 1 / lasted if lasted > 0 else 0.0
+
+
+def _scale(dx: float, dy: float, dz: float) -> float:
+    """One over the squared length of a chord.
+
+    A chord too short to divide by is a point: a closed loop ends where it starts.
+    """
+    squared = dx * dx + dy * dy + dz * dz
+    return 1 / squared if squared > 1e-300 else 0.0

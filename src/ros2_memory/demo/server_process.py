@@ -1,0 +1,147 @@
+"""The real query server as a child process on the loopback address."""
+
+from __future__ import annotations
+
+import errno
+import http.client
+import os
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.errors import ConfigError, EpisodicError
+from ros2_memory.recorder.process.child import LAUNCHER
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+HOST: Final = "127.0.0.1"
+LOG_NAME: Final = "server.log"
+_OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION_INTERFACES_PATH", "CREDENTIALS_DIRECTORY")
+_UP_WITHIN_S: Final = 30.0
+_DOWN_WITHIN_S: Final = 5.0
+_LOG_LINES_SHOWN: Final = 8
+
+
+def free_port(wanted: int) -> int:
+    """The port to serve on: `wanted`, or any that is free where that is 0.
+
+    Raises:
+        ConfigError: the port cannot be had; says why and what to do.
+    """
+    if not 0 <= wanted <= 65535:
+        raise ConfigError(f"port {wanted} does not exist; give --port a number from 0 to 65535")
+    try:
+        with socket.create_server((HOST, wanted)) as probe:
+            port: int = probe.getsockname()[1]
+            return port
+    except OSError as error:
+        in_use = error.errno == errno.EADDRINUSE
+        why = "is in use by another program" if in_use else f"cannot be opened ({error})"
+        raise ConfigError(
+            f"port {wanted} on {HOST} {why}; choose another with --port, or --port 0 for any"
+        ) from error
+
+
+def server_environment(
+    environment: Mapping[str, str],
+    bag_dir: Path,
+    port: int,
+    split_duration_s: float,
+    cache: str,
+) -> dict[str, str]:
+    """The environment of a server that serves `bag_dir` and obeys no setting of the caller's."""
+    kept = {name: value for name, value in environment.items() if not name.startswith(_OURS)}
+    return kept | {
+        "MCP_TRANSPORT": "sse",
+        "MCP_HOST": HOST,
+        "MCP_PORT": str(port),
+        "MEMORY_BAG_DIR": str(bag_dir),
+        "XDG_CACHE_HOME": cache,
+        "MEMORY_CONFIG_OVERRIDES": (
+            f"recorder=none storage=mcap reader.index_refresh_s=1 "
+            f"recording.split_duration_s={split_duration_s:g}"
+        ),
+    }
+
+
+@contextmanager
+def served(
+    bag_dir: Path, port: int, *, split_duration_s: float, verbose: bool = False
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A server that answers, until the end of the block.
+
+    Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its catalogue
+    into a folder that is removed at the end: nobody else will ask for it.
+
+    Raises:
+        EpisodicError: it did not come up; the sentence ends with the last lines of its log.
+    """
+    log_path = bag_dir / LOG_NAME
+    with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
+        environment = server_environment(os.environ, bag_dir, port, split_duration_s, cache)
+        with log_path.open("wb") as log:
+            process = subprocess.Popen(  # noqa: S603 - an argv list, and never a shell
+                [
+                    # It ends with this program, also where that is killed.
+                    *(sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid())),
+                    *(sys.executable, "-m", "ros2_memory.server"),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=None if verbose else log,
+                stderr=None if verbose else log,
+                cwd=bag_dir,
+                env=environment,
+                # A Ctrl-C reaches the whole process group of a terminal; the order in which things
+                # end is ours to choose.
+                process_group=0,
+            )
+        try:
+            _wait_until_up(process, port, log_path)
+            yield process
+        finally:
+            _end(process)
+
+
+def _wait_until_up(process: subprocess.Popen[bytes], port: int, log_path: Path) -> None:
+    give_up = time.monotonic() + _UP_WITHIN_S
+    while not _healthy(port):
+        code = process.poll()
+        if code is not None:
+            raise EpisodicError(f"the server ended with exit code {code}{_last_words(log_path)}")
+        if time.monotonic() > give_up:
+            raise EpisodicError(
+                f"the server did not answer on port {port} within {_UP_WITHIN_S:g} s"
+                f"{_last_words(log_path)}"
+            )
+        time.sleep(0.05)
+
+
+def _healthy(port: int) -> bool:
+    connection = http.client.HTTPConnection(HOST, port, timeout=2.0)
+    try:
+        connection.request("GET", "/health")
+        return connection.getresponse().status == http.HTTPStatus.OK
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()
+
+
+def _last_words(log_path: Path) -> str:
+    lines = log_path.read_text(errors="replace").splitlines()[-_LOG_LINES_SHOWN:]
+    return "".join(f"\n  {line}" for line in (": its last words are", *lines)) if lines else ""
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_DOWN_WITHIN_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,179 @@
+"""The same message in two recordings: how copies are recognised, and how one of them is kept.
+
+Recordings overlap for some seconds while one takes over from the other. A message that stands in
+both carries the same publish time and payload in each, and log times that differ by little
+(`COPY_HORIZON_NS` at most); it counts once, at its earliest log time. Inside one recording nothing
+is a copy, however alike two messages are.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.storage.base import Record
+
+COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
+_LONGEST_ROW_NS: Final[Ns] = 3 * COPY_HORIZON_NS
+"""Bounds what is held of a topic whose messages are all alike, their publish times too."""
+
+
+class Found(NamedTuple):
+    """One undecoded message and the bag it stands in."""
+
+    bag: BagFile
+    record: Record
+
+    @property
+    def time(self) -> Ns:
+        """Log time."""
+        return self.record.log_time
+
+
+class Holding(NamedTuple):
+    """A bag that holds messages of the topics asked for; `first` and `last` are inclusive."""
+
+    first: Ns
+    last: Ns
+    bag: BagFile
+
+
+class Copy(NamedTuple):
+    """What two copies of one message share."""
+
+    topic: str
+    publish_time: Ns
+    size: int
+    digest: int
+
+
+def copy_key(record: Record) -> Copy:
+    """The identity of a message across recordings."""
+    payload = record.payload
+    return Copy(record.channel.topic, record.publish_time, len(payload), hash(payload))
+
+
+def contested(holdings: Iterable[Holding]) -> list[tuple[Ns, Ns]]:
+    """The half-open spans in which bags of different recordings can hold copies, merged.
+
+    Two bags contest the time that both hold, widened by the horizon at both ends.
+    """
+    return contested_spans((held.first, held.last, held.bag.recording) for held in holdings)
+
+
+def contested_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
+    """As `contested`, of first and last log time (inclusive) and recording."""
+    spans: list[tuple[Ns, Ns]] = []
+    open_ones: list[tuple[Ns, Path]] = []
+    for first, last, recording in sorted(held, key=lambda each: each[0]):
+        open_ones = [each for each in open_ones if each[0] + COPY_HORIZON_NS >= first]
+        spans.extend(
+            (first - COPY_HORIZON_NS, min(other, last) + COPY_HORIZON_NS + 1)
+            for other, folder in open_ones
+            if folder != recording
+        )
+        open_ones.append((last, recording))
+    return united(spans)
+
+
+def united(spans: Iterable[tuple[Ns, Ns]]) -> list[tuple[Ns, Ns]]:
+    """Half-open spans, sorted, those that touch made one."""
+    united: list[tuple[Ns, Ns]] = []
+    for start, stop in sorted(spans):
+        if united and start <= united[-1][1]:
+            united[-1] = (united[-1][0], max(united[-1][1], stop))
+        else:
+            united.append((start, stop))
+    return united
+
+
+def _inside(spans: Sequence[tuple[Ns, Ns]], moment: Ns) -> bool:
+    index = bisect_right(spans, (moment, MAX_NS)) - 1
+    return index >= 0 and moment < spans[index][1]
+
+
+def once_forward(found: Iterable[Found], spans: Sequence[tuple[Ns, Ns]]) -> Iterator[Found]:
+    """An ascending stream without the later copies.
+
+    Where one recording holds a message n times and another m times, max(n, m) remain.
+    """
+    recent: deque[tuple[Ns, Copy]] = deque()
+    counts: dict[Copy, dict[Path, int]] = {}
+    for each in found:
+        if not _inside(spans, each.time):
+            yield each
+            continue
+        while recent and recent[0][0] < each.time - COPY_HORIZON_NS:
+            counts.pop(recent.popleft()[1], None)
+        key = copy_key(each.record)
+        by_recording = counts.setdefault(key, {})
+        before = max(by_recording.values(), default=0)
+        recording = each.bag.recording
+        by_recording[recording] = by_recording.get(recording, 0) + 1
+        if by_recording[recording] > before:
+            recent.append((each.time, key))
+            yield each
+
+
+def once_backward(found: Iterable[Found], spans: Sequence[tuple[Ns, Ns]]) -> Iterator[Found]:
+    """A descending stream without the copies that `once_forward` leaves out.
+
+    Held back until no earlier copy can come. Where copies follow each other for longer than
+    `_LONGEST_ROW_NS`, with never a pause of `COPY_HORIZON_NS`, other ones of them may be left out.
+    """
+    held: deque[tuple[Found, _Row | None]] = deque()
+    rows: dict[Copy, _Row] = {}
+    for each in found:
+        while held and (held[0][1] is None or held[0][1].is_over(each.time)):
+            yield from _released(*held.popleft(), rows)
+        if not _inside(spans, each.time):
+            held.append((each, None))
+            continue
+        key = copy_key(each.record)
+        row = rows.get(key)
+        if row is None or row.is_over(each.time):
+            row = rows[key] = _Row(key)
+        row.messages.append(each)
+        held.append((each, row))
+    for each, row in held:
+        yield from _released(each, row, rows)
+
+
+class _Row:
+    """Copies that follow each other without a long pause, newest first."""
+
+    def __init__(self, key: Copy) -> None:
+        self.key = key
+        self.messages: list[Found] = []
+        self._kept: set[int] | None = None
+
+    def is_over(self, now: Ns) -> bool:
+        """Whether what comes at a moment, or before it, is no part of it."""
+        if self._kept is not None:
+            return True
+        first, last = self.messages[-1].time, self.messages[0].time
+        return now < max(first - COPY_HORIZON_NS, last - _LONGEST_ROW_NS)
+
+    def keeps(self, found: Found) -> bool:
+        """Whether one of its messages counts; it is over then."""
+        if len(self.messages) == 1:
+            return True
+        if self._kept is None:
+            everywhere = [(MIN_NS, MAX_NS)]
+            self._kept = {id(each) for each in once_forward(reversed(self.messages), everywhere)}
+        return id(found) in self._kept
+
+
+def _released(each: Found, row: _Row | None, rows: dict[Copy, _Row]) -> Iterator[Found]:
+    if row is None or row.keeps(each):
+        yield each
+    if row is not None and rows.get(row.key) is row:
+        del rows[row.key]

@@ -1,0 +1,283 @@
+"""Many bags read as one stream: in log-time order, each message once.
+
+Besides the overlap of recordings (see `copies`), a new recording receives the latched messages
+again: a new log time, the original publish time. Such a message counts once too, at its earliest
+log time, however long ago that is.
+"""
+
+from __future__ import annotations
+
+import heapq
+from bisect import bisect_left, bisect_right
+from collections import Counter, deque
+from functools import partial
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S
+from ros2_memory.history.bag_access import Reading
+from ros2_memory.history.duplicates import (
+    COPY_HORIZON_NS,
+    Copy,
+    Found,
+    Holding,
+    contested,
+    contested_spans,
+    copy_key,
+    once_backward,
+    once_forward,
+    united,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.sessions import Sessions
+    from ros2_memory.index.segment import Run
+
+RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
+"""A latched message logged this long after it was published may have been received before."""
+_FEW_SOUGHT: Final = 8
+
+
+class Streams(Reading):
+    """One call's sight of all bags together.
+
+    Attributes:
+        sessions: which recordings belong together, once that is asked (see `frames`).
+    """
+
+    def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
+        super().__init__(memory, call, reach)
+        self.sessions: Sessions | None = None
+        self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
+        self._sought: Counter[str] = Counter()
+
+    def holdings(self, topics: Collection[str], window: TimeWindow) -> list[Holding]:
+        """The bags that hold messages of these topics in the window, in order.
+
+        Each with the times of its first and last message of these topics, in the window or not.
+        """
+        names = tuple(topics)
+        if len(names) == 1 and len(self.snapshot.types_of(names[0])) == 1:
+            # The entry of a bag is then all that it holds of these topics.
+            extents = self.snapshot.extents(names[0], window)
+            return sorted(
+                [Holding(first, last, bag) for bag, first, last in extents], key=_in_order
+            )
+        found: dict[str, Holding] = {}
+        for topic in names:
+            for bag, *_ in self.snapshot.extents(topic, window):
+                if bag.file not in found:
+                    found[bag.file] = holding_of(bag, names)
+        return sorted(found.values(), key=_in_order)
+
+    def stream(
+        self,
+        topics: Sequence[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+        among: Sequence[Holding] | None = None,
+    ) -> Iterator[Found]:
+        """The messages of the topics in the window in log-time order, each one once.
+
+        `among` narrows the search to some of the bags.
+
+        Raises:
+            QueryTimeoutError: the deadline passed on the way.
+        """
+        if among is not None:
+            return self.used(self._part(topics, window, among, newest_first=newest_first))
+        parts = self._parts(topics, window)
+        return self.used(
+            chain.from_iterable(
+                self._part(topics, part, None, newest_first=newest_first)
+                for part in (reversed(parts) if newest_first else parts)
+            )
+        )
+
+    def last_of(self, topic: str, window: TimeWindow) -> Found | None:
+        """What `stream` gives first of the topic when it is newest first."""
+        if len(self._parts([topic], window)) == 1 and not self.received_twice([topic]):
+            holdings = self.holdings([topic], _with_horizon(window))
+            if not contested(holdings):
+                inside = [held for held in holdings if window.overlaps(held.first, held.last)]
+                if not inside:
+                    return None
+                if len(inside) == 1:
+                    found = self.newest_in(inside[0].bag, topic, window)
+                    return None if found is None else next(self.used(iter((found,))))
+        return next(self.stream([topic], window, newest_first=True), None)
+
+    def spans_of_copies(self, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
+        """Where in the window the topic's messages may stand in two recordings, widened."""
+        recordings = self.snapshot.recordings(topic)
+        if len(recordings) < 2:
+            return []
+        # First by whole recordings, which are few; then by bags, where these overlap.
+        coarse = contested_spans((*span, folder) for folder, span in recordings.items())
+        near = [TimeWindow(*span) for span in coarse if window.overlaps(span[0], span[1] - 1)]
+        return united(span for each in near for span in contested(self.holdings([topic], each)))
+
+    def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
+        """The window cut where runs of bags begin: a stream then holds few of them at a time."""
+        runs = self.snapshot.runs
+        begin = bisect_right(runs, window.start, key=_begins)
+        end = bisect_left(runs, window.stop, begin, key=_begins)
+        cuts = [
+            _begins(run) for run in runs[begin:end] if any(topic in run.spans for topic in topics)
+        ]
+        edges = [window.start, *dict.fromkeys(cuts), window.stop]
+        return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
+
+    def _part(
+        self,
+        topics: Sequence[str],
+        window: TimeWindow,
+        among: Sequence[Holding] | None,
+        *,
+        newest_first: bool,
+    ) -> Iterator[Found]:
+        wider = _with_horizon(window)
+        holdings = self.holdings(topics, wider) if among is None else among
+        spans = contested(holdings)
+        found: Iterator[Found]
+        if spans:
+            merged = self.merged(
+                holdings, topics, wider, newest_first=newest_first, since=window.start
+            )
+            once = (once_backward if newest_first else once_forward)(merged, spans)
+            found = (each for each in once if window.contains(each.time))
+        else:
+            found = self.merged(holdings, topics, window, newest_first=newest_first)
+        if self.received_twice(topics):
+            return (each for each in found if not self._received_again(each))
+        return found
+
+    def received_twice(self, topics: Iterable[str]) -> bool:
+        """Whether a latched message of these topics may have been received by two recordings."""
+        return any(
+            self.snapshot.is_transient_local(topic) and len(self.snapshot.recordings(topic)) > 1
+            for topic in topics
+        )
+
+    def seek_first(self, found: Found) -> None:
+        """Notes what cannot be read where a message may have been received before."""
+        if _is_late(found) and self.received_twice([found.record.channel.topic]):
+            record = found.record
+            window = TimeWindow(record.publish_time, found.time)
+            self._seek(record.channel.topic, copy_key(record), window)
+
+    def _received_again(self, found: Found) -> bool:
+        record = found.record
+        if not _is_late(found):
+            return False
+        topic, key = record.channel.topic, copy_key(record)
+        if key not in self._first_copies:
+            self._sought[topic] += 1
+            if self._sought[topic] > _FEW_SOUGHT:
+                self._seek_all(topic)
+            else:
+                self._seek(topic, key, TimeWindow(record.publish_time, found.time))
+        first = self._first_copies.get(key, (found.time, found.bag.recording))
+        return found.time > first[0] and found.bag.recording != first[1]
+
+    def _seek(self, topic: str, key: Copy, window: TimeWindow) -> None:
+        """Remembers where a message was received first, from its publish time on."""
+        wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop + 1)
+        for each in self.merged(self.holdings([topic], wider), [topic], wider, newest_first=False):
+            if copy_key(each.record) == key:
+                self._first_copies[key] = (each.time, each.bag.recording)
+                return
+
+    def _seek_all(self, topic: str) -> None:
+        """The same for every message of a topic that has many: one pass in place of one for each.
+
+        So it is where publish times say nothing, such as those of a simulated clock.
+        """
+        everything = TimeWindow.everything()
+        holdings = self.holdings([topic], everything)
+        for each in self.merged(holdings, [topic], everything, newest_first=False):
+            first = (each.time, each.bag.recording)
+            self._first_copies.setdefault(copy_key(each.record), first)
+
+    def merged(
+        self,
+        holdings: Sequence[Holding],
+        topics: Sequence[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool,
+        since: Ns = MIN_NS,
+    ) -> Iterator[Found]:
+        """All messages in order, copies too, opening a bag only when the stream reaches it.
+
+        What cannot be read is noted where it was asked for: not all of it lies before `since`.
+        """
+        read = partial(
+            self.read, topics=topics, window=window, newest_first=newest_first, since=since
+        )
+        if len(holdings) == 1:
+            yield from read(holdings[0].bag)
+            return
+        sign = -1 if newest_first else 1
+        waiting = deque(
+            sorted(
+                enumerate(holdings),
+                key=lambda held: (
+                    (-held[1].last, -held[0]) if newest_first else (held[1].first, held[0])
+                ),
+            )
+        )
+        heap: list[tuple[int, int, Found, Iterator[Found]]] = []
+
+        def push(rank: int, source: Iterator[Found]) -> None:
+            found = next(source, None)
+            if found is not None:
+                heapq.heappush(heap, (sign * found.time, rank, found, source))
+
+        while heap or waiting:
+            while waiting and (
+                not heap or _edge(waiting[0][1], newest_first=newest_first) <= heap[0][0]
+            ):
+                index, held = waiting.popleft()
+                push(sign * index, read(held.bag))
+            if heap:
+                _, rank, found, source = heapq.heappop(heap)
+                yield found
+                push(rank, source)
+
+
+def _is_late(found: Found) -> bool:
+    record = found.record
+    return record.channel.latched and found.time - record.publish_time > RECEIVED_AGAIN_NS
+
+
+def _with_horizon(window: TimeWindow) -> TimeWindow:
+    """The window and what before it can be the original of a copy in it."""
+    return TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
+
+
+def _begins(run: Run) -> Ns:
+    """Log time of the first message of the first bag: runs lie in its order."""
+    return run.bags[0].start
+
+
+def _in_order(held: Holding) -> tuple[Ns, Ns, str]:
+    return held.first, held.last, held.bag.file
+
+
+def holding_of(bag: BagFile, topics: Collection[str]) -> Holding:
+    """A bag with the times of its first and last message of these topics; it must hold some."""
+    return Holding(*bag.summary.span_of(topics), bag)
+
+
+def _edge(held: Holding, *, newest_first: bool) -> Ns:
+    """The first moment at which a bag can have something for the stream, in the heap's sign."""
+    return -held.last if newest_first else held.first

@@ -1,0 +1,100 @@
+"""Whether recordings that hold a topic at the same time may be of two robots.
+
+They are of one where a handover joins them, or where what one holds stands in the other too.
+"""
+
+from __future__ import annotations
+
+from itertools import islice
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.wording import listed
+from ros2_memory.history.duplicates import COPY_HORIZON_NS, copy_key
+from ros2_memory.history.transforms import sessions_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.view import View
+
+_NEAR_NS: Final[Ns] = 10 * NS_PER_S
+"""How far around one message others count as recorded at its time."""
+_TRIED: Final = 3
+"""So many messages are looked for in the other recording: a subscriber may miss one."""
+
+
+def note_robots(view: View, topic: str, window: TimeWindow) -> None:
+    """Names the recordings that hold a topic at the same time in a window, each its own messages.
+
+    Nothing is noted of latched topics, of which each recording receives the same anew, and where
+    the time for the answer is over before it is known.
+    """
+    if view.snapshot.is_transient_local(topic):
+        return
+    apart: set[Path] = set()
+    said = view.noted_things()
+    try:
+        for pair, both in _at_once(view, topic, window):
+            if not apart.issuperset(pair) and _are_apart(view, topic, pair, both):
+                apart.update(pair)
+    except QueryTimeoutError:
+        return
+    finally:
+        # The answer itself needed nothing of what was read here.
+        view.unsay_before(MAX_NS, said)
+    if apart:
+        names = sorted(each.name for each in apart)
+        view.note(
+            f"{len(names)} recordings hold messages of their own on {topic} at the same time, "
+            f"as of several robots, and the answer does not tell them apart: {listed(names)}"
+        )
+
+
+def note_robots_near(view: View, found: Found) -> None:
+    """As `note_robots`, of the time of a message."""
+    start, stop = max(found.time - _NEAR_NS, MIN_NS), min(found.time + _NEAR_NS + 1, MAX_NS)
+    note_robots(view, found.record.channel.topic, TimeWindow(start, stop))
+
+
+def _at_once(
+    view: View, topic: str, window: TimeWindow
+) -> Iterator[tuple[tuple[Path, Path], TimeWindow]]:
+    """Pairs of recordings that hold a topic at the same time, and when."""
+    under_way: list[tuple[Ns, Path]] = []
+    spans = [(*span, path) for path, span in view.snapshot.recordings(topic).items()]
+    for first, last, path in sorted(each for each in spans if window.overlaps(each[0], each[1])):
+        under_way = [each for each in under_way if each[0] >= first]
+        for until, other in under_way:
+            start, stop = max(first, window.start), min(last + 1, until + 1, window.stop)
+            if start < stop:
+                yield (path, other), TimeWindow(start, stop)
+        under_way.append((last, path))
+
+
+def _are_apart(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
+    """Whether two recordings hold messages in a window, and those of one are not in the other."""
+    if sessions_of(view).are_joined(*pair):
+        return False
+    one, other = pair
+    if next(_messages(view, topic, other, both), None) is None:
+        return False
+    some = list(islice(_messages(view, topic, one, both), _TRIED))
+    return bool(some) and not any(_stands_in(view, topic, other, each) for each in some)
+
+
+def _stands_in(view: View, topic: str, recording: Path, found: Found) -> bool:
+    """Whether a recording holds a copy of a message."""
+    start, stop = found.time - COPY_HORIZON_NS, found.time + COPY_HORIZON_NS + 1
+    near = TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
+    key = copy_key(found.record)
+    return any(copy_key(each.record) == key for each in _messages(view, topic, recording, near))
+
+
+def _messages(view: View, topic: str, recording: Path, window: TimeWindow) -> Iterator[Found]:
+    held = [each for each in view.holdings([topic], window) if each.bag.recording == recording]
+    return view.merged(held, [topic], window, newest_first=False)

@@ -1,0 +1,245 @@
+"""Which recordings hold what one robot said of itself in one go.
+
+A transform holds in the session in which it was published: another robot, or the same one after it
+was started anew, has its own. A session is a recording and those that it is joined with by
+handovers, and what was carried of these when their bags were deleted.
+
+Recordings of one time may be of one robot, for which two recorders were started. So one that has
+moving transforms alone borrows the static ones of other frames of one that has these alone, and
+one that has none borrows from the one session beside it that has some. None is lent where two
+recordings hold poses then: these are two robots. Nothing but a handover proves that two recordings
+are of one robot, so a reply that uses a loan has to say so.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from itertools import combinations
+from typing import TYPE_CHECKING, Final, TypeAlias
+from weakref import WeakKeyDictionary
+
+from ros2_memory.bag_dir.carried_origin import origin_of
+from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.layout import CARRY_FOLDER
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.history.bag_access import Reading
+    from ros2_memory.history.duplicates import Found
+    from ros2_memory.index.timeline import Timeline
+
+Session: TypeAlias = frozenset[str]
+"""The folders of the recordings, as they are called where they were recorded."""
+
+_AROUND_NS: Final[Ns] = 10 * NS_PER_S
+"""A recording goes on at a moment where it has a bag so near: tf2 remembers no longer."""
+_JOINED: Final[WeakKeyDictionary[Timeline, Mapping[str, Session]]] = WeakKeyDictionary()
+"""What the sidecars of a timeline's recordings join; a new bag makes a new timeline."""
+
+
+class Sessions:
+    """The sessions of a view that hold transforms.
+
+    Args:
+        view: one call's sight of the memory.
+        moving: the topics of moving transforms.
+        static: those of static ones.
+        poses: the topic of the robot's own poses: two sessions that hold it at once are two robots.
+        children: the child frames that a session has on some topics.
+    """
+
+    def __init__(
+        self,
+        view: Reading,
+        moving: Sequence[str],
+        static: Sequence[str],
+        poses: str,
+        children: Callable[[Sequence[str], Session], set[str]],
+    ) -> None:
+        self._view = view
+        self._topics = {"moving": tuple(moving), "static": tuple(static)}
+        self._children = children
+        self._names = KeptNames(view.memory.index.bag_dir)
+        self._root = str(view.memory.index.bag_dir).rstrip("/")
+        self._carried = f"{self._root}/{CARRY_FOLDER}"
+        self._spans: dict[str, dict[str, tuple[Ns, Ns]]] = {
+            kind: self._spans_of(topics) for kind, topics in self._topics.items()
+        }
+        self._joined = self._chains(poses)
+        self._poses = [*self._spans_of((poses,)).items()]
+        self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
+        self._parts: dict[Session, tuple[Session, Session]] = {}
+        self._lending: dict[tuple[str, Ns], Session] = {}
+
+    def folder(self, recording: Path) -> str:
+        """Where a recording lies, or lay when it was recorded, if a moment keeps it."""
+        return self._names.recorded_as(str(recording))
+
+    def has(self, session: Session, found: Found) -> bool:
+        """Whether a message is of a session; a carried one that names no recording is of each."""
+        folder = self.folder(found.bag.recording)
+        if folder != self._carried:
+            return folder in session
+        origin = origin_of(found.record.channel)
+        if origin is None or session == {self._carried}:
+            return True
+        return any(f"{self._root}/{each}" in session for each in origin.recordings)
+
+    def is_carried(self, bag: BagFile) -> bool:
+        """Whether a bag is that of carried messages, which are of several sessions."""
+        return self.folder(bag.recording) == self._carried
+
+    def of(self, recording: Path) -> Session:
+        """The session of a recording."""
+        return self._of(self.folder(recording))
+
+    def are_joined(self, one: Path, other: Path) -> bool:
+        """Whether two recordings are of one session, whatever they hold."""
+        if self.of(one) == self.of(other):
+            return True
+        return other.name in _neighbours(one) or one.name in _neighbours(other)
+
+    def lending_to(self, recording: Path, at: Ns) -> Session:
+        """Whose transforms hold for a message of a recording; empty where no session's do.
+
+        That is more than the recording's own session where another one lends.
+        """
+        key = (self.folder(recording), at // _AROUND_NS)
+        if key not in self._lending:
+            self._lending[key] = self._completed(self._of(key[0]), at)
+        return self._lending[key]
+
+    def recorded_at(self, moment: Ns) -> list[Session] | None:
+        """The sessions whose transforms hold at a moment; None where nothing was recorded then."""
+        around = self._around(moment)
+        if not around:
+            return None
+        holding = (each for each in around if self._kinds(each))
+        return [*dict.fromkeys(self._completed(each, moment) for each in holding)]
+
+    def names(self, session: Session, at: Ns) -> str:
+        """The recordings of a session that went on at a moment; all of it where none did."""
+        recordings = sorted(session - {self._carried})
+        around = [each for each in recordings if each in self._folders_around(at)] or recordings
+        return " and ".join(each.rpartition("/")[2] for each in around) or "deleted recordings"
+
+    def parts_of(self, session: Session) -> tuple[Session, ...]:
+        """The two sessions that one is made of by a loan; none where it is one."""
+        return self._parts.get(session, ())
+
+    def nearest_to(self, moment: Ns) -> list[Session]:
+        """All sessions that hold transforms, the nearest in time first."""
+        spans = [span for by_folder in self._spans.values() for span in by_folder.items()]
+        near = sorted(spans, key=lambda each: (_off(each[1], moment), each[0]))
+        return [*dict.fromkeys(self._of(folder) for folder, _ in near)]
+
+    def _completed(self, own: Session, at: Ns) -> Session:
+        """A session with the one beside it that has what it lacks; empty where it has nothing."""
+        kinds = self._kinds(own)
+        if len(kinds) == len(self._topics) or self._are_two_robots(at):
+            return own if kinds else frozenset()
+        beside = [each for each in self._around(at) if each != own and self._kinds(each)]
+        if kinds:
+            partners = [each for each in beside if self._complement(own, each)]
+        else:
+            partners = [*dict.fromkeys(self._completed(each, at) for each in beside)]
+        if len(partners) == 1:
+            completed = own | partners[0]
+            self._parts[completed] = own, partners[0]
+            return completed
+        return own if kinds else frozenset()
+
+    def _are_two_robots(self, at: Ns) -> bool:
+        """Whether two sessions around a moment hold poses of the same time."""
+        near = [each for each in self._poses if _off(each[1], at) <= _AROUND_NS]
+        return any(
+            max(first, begin) <= min(last, end) and self._of(one) != self._of(other)
+            for (one, (first, last)), (other, (begin, end)) in combinations(near, 2)
+        )
+
+    def _complement(self, one: Session, other: Session) -> bool:
+        """Whether one has moving transforms alone, the other static ones alone, of other frames."""
+        if self._kinds(one) & self._kinds(other):
+            return False
+        every = [topic for topics in self._topics.values() for topic in topics]
+        return not self._children(every, one) & self._children(every, other)
+
+    def _kinds(self, session: Session) -> frozenset[str]:
+        """Which kinds of transforms a session holds; those that are carried count as its own."""
+        return frozenset(kind for kind, spans in self._spans.items() if session & spans.keys())
+
+    def _around(self, moment: Ns) -> list[Session]:
+        """The sessions that were being recorded at a moment."""
+        return [*dict.fromkeys(map(self._of, sorted(self._folders_around(moment))))]
+
+    def _folders_around(self, moment: Ns) -> set[str]:
+        """Where the recordings lie that went on at a moment."""
+        start, stop = max(moment - _AROUND_NS, MIN_NS), min(moment + _AROUND_NS + 1, MAX_NS)
+        bags = self._view.snapshot.overlapping(TimeWindow(start, stop))
+        return {self.folder(bag.recording) for bag in bags} - {self._carried}
+
+    def _of(self, folder: str) -> Session:
+        if folder == self._carried:
+            return frozenset({folder})
+        return self._joined.get(folder) or frozenset({folder, self._carried})
+
+    def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
+        spans: dict[str, tuple[Ns, Ns]] = {}
+        for topic in topics:
+            for recording, (first, last) in self._view.snapshot.recordings(topic).items():
+                folder = self.folder(recording)
+                known = spans.get(folder, (first, last))
+                spans[folder] = min(first, known[0]), max(last, known[1])
+        return spans
+
+    def _chains(self, poses: str) -> Mapping[str, Session]:
+        """By folder, the recordings with transforms or poses that are joined by handovers."""
+        timeline = self._view.snapshot.timeline
+        known = None if timeline is None else _JOINED.get(timeline)
+        if known is None:
+            every = [topic for topics in self._topics.values() for topic in topics]
+            recordings = [self._view.snapshot.recordings(topic) for topic in (*every, poses)]
+            paths = {self.folder(path): path for some in recordings for path in some}
+            chains = _joined(paths) if len(paths) > 1 else {}
+            known = {folder: chain | {self._carried} for folder, chain in chains.items()}
+            if timeline is not None:
+                _JOINED[timeline] = known
+        return known
+
+
+def _joined(paths: Mapping[str, Path]) -> dict[str, Session]:
+    """By folder, all that are joined with it, of recordings by their folders."""
+    beside: defaultdict[str, set[str]] = defaultdict(set)
+    for folder, path in paths.items():
+        for name in _neighbours(path):
+            other = f"{folder.rpartition('/')[0]}/{name}"
+            beside[folder].add(other)
+            beside[other].add(folder)
+    joined: dict[str, Session] = {}
+    for folder in paths:
+        if folder in joined:
+            continue
+        chain, waiting = {folder}, [folder]
+        while waiting:
+            fresh = beside[waiting.pop()] - chain
+            chain |= fresh
+            waiting += fresh
+        joined.update(dict.fromkeys(chain, frozenset(chain)))
+    return joined
+
+
+def _off(span: tuple[Ns, Ns], moment: Ns) -> Ns:
+    """How far a moment is from a span of time."""
+    return max(span[0] - moment, moment - span[1], 0)
+
+
+def _neighbours(recording: Path) -> tuple[str, ...]:
+    """The names of the recordings before and after one that are joined with it by a handover."""
+    handover = read_handover(recording).handover
+    return tuple(filter(None, (handover.previous, handover.next)))

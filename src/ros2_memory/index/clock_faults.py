@@ -1,0 +1,225 @@
+"""Bags that a wrong clock dated, found by what lies around them. Pure decisions.
+
+A robot without a clock of its own starts in 1970 and is corrected once it has a network; clocks
+are also ahead, and are set back while a recording runs. Bags keep their times, and are found by
+them; but what spans the memory, and what is its newest moment, is told without the bags that are
+at fault:
+
+    before 2017          the clock was not set; simulated where no bag has another date
+    after now            the clock was ahead; this machine's own is behind where all bags are so
+    set back by a day    of the two sides the one with fewer bags around it; of equals the earlier
+
+A clock that is set back by less is listed and leaves the span as it is. Where this machine's own
+clock stands before 2017 it tells nothing of the future.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.core.bag_summary import set_back_while_written
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.index.split_order import StepBack
+
+FIRST_BAGS_NS: Final[Ns] = 1_483_228_800 * NS_PER_S
+"""2017-01-01: there was no release of ROS 2 before. Clocks without a battery start in 1970."""
+FUTURE_NS: Final[Ns] = 60 * NS_PER_S
+"""A date so little ahead of the clock comes from a clock that is being corrected."""
+FAR_BACK_NS: Final[Ns] = 24 * 3600 * NS_PER_S
+"""A clock that is set back by so much leaves dates on one of its sides that mean nothing."""
+
+
+class FaultyClock(StrEnum):
+    """What is wrong with the dates of a bag."""
+
+    UNSET = "unset"
+    AHEAD = "ahead"
+    SET_BACK = "set back"
+    STRAY = "stray"
+
+
+class ClockFault(NamedTuple):
+    """A bag that a wrong clock dated.
+
+    `by` is how far its last message lies after the present, or how far the clock was set back after
+    the bag `before` was begun (None: at least so far, while this one was being written).
+    `misleads`: it is left out of what spans the memory.
+    """
+
+    bag: BagFile
+    kind: FaultyClock
+    by: Ns = 0
+    before: BagFile | None = None
+    misleads: bool = True
+
+    @property
+    def file(self) -> str:
+        """The path of the bag file."""
+        return self.bag.file
+
+    @property
+    def reason(self) -> str:
+        """What is wrong, in a sentence."""
+        return f"{self.told}; left out of earliest and latest" if self.misleads else self.told
+
+    @property
+    def told(self) -> str:
+        """As `reason`, of the bag alone."""
+        match self.kind:
+            case FaultyClock.UNSET if self.bag.mtime_ns >= FIRST_BAGS_NS:
+                return (
+                    f"its messages are dated from {_seconds(self.bag.start)} on, its file "
+                    f"{_seconds(self.bag.mtime_ns)}: the clock was not set, or was simulated"
+                )
+            case FaultyClock.UNSET:
+                return f"dated from {_seconds(self.bag.start)} on: the clock was not set"
+            case FaultyClock.AHEAD:
+                return (
+                    f"dated up to {_seconds(self.bag.end)}, {_length(self.by)} after now: "
+                    "the clock was ahead"
+                )
+            case FaultyClock.SET_BACK if self.before is not None:
+                name = self.before.path.name
+                return f"the clock was set back by {_length(self.by)} after {name} was begun"
+            case FaultyClock.SET_BACK:
+                return set_back_while_written(self.by)
+            case FaultyClock.STRAY:
+                return (
+                    f"dated {_seconds(self.bag.start)}, a day or more from the rest of its "
+                    "recording, between which the clock was set back"
+                )
+
+
+@dataclass(frozen=True, slots=True)
+class Dating:
+    """What the dates of all bags come to.
+
+    `earliest` and `latest` are the log times of the first and last message (inclusive) of the bags
+    that no fault misdates; None without bags. `note` is a sentence on a clock that is at odds with
+    all of them.
+    """
+
+    earliest: Ns | None = None
+    latest: Ns | None = None
+    faults: tuple[ClockFault, ...] = ()
+    note: str | None = None
+
+    @property
+    def misdated(self) -> frozenset[str]:
+        """The bags that are left out of the span."""
+        return frozenset(fault.file for fault in self.faults if fault.misleads)
+
+
+class Part(NamedTuple):
+    """Some bags, sorted by their start, and the latest end among them."""
+
+    bags: Sequence[BagFile]
+    latest: Ns
+
+
+def last_believed(now: Ns) -> Ns:
+    """The latest date that a message can bear now."""
+    return MAX_NS if now < FIRST_BAGS_NS else min(now + FUTURE_NS, MAX_NS)
+
+
+def dating_of(
+    parts: Sequence[Part],
+    steps: Sequence[StepBack],
+    now: Ns,
+    around: Callable[[Ns, Ns], Sequence[BagFile]],
+) -> Dating:
+    """What is to be made of the dates of all bags.
+
+    Args:
+        parts: the bags, in parts in order.
+        steps: where a clock was set back while a recording ran.
+        now: the present by this machine's clock.
+        around: the bags with a moment between two log times (inclusive).
+    """
+    limit = last_believed(now)
+    ahead = [
+        ClockFault(bag, FaultyClock.AHEAD, bag.end - now)
+        for part in parts
+        if part.latest > limit
+        for bag in part.bags
+        if bag.end > limit
+    ]
+    unset = [ClockFault(bag, FaultyClock.UNSET) for bag in _unset(parts) if bag.end <= limit]
+    bags = sum(len(part.bags) for part in parts)
+    note: str | None = None
+    if len(ahead) == bags and bags:
+        ahead = [fault._replace(misleads=False) for fault in ahead]
+        note = "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
+    elif len(ahead) + len(unset) == bags:
+        unset = []  # a simulated clock, or a robot that has none
+    faults = [*unset, *ahead]
+    faults += _of_steps(steps, {fault.file for fault in faults}, around)
+    dating = Dating(faults=tuple(faults), note=note)
+    if len(dating.misdated) == bags:
+        dating = replace(dating, faults=tuple(each._replace(misleads=False) for each in faults))
+    earliest, latest = _span(parts, [fault.bag for fault in dating.faults if fault.misleads])
+    return replace(dating, earliest=earliest, latest=latest)
+
+
+def _unset(parts: Iterable[Part]) -> Iterator[BagFile]:
+    for part in parts:
+        for bag in part.bags:
+            if bag.start >= FIRST_BAGS_NS:
+                return
+            yield bag
+
+
+def _of_steps(
+    steps: Iterable[StepBack],
+    known: Collection[str],
+    around: Callable[[Ns, Ns], Sequence[BagFile]],
+) -> Iterator[ClockFault]:
+    """The faults that steps back come to, where no other names a bag at the step."""
+    named: set[str] = set()
+    for step in steps:
+        if step.before.file in known or step.after.file in known:
+            continue
+        within = step.before is step.after
+        before = None if within else step.before
+        yield ClockFault(step.after, FaultyClock.SET_BACK, step.by, before, misleads=False)
+        if within or step.by < FAR_BACK_NS:
+            continue
+        half = FAR_BACK_NS // 2
+        sides = [around(at - half, at + half) for at in (step.after.start, step.before.end)]
+        # Of equals the earlier one strayed: a clock that loses its time falls back.
+        for bag in min(sides, key=len):
+            if bag.file not in named and bag.file not in known:
+                named.add(bag.file)
+                yield ClockFault(bag, FaultyClock.STRAY)
+
+
+def _span(parts: Sequence[Part], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
+    """The first start and the last end of the bags that are not left out."""
+    starts = sorted(bag.start for bag in left_out)
+    files = {bag.file for bag in left_out}
+    spans: list[tuple[Ns, Ns]] = []
+    for part in parts:
+        first, last = part.bags[0].start, part.bags[-1].start
+        if bisect_left(starts, first) == bisect_right(starts, last):
+            spans.append((first, part.latest))
+        else:
+            spans += [(bag.start, bag.end) for bag in part.bags if bag.file not in files]
+    if not spans:
+        return None, None
+    return min(first for first, _ in spans), max(last for _, last in spans)
+
+
+def _seconds(at: Ns) -> str:
+    return f"{unix_from_ns(at):.0f}"
+
+
+def _length(duration: Ns) -> str:
+    return f"{unix_from_ns(duration):.0f} s"

@@ -1,0 +1,111 @@
+"""Recordings of several runs that overlap in time, and are answered together without being one.
+
+Bags that were copied into one folder, two robots' for instance, answer as one memory. Where one
+recording took over from another they overlap too: that is written down (see `handover`), each
+message counts once, and it is nothing to report.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
+from ros2_memory.core.timebase import NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.index.snapshot import Snapshot
+
+LONG_NS: Final[Ns] = 30 * NS_PER_S
+"""No handover takes longer; a shorter overlap is one where it is half of a recording."""
+SHORT_NS: Final[Ns] = NS_PER_S
+_KEPT: Final = f"/{MOMENTS_FOLDER}/"
+_MOMENT: Final = re.compile(rf"(?P<bag_dir>.*){_KEPT}\d{{8}}T\d{{6}}Z[^/]*/(?P<recording>.+)")
+_MOST_READ: Final = 200
+"""Of so many pairs it is looked whether one took over from the other; each costs two files."""
+
+
+class Together(NamedTuple):
+    """Two recordings, by their folders, and when (log times, inclusive) they overlap."""
+
+    first: Path
+    second: Path
+    start: Ns
+    end: Ns
+
+
+def overlapping_recordings(snapshot: Snapshot) -> tuple[Together, ...]:
+    """The pairs of recordings that overlap and that no handover joins, in order of time.
+
+    Bags that a wrong clock dated are left out: their own dates say nothing. Those of a moment that
+    is kept are of the recording that they were taken from.
+    """
+    spans, pairs = _swept(snapshot)
+    found = []
+    for (one, other), (start, end, shared) in pairs.items():
+        shorter = min(spans[one], spans[other])
+        if shared > LONG_NS or (shared > SHORT_NS and 2 * shared >= shorter):
+            found.append(Together(Path(one), Path(other), start, end))
+    asked = sorted(found, key=lambda each: each.start)[:_MOST_READ]
+    return tuple(each for each in asked if not _took_over(each))
+
+
+def _swept(
+    snapshot: Snapshot,
+) -> tuple[dict[str, Ns], dict[tuple[str, str], tuple[Ns, Ns, Ns]]]:
+    """How long each recording is, and for each pair when, and for how long, both have a bag."""
+    left_out, spans = snapshot.dating.misdated, dict[str, Ns]()
+    pairs: dict[tuple[str, str], tuple[Ns, Ns, Ns]] = {}
+    reach: dict[str, Ns] = {}
+    for bag in snapshot.bags:
+        if bag.file in left_out:
+            continue
+        own, start, end = bag.file.rpartition("/")[0], bag.start, bag.end
+        if _KEPT in own:
+            own = _home(own)
+        before = reach.get(own)
+        if len(reach) > (before is not None):
+            for other, until in [*reach.items()]:
+                if other == own:
+                    continue
+                if until <= start:
+                    del reach[other]
+                    continue
+                pair = (other, own) if other < own else (own, other)
+                last = min(until, end)
+                first, until_then, shared = pairs.get(pair, (start, last, 0))
+                pairs[pair] = (first, max(last, until_then), shared + last - start)
+        reach[own] = end if before is None or end > before else before
+        spans[own] = spans.get(own, 0) + end - start
+    return spans, pairs
+
+
+def _home(folder: str) -> str:
+    """The recording that a folder of a kept moment has bags of, where it lies or lay."""
+    found = _MOMENT.fullmatch(folder)
+    return f"{found['bag_dir']}/{found['recording']}" if found else folder
+
+
+def _took_over(pair: Together) -> bool:
+    """Whether the recorder wrote down that one of two recordings goes on with the other."""
+    names = {pair.first.name, pair.second.name}
+    if pair.first.parent != pair.second.parent:
+        return False
+    for recording in (pair.first, pair.second):
+        handover = read_handover(recording).handover
+        if names & {handover.previous, handover.next}:
+            return True
+    return False
+
+
+def named(pairs: Sequence[Together]) -> Iterator[tuple[str, str]]:
+    """The names of each pair: their folders, and where those are alike, what stands above them."""
+    for first, second, *_ in pairs:
+        if first.name != second.name:
+            yield first.name, second.name
+        else:
+            yield "/".join(first.parts[-2:]), "/".join(second.parts[-2:])

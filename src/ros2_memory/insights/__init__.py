@@ -1,0 +1,1 @@
+"""The tools beyond the specification: sightings, visits, recap, saved moments, status."""

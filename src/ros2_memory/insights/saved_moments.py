@@ -1,0 +1,135 @@
+"""Moments: asks the recorder to keep some, which alone writes there, and lists those it keeps."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.accounts import KeptMoment, KeptMoments, Remembered
+from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.bag_dir.moment_file import held_in
+from ros2_memory.bag_dir.request_queue import Slot
+from ros2_memory.core.errors import RefusedError
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
+from ros2_memory.history.view import View
+
+if TYPE_CHECKING:
+    from ros2_memory.bag_dir.request_queue import Outcome
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Call, Memory
+
+PATIENCE_S: Final = 5.0
+"""The recorder looks once a second, and may be deleting."""
+MOST_LISTED: Final = 20
+_POLL_S: Final = 0.05
+_ENDED: Final = frozenset({RecorderState.STOPPING, RecorderState.STOPPED})
+
+
+def remember_moment(
+    memory: Memory, call: Call, label: str, *, seconds_before: float, seconds_after: float
+) -> Remembered:
+    """Has the recorder keep what was and will be recorded around now.
+
+    Raises:
+        RefusedError: nothing records here, or the recorder does not keep it.
+        QueryTimeoutError: there is no time to wait for the recorder.
+    """
+    now = _now(memory, call)
+    _require_recorder(memory)
+    start, end = now - ns_from_unix(seconds_before), now + ns_from_unix(seconds_after)
+    asked = memory.clock.now()
+    slot = Slot(memory.index.bag_dir, label, max(start, MIN_NS + 1), min(end, MAX_NS - 1), asked)
+    try:
+        slot.post()
+    except OSError as error:
+        raise RefusedError(
+            f"the recorder cannot be asked: {error.strerror or error}; this server must be allowed "
+            "to write into .episodic/requests of the bag directory (as a service that was started "
+            "before the recorder made that: restart it)"
+        ) from error
+    try:
+        outcome = _awaited(slot, call)
+    finally:
+        slot.withdraw()
+        slot.close()
+    if outcome is None:
+        raise RefusedError(
+            f"the recorder did not answer within {PATIENCE_S:g} s; list_moments tells whether it "
+            "keeps the moment all the same, else ask again"
+        )
+    if outcome.moment is None:
+        raise RefusedError(outcome.refused or "the recorder does not say why")
+    return Remembered(outcome.moment, label, start, end, outcome.bags, outcome.pending)
+
+
+def list_moments(memory: Memory, call: Call) -> KeptMoments:
+    """The moments that are kept, the newest first.
+
+    Raises:
+        RefusedError: they cannot be listed.
+    """
+    try:
+        held = [*held_in(memory.index.bag_dir)]
+    except OSError as error:
+        raise RefusedError(
+            f"the moments cannot be listed: {error.strerror or error}; this server must be allowed "
+            "to read moments/ of the bag directory"
+        ) from error
+    newest = sorted(held, key=lambda each: (each.keepsake.end, each.folder.name), reverse=True)
+    listed = (
+        KeptMoment(
+            each.folder.name,
+            each.keepsake.label,
+            each.keepsake.start,
+            each.keepsake.end,
+            len(each.files),
+            sum(each.files.values()),
+            each.keepsake.pending,
+            each.keepsake.missing,
+        )
+        for each in newest[:MOST_LISTED]
+    )
+    return KeptMoments(tuple(listed), len(newest[MOST_LISTED:]), _now(memory, call))
+
+
+def _now(memory: Memory, call: Call) -> Ns:
+    """What "ago" counts from."""
+    wall = memory.clock.now()
+    if memory.limits.now == "wall":
+        return wall
+    latest = View(memory, call, wall).snapshot.latest
+    return wall if latest is None else latest
+
+
+def _require_recorder(memory: Memory) -> None:
+    """Refuses where nobody would hear of a wish.
+
+    Raises:
+        RefusedError: nothing records here, or not just now.
+    """
+    if memory.limits.kept is None:
+        raise RefusedError(
+            "nothing is recorded here (recorder=none), and nothing deleted: copy the bags, or ask "
+            "the server of the robot that records"
+        )
+    heartbeat = memory.index.heartbeat()
+    if heartbeat is None or not heartbeat.is_live(memory.clock.now()) or heartbeat.state in _ENDED:
+        raise RefusedError(
+            "the recorder, which alone keeps moments, is not running: start ros2-memory-recorder, "
+            "then ask again"
+        )
+
+
+def _awaited(slot: Slot, call: Call) -> Outcome | None:
+    """What the recorder answers; None where it has not begun in time, and so never will."""
+    for _ in range(2):
+        patience = Deadline.after(PATIENCE_S)
+        while not patience.expired() and not call.deadline.expired():
+            outcome = slot.outcome()
+            if outcome is not None:
+                return outcome
+            time.sleep(_POLL_S)
+        # What cannot be withdrawn has been begun, and is waited for once more.
+        if slot.withdraw():
+            return None
+    return slot.outcome()

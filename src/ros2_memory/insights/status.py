@@ -1,0 +1,157 @@
+"""How far the memory can be trusted just now: what records, how fresh and how whole it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.accounts import Budget, Status, Stillness
+from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.wording import counted, listed
+from ros2_memory.history.view import View
+from ros2_memory.index.listed_splits import absence_told, absent_splits
+from ros2_memory.overview import nothing_here, odd_bags, undecodable_topics
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.latching import Latching
+    from ros2_memory.index.snapshot import Snapshot
+
+SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
+_SILENT_PERIODS: Final = 10
+"""A topic is silent after so many times the spacing that its messages had."""
+_FEW: Final = 5
+"""A topic with fewer messages has no usual spacing."""
+_GROWTH_NS: Final[Ns] = 24 * 3600 * NS_PER_S
+"""Growth is measured over the newest data of this length."""
+
+
+def memory_status(memory: Memory, call: Call) -> Status:
+    """What the recorder does, how old the newest data is, what fell silent, what is amiss."""
+    wall = memory.clock.now()
+    view = View(memory, call, wall)
+    view.count_all()
+    snapshot, heartbeat = view.snapshot, memory.heartbeat()
+    latest = snapshot.dating.latest
+    now = wall if memory.limits.now == "wall" or latest is None else latest
+    return Status(
+        now=now,
+        earliest=snapshot.dating.earliest,
+        latest=latest,
+        recorder=None if heartbeat is None else str(heartbeat.state),
+        live=heartbeat is not None and heartbeat.is_live(wall),
+        restarts=0 if heartbeat is None else heartbeat.restarts,
+        missing=() if heartbeat is None else heartbeat.missing,
+        never_heard=() if heartbeat is None else heartbeat.silent,
+        fell_silent=tuple(_fallen_silent(snapshot, memory.limits.latching)),
+        damaged=len(snapshot.damaged),
+        incomplete=snapshot.taken[1],
+        unread=len(snapshot.unread),
+        budget=_budget(memory, snapshot, heartbeat, wall),
+        problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
+        notes=(*view.notes, *_age_held(heartbeat, wall)),
+    )
+
+
+def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
+    """Why answers may be missing something, in sentences.
+
+    A recorder that should be recording is a problem where it does not; a stopped one was stopped.
+    """
+    if snapshot.problem:
+        yield snapshot.problem
+    if snapshot.damaged:
+        damaged = counted(len(snapshot.damaged), "damaged bag file")
+        yield f"{damaged}; data_time_range lists what does not answer"
+    if snapshot.dating.note:
+        yield snapshot.dating.note
+    if heartbeat is None or heartbeat.state is RecorderState.STOPPED:
+        return
+    if not heartbeat.is_live(wall):
+        yield "the recorder has stopped without saying so"
+    elif heartbeat.state is RecorderState.PAUSED:
+        yield f"the recorder is paused: {heartbeat.last_error or 'it does not say why'}"
+
+
+def lacking_in(view: View) -> Iterator[str]:
+    """What is known to be missing from the answers, in sentences, each with its count.
+
+    Damaged files and a directory that cannot be read are among `problems_of`.
+    """
+    snapshot = view.snapshot
+    if snapshot.problem is None and not snapshot.bags:
+        yield nothing_here(snapshot)
+    if left_open := snapshot.taken[1]:
+        bags = counted(left_open, "bag was", "bags were")
+        yield f"{bags} left open by a crash: what did not reach the disk is lost"
+    if snapshot.unread:
+        files = counted(len(snapshot.unread), "file is not read", "files are not read")
+        yield f"{files}; data_time_range says why"
+    if odd := len(odd_bags(snapshot)):
+        bags = counted(odd, "bag is", "bags are")
+        yield f"{bags} not whole or contradictory; data_time_range says how"
+    yield from absence_told(absent_splits(snapshot, view.memory.index.bag_dir))
+    if undecodable := {each.topic for each in undecodable_topics(view)}:
+        topics = counted(len(undecodable), "topic")
+        yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
+
+
+def _age_held(heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
+    """What a live recorder keeps longer than it should, for want of a clock that is right."""
+    if heartbeat is not None and heartbeat.age_held is not None and heartbeat.is_live(wall):
+        yield heartbeat.age_held
+
+
+def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[Stillness]:
+    """Topics that were heard often, and not any more when the newest data was recorded."""
+    latest = snapshot.dating.latest
+    if latest is None:
+        return
+    for topic in snapshot.topics():
+        if snapshot.is_log(topic) or latching.is_latched(snapshot, topic):
+            continue
+        stated = [*snapshot.stated(topic).values()]
+        messages = sum(each.messages for each in stated)
+        first, last = min(each.first for each in stated), max(each.last for each in stated)
+        if messages < _FEW:
+            continue
+        usual = (last - first) // (messages - 1)
+        if latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual):
+            yield Stillness(topic, last, usual)
+
+
+def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:
+    """What the bags take, how fast that grows, and for how long the budget lasts.
+
+    Growth is only predicted while a live recorder records. Where none is configured there is no
+    budget either.
+    """
+    kept, latest = memory.limits.kept, snapshot.dating.latest
+    used, _ = snapshot.taken
+    if kept is None:
+        return Budget(used, None, None, None)
+    foreign = memory.foreign(snapshot)
+    folders = frozenset[str]() if foreign is None else foreign.folders
+    foreign_bytes = None if foreign is None else foreign.total_bytes
+    used -= 0 if foreign is None else foreign.bag_bytes
+    if heartbeat is None or not _is_recording(heartbeat, wall):
+        return Budget(used, kept.max_total_bytes, None, kept.max_age_ns, foreign_bytes)
+    grown, since = 0, latest
+    if latest is not None:
+        for bag in reversed(snapshot.bags):
+            if bag.end < latest - _GROWTH_NS:
+                break
+            if str(bag.recording) in folders:
+                continue
+            grown += bag.size
+            since = min(bag.start, latest if since is None else since)
+    span = 0 if latest is None or since is None else latest - since
+    per_day = grown * _GROWTH_NS // span if span > 0 else None
+    return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns, foreign_bytes)
+
+
+def _is_recording(heartbeat: Heartbeat, wall: Ns) -> bool:
+    return heartbeat.state is RecorderState.RECORDING and heartbeat.is_live(wall)

@@ -1,0 +1,81 @@
+"""What the replies show of a message type: its fields, as the dot-paths that tools take."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.accounts import TypeFields
+from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.coverage import require_bags
+from ros2_memory.history.view import View
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.context import Call, Memory
+
+MOST_FIELDS: Final = 100
+
+
+def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
+    """The fields of a recorded message type, from the newest message of it.
+
+    Raises:
+        NoDataError: no topic was recorded under the type, or none of its messages can be decoded.
+    """
+    view = View(memory, call, memory.clock.now())
+    require_bags(view)
+    snapshot = view.snapshot
+    topics = [topic for topic in snapshot.topics() if type_name in snapshot.types_of(topic)]
+    if not topics:
+        known = sorted({each for topic in snapshot.topics() for each in snapshot.types_of(topic)})
+        more = f" and {len(known) - MOST_FIELDS} more" if len(known) > MOST_FIELDS else ""
+        names = ", ".join(known[:MOST_FIELDS]) + more
+        raise NoDataError(
+            NoDataReason.TOPIC_NOT_RECORDED,
+            f"no topic was recorded under this type; there are {names}",
+        )
+    failure = ""
+    for topic in topics:
+        found = view.newest(topic, TimeWindow.everything())
+        if found is None or found.record.channel.type != type_name:
+            continue
+        try:
+            message = memory.reader.decode(found.record)
+        except UndecodableError as error:
+            failure = error.reason
+            continue
+        value = memory.extractor.exact(message, type_name)
+        fields = dict(_fields(value, ""))
+        if len(fields) > MOST_FIELDS:
+            view.note(f"{MOST_FIELDS} of {len(fields)} fields")
+        told = tuple(fields.items())[:MOST_FIELDS]
+        return TypeFields(type_name, tuple(topics), told, view.notes)
+    raise NoDataError(
+        NoDataReason.UNDECODABLE,
+        f"no newest message of this type can be read: {failure or 'others came after it'}",
+    )
+
+
+def _fields(value: JsonValue, path: str) -> Iterator[tuple[str, str]]:
+    """Dot-paths and the kinds of what stands there; a list is told by its first element."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _fields(inner, f"{path}.{name}" if path else name)
+    elif isinstance(value, list):
+        if value and isinstance(value[0], dict | list):
+            yield from _fields(value[0], path)
+        else:
+            yield path, f"list of {_kind(value[0])}s" if value else "list"
+    else:
+        yield path, _kind(value)
+
+
+def _kind(value: JsonValue) -> str:
+    if isinstance(value, bool):
+        return "boolean"
+    if isinstance(value, str):
+        return "text"
+    return "number"

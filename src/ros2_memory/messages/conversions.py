@@ -1,0 +1,232 @@
+"""What a message means, beyond its fields: rotations, points, times, pictures.
+
+The extracted view, which replies and conditions see, is the message with a quaternion as
+`roll_deg`, `pitch_deg` and `yaw_deg`, a time as one number, and the data of images, point clouds
+and maps as summaries. `view` steps through it; `kind_of` and `summaries_of` say what differs.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sized
+from enum import Enum, auto
+from functools import lru_cache
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.core import geometry
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.messages.fields import (
+    ABSENT,
+    descend,
+    field_of,
+    layout_of,
+    layout_of_class,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from ros2_memory.core.model import Quaternion, Vector3
+    from ros2_memory.messages.fields import Layout
+
+ANGLES: Final = ("roll_deg", "pitch_deg", "yaw_deg")
+
+
+class Metric(float):
+    """A component of a point or vector of geometry_msgs: metres, m/s, rad/s and their kin."""
+
+    __slots__ = ()
+
+
+class Degrees(float):
+    """An angle that came from a quaternion."""
+
+    __slots__ = ()
+
+
+class Kind(Enum):
+    """How the extracted view sees a message."""
+
+    PLAIN = auto()  # field by field
+    VECTOR = auto()  # field by field, each a `Metric`
+    QUATERNION = auto()  # as Euler angles
+    TIME = auto()  # as one number of seconds
+
+
+def kind_of(node: object) -> Kind:
+    """How the extracted view sees a node; PLAIN for what is no message."""
+    cls: type = type(node)
+    return _kind_of_class(cls)
+
+
+@lru_cache(maxsize=4096)
+def _kind_of_class(cls: type) -> Kind:
+    layout = layout_of_class(cls)
+    if layout is None:
+        return Kind.PLAIN
+    kind, fields = _KINDS.get(layout.type, (Kind.PLAIN, ""))
+    # A bag may bring a definition of its own under the name of a standard type.
+    return kind if fields.split() == list(layout.attributes) else Kind.PLAIN
+
+
+def view(node: object, name: str) -> object:
+    """What stands under this name in the extracted view of a message; else ABSENT."""
+    kind = kind_of(node)
+    if kind is Kind.TIME:
+        return ABSENT
+    if kind is Kind.QUATERNION:
+        angles = euler(node)
+        return (None if angles is None else angles[name]) if name in ANGLES else ABSENT
+    found = field_of(node, name)
+    if kind is Kind.VECTOR:
+        return Metric(found) if isinstance(found, float) else found
+    layout = None if found is ABSENT else layout_of(node)
+    summaries = _NONE if layout is None else summaries_of(layout)
+    return summaries[name](node, found) if name in summaries else found
+
+
+def summaries_of(layout: Layout) -> Mapping[str, Callable[[object, object], object]]:
+    """By field of such messages, what makes a summary of the message and what was found there."""
+    return _VIEWS.get(layout.type, _NONE)
+
+
+_XYZ: Final = attrgetter("x", "y", "z")
+_XYZW: Final = attrgetter("x", "y", "z", "w")
+
+
+def xyz(node: object) -> Vector3 | None:
+    """The numbers of a message or JSON object shaped like a point; None where it is not."""
+    try:
+        x, y, z = _XYZ(node)
+    except AttributeError:
+        x, y, z = (field_of(node, name) for name in "xyz")
+    if type(x) is type(y) is type(z) is float:
+        return (x, y, z)
+    numbers = _floats(x, y, z)
+    return (numbers[0], numbers[1], numbers[2]) if numbers else None
+
+
+def xyzw(node: object) -> Quaternion | None:
+    """The numbers of a message or JSON object shaped like a quaternion, not normalised."""
+    try:
+        x, y, z, w = _XYZW(node)
+    except AttributeError:
+        x, y, z, w = (field_of(node, name) for name in "xyzw")
+    if type(x) is type(y) is type(z) is type(w) is float:
+        return (x, y, z, w)
+    numbers = _floats(x, y, z, w)
+    return (numbers[0], numbers[1], numbers[2], numbers[3]) if numbers else None
+
+
+def _floats(*values: object) -> list[float] | None:
+    if not all(isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values):
+        return None
+    try:
+        return [float(value) for value in values if isinstance(value, int | float | np.number)]
+    except (OverflowError, TypeError):
+        return None
+
+
+def rotation(node: object) -> Quaternion | None:
+    """The unit quaternion of a node; None where it is no rotation: zero, not finite, no numbers."""
+    numbers = xyzw(node)
+    return None if numbers is None else unit(numbers)
+
+
+def unit(numbers: Quaternion) -> Quaternion | None:
+    """The unit quaternion of four numbers; None where they are no rotation."""
+    x, y, z, w = numbers
+    # Nearly every quaternion of a robot is a unit one; this door is passed for each pose.
+    if abs(x * x + y * y + z * z + w * w - 1) < 1e-12:
+        return numbers
+    return geometry.normalised(numbers)
+
+
+def euler(node: object) -> dict[str, Degrees] | None:
+    """Roll, pitch and yaw (REP-103, degrees) of a quaternion; None where it is no rotation."""
+    unit = rotation(node)
+    if unit is None:
+        return None
+    roll, pitch, yaw = geometry.rpy(unit)
+    return {
+        "roll_deg": Degrees(math.degrees(roll)),
+        "pitch_deg": Degrees(math.degrees(pitch)),
+        "yaw_deg": Degrees(math.degrees(yaw)),
+    }
+
+
+def nanoseconds(node: object) -> Ns | None:
+    """The nanoseconds of a Time or Duration (or its JSON likeness); None where it is none."""
+    for names in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs")):
+        sec, rest = (field_of(node, name) for name in names)
+        if isinstance(sec, int) and isinstance(rest, int):
+            whole = sec * NS_PER_S + rest
+            return whole if MIN_NS <= whole <= MAX_NS else None
+    return None
+
+
+def _image(message: object, data: object) -> object:
+    encoding = field_of(message, "encoding")
+    size = [field_of(message, "height"), field_of(message, "width")]
+    shape = [n for n in (*size, _channels(str(encoding))) if isinstance(n, int)]
+    return {**_bytes(data), "encoding": _or_null(encoding), "shape": shape}
+
+
+def _channels(encoding: str) -> int | None:
+    """Channels by the names of sensor_msgs/image_encodings.hpp; None for one without (yuv)."""
+    typed = re.fullmatch(r"\d+[USF]C(\d{1,3})", encoding)
+    if typed:
+        return int(typed[1])
+    named = re.match(r"mono|bayer|rgba|bgra|rgb|bgr", encoding)
+    return {"mono": 1, "bayer": 1, "rgb": 3, "bgr": 3}.get(named[0], 4) if named else None
+
+
+def _compressed_image(message: object, data: object) -> object:
+    return {**_bytes(data), "encoding": _or_null(field_of(message, "format"))}
+
+
+def _point_cloud(message: object, data: object) -> object:
+    size = [field_of(message, "height"), field_of(message, "width")]
+    shape = [n for n in size if isinstance(n, int)]
+    return {**_bytes(data), "points": math.prod(shape), "shape": shape}
+
+
+def _occupancy_grid(message: object, data: object) -> object:
+    size = [descend(message, ("info", name)) for name in ("height", "width")]
+    return {**_bytes(data), "shape": [n for n in size if isinstance(n, int)]}
+
+
+def _magnetic_field(_message: object, field: object) -> object:
+    """Without the decimals that suit metres: in Tesla, the field of the Earth would vanish."""
+    numbers = xyz(field)
+    return field if numbers is None else dict(zip("xyz", numbers, strict=True))
+
+
+def _bytes(data: object) -> dict[str, object]:
+    return {"bytes": len(data) if isinstance(data, Sized) else 0}
+
+
+def _or_null(node: object) -> object:
+    return None if node is ABSENT else node
+
+
+_KINDS: Final[Mapping[str, tuple[Kind, str]]] = {
+    "geometry_msgs/msg/Point": (Kind.VECTOR, "x y z"),
+    "geometry_msgs/msg/Point32": (Kind.VECTOR, "x y z"),
+    "geometry_msgs/msg/Vector3": (Kind.VECTOR, "x y z"),
+    "geometry_msgs/msg/Quaternion": (Kind.QUATERNION, "x y z w"),
+    "builtin_interfaces/msg/Time": (Kind.TIME, "sec nanosec"),
+    "builtin_interfaces/msg/Duration": (Kind.TIME, "sec nanosec"),
+}
+_NONE: Final[Mapping[str, Callable[[object, object], object]]] = {}
+_VIEWS: Final[Mapping[str, Mapping[str, Callable[[object, object], object]]]] = {
+    "sensor_msgs/msg/Image": {"data": _image},
+    "sensor_msgs/msg/CompressedImage": {"data": _compressed_image},
+    "sensor_msgs/msg/PointCloud2": {"data": _point_cloud},
+    "nav_msgs/msg/OccupancyGrid": {"data": _occupancy_grid},
+    "sensor_msgs/msg/MagneticField": {"magnetic_field": _magnetic_field},
+}

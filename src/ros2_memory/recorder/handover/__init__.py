@@ -1,0 +1,1 @@
+"""One recording takes over from another without losing or doubling a message."""

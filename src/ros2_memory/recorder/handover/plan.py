@@ -1,0 +1,196 @@
+"""One recording takes over from another: when each step is due, and what is written down. Pure.
+
+The new recorder is started beside the old one and waited for until it has subscribed to all that
+the old one had, though not for ever, since a publisher may be gone. Then both run for two seconds
+more. The cut lies in the middle of those: whatever was published about it stands in both, so that
+neither a message under way nor a clock that is off by less than a second is lost or counts twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.bag_dir.handover_file import (
+    LOG_CLOCK_NOTE,
+    Counting,
+    CutClock,
+    Handover,
+    Overlap,
+)
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+SUBSCRIBE_TIMEOUT_S: Final = 20.0
+READY_TIMEOUT_S: Final = 120.0
+"""A recorder that has not begun after so long does not begin."""
+BOTH_S: Final = 2.0
+STEP_NS: Final[Ns] = 100 * NS_PER_MS
+"""A clock that falls behind by so much at once was set back; a slewed one falls behind slowly."""
+
+LAST_WORDS_NS: Final[Ns] = 30 * NS_PER_S
+"""How long the old recorder may still receive after it was told to end."""
+
+
+class Moment(NamedTuple):
+    """One moment by the two clocks: seconds that never step, and the wall clock."""
+
+    monotonic_s: float
+    wall: Ns
+
+
+def set_back(earlier: Moment, later: Moment, by_ns: Ns = STEP_NS) -> bool:
+    """Whether the wall clock was set back by more between two moments that lie close together.
+
+    A clock that is set forward does no harm: what was published before and after it still falls on
+    either side of one cut.
+    """
+    passed = round((later.monotonic_s - earlier.monotonic_s) * NS_PER_S)
+    return passed - (later.wall - earlier.wall) > by_ns
+
+
+class Step(Enum):
+    """What a handover needs next."""
+
+    WAIT = auto()
+    COMPLETE = auto()
+    # The new recorder does not begin, or the clock was set back: then one cut cannot part what was
+    # published before and after it.
+    ABANDON = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """The times of a handover that is complete: both recorders received from `both` to `ended`."""
+
+    began: Ns
+    both: Ns
+    cut: Ns
+    ended: Ns
+
+
+class Passage:
+    """A handover under way, from the moment before the new recorder was started."""
+
+    def __init__(
+        self,
+        began: Moment,
+        *,
+        subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S,
+        both_s: float = BOTH_S,
+    ) -> None:
+        self.began = began
+        self._timeout_s = subscribe_timeout_s
+        self._both_s = both_s
+        self._both: Moment | None = None
+        self._last = began
+
+    @property
+    def overlapping(self) -> bool:
+        """Whether the new recorder receives all that the old one does."""
+        return self._both is not None
+
+    def advance(self, now: Moment, *, ready: bool, missing: Collection[str]) -> Step:
+        """What is due. To be asked several times a second.
+
+        Args:
+            now: this moment.
+            ready: whether the new recorder records, into a directory that exists.
+            missing: the topics that the old one has subscribed to, and the new one not yet.
+        """
+        before, self._last = self._last, now
+        if set_back(before, now):
+            return Step.ABANDON
+        age_s = now.monotonic_s - self.began.monotonic_s
+        if missing and age_s < self._timeout_s:
+            # Also of a publisher that appears while both run: what it sends before the new one has
+            # subscribed stands in the old one alone, and must not lie behind the cut.
+            self._both = None
+        elif self._both is None and ready:
+            self._both = now
+        if self._both is None:
+            return Step.WAIT if ready or age_s < READY_TIMEOUT_S else Step.ABANDON
+        over = now.monotonic_s - self._both.monotonic_s >= self._both_s
+        return Step.COMPLETE if over else Step.WAIT
+
+    def bounds(self, now: Moment) -> Bounds | None:
+        """The times of the handover if it is completed now; None while the two do not overlap."""
+        if self._both is None:
+            return None
+        middle = (self._both.wall + now.wall) // 2
+        return Bounds(self.began.wall, self._both.wall, middle, now.wall)
+
+
+class Sidecars(NamedTuple):
+    """What is written down for the old and for the new recording."""
+
+    old: Handover
+    new: Handover
+
+
+def intended(old: Handover, new_name: str) -> Handover:
+    """For the old recording, before the new one is started: a crash may come at any moment."""
+    return replace(old, next=new_name, counts_until=None, end=None)
+
+
+def pending(old_name: str) -> Handover:
+    """For the new recording, as soon as its directory exists: until the cut it does not count."""
+    return Handover(state=Counting.PENDING, previous=old_name)
+
+
+def void(old_name: str) -> Handover:
+    """For a new recording that did not take over: the old one went on, and has all of it."""
+    return Handover(state=Counting.VOID, previous=old_name)
+
+
+def withdrawn(old: Handover) -> Handover:
+    """For the old recording, when the new one did not take over."""
+    return replace(old, next=None, counts_until=None, end=None)
+
+
+def handed_over(
+    old: Handover,
+    old_name: str,
+    new_name: str,
+    bounds: Bounds,
+    *,
+    old_files: Collection[str],
+    new_files: Collection[str],
+    simulated: bool,
+    clock: CutClock,
+) -> Sidecars:
+    """What is written down when a handover is complete, for the new recording first.
+
+    Args:
+        old: the sidecar of the old recording as it stands.
+        old_name: the old recording.
+        new_name: the new recording.
+        bounds: the times of the handover.
+        old_files: the bag files of the old recording that were open at any time in it.
+        new_files: the bag files of the new recording so far.
+        simulated: whether log times are those of a simulated clock.
+        clock: whether publish times differ from log times.
+    """
+    both, last = (None, None) if simulated else (bounds.both, bounds.ended + LAST_WORDS_NS)
+    began, ended = (None, None) if simulated else (bounds.began, bounds.ended)
+    notes = (LOG_CLOCK_NOTE,) if clock is CutClock.LOG else ()
+    return Sidecars(
+        old=replace(
+            old,
+            clock=clock,
+            next=new_name,
+            counts_until=bounds.cut,
+            end=Overlap(both, last, tuple(sorted(old_files))),
+            notes=tuple(dict.fromkeys((*old.notes, *notes))),
+        ),
+        new=Handover(
+            clock=clock,
+            previous=old_name,
+            counts_from=bounds.cut,
+            begin=Overlap(began, ended, tuple(sorted(new_files))),
+            notes=notes,
+        ),
+    )

@@ -1,0 +1,168 @@
+"""One recording taking over from another: the sidecars are written as the handover goes on.
+
+Each is written before what it speaks of can matter: the old recording names the new one before
+that is started, the new one counts for nothing as soon as it exists, and when the cut is made it is
+written to the new one first. So a crash leaves a pair that `settle` can bring to its end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from ros2_memory.bag_dir.handover_file import (
+    CutClock,
+    Handover,
+    standing_handover,
+    write_handover,
+    write_handovers,
+)
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.handover.plan import (
+    handed_over,
+    intended,
+    pending,
+    void,
+    withdrawn,
+)
+from ros2_memory.recorder.handover.recovery import cut_clock, settle
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.recorder.handover.plan import Moment, Passage, Step
+    from ros2_memory.recorder.session import Session
+    from ros2_memory.storage.base import BagReader
+
+
+class Takeover:
+    """A handover from one running session to another.
+
+    `simulated`: log times come from a simulated clock.
+    """
+
+    def __init__(
+        self, old: Session, new: Session, passage: Passage, reader: BagReader, *, simulated: bool
+    ) -> None:
+        self.old = old
+        self.new = new
+        self._passage = passage
+        self._reader = reader
+        self._simulated = simulated
+        self._marked = False
+        self._closed_before = old.splits.closed_names
+
+    @staticmethod
+    def announce(old: Session, new_name: str) -> None:
+        """Has the old recording name the new one, which is about to be started.
+
+        Raises:
+            RecorderError: it cannot be written.
+        """
+        directory = old.splits.directory
+        write_handover(directory, intended(standing_handover(directory), new_name))
+
+    @staticmethod
+    def withdraw(old: Session) -> None:
+        """Has the old recording name no next one, if it is still there.
+
+        Raises:
+            RecorderError: it cannot be written.
+        """
+        directory = old.splits.directory
+        if _is_there(directory):
+            write_handover(directory, withdrawn(standing_handover(directory)))
+
+    @property
+    def missing(self) -> frozenset[str]:
+        """Topics that the old recorder has subscribed to, and the new one not yet."""
+        return frozenset(self.old.subscribed - self.new.subscribed)
+
+    def advance(self, now: Moment) -> Step:
+        """What is due at this moment.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        if not self._marked and self.new.splits.exists:
+            write_handover(self.new.splits.directory, pending(self.old.name))
+            self._marked = True
+        ready = self._marked and self.new.ready
+        return self._passage.advance(now, ready=ready, missing=self.missing)
+
+    def complete(self, now: Moment) -> bool:
+        """Makes the cut, when both recorders receive; False where they do not overlap yet.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        bounds = self._passage.bounds(now)
+        if bounds is None:
+            return False
+        sidecars = handed_over(
+            standing_handover(self.old.splits.directory),
+            self.old.name,
+            self.new.name,
+            bounds,
+            old_files=self._old_files(),
+            new_files=self.new.splits.names(),
+            simulated=self._simulated,
+            clock=self._clock(),
+        )
+        write_handovers(
+            {
+                self.new.splits.directory: sidecars.new,
+                self.old.splits.directory: sidecars.old,
+            }
+        )
+        return True
+
+    def abandon(self) -> None:
+        """The old recording goes on, and has all that the new one has.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        if _is_there(self.new.splits.directory):
+            write_handover(self.new.splits.directory, void(self.old.name))
+        self.withdraw(self.old)
+
+    def old_has_ended(self) -> None:
+        """Adds the splits that the old recorder opened after the cut, while it was ending.
+
+        Raises:
+            RecorderError: the sidecar cannot be written.
+        """
+        directory = self.old.splits.directory
+        handover = standing_handover(directory)
+        if handover.end is not None:
+            files = tuple(sorted(self._old_files() | frozenset(handover.end.files)))
+            write_handover(directory, replace(handover, end=replace(handover.end, files=files)))
+
+    def settle(self) -> None:
+        """After the old recorder died half-way: the new recording counts from where it ends.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        if _is_there(self.old.splits.directory):
+            settle(self.old.splits.directory, self.new.splits.directory, self._reader)
+        elif _is_there(self.new.splits.directory):
+            write_handover(self.new.splits.directory, Handover())
+
+    def _old_files(self) -> frozenset[str]:
+        return self.old.splits.names() - self._closed_before
+
+    def _clock(self) -> CutClock:
+        closed = sorted(self.old.splits.closed_names)
+        if not closed:
+            return CutClock.PUBLISH
+        return cut_clock(self.old.splits.directory / closed[-1], self._reader)
+
+
+def _is_there(recording: Path) -> bool:
+    """Whether the directory of a recording is there; an error where that cannot be told."""
+    try:
+        return recording.is_dir()
+    except OSError as error:
+        raise RecorderError(f"{recording}: {error.strerror or error}") from error

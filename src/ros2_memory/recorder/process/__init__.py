@@ -1,0 +1,1 @@
+"""The `ros2 bag record` subprocess: argv, environment, output, signals."""

@@ -1,0 +1,237 @@
+"""One child process: started without a shell, read line by line, ended within a bounded time.
+
+A child is a session and a process group of its own. It dies with the thread that started it, so
+only the main thread may start one. What it prints is read by a thread, so that it never waits for
+us; what nobody asks for is dropped in time. Nothing is ever sent to a process that was not started
+here: the exit of a child is noticed without reaping it, and until it is reaped its number is taken.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.core.errors import RecorderError
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping, Sequence
+
+    from ros2_memory.recorder.ports import RecorderProcess
+
+LAUNCHER: Final = Path(__file__).with_name("launch.py")
+MAX_LINE: Final = 4096
+"""Characters of one line that are kept."""
+MAX_LINES: Final = 10_000
+"""Lines that wait to be taken; of more, the oldest are dropped."""
+
+_READER_PATIENCE_S: Final = 1.0
+_POLL_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long an ending child is waited for after each signal, in seconds."""
+
+    interrupt_s: float = 8.0
+    terminate_s: float = 4.0
+    kill_s: float = 3.0
+
+    @property
+    def total_s(self) -> float:
+        """After this long it is given up: not even SIGKILL ends a process that waits for a disk."""
+        return self.interrupt_s + self.terminate_s + self.kill_s
+
+    def signal_due(self, since_s: float) -> signal.Signals:
+        """The strongest signal that has fallen due, `since_s` seconds after the first."""
+        if since_s < self.interrupt_s:
+            return signal.SIGINT
+        if since_s < self.interrupt_s + self.terminate_s:
+            return signal.SIGTERM
+        return signal.SIGKILL
+
+
+class Child:
+    """A running program, and what it printed. Built by `start`; used from one thread."""
+
+    def __init__(
+        self, process: subprocess.Popen[bytes], output: IO[bytes], patience: Patience
+    ) -> None:
+        self._process = process
+        self._patience = patience
+        self._lines: deque[str] = deque(maxlen=MAX_LINES)
+        self._status: int | None = None
+        self._ending_since: float | None = None
+        self._sent: signal.Signals | None = None
+        self._reader = threading.Thread(
+            target=_read, args=(output, self._lines), name=f"output of {process.pid}", daemon=True
+        )
+        self._reader.start()
+
+    @classmethod
+    def start(
+        cls,
+        argv: Sequence[str],
+        env: Mapping[str, str],
+        *,
+        keep_open: Collection[int] = (),
+        patience: Patience | None = None,
+    ) -> Child:
+        """Starts `argv`, whose first element is the path of a program.
+
+        Args:
+            argv: the program and its arguments, as they are: no shell sees them.
+            env: its whole environment.
+            keep_open: file descriptors that it inherits besides its output.
+            patience: how long it is waited for when it is to end.
+
+        Raises:
+            RecorderError: it cannot be started.
+        """
+        if threading.current_thread() is not threading.main_thread():
+            raise RecorderError("a recorder must be started from the main thread: it dies with it")
+        launched = [sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid()), *argv]
+        readable, writable = os.pipe()
+        output = os.fdopen(readable, "rb")
+        try:
+            process = _spawn(launched, env, writable, writable, keep_open)
+        except RecorderError:
+            output.close()
+            raise
+        finally:
+            os.close(writable)
+        return cls(process, output, patience or Patience())
+
+    @property
+    def pid(self) -> int:
+        """Its process number, which is also its group's."""
+        return self._process.pid
+
+    @property
+    def patience_s(self) -> float:
+        """For how long `end` is worth calling; after that nothing ends it."""
+        return self._patience.total_s
+
+    def take_lines(self) -> list[str]:
+        """What it printed since the last call, oldest first."""
+        # As many as there are at this moment: the reading thread may add without end.
+        return [self._lines.popleft() for _ in range(len(self._lines))]
+
+    def exit_status(self) -> int | None:
+        """None while it runs; then its exit code, or minus the number of the signal it died by.
+
+        Whatever is left of its group is killed first. All its output can then be taken.
+        """
+        if self._status is not None:
+            return self._status
+        try:
+            if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+                return None
+            self._signal_group(signal.SIGKILL)
+        except ChildProcessError:
+            pass  # reaped already, where SIGCHLD is ignored: the number may be another's
+        self._status = self._process.wait()
+        self._reader.join(_READER_PATIENCE_S)
+        return self._status
+
+    def end(self) -> int | None:
+        """Has it end, without waiting: to be called again until there is an exit status.
+
+        The first call sends SIGINT, and later ones SIGTERM and SIGKILL as its patience runs out.
+        """
+        status = self.exit_status()
+        if status is not None:
+            return status
+        now = time.monotonic()
+        if self._ending_since is None:
+            self._ending_since = now
+        due = self._patience.signal_due(now - self._ending_since)
+        if due is not self._sent:
+            self._sent = due
+            self._signal_group(due)
+        return None
+
+    def _signal_group(self, number: signal.Signals) -> None:
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, number)
+
+
+def end_all(children: Collection[RecorderProcess]) -> list[RecorderProcess]:
+    """Ends all of them at once; returns those that not even SIGKILL ended in time, mostly none."""
+    patience_s = max((child.patience_s for child in children), default=0.0)
+    give_up = time.monotonic() + patience_s
+    while True:
+        left = [child for child in children if child.end() is None]
+        if not left or time.monotonic() >= give_up:
+            return left
+        time.sleep(_POLL_S)
+
+
+class Finished(NamedTuple):
+    """A program that came to its end: exit code (or minus a signal's number), and its output."""
+
+    status: int
+    output: bytes
+    errors: bytes
+
+
+def run_bounded(argv: Sequence[str], env: Mapping[str, str], timeout_s: float) -> Finished:
+    """Runs a program to its end. What it leaves running in the background is not waited for.
+
+    Raises:
+        RecorderError: it cannot be started, or runs for longer than `timeout_s`.
+    """
+    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
+        process = _spawn(argv, env, output.fileno(), errors.fileno(), ())
+        try:
+            status = process.wait(timeout_s)
+        except subprocess.TimeoutExpired as error:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            raise RecorderError(
+                f"{' '.join(argv[:3])} ... did not come to an end within {timeout_s:g} s"
+            ) from error
+        return Finished(status, _content(output), _content(errors))
+
+
+def _spawn(
+    argv: Sequence[str],
+    env: Mapping[str, str],
+    stdout: int,
+    stderr: int,
+    keep_open: Collection[int],
+) -> subprocess.Popen[bytes]:
+    try:
+        return subprocess.Popen(  # noqa: S603 - an argv list, and never a shell
+            list(argv),
+            env=dict(env),
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=stderr,
+            start_new_session=True,
+            pass_fds=tuple(keep_open),
+        )
+    except (OSError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise RecorderError(f"{argv[0]} cannot be started: {reason}") from error
+
+
+def _content(stream: IO[bytes]) -> bytes:
+    stream.seek(0)
+    return stream.read()
+
+
+def _read(stream: IO[bytes], lines: deque[str]) -> None:
+    """Takes everything that comes until all ends of the pipe are closed."""
+    with stream:
+        while piece := stream.readline(MAX_LINE):
+            lines.append(piece.decode("utf-8", errors="replace").rstrip("\r\n"))

@@ -1,0 +1,153 @@
+"""The environment that `ros2` runs in: the robot's, and nothing of ours.
+
+The setup files of a distribution and of workspaces (`/opt/ros/jazzy/setup.bash`) are shell scripts
+that only a shell can read. One constant helper sources them, in order, and prints the environment
+that came of it; their paths reach it as arguments, so that no path is ever read as shell text.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.process.child import run_bounded
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+SETUP_TIMEOUT_S: Final = 60.0
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+# Each file is announced before it is sourced, so that one that fails, or exits, has a name. What it
+# prints goes to stderr. No file sees the arguments, which some would take for their own. An empty
+# entry ends the names and begins the environment.
+_SOURCE_ALL: Final = (
+    'files=("$@"); set --; '
+    'for file in "${files[@]}"; do printf "%s\\0" "$file"; . "$file" >&2 || exit; done; '
+    'printf "\\0"; exec env -0'
+)
+_OURS: Final = frozenset(
+    {
+        "VIRTUAL_ENV",
+        "VIRTUAL_ENV_PROMPT",
+        "PYTHONHOME",
+        "PYTHONEXECUTABLE",
+        "BASH_ENV",  # bash would source it, uninvited
+        # The service manager's channels belong to the daemon.
+        "NOTIFY_SOCKET",
+        "WATCHDOG_PID",
+        "WATCHDOG_USEC",
+        "LISTEN_FDS",
+        "LISTEN_PID",
+        "JOURNAL_STREAM",
+        "CREDENTIALS_DIRECTORY",
+        # The server's, from an environment file that both programs have.
+        "MEMORY_API_TOKEN",
+    }
+)
+_SHELLS_OWN: Final = ("_", "SHLVL", "PWD", "OLDPWD")
+# The recorder's lines are read by a program: whole lines, on stderr, without colours, in rcutils'
+# default form. A robot may well be set to another one.
+_READABLE_OUTPUT: Final = {
+    "RCUTILS_COLORIZED_OUTPUT": "0",
+    "RCUTILS_LOGGING_BUFFERED_STREAM": "1",
+    "RCUTILS_LOGGING_USE_STDOUT": "0",
+    "RCUTILS_CONSOLE_OUTPUT_FORMAT": "[{severity}] [{time}] [{name}]: {message}",
+    "PYTHONUNBUFFERED": "1",
+}
+
+
+def robot_environment(
+    setup_files: Sequence[Path],
+    log_dir: Path,
+    inherited: Mapping[str, str] | None = None,
+) -> dict[str, str]:
+    """The environment for `ros2`: what is inherited, less what is ours, after the setup files.
+
+    `ROS_DOMAIN_ID`, the RMW's settings and everything else of the robot pass through.
+
+    Args:
+        setup_files: bash scripts, sourced in this order; none where `ros2` is on PATH already.
+        log_dir: where ROS leaves the log file of each run, unless the environment names a place.
+        inherited: the environment to begin with; the process's own where None.
+
+    Raises:
+        RecorderError: a setup file is missing or fails; the sentence names it.
+    """
+    base = without_ours(os.environ if inherited is None else inherited)
+    if setup_files:
+        # Setup files set it anew; what stands there before them is not the robot's.
+        base.pop("PYTHONPATH", None)
+        base = _sourced(setup_files, base)
+    return {"ROS_LOG_DIR": str(log_dir), **base, **_READABLE_OUTPUT}
+
+
+def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
+    """The environment less our Python's virtual environment and the service manager's channels."""
+    prefixes = [inherited["VIRTUAL_ENV"]] if inherited.get("VIRTUAL_ENV") else []
+    if sys.prefix != sys.base_prefix:
+        prefixes.append(sys.prefix)
+    env = {name: value for name, value in inherited.items() if name not in _OURS}
+    for name in ("PATH", "PYTHONPATH"):
+        if name in env:
+            kept = [part for part in env[name].split(os.pathsep) if not _below(part, prefixes)]
+            env[name] = os.pathsep.join(kept)
+    if not env.get("PYTHONPATH"):
+        env.pop("PYTHONPATH", None)
+    return env
+
+
+def find_ros2(env: Mapping[str, str]) -> str:
+    """The path of the `ros2` program.
+
+    Raises:
+        RecorderError: it is not on the environment's PATH.
+    """
+    found = shutil.which("ros2", path=env.get("PATH", os.defpath))
+    if found is None:
+        raise RecorderError(
+            "there is no ros2 program on PATH; name the setup.bash of the ROS 2 distribution, and "
+            "of the workspace with the robot's own messages, in recorder.setup_files"
+        )
+    return str(Path(found).absolute())
+
+
+def _sourced(setup_files: Sequence[Path], base: Mapping[str, str]) -> dict[str, str]:
+    for file in setup_files:
+        if not file.is_file():
+            raise RecorderError(f"{file} is not there; correct recorder.setup_files")
+    bash = shutil.which("bash", path=base.get("PATH", os.defpath))
+    if bash is None:
+        raise RecorderError("there is no bash on PATH, which recorder.setup_files need")
+    # Absolute: a bare name would be looked for on PATH.
+    names = [str(file.absolute()) for file in setup_files]
+    argv = [bash, "--noprofile", "--norc", "-c", _SOURCE_ALL, "ros2-memory-setup", *names]
+    finished = run_bounded(argv, base, SETUP_TIMEOUT_S)
+    begun, ended, printed = os.fsdecode(finished.output).partition("\0\0")
+    said = finished.errors.decode("utf-8", errors="replace")
+    if finished.status != 0 or not ended:
+        raise RecorderError(_failure(begun, finished.status, said))
+    for line in said.splitlines():
+        _log.warning("setup_file_said", text=line)
+    pairs = (entry.partition("=") for entry in printed.split("\0") if entry)
+    return {name: value for name, _, value in pairs if name not in _SHELLS_OWN}
+
+
+def _failure(begun: str, status: int, errors: str) -> str:
+    name = begun.rstrip("\0").rpartition("\0")[2] or "the shell"
+    said = " ".join(errors.split())[-300:]
+    return (
+        f"{name} failed with status {status}"
+        f"{f' ({said})' if said else ''}; correct it, or recorder.setup_files"
+    )
+
+
+def _below(entry: str, prefixes: Sequence[str]) -> bool:
+    return any(Path(entry).is_relative_to(prefix) for prefix in prefixes)

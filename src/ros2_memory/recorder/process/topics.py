@@ -1,0 +1,132 @@
+"""`topics.yaml`: which topics are recorded, and the one regular expression that says so to ROS 2.
+
+    topics:
+      - /odom
+      - /vision/*/detections_meta
+
+An entry is a fully qualified topic name, or a glob: `*` stands for one or more characters other
+than `/`, inside one part of the name. What is commented out is not recorded. Names are those of
+the ROS 2 design article "Topic and Service name mapping to DDS".
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import yaml
+
+from ros2_memory.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MAX_NAME: Final = 247
+"""Characters in a topic name: what rmw leaves of DDS's 255 for the name itself."""
+MAX_REGEX: Final = 60_000
+"""Characters in the regular expression: the C++ library gives up on patterns not much larger."""
+
+_PART = re.compile(r"[A-Za-z_*][A-Za-z0-9_*]*")
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSelection:
+    """The entries of `topics.yaml`, each once, in the order of the file."""
+
+    entries: tuple[str, ...]
+
+    @property
+    def exact(self) -> tuple[str, ...]:
+        """The entries that are names, not globs."""
+        return tuple(entry for entry in self.entries if "*" not in entry)
+
+    @property
+    def hidden(self) -> bool:
+        """Whether a hidden topic is asked for by name: one with a part that begins with `_`.
+
+        The recorder leaves those out unless it is told to look at them.
+        """
+        return any("/_" in entry for entry in self.entries)
+
+    @property
+    def regex(self) -> str:
+        """An anchored ECMAScript (and Python) regular expression that matches these topics alone.
+
+        A regular expression is the only form in which every distribution from Humble to Rolling
+        takes topics, and the only one with which the recorder never stops discovering.
+        """
+        return f"^({'|'.join(_pattern(entry) for entry in self.entries)})$"
+
+    def matches(self, topic: str) -> bool:
+        """Whether the topic is recorded."""
+        return re.search(self.regex, topic) is not None
+
+
+def load_topics(path: Path) -> TopicSelection:
+    """The topics that the file lists.
+
+    Raises:
+        ConfigError: the file is missing, is not such a list, lists nothing, or an entry is no
+            topic name; the sentence names the file, the entry and the reason.
+    """
+    entries = _entries(path)
+    for entry in entries:
+        reason = _fault(entry)
+        if reason is not None:
+            raise ConfigError(f"{path}: {entry!r} cannot be recorded: {reason}")
+    selection = TopicSelection(tuple(dict.fromkeys(str(entry) for entry in entries)))
+    if len(selection.regex) > MAX_REGEX:
+        raise ConfigError(
+            f"{path}: {len(selection.entries)} topics make a pattern of more than {MAX_REGEX} "
+            "characters, which ROS 2 does not take; use globs such as /vision/*/detections_meta"
+        )
+    return selection
+
+
+def _entries(path: Path) -> list[object]:
+    try:
+        content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: the list of topics cannot be read: {error.strerror or error}; "
+            "correct recording.topics_file"
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: it is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict) or list(content) != ["topics"]:
+        raise ConfigError(f"{path}: it must hold one key, topics, and below it a list of topics")
+    listed: object = content["topics"]
+    if listed is None or listed == []:
+        raise ConfigError(f"{path}: no topic is listed, so nothing would be recorded; list some")
+    if not isinstance(listed, list):
+        raise ConfigError(f"{path}: topics must be a list, one topic to a line: - /odom")
+    return listed
+
+
+def _fault(entry: object) -> str | None:
+    """Why an entry is no topic name and no glob; None where it is one."""
+    if not isinstance(entry, str):
+        return "an entry must be text, such as /odom"
+    if not entry.startswith("/"):
+        return "the name must be fully qualified: it begins with /"
+    if len(entry) > MAX_NAME:
+        return f"the name is longer than {MAX_NAME} characters"
+    faults = (_fault_of_part(part) for part in entry[1:].split("/"))
+    return next((fault for fault in faults if fault is not None), None)
+
+
+def _fault_of_part(part: str) -> str | None:
+    if not part:
+        return "a part of the name is empty: no // and no / at the end"
+    if "**" in part:
+        return "a glob's * stands inside one part of the name; write one * for each part"
+    if part[0].isdigit():
+        return f"the part {part!r} begins with a digit"
+    if not _PART.fullmatch(part):
+        return f"the part {part!r} holds more than ASCII letters, digits, _ and *"
+    return None
+
+
+def _pattern(entry: str) -> str:
+    return "[^/]+".join(re.escape(literal) for literal in entry.split("*"))

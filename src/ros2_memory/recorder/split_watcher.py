@@ -1,0 +1,138 @@
+"""The bag files of one recording while it is being written: which are closed, and how it grows.
+
+A file says of itself whether it is closed; its name says nothing, since distributions differ in
+how they number splits, and a new file appears some milliseconds before the old one is closed.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.core.errors import BagError
+from ros2_memory.storage.base import Closing
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.storage.base import BagReader
+
+EMPTY_GRACE_S: Final = 5.0
+"""A file that is still 0 bytes so long after a newer one appeared was not written: disk full."""
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What one look found: splits closed since the last, splits left empty, and what is amiss.
+
+    `gone`: the directory was there and is not any more. `faults` are sentences on what could not
+    be read.
+    """
+
+    closed: tuple[str, ...] = ()
+    empty: tuple[str, ...] = ()
+    gone: bool = False
+    faults: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Split:
+    first_seen_s: float
+    size: int = 0
+    closed: bool = False
+    reported_empty: bool = False
+
+
+@dataclass(slots=True)
+class Splits:
+    """The splits of one recording, as far as it has been looked at."""
+
+    directory: Path
+    reader: BagReader
+    exists: bool = False
+    heard: set[str] = field(default_factory=set)
+    messages: int = 0
+    _files: dict[str, _Split] = field(default_factory=dict)
+
+    def look(self, now_s: float) -> Changes:
+        """Looks at the directory again. Raises nothing.
+
+        `heard` then has every topic of which a closed split holds a message, and `messages` how
+        many there are in all of them.
+        """
+        try:
+            sizes = self._sizes()
+        except (FileNotFoundError, NotADirectoryError):
+            existed, self.exists = self.exists, False
+            return Changes(gone=existed)
+        except OSError as error:
+            return Changes(faults=(f"{self.directory}: {error.strerror or error}",))
+        self.exists = True
+        for name, size in sizes.items():
+            split = self._files.setdefault(name, _Split(now_s))
+            split.size = max(split.size, size)
+        faults: list[str] = []
+        closed = tuple(name for name in sizes if self._has_closed(name, faults))
+        newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
+        overdue = now_s - newest_s >= EMPTY_GRACE_S
+        empty = tuple(
+            name for name, size in sizes.items() if overdue and self._is_empty(name, size, newest_s)
+        )
+        return Changes(closed, empty, faults=tuple(faults))
+
+    @property
+    def bytes_written(self) -> int:
+        """What the splits hold, deleted ones too; it never shrinks."""
+        return sum(split.size for split in self._files.values())
+
+    @property
+    def closed_names(self) -> frozenset[str]:
+        """The splits that were closed when they were last looked at."""
+        return frozenset(name for name, split in self._files.items() if split.closed)
+
+    def names(self) -> frozenset[str]:
+        """All splits: those that were seen, and those that are there at this moment."""
+        with suppress(OSError):
+            return frozenset(self._files) | frozenset(self._sizes())
+        return frozenset(self._files)
+
+    def _sizes(self) -> dict[str, int]:
+        sizes: dict[str, int] = {}
+        with os.scandir(self.directory) as entries:
+            for entry in entries:
+                if bag_kind(entry.name) and entry.is_file(follow_symlinks=False):
+                    sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
+        return sizes
+
+    def _has_closed(self, name: str, faults: list[str]) -> bool:
+        """Whether the split is closed, and was not when it was last looked at."""
+        split = self._files[name]
+        if split.closed or split.size == 0:
+            return False
+        path = self.directory / name
+        try:
+            if self.reader.closing(path) is not Closing.CLOSED:
+                return False
+            split.closed = True
+            summary = self.reader.summarize(path)
+        except BagError as error:
+            if split.closed:
+                faults.append(str(error))
+            return split.closed
+        except OSError as error:
+            faults.append(f"{path}: {error.strerror or error}")
+            return split.closed
+        self.heard.update(topic.topic for topic in summary.topics)
+        self.messages += summary.count
+        return True
+
+    def _is_empty(self, name: str, size: int, newest_s: float) -> bool:
+        """Whether the split is empty though a newer one was seen; said once."""
+        split = self._files[name]
+        if size > 0 or split.reported_empty or newest_s <= split.first_seen_s:
+            return False
+        split.reported_empty = True
+        return True

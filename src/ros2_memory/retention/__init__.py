@@ -1,0 +1,1 @@
+"""Garbage collection, latched carry-forward, repair and saved moments."""

@@ -1,0 +1,119 @@
+"""Deletes bags and what stands beside them, and never anything else.
+
+Every name is looked up below the bag directory without following a link, and a bag file goes only
+while it is the very file that was judged. A recording's directory goes when nothing is left in it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.bag_dir.layout import RECORDING_FILES, bag_kind
+from ros2_memory.core import directories
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+REPAIR_SUFFIX: Final = ".repair"
+_LEFTOVER: Final = re.compile(r"\.(?P<target>.+)\.tmp|\.(?P<bag>.+)" + re.escape(REPAIR_SUFFIX))
+_COMPANION: Final = re.compile(r"(?P<bag>.+\.db3)-(wal|shm|journal)", re.IGNORECASE)
+
+
+class Inode(NamedTuple):
+    """Which file a name means: its device and its number there."""
+
+    device: int
+    number: int
+
+
+def repair_name(name: str) -> str:
+    """What a bag file is called while it is being repaired; the index passes it by."""
+    return f".{name}{REPAIR_SUFFIX}"
+
+
+def left_by_repair(name: str) -> bool:
+    """Whether a file is what a repair that was cut short left."""
+    left = _LEFTOVER.fullmatch(name)
+    return left is not None and bag_kind(left["bag"] or "") is not None
+
+
+def goes_with_bags(name: str) -> bool:
+    """Whether a file of a recording has no meaning without its bags.
+
+    Those are what the recorder notes of them, and what a crash left of files being written.
+    """
+    left = _LEFTOVER.fullmatch(name)
+    if left is not None:
+        return left["target"] in RECORDING_FILES or left_by_repair(name)
+    return name in RECORDING_FILES or _COMPANION.fullmatch(name) is not None
+
+
+def remove_bag(root: Path, path: Path, inode: Inode) -> int:
+    """Deletes one bag file below the root, and a sqlite bag's journals; the bytes it held.
+
+    Raises:
+        FileNotFoundError: it is not there any more.
+        OSError: it cannot be deleted, or is not the file that was looked at.
+    """
+    with directories.opened(root, path.parent) as directory:
+        status = os.stat(path.name, dir_fd=directory, follow_symlinks=False)
+        if not stat.S_ISREG(status.st_mode) or (status.st_dev, status.st_ino) != inode:
+            raise OSError(f"{path} is not the file that was looked at")
+        os.unlink(path.name, dir_fd=directory)
+        for name in _companions(directory, path.name):
+            with suppress(FileNotFoundError):
+                os.unlink(name, dir_fd=directory)
+        return status.st_size
+
+
+def remove_emptied(root: Path, recording: Path) -> int:
+    """Deletes a recording of which no bag is left; how many files went.
+
+    What is not known by name stays, and then the directory does.
+
+    Raises:
+        OSError: something that has to go cannot be deleted.
+    """
+    if recording == root:
+        return 0
+    removed = 0
+    try:
+        with directories.opened(root, recording) as directory:
+            with os.scandir(directory) as listing:
+                entries = list(listing)
+            if any(bag_kind(entry.name) for entry in entries):
+                return 0
+            for entry in entries:
+                if goes_with_bags(entry.name) and entry.is_file(follow_symlinks=False):
+                    os.unlink(entry.name, dir_fd=directory)
+                    removed += 1
+            if len(entries) > removed:
+                return removed
+        with directories.opened(root, recording.parent) as above:
+            os.rmdir(recording.name, dir_fd=above)
+    except FileNotFoundError:
+        pass
+    return removed
+
+
+def beside_bags(recording: Path) -> int:
+    """The bytes of what goes with the last bag of a recording; what cannot be seen counts none."""
+    size = 0
+    with suppress(OSError), os.scandir(recording) as entries:
+        for entry in entries:
+            if goes_with_bags(entry.name) and entry.is_file(follow_symlinks=False):
+                size += entry.stat(follow_symlinks=False).st_size
+    return size
+
+
+def _companions(directory: int, bag: str) -> list[str]:
+    if not bag.lower().endswith(".db3"):
+        return []
+    with os.scandir(directory) as entries:
+        names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False)]
+    found = ((name, _COMPANION.fullmatch(name)) for name in names)
+    return [name for name, match in found if match and match["bag"] == bag]

@@ -1,0 +1,105 @@
+"""How much of a bag directory bags take that its recorder did not make."""
+
+from __future__ import annotations
+
+import os
+import stat
+from contextlib import suppress
+from typing import TYPE_CHECKING, NamedTuple
+
+from ros2_memory.bag_dir.own_recordings import (
+    OwnRecordings,
+    identity_of,
+    is_kept_apart,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.own_recordings import Identity
+    from ros2_memory.core.model import SetAside
+    from ros2_memory.index.snapshot import Snapshot
+
+
+class Foreign(NamedTuple):
+    """The bags that the recorder did not make, as retention keeps them.
+
+    `folders` are the directories that they lie in. `bag_bytes` is what those among them take that
+    answer, `total_bytes` what all do.
+    """
+
+    folders: frozenset[str]
+    bag_bytes: int
+    total_bytes: int
+
+
+class ForeignBags:
+    """Measures the foreign bags of one bag directory. Safe for several threads at once.
+
+    What was measured stays while the index and the list stay as they are.
+    """
+
+    def __init__(self, bag_dir: Path) -> None:
+        self._own = OwnRecordings(bag_dir)
+        self._identities: dict[str, tuple[int, Identity | None]] = {}
+        self._known: tuple[tuple[object, ...], Foreign] | None = None
+
+    def measured(self, snapshot: Snapshot, recording: Collection[str]) -> Foreign | None:
+        """What they take; None where no recorder has noted yet which recordings are its own.
+
+        `recording` are the recordings that a recorder says it is writing.
+        """
+        try:
+            if not self._own.exists():
+                return None
+        except OSError:
+            return None
+        set_aside = (snapshot.active, snapshot.damaged, snapshot.unread)
+        key = (snapshot.timeline, *set_aside, self._own.stamp, tuple(recording))
+        known = self._known
+        if known is None or any(a is not b and a != b for a, b in zip(known[0], key, strict=True)):
+            known = self._known = (key, self._measured(snapshot, frozenset(recording)))
+        return known[1]
+
+    def _measured(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
+        sizes: dict[str, int] = {}
+        for run in snapshot.runs:
+            for folder, size in run.taken_in.items():
+                sizes[folder] = sizes.get(folder, 0) + size
+        asides = [
+            aside
+            for aside in (*snapshot.active, *snapshot.damaged, *snapshot.unread)
+            if not aside.answers
+        ]
+        folders = {str(aside.path.parent) for aside in asides} | sizes.keys()
+        self._identities = {
+            folder: known for folder, known in self._identities.items() if folder in folders
+        }
+        foreign = frozenset(each for each in folders if not self._is_own(each, recording))
+        bag_bytes = sum(size for folder, size in sizes.items() if folder in foreign)
+        beside = sum(_size(each) for each in asides if str(each.path.parent) in foreign)
+        return Foreign(foreign, bag_bytes, bag_bytes + beside)
+
+    def _is_own(self, folder: str, recording: frozenset[str]) -> bool:
+        name = self._own.name_of(folder)
+        if name in recording or is_kept_apart(name):
+            return True
+        return self._own.lists(name, self._identity(folder))
+
+    def _identity(self, folder: str) -> Identity | None:
+        try:
+            changed = os.stat(folder, follow_symlinks=False).st_ctime_ns  # noqa: PTH116 - many
+            known = self._identities.get(folder)
+            if known is None or known[0] != changed:
+                known = self._identities[folder] = (changed, identity_of(folder))
+        except OSError:
+            return None
+        return known[1]
+
+
+def _size(aside: SetAside) -> int:
+    with suppress(OSError):
+        status = aside.path.lstat()
+        return status.st_size if stat.S_ISREG(status.st_mode) else 0
+    return 0

@@ -1,0 +1,168 @@
+"""How long has been recorded since each recording ended, whatever the wall clock did meanwhile.
+
+The monotonic clock begins anew at every boot, so the time that was recorded is added up, and kept
+in `.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,
+with the recorded time at which it was last seen to grow. The last line of a recording counts. A
+recording that has no line counts as recorded when it is first asked about: nothing says that it is
+older.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import threading
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from ros2_memory.bag_dir.durable_write import (
+    append_durably,
+    open_plain,
+    own_folder,
+    write_durably,
+)
+from ros2_memory.bag_dir.layout import OWN_FOLDER, RECORDED_FILE
+from ros2_memory.core.timebase import Ns, ns_from_unix
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+    from pathlib import Path
+
+SAVE_S: Final = 60.0
+"""A crash forgets at most so much of what was recorded, and so keeps bags for longer."""
+LONGEST_SILENCE_S: Final = 60.0
+"""Of a pause in which nothing reached the disk no more than this counts as recorded."""
+_MOST_LINES: Final = 20_000
+_MOST_BYTES: Final = 1 << 26
+_LONGEST_S: Final = 1e9
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+class RecordedTime:
+    """The recorded time of one bag directory, whose lock the caller holds. Safe for threads.
+
+    Nothing is read or written before it is first asked or told. Recordings are directories
+    relative to the bag directory, with forward slashes.
+    """
+
+    def __init__(self, bag_dir: Path) -> None:
+        self._bag_dir = bag_dir
+        self._path = bag_dir / OWN_FOLDER / RECORDED_FILE
+        self._lock = threading.Lock()
+        self._loaded = False
+        self._total_s = 0.0
+        self._seen_s: dict[str, float] = {}
+        self._unsaved: set[str] = set()
+        self._lines = 0
+        self._grew: tuple[float, int] | None = None
+        self._recording: frozenset[str] = frozenset()
+        self._saved_at_s = -math.inf
+        self._reported: str | None = None
+
+    def note(self, recordings: Collection[str], bytes_written: int, monotonic_s: float) -> None:
+        """Counts the time since the last call, if recordings grew in it.
+
+        Args:
+            recordings: those that are being written.
+            bytes_written: how much all recordings wrote since the recorder started.
+            monotonic_s: the monotonic clock, in seconds.
+        """
+        with self._lock:
+            self._load()
+            before, self._recording = self._recording, frozenset(recordings)
+            if not recordings:
+                self._grew = None
+            elif self._grew is None:
+                self._grew = (monotonic_s, bytes_written)
+            elif bytes_written != self._grew[1]:
+                self._total_s += min(monotonic_s - self._grew[0], LONGEST_SILENCE_S)
+                self._grew = (monotonic_s, bytes_written)
+            for name in recordings:
+                self._seen_s[name] = self._total_s
+            self._unsaved |= self._recording
+            # While nothing is recorded the disk may be away.
+            changed = self._recording != before
+            if recordings and (changed or monotonic_s - self._saved_at_s >= SAVE_S):
+                self._saved_at_s = monotonic_s
+                self._save()
+
+    def since(self, recordings: Iterable[str]) -> dict[str, Ns]:
+        """By recording, how long was recorded after it."""
+        with self._lock:
+            self._load()
+            return {name: ns_from_unix(self._total_s - self._seen(name)) for name in recordings}
+
+    def _seen(self, name: str) -> float:
+        if name not in self._seen_s:
+            self._seen_s[name] = self._total_s
+            self._unsaved.add(name)
+        return self._seen_s[name]
+
+    def _load(self) -> None:
+        if self._loaded:
+            return
+        self._loaded = True
+        try:
+            with open_plain(self._path) as stream:
+                for line in stream.read(_MOST_BYTES).splitlines():
+                    self._take(line)
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError) as error:
+            _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
+        self._total_s = max(self._seen_s.values(), default=0.0)
+        # The greatest is the total: it stays, though its recording may be gone.
+        newest = max(self._seen_s, key=self._seen_s.__getitem__, default=None)
+        self._seen_s = {
+            name: seen_s
+            for name, seen_s in self._seen_s.items()
+            if name == newest or (self._bag_dir / name).is_dir()
+        }
+        self._lines = _MOST_LINES  # has the next save leave out what is gone
+
+    def _take(self, line: bytes) -> None:
+        """Takes in one line; one that a crash cut short says nothing."""
+        try:
+            value: object = json.loads(line)
+        except (ValueError, RecursionError):
+            return
+        if not isinstance(value, dict):
+            return
+        name, seen_s = value.get("recording"), value.get("recorded_s")
+        if isinstance(name, str) and isinstance(seen_s, int | float) and 0 <= seen_s <= _LONGEST_S:
+            self._seen_s[name] = float(seen_s)
+
+    def _save(self) -> None:
+        names = sorted(self._unsaved)
+        try:
+            own_folder(self._path.parent)
+            if self._lines + len(names) > _MOST_LINES:
+                write_durably(self._path, self._text(self._seen_s))
+                self._lines = len(self._seen_s)
+            elif names:
+                append_durably(self._path, self._text(names))
+                self._lines += len(names)
+        except OSError as error:
+            reason = f"{self._path}: {error.strerror or error}"
+            if reason != self._reported:
+                _log.error("recorded_time_not_kept", reason=reason)
+            self._reported = reason
+        else:
+            self._unsaved.clear()
+            self._reported = None
+
+    def _text(self, names: Iterable[str]) -> str:
+        # A line break before, too: what a full disk cut short must not swallow the next line.
+        lines = (
+            json.dumps({"recording": name, "recorded_s": round(self._seen_s[name], 3)})
+            for name in names
+        )
+        return "".join(f"\n{line}\n" for line in lines)
+
+
+def relative_recording(recording: str, bag_dir: Path) -> str:
+    """A recording's directory as lines name it."""
+    return recording.removeprefix(f"{str(bag_dir).rstrip(os.sep)}{os.sep}")

@@ -1,0 +1,168 @@
+"""Puts right what a crash left open: the bag keeps its name, and is whole afterwards.
+
+A file of 0 bytes is removed: nothing had reached the disk. One that was cut short is rewritten
+beside itself from all that can be read of it, read back, compared and flushed; only then it takes
+the name of the original, which stays as it is in every other case.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ros2_memory.bag_dir.durable_write import flush
+from ros2_memory.bag_dir.metadata_yaml import correct
+from ros2_memory.core import directories
+from ros2_memory.core.errors import BagError, BagVanishedError
+from ros2_memory.retention.delete import repair_name
+from ros2_memory.storage.base import Closing
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ros2_memory.storage.base import BagReader
+    from ros2_memory.storage.writing import BagWriter, Rewritten
+
+
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """What became of one file.
+
+    `was_bytes` and `is_bytes` are its sizes before and after; `rewritten` says what was recovered,
+    None where an empty file was removed.
+    """
+
+    path: Path
+    was_bytes: int
+    is_bytes: int = 0
+    rewritten: Rewritten | None = None
+
+
+class Repairer:
+    """Repairs MCAP files in place. Whoever calls knows that nobody writes them any more.
+
+    What is repaired lies below `root`, and is not reached through a symbolic link there.
+    """
+
+    def __init__(self, reader: BagReader, writer: BagWriter, root: Path = Path("/")) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._root = root
+
+    def is_whole(self, path: Path) -> bool:
+        """Whether the writer of a file finished it, so that there is nothing to repair.
+
+        Raises:
+            BagVanishedError: it is not there.
+            BagError: it cannot be opened, or is no MCAP file.
+        """
+        whole = self._reader.closing(path) is Closing.CLOSED
+        if whole:
+            # What is no bag at all counts as closed; here it is said to be none.
+            self._reader.channels(path)
+        return whole
+
+    def repair(self, path: Path, progress: Callable[[int], None] | None = None) -> Repaired | None:
+        """Repairs one file; None where its writer had finished it.
+
+        `progress` is told how many bytes of it were read.
+
+        Raises:
+            BagVanishedError: it is not there.
+            BagError: it cannot be repaired, and is as it was.
+        """
+        try:
+            with directories.opened(self._root, path.parent.absolute()) as folder:
+                # The directory itself, whatever takes its name meanwhile.
+                here = Path(f"/proc/self/fd/{folder}", path.name)
+                repaired = self._repair(here, path, progress)
+        except BagVanishedError as error:
+            raise BagVanishedError(str(path), error.reason) from error
+        except BagError as error:
+            raise BagError(str(path), error.reason) from error
+        except FileNotFoundError as error:
+            raise BagVanishedError(str(path), "the file is not there any more") from error
+        except OSError as error:
+            raise BagError(
+                str(path), f"it cannot be repaired: {error.strerror or error}"
+            ) from error
+        return None if repaired is None else replace(repaired, path=path)
+
+    def correct_metadata(self, recording: Path) -> bool:
+        """Writes metadata.yaml by what the files hold, as `metadata.correct` does."""
+        with directories.opened(self._root, recording.absolute()):
+            return correct(recording, self._reader)
+
+    def _repair(
+        self, here: Path, path: Path, progress: Callable[[int], None] | None
+    ) -> Repaired | None:
+        before = _status(here)
+        if not before.st_size:
+            here.unlink()
+            flush(here.parent)
+            return Repaired(path, 0)
+        if self._reader.closing(path) is Closing.CLOSED:
+            return None
+        return self._rewrite(here, before, progress)
+
+    def _rewrite(
+        self, path: Path, before: os.stat_result, progress: Callable[[int], None] | None
+    ) -> Repaired:
+        beside = path.with_name(repair_name(path.name))
+        beside.unlink(missing_ok=True)
+        try:
+            rewritten = self._writer.rewrite(path, beside, progress)
+            _like(beside, before)
+            _require_same(path, before)
+            beside.replace(path)
+        except BaseException:
+            with suppress(OSError):
+                beside.unlink(missing_ok=True)
+            raise
+        flush(path.parent)
+        return Repaired(path, before.st_size, path.stat().st_size, rewritten)
+
+
+def open_files() -> frozenset[tuple[int, int]]:
+    """The files (device and inode) that processes hold open, as far as they may be looked at."""
+    found: set[tuple[int, int]] = set()
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError), os.scandir(process / "fd") as descriptors:
+            for each in descriptors:
+                with suppress(OSError):
+                    status = each.stat()
+                    found.add((status.st_dev, status.st_ino))
+    return frozenset(found)
+
+
+def _status(path: Path) -> os.stat_result:
+    """The status of a regular file.
+
+    Raises:
+        BagError: it is something else.
+        OSError: it cannot be looked at.
+    """
+    status = path.lstat()
+    if not stat.S_ISREG(status.st_mode):
+        raise BagError(str(path), "not a regular file")
+    return status
+
+
+def _require_same(path: Path, before: os.stat_result) -> None:
+    after = _status(path)
+    for each in ("st_ino", "st_size", "st_mtime_ns"):
+        if getattr(after, each) != getattr(before, each):
+            raise BagError(str(path), "it was written to while it was being repaired")
+
+
+def _like(path: Path, model: os.stat_result) -> None:
+    """Gives a file the rights, the owner and the time of another."""
+    path.chmod(stat.S_IMODE(model.st_mode))
+    with suppress(OSError):
+        shutil.chown(path, model.st_uid, model.st_gid)
+    os.utime(path, ns=(model.st_atime_ns, model.st_mtime_ns))

@@ -1,0 +1,1 @@
+"""Dispatch, the MCP server, HTTP, access, limits, health, and the catalogue's backfill."""

@@ -1,0 +1,154 @@
+"""Where everything foreign becomes the error tree.
+
+Reading bytes that anybody may have written raises whatever the libraries and the interpreter make
+of them: struct.error, ZstdError, sqlite3.Error, lz4's RuntimeError, MemoryError, UnicodeDecodeError
+and more. The rooms below the adapters let all of it pass, and say `UnreadableError` for what they
+find wrong themselves; `reading` names the file.
+"""
+
+from __future__ import annotations
+
+import errno
+import sqlite3
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeVar
+
+from ros2_memory.core.errors import (
+    BagContradictionError,
+    BagError,
+    BagUnreachableError,
+    BagVanishedError,
+    EpisodicError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from types import TracebackType
+
+    from ros2_memory.core.timebase import Ns
+
+T = TypeVar("T")
+
+# Not ESTALE and ENODEV: a server or a disk that went may come back with all its files.
+_GONE = {errno.ENOENT, errno.ENOTDIR}
+_OF_THE_DISK = {
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_PERM,
+}
+
+
+class UnreadableError(Exception):
+    """Bytes of a bag that cannot be read; the text is the reason, without the file's name."""
+
+
+class UnreachableError(UnreadableError):
+    """As `UnreadableError`, where the fault is not the file's and may pass."""
+
+
+class LostError(UnreadableError):
+    """Messages that cannot be read, while those around them may be.
+
+    `first` and `last` are log times: none of the lost ones lies outside of them.
+    """
+
+    def __init__(self, reason: str, first: Ns, last: Ns) -> None:
+        super().__init__(reason)
+        self.first = first
+        self.last = last
+
+
+class ContradictionError(LostError):
+    """Indexes that contradict the messages: these are read without them, from `first` to `last`."""
+
+
+def whole(path: Path, item: T | LostError) -> T:
+    """The item itself.
+
+    Raises:
+        BagContradictionError: it says that the indexes of `path` are not believed.
+        BagError: it stands for messages of `path` that are lost.
+    """
+    if isinstance(item, ContradictionError):
+        raise BagContradictionError(str(path), str(item), (item.first, item.last))
+    if isinstance(item, LostError):
+        raise BagError(str(path), str(item), (item.first, item.last))
+    return item
+
+
+def reading(path: Path) -> _Reading:
+    """A context that raises only `EpisodicError`, about `path`, whatever is raised inside it.
+
+    Raises:
+        BagVanishedError: the file or a folder above it is gone.
+        BagUnreachableError: the fault is not the file's, and may pass.
+        BagError: anything else; it ends on the reason.
+    """
+    return _Reading(path)
+
+
+class _Reading:
+    # A class and not a generator: it is entered for every query of every bag.
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if not isinstance(error, Exception) or isinstance(error, EpisodicError):
+            return
+        if isinstance(error, OSError) and error.errno in _GONE:
+            raise BagVanishedError(str(self._path), "the file is not there any more") from error
+        kind_of = BagUnreachableError if _may_pass(error) else BagError
+        raise kind_of(str(self._path), reason_of(error)) from error
+
+
+@contextmanager
+def damage() -> Iterator[None]:
+    """Raises `UnreadableError` for whatever damaged bytes raise, where others may be whole.
+
+    What the disk or the machine lacks (OSError, MemoryError) passes: whole bytes raise it too.
+    """
+    try:
+        yield
+    except (UnreadableError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        raise UnreadableError(reason_of(error)) from error
+
+
+def reason_of(error: Exception) -> str:
+    """One line that says why the bytes cannot be read."""
+    if isinstance(error, UnreadableError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"it cannot be opened or read: {error.strerror or error}"
+    if isinstance(error, MemoryError):
+        return "there is not enough memory to read it"
+    if _sqlite_code(error) in _OF_THE_DISK:
+        return f"it cannot be opened or read: {error}"
+    words = " ".join(str(error).split())[:160]
+    return f"damaged: {words} ({type(error).__name__})" if words else type(error).__name__
+
+
+def _may_pass(error: Exception) -> bool:
+    """Whether the same bytes may be read later."""
+    if isinstance(error, (OSError, MemoryError, UnreachableError)):
+        return True
+    return _sqlite_code(error) in _OF_THE_DISK
+
+
+def _sqlite_code(error: Exception) -> int | None:
+    """SQLite's primary code; None of any other error."""
+    code: object = getattr(error, "sqlite_errorcode", None)
+    return code & 0xFF if isinstance(code, int) else None

@@ -1,0 +1,113 @@
+"""A file on disk: bounded reads at any place, and what tells one content from another."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
+
+from ros2_memory.storage.errors import UnreadableError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+    from types import TracebackType
+
+EMPTY_FILE: Final = "empty file: nothing had reached the disk"
+LINK: Final = "a symbolic link, which is not followed"
+
+
+def open_regular(path: Path) -> int:
+    """A descriptor of a regular file, which stands there itself and not through a link.
+
+    Raises:
+        OSError: it cannot be opened.
+        UnreadableError: it is not a regular file.
+    """
+    try:
+        # Without blocking: opening a pipe would wait for somebody to write into it.
+        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
+        descriptor = os.open(path, flags)
+    except OSError as error:
+        if error.errno == errno.ELOOP and path.is_symlink():
+            raise UnreadableError(LINK) from None
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise UnreadableError("not a regular file")
+    return descriptor
+
+
+class FileKey(NamedTuple):
+    """Which content a file had: another size, time or inode is another content."""
+
+    path: str
+    size: int
+    mtime_ns: int
+    inode: int
+
+
+class OpenFile:
+    """A file opened for reading at any place; a context manager.
+
+    What was read of it stays readable after the file is deleted, until it is closed. Safe to use
+    from several threads at once.
+
+    Raises:
+        OSError: it cannot be opened.
+        UnreadableError: it is not a regular file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._descriptor = open_regular(path)
+        status = os.fstat(self._descriptor)
+        self.size = status.st_size
+        self.key = FileKey(str(path), status.st_size, status.st_mtime_ns, status.st_ino)
+
+    def __enter__(self) -> Self:
+        """The open file."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Closes it."""
+        os.close(self._descriptor)
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Exactly `length` bytes from `offset`.
+
+        Raises:
+            UnreadableError: the file has fewer; nothing is allocated for them then.
+        """
+        if offset < 0 or length < 0 or offset + length > self.size:
+            raise UnreadableError("damaged: it refers to bytes past its end")
+        pieces: list[bytes] = []
+        missing = length
+        while missing:
+            piece = os.pread(self._descriptor, missing, offset)
+            if not piece:
+                raise UnreadableError("it became shorter while it was being read")
+            if len(piece) == length:
+                return piece
+            pieces.append(piece)
+            offset += len(piece)
+            missing -= len(piece)
+        return b"".join(pieces)
+
+    def read_each(self, offsets: Iterable[int], length: int) -> list[bytes]:
+        """`length` bytes from each of these places, which lie in the file; fewer at its end.
+
+        Raises:
+            UnreadableError: the file became shorter.
+        """
+        read, descriptor = os.pread, self._descriptor
+        pieces = [(offset, read(descriptor, length, offset)) for offset in offsets]
+        return [
+            piece if len(piece) == length else self.read(offset, min(length, self.size - offset))
+            for offset, piece in pieces
+        ]

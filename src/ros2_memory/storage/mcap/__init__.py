@@ -1,0 +1,1 @@
+"""The MCAP format: records, chunks, indexes, summaries, salvage, writing."""

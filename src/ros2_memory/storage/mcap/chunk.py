@@ -1,0 +1,471 @@
+"""What is inside a chunk: decompression, and where the messages of each channel lie."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import lz4.frame  # type: ignore[import-untyped]  # has no types
+import numpy as np
+import zstandard
+from mcap.opcode import Opcode
+
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.storage.errors import UnreadableError
+from ros2_memory.storage.limits import (
+    MAX_CHUNK_DECLARATIONS,
+    MAX_CHUNK_MESSAGES,
+    too_large,
+)
+from ros2_memory.storage.mcap.records import (
+    CHUNK_TIMES,
+    MESSAGE,
+    MESSAGE_FIELDS,
+    RECORD,
+)
+from ros2_memory.storage.zstd import unpacked_zstd
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from ros2_memory.storage.file_io import OpenFile
+
+Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
+
+_INDEX_HEAD: Final = struct.Struct("<BQHI")
+"""A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
+_INDEX_HEAD_BYTES: Final = _INDEX_HEAD.size
+_index_head: Final = _INDEX_HEAD.unpack_from
+_PAIR_BYTES: Final = 16
+_tuple: Final = tuple.__new__
+"""Makes a named tuple, past the function that its fields go through."""
+_MESSAGE_INDEX: Final = int(Opcode.MESSAGE_INDEX)
+_NO_INDEX: Final = "damaged: a message index is not where its chunk index says"
+_OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"
+_LONG_INDEX: Final = "damaged: a message index holds more than a chunk can"
+_IMPOSSIBLE_TIMES: Final = "damaged: a message index holds impossible log times"
+NOT_THERE: Final = "damaged: a message is not where its index says"
+_MESSAGE: Final = int(Opcode.MESSAGE)
+_MESSAGE_OPCODE: Final = bytes((_MESSAGE,))
+_message: Final = MESSAGE.unpack_from
+_MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
+_LENGTH_AT: Final = 1
+_CHANNEL_AT: Final = 9
+_LOG_TIME_AT: Final = 15
+"""Where these fields lie in a message record."""
+_UINT16: Final = np.dtype("<u2")
+_INT64: Final = np.dtype("<i8")
+_UINT64: Final = np.dtype("<u8")
+_EVERY_BYTE: Final = (1,)
+_EVERY_PAIR: Final = (_PAIR_BYTES,)
+_time: Final = struct.Struct("<Q").unpack_from
+_FEW: Final = 100
+_FEW_MESSAGES: Final = 24
+"""So many numbers, or messages, are sooner looked through one by one than made an array."""
+_EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
+_NOUGHT: Final[Ints] = np.zeros(1, dtype=np.int64)
+
+
+class Column(NamedTuple):
+    """The messages of one channel in one stretch of a file, by log time, ties in file order.
+
+    `places` are the offsets of the message records.
+    """
+
+    times: Ints
+    places: Ints
+
+    @property
+    def bytes_held(self) -> int:
+        """About how much memory it takes."""
+        return 2 * self.times.nbytes + 300
+
+    @classmethod
+    def of(cls, times: Ints, places: Ints) -> Column:
+        """Sorts; leaves out the messages whose log time is none (past what 64 bits signed hold)."""
+        if times.size > 1 and not bool((times[1:] > times[:-1]).all()):
+            order = np.lexsort((places, times))
+            times, places = times[order], places[order]
+            if bool(((times[1:] == times[:-1]) & (places[1:] == places[:-1])).any()):
+                raise UnreadableError("damaged: a message index holds a message twice")
+        if times.size and times[0] >= 0 and times[-1] < MAX_NS:
+            return cls(times, places)
+        # An unsigned time past the signed range has wrapped to below zero.
+        first = int(np.searchsorted(times, 0))
+        stop = int(np.searchsorted(times, MAX_NS))
+        return cls(times[first:stop], places[first:stop])
+
+    def between(self, start: int, stop: int) -> Column:
+        """The part with log time in `[start, stop)`."""
+        times = self.times
+        first, last = times.searchsorted(start), times.searchsorted(stop)
+        if not first and last == times.size:
+            return self
+        return Column(times[first:last], self.places[first:last])
+
+
+NO_MESSAGES: Final = Column(_EMPTY, _EMPTY)
+
+
+def joined(columns: list[Column]) -> Column:
+    """Several channels' messages as one column."""
+    if len(columns) == 1:
+        return columns[0]
+    if not columns:
+        return NO_MESSAGES
+    times = np.concatenate([column.times for column in columns])
+    places = np.concatenate([column.places for column in columns])
+    order = np.lexsort((places, times))
+    return Column(times[order], places[order])
+
+
+def columns_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> dict[int, Column]:
+    """The columns that the message index records of one chunk hold.
+
+    Args:
+        region: the bytes behind the chunk in which they lie.
+        offsets: where each channel's record begins in the file.
+        base: where the region begins in the file.
+    """
+    columns: dict[int, Column] = {}
+    for channel, offset in offsets.items():
+        at, count = _index_at(region, channel, offset - base)
+        pairs = np.frombuffer(region, "<i8", 2 * count, at).reshape(-1, 2)
+        column = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
+        if column.times.size != count:
+            raise UnreadableError(_IMPOSSIBLE_TIMES)
+        columns[channel] = column
+    return columns
+
+
+def require_indexed(data: bytes, channel: int, column: Column) -> None:
+    """Refuses a column that is not of messages of the channel, each at its own log time.
+
+    Together with their number, which `mcap_index` holds against the statistics, that makes the
+    column the whole of the channel in this chunk. It costs some microseconds a chunk.
+
+    Args:
+        data: the decompressed records of the chunk, which its checksum vouches for.
+        channel: the number of the channel.
+        column: what the message index of the channel holds.
+
+    Raises:
+        UnreadableError: one of them is not there, or is another channel's, or of another time.
+    """
+    times, places = column
+    count = times.size
+    stop = len(data) - MESSAGE.size + 1
+    if not count:
+        return
+    if stop <= 0 or places.min() < 0:
+        raise UnreadableError(NOT_THERE)
+    if count <= _FEW_MESSAGES:
+        for time, place in zip(times.tolist(), places.tolist(), strict=True):
+            if place >= stop:
+                raise UnreadableError(NOT_THERE)
+            opcode, _, number, _, log_time, _ = _message(data, place)
+            if log_time != time or number != channel or opcode != _MESSAGE:
+                raise UnreadableError(NOT_THERE)
+        return
+    # Views of the bytes that begin at every byte: all the fields of a kind are gathered at once.
+    try:
+        opcodes = np.ndarray(stop, np.uint8, data, 0, _EVERY_BYTE)[places]
+        channels = np.ndarray(stop, _UINT16, data, _CHANNEL_AT, _EVERY_BYTE)[places]
+        stated = np.ndarray(stop, _INT64, data, _LOG_TIME_AT, _EVERY_BYTE)[places]
+    except IndexError:
+        raise UnreadableError(NOT_THERE) from None
+    if (
+        opcodes.tobytes() != _MESSAGE_OPCODE * count
+        or channels.tobytes() != channel.to_bytes(2, "little") * count
+        or stated.tobytes() != times.tobytes()
+    ):
+        raise UnreadableError(NOT_THERE)
+
+
+def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, bytes]]:
+    """The schema and channel records of a chunk: what lies between its messages is walked alone.
+
+    Args:
+        data: the decompressed records of the chunk.
+        columns: all of its messages, held against these records.
+
+    Returns:
+        Opcode and body of each.
+
+    Raises:
+        UnreadableError: there are other messages between them, or too many declarations.
+    """
+    places = np.sort(np.concatenate([column.places for column in columns] or [_EMPTY]))
+    size = len(data)
+    lengths = _EMPTY
+    if places.size:
+        stop = size - RECORD.size + 1
+        lengths = np.ndarray(stop, _INT64, data, _LENGTH_AT, _EVERY_BYTE)[places]
+        if lengths.min() < 0 or lengths.max() > size:
+            raise UnreadableError(NOT_THERE)
+    begins = np.concatenate([_NOUGHT, places + RECORD.size + lengths])
+    ends = np.append(places, size)
+    if bool((begins > ends).any()):
+        raise UnreadableError(NOT_THERE)
+    found: list[tuple[int, bytes]] = []
+    between = begins < ends
+    for begin, end in zip(begins[between].tolist(), ends[between].tolist(), strict=True):
+        walked = walk(data[begin:end])
+        if walked.messages:
+            raise UnreadableError("damaged: a chunk holds messages that its indexes do not")
+        found += walked.declarations
+        if len(found) > MAX_CHUNK_DECLARATIONS:
+            raise UnreadableError(_MANY_DECLARED)
+    return found
+
+
+class Extent(NamedTuple):
+    """How many messages of a channel a chunk holds, and their least and greatest log time."""
+
+    messages: int
+    first: int
+    last: int
+
+
+def extents_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> dict[int, Extent]:
+    """What `columns_from_index` amounts to, of the channels that have messages."""
+    extents: dict[int, Extent] = {}
+    latest = held = 0
+    size = len(region)
+    for channel, offset in offsets.items():
+        # As `_index_at`, whose call would be a third of the work.
+        at = offset - base + _INDEX_HEAD_BYTES
+        if not _INDEX_HEAD_BYTES <= at <= size:
+            raise UnreadableError(_NO_INDEX)
+        opcode, length, number, stored = _index_head(region, at - _INDEX_HEAD_BYTES)
+        count = stored // _PAIR_BYTES
+        whole = length == stored + 6 == count * _PAIR_BYTES + 6
+        if opcode != _MESSAGE_INDEX or number != channel or not whole:
+            raise UnreadableError(_OTHER_INDEX)
+        if at + stored > size or count > MAX_CHUNK_MESSAGES:
+            raise UnreadableError(_LONG_INDEX)
+        held += count
+        if count > _FEW:
+            column = np.ndarray(count, _UINT64, region, at, _EVERY_PAIR)
+            first, last = int(column.min()), int(column.max())
+        elif count > 1:
+            times = _times_of(count)(region, at)
+            first, last = min(times), max(times)
+        elif count:
+            first = last = _time(region, at)[0]
+        else:
+            continue
+        extents[channel] = _tuple(Extent, (count, first, last))
+        latest = max(latest, last)
+    if latest >= MAX_NS:
+        raise UnreadableError(_IMPOSSIBLE_TIMES)
+    if index_bytes(len(offsets), held) != len(region):
+        raise UnreadableError("damaged: a chunk has message indexes that its chunk index lacks")
+    return extents
+
+
+def indexed_channels(region: bytes) -> frozenset[int]:
+    """The channels whose message indexes lie in these bytes behind a chunk."""
+    channels = []
+    at, size = 0, len(region)
+    while at < size:
+        if at + _INDEX_HEAD_BYTES > size:
+            raise UnreadableError(_NO_INDEX)
+        opcode, length, number, _ = _index_head(region, at)
+        if opcode != _MESSAGE_INDEX:
+            raise UnreadableError(_NO_INDEX)
+        channels.append(number)
+        at += RECORD.size + length
+    return frozenset(channels)
+
+
+def index_bytes(indexes: int, messages: int) -> int:
+    """How many bytes so many message indexes take that hold so many messages together."""
+    return indexes * _INDEX_HEAD_BYTES + messages * _PAIR_BYTES
+
+
+@lru_cache(256)
+def _times_of(count: int) -> Callable[[bytes, int], tuple[int, ...]]:
+    """What takes the log times from so many pairs of log time and offset."""
+    return struct.Struct("<" + "Q8x" * count).unpack_from
+
+
+def _index_at(region: bytes, channel: int, at: int) -> tuple[int, int]:
+    """Where the pairs of log time and offset of a message index begin, and how many there are."""
+    pairs_at = at + _INDEX_HEAD_BYTES
+    if at < 0 or pairs_at > len(region):
+        raise UnreadableError(_NO_INDEX)
+    opcode, length, number, size = _index_head(region, at)
+    if opcode != _MESSAGE_INDEX or number != channel or length != size + 6 or size % _PAIR_BYTES:
+        raise UnreadableError(_OTHER_INDEX)
+    count = size // _PAIR_BYTES
+    if count > MAX_CHUNK_MESSAGES or pairs_at + size > len(region):
+        raise UnreadableError(_LONG_INDEX)
+    return pairs_at, count
+
+
+_COUNTED_EVERY: Final = 1 << 20
+
+
+@dataclass(slots=True)
+class Walked:
+    """What walking the records of a chunk found.
+
+    `usable` is how many bytes of whole records there are.
+    """
+
+    columns: dict[int, Column]
+    usable: int
+    messages: int
+    declarations: list[tuple[int, bytes]] = field(default_factory=list)
+
+
+def walk(data: bytes) -> Walked:
+    """The messages of a decompressed chunk, as far as whole records reach.
+
+    Raises:
+        UnreadableError: they are more than can be kept in mind.
+    """
+    found: dict[int, tuple[list[int], list[int]]] = {}
+    declarations: list[tuple[int, bytes]] = []
+    position, end = 0, len(data)
+    record, message = RECORD.unpack_from, MESSAGE.unpack_from
+    counted = MAX_CHUNK_MESSAGES * MESSAGE.size  # where there can first be too many
+    while position + RECORD.size <= end:
+        if position > counted:
+            _require_few(found)
+            counted += _COUNTED_EVERY
+        opcode, length = record(data, position)
+        following = position + RECORD.size + length
+        if following > end or opcode == 0:
+            break
+        if opcode == Opcode.MESSAGE:
+            if length < MESSAGE_FIELDS:
+                break
+            _, _, channel, _, log_time, _ = message(data, position)
+            entry = found.get(channel)
+            if entry is None:
+                entry = found[channel] = ([], [])
+            entry[0].append(log_time)
+            entry[1].append(position)
+        elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
+            declarations.append((opcode, data[position + RECORD.size : following]))
+            if len(declarations) > MAX_CHUNK_DECLARATIONS:
+                raise UnreadableError(_MANY_DECLARED)
+        position = following
+    columns = {channel: column_of(*lists) for channel, lists in found.items()}
+    messages = sum(len(times) for times, _ in found.values())
+    return Walked(columns, position, messages, declarations)
+
+
+def _require_few(found: Mapping[int, tuple[list[int], list[int]]]) -> None:
+    if sum(len(times) for times, _ in found.values()) > MAX_CHUNK_MESSAGES:
+        raise UnreadableError(f"a chunk holds more than {MAX_CHUNK_MESSAGES} messages")
+
+
+def column_of(times: Sequence[int], places: Sequence[int]) -> Column:
+    """A column from log times (unsigned, in file order) and places."""
+    return Column.of(
+        np.array(times, dtype=np.uint64).astype(np.int64), np.array(places, dtype=np.int64)
+    )
+
+
+class ChunkHead(NamedTuple):
+    """The fields of a chunk record before its data, which begins at `data_at` in the body."""
+
+    crc: int
+    compression: str
+    data_size: int
+    data_at: int
+
+
+CHUNK_HEAD_BYTES: Final = 96
+"""As much of a chunk record's body as holds its fields, whatever its compression is called."""
+_SMALL_BYTES: Final = 48 << 10
+
+
+def packed_chunk(
+    file: OpenFile, body_at: int, body_size: int, max_bytes: int
+) -> tuple[ChunkHead, bytes]:
+    """The fields of a chunk record, and its data as far as the body reaches.
+
+    Args:
+        file: the open file.
+        body_at: where the record's body begins.
+        body_size: how much of the body there is.
+        max_bytes: what a chunk may hold.
+
+    Raises:
+        UnreadableError: the fields are not all there, or the data are larger than allowed.
+    """
+    # A small one is read at once: what is cut off costs less than to read twice.
+    whole = file.read(body_at, body_size if body_size <= _SMALL_BYTES else CHUNK_HEAD_BYTES)
+    head = chunk_head(whole)
+    if head.data_size > max_bytes:
+        raise _too_large(max_bytes)
+    held = min(body_size - head.data_at, head.data_size)
+    if head.data_at + held <= len(whole):
+        return head, whole[head.data_at : head.data_at + held]
+    return head, file.read(body_at + head.data_at, held)
+
+
+def _too_large(max_bytes: int) -> UnreadableError:
+    return UnreadableError(too_large("a chunk", max_bytes))
+
+
+def chunk_head(body: bytes) -> ChunkHead:
+    """The fields of a chunk record, from the beginning of its body.
+
+    Raises:
+        UnreadableError: that is not enough of it.
+    """
+    if len(body) < CHUNK_TIMES.size + 12:
+        raise UnreadableError("damaged: a chunk ends inside its own header")
+    crc: int = CHUNK_TIMES.unpack_from(body)[3]
+    at = CHUNK_TIMES.size + 4
+    name_size = int.from_bytes(body[at - 4 : at], "little")
+    name = body[at : at + name_size]
+    at += name_size + 8
+    if at > len(body):
+        raise UnreadableError("damaged: a chunk ends inside its own header")
+    return ChunkHead(crc, name.decode(), int.from_bytes(body[at - 8 : at], "little"), at)
+
+
+def unpacked(head: ChunkHead, packed: bytes, max_bytes: int) -> bytes:
+    """The records of a whole chunk, its checksum verified where it has one.
+
+    The size that the chunk states is not relied on for any allocation.
+
+    Raises:
+        UnreadableError: it is damaged, larger than `max_bytes`, or in a compression not known.
+    """
+    if len(packed) != head.data_size:
+        raise UnreadableError("damaged: a chunk is shorter than it states")
+    data = _decompressed(head.compression, packed, max_bytes)
+    if len(data) > max_bytes:
+        raise _too_large(max_bytes)
+    if head.crc and zlib.crc32(data) != head.crc:
+        raise UnreadableError("damaged: a chunk does not match its checksum")
+    return data
+
+
+def unpacked_in_part(head: ChunkHead, packed: bytes, max_bytes: int) -> bytes:
+    """As much of a chunk as a file that ends inside it holds."""
+    if head.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
+            return stream.read(max_bytes)
+    return _decompressed(head.compression, packed, max_bytes)[:max_bytes]
+
+
+def _decompressed(compression: str, packed: bytes, max_bytes: int) -> bytes:
+    """At most a byte more than allowed, so that the excess shows."""
+    if not compression:
+        return packed
+    if compression == "zstd":
+        return unpacked_zstd(packed, max_bytes)
+    if compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_bytes + 1))
+    raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")

@@ -1,0 +1,105 @@
+"""What rosbag2 embeds in each MCAP file besides messages: a metadata record with its metadata.yaml.
+
+It stands right behind the header, and again before the end, and holds the custom data that `ros2
+bag record --custom-data` was given (seen in the files of Jazzy; Humble has no such option).
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Final
+
+import yaml
+from mcap.records import Metadata
+
+from ros2_memory.storage.errors import UnreadableError
+from ros2_memory.storage.file_io import OpenFile
+from ros2_memory.storage.mcap.file import require_mcap
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, RECORD, Opcode
+from ros2_memory.storage.mcap.salvage import parsed
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from mcap.records import McapRecord
+
+_NAME: Final = "rosbag2"
+_KEY: Final = "serialized_metadata"
+_OF_HUMBLE: Final = frozenset({"ROS_DISTRO"})
+"""What Humble's record has instead (seen in its files)."""
+_NEXT_KEY: Final = re.compile(r"[a-z_]+:|\s*\Z")
+_MOST_BYTES: Final = 16 << 20
+"""A longer record is not read. The metadata record grows by 180 bytes a split."""
+_BEFORE: Final = frozenset(
+    {Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.ATTACHMENT}
+)
+_END: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END})
+# The whole text lists every split: parsing it as YAML takes a thousand times as long.
+_CUSTOM_DATA: Final = re.compile(r"^custom_data:[^\n]*\n(?: +[^\s#][^\n]*(?:\n|$))*", re.MULTILINE)
+
+
+def custom_data(path: Path) -> dict[str, str] | None:
+    """The custom data that `ros2 bag record` embedded in an MCAP file; empty where there is none.
+
+    Reads up to the first message or chunk, so a file that ends after that has it too. None where
+    that cannot be known: the file is no MCAP file, ends before it, or is damaged there.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    try:
+        with OpenFile(path) as file:
+            require_mcap(file)
+            for record in _before_messages(file):
+                if isinstance(record, Metadata):
+                    text = record.metadata.get(_KEY)
+                    if text is not None:
+                        return _custom_data_in(text) if record.name == _NAME else None
+                    if record.name == _NAME and record.metadata.keys() - _OF_HUMBLE:
+                        return None
+    except UnreadableError:
+        return None
+    return {}
+
+
+def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
+    """The records before the first message or chunk.
+
+    Raises:
+        UnreadableError: the file ends before one, or what stands before it is damaged.
+    """
+    position, begins = MAGIC_SIZE, True
+    while True:
+        opcode, length = RECORD.unpack(file.read(position, RECORD.size))
+        if begins != (opcode == Opcode.HEADER):
+            raise UnreadableError("damaged: it does not begin with one header")
+        if opcode in _END:
+            return
+        if opcode not in _BEFORE or length > _MOST_BYTES:
+            raise UnreadableError("damaged: no such record stands before the first message")
+        body = file.read(position + RECORD.size, length)
+        records = [*parsed([(opcode, body)])]
+        if not records:
+            raise UnreadableError("damaged: a record before the first message cannot be read")
+        yield records[0]
+        position += RECORD.size + length
+        begins = False
+
+
+def _custom_data_in(text: str) -> dict[str, str] | None:
+    found = _CUSTOM_DATA.search(text)
+    if found is None or not _NEXT_KEY.match(text, found.end()):
+        return None
+    try:
+        content: object = yaml.safe_load(found[0])
+    except (yaml.YAMLError, RecursionError, ValueError):
+        return None
+    if not isinstance(content, dict):
+        return None
+    values: object = content.get("custom_data")
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        return None
+    return {str(key): str(value) for key, value in values.items()}

@@ -1,0 +1,472 @@
+"""Where the messages of an MCAP file lie: from its summary section, or by scanning it once.
+
+The summary section is believed where its checksum holds and it agrees with itself and with the
+message indexes looked into. Everything else (no summary, no statistics, channels not repeated, no
+message index, no chunks, cut short) is answered by one scan, which finds the same from the
+messages themselves.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from operator import attrgetter, itemgetter, le
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.core.bag_summary import (
+    MESSAGES_MISSING,
+    OUT_OF_ORDER_NS,
+    WRONG_STATISTICS,
+)
+from ros2_memory.core.timebase import MAX_NS, unix_from_ns
+from ros2_memory.storage.errors import UnreadableError, reason_of
+from ros2_memory.storage.limits import MAX_CHUNKS, MAX_SECTION_BYTES
+from ros2_memory.storage.mcap.chunk import (
+    Column,
+    Extent,
+    columns_from_index,
+    declarations_of,
+    extents_from_index,
+    index_bytes,
+    indexed_channels,
+    packed_chunk,
+    require_indexed,
+    unpacked,
+    unpacked_in_part,
+)
+from ros2_memory.storage.mcap.records import (
+    MAGIC_SIZE,
+    RECORD,
+    Declarations,
+    Opcode,
+    Statistics,
+)
+from ros2_memory.storage.mcap.summary import (
+    INDEX_OFFSET_BYTES,
+    Chunk,
+    DoubtError,
+    read_summary,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Mapping, Sequence
+
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import Channel
+    from ros2_memory.storage.file_io import OpenFile
+
+_CHUNK: Final = int(Opcode.CHUNK)
+_INDEXED: Final = frozenset((_CHUNK, int(Opcode.MESSAGE_INDEX)))
+_OTHER_CHUNKS: Final = "its chunk indexes do not agree with its chunks"
+OTHER_DECLARED: Final = "its summary section declares other channels or types than its messages"
+_STATED: Final = struct.Struct("<BQQQ")
+"""A chunk record up to its times: opcode, length, first and last log time."""
+_STATED_BYTES: Final = _STATED.size
+_HEAD_BYTES: Final = RECORD.size
+_stating: Final = _STATED.pack
+_USUAL_BYTES: Final = 32 << 10
+_NEVER: Final = 1 << 64
+"""Later than any time that a file can state."""
+
+
+@dataclass(slots=True)
+class Total:
+    """Messages of one channel: how many, and the log times of the earliest and the latest."""
+
+    count: int
+    first: Ns
+    last: Ns
+
+
+class McapIndex(NamedTuple):
+    """What is known of a file without its payloads.
+
+    `loose` are the messages outside chunks, by channel, at their places in the file. `set_back` is
+    by how much a channel's log times go back from one chunk, or one loose message, to a later one,
+    at most; 0 where that is no more than `OUT_OF_ORDER_NS`. `contradiction` says where the file's
+    own indexes were found to contradict its messages after they had been believed; else it is
+    empty. `declared` is what the summary section declares, where the index comes from it.
+    """
+
+    channels: Mapping[int, Channel]
+    chunks: tuple[Chunk, ...]
+    totals: Mapping[int, Total]
+    loose: Mapping[int, Column] = MappingProxyType({})
+    complete: bool = True
+    notes: tuple[str, ...] = ()
+    set_back: Ns = 0
+    contradiction: str = ""
+    declared: Declarations | None = None
+
+    @property
+    def bytes_held(self) -> int:
+        """About how much memory it takes, but for `channels_bytes`."""
+        places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
+        loose = sum([column.times.nbytes * 2 for column in self.loose.values()])
+        return 1000 + 400 * len(self.chunks) + places + loose
+
+
+def channels_bytes(channels: Mapping[int, Channel]) -> int:
+    """About how much memory channels take; those of usual length are shared with other files."""
+    long = sum([size for each in channels.values() if (size := each.bytes_held) > _USUAL_BYTES])
+    return 300 * len(channels) + long
+
+
+def chunk_columns(
+    file: OpenFile, chunk: Chunk, wanted: Collection[int] | None = None
+) -> dict[int, Column]:
+    """The messages of a chunk by its message indexes. Only where it has `index_places`.
+
+    Args:
+        file: the open file.
+        chunk: one of its chunks.
+        wanted: the channels to read, or all.
+
+    Raises:
+        UnreadableError: the indexes are damaged, or disagree with the chunk's stated span.
+    """
+    offsets = chunk.index_offsets
+    if wanted is not None:
+        offsets = {channel: offset for channel, offset in offsets.items() if channel in wanted}
+    columns = columns_from_index(_index_region(file, chunk), offsets, chunk.offset + chunk.length)
+    for times, _ in columns.values():
+        if times.size and not chunk.start <= int(times[0]) <= int(times[-1]) <= chunk.end:
+            raise _outside()
+    return columns
+
+
+def require_channels(file: OpenFile, chunk: Chunk) -> None:
+    """Holds the channels that a chunk index names against the message indexes behind the chunk.
+
+    Raises:
+        UnreadableError: they are others.
+    """
+    if indexed_channels(_index_region(file, chunk)) != chunk.channels:
+        raise UnreadableError(
+            "damaged: a chunk index names other channels than have messages in its chunk"
+        )
+
+
+def proven_columns(
+    file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes
+) -> dict[int, Column]:
+    """As `chunk_columns`, held against the decompressed records of the chunk.
+
+    Raises:
+        UnreadableError: the indexes do not agree with the records.
+    """
+    columns = chunk_columns(file, chunk, wanted)
+    for channel, column in columns.items():
+        require_indexed(data, channel, column)
+    return columns
+
+
+def require_declared(declared: Declarations, data: bytes, columns: Sequence[Column]) -> None:
+    """Holds what a summary section declares against what a chunk declares.
+
+    Args:
+        declared: what the summary section declares.
+        data: the decompressed records of the chunk, which its checksum vouches for.
+        columns: all messages of the chunk, held against these records.
+
+    Raises:
+        UnreadableError: the chunk declares a channel or a schema otherwise, or holds more messages.
+    """
+    for opcode, body in declarations_of(data, columns):
+        if not declared.agrees(opcode, body):
+            raise UnreadableError(OTHER_DECLARED)
+
+
+def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
+    """What `chunk_columns` amounts to, for less."""
+    offsets, base = chunk.index_offsets, chunk.offset + chunk.length
+    extents = extents_from_index(_index_region(file, chunk), offsets, base)
+    start, end = chunk.start, chunk.end
+    for _, first, last in extents.values():
+        if not start <= first <= last <= end:
+            raise _outside()
+    return extents
+
+
+def _set_back(file: OpenFile, chunks: Sequence[Chunk]) -> Ns:
+    """As in `McapIndex`, of chunks with message indexes in the order of writing.
+
+    Chunks that overlap are no sign of it by themselves: some writers sort channels into chunks.
+    """
+    latest = -1
+    for chunk in chunks:
+        if chunk.start < latest - OUT_OF_ORDER_NS:
+            break
+        latest = max(latest, chunk.end)
+    else:
+        return 0
+    most: Ns = 0
+    lasts: dict[int, Ns] = {}
+    for chunk in chunks:
+        for channel, (_, first, last) in _chunk_extents(file, chunk).items():
+            before = lasts.get(channel, first)
+            most = max(most, before - first)
+            lasts[channel] = max(before, last)
+    return beyond_disorder(most)
+
+
+def beyond_disorder(back: Ns) -> Ns:
+    """By how much times go back; 0 where messages are merely out of order."""
+    return back if back > OUT_OF_ORDER_NS else 0
+
+
+def _index_region(file: OpenFile, chunk: Chunk) -> bytes:
+    if chunk.index_length > MAX_SECTION_BYTES:
+        raise UnreadableError("damaged: a message index is larger than any chunk")
+    return file.read(chunk.offset + chunk.length, chunk.index_length)
+
+
+def _outside() -> UnreadableError:
+    return UnreadableError("damaged: a chunk holds messages outside its stated times")
+
+
+def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
+    """The decompressed records of a chunk.
+
+    Raises:
+        UnreadableError: the chunk is damaged or larger than `max_bytes`.
+    """
+    body_at, body_size = chunk.offset + RECORD.size, chunk.length - RECORD.size
+    head, packed = packed_chunk(file, body_at, body_size, max_bytes)
+    if chunk.usable is not None:
+        return unpacked_in_part(head, packed, max_bytes)[: chunk.usable]
+    return unpacked(head, packed, max_bytes)
+
+
+def index_from_summary(file: OpenFile) -> McapIndex:
+    """The index that the summary section gives.
+
+    Raises:
+        DoubtError: there is none to rely on; scan the file.
+    """
+    try:
+        return _index_from_summary(file)
+    except (DoubtError, OSError):
+        raise
+    except Exception as error:
+        raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
+
+
+def _index_from_summary(file: OpenFile) -> McapIndex:
+    start, channels, declared, chunks, stated = read_summary(file)
+    if stated is None or not declared.resolved or stated.channels > len(channels):
+        raise DoubtError
+    counts = stated.counts
+    if not counts.keys() <= channels.keys() or len(chunks) > MAX_CHUNKS:
+        raise DoubtError
+    held = [chunk for chunk in chunks if chunk.channels]
+    if counts and len(held) < len(chunks):  # some have no index places
+        raise DoubtError
+    known = frozenset(channels)
+    if not all(map(known.issuperset, {chunk.channels for chunk in held})):
+        raise DoubtError("its chunk indexes name channels that it does not declare")
+    if chunks:
+        _require_as_stated(file, start, chunks)
+    exact = _agrees(stated, chunks, held)
+    if exact and not _indexes_all(held, stated.messages):
+        raise DoubtError("its message indexes do not hold what its statistics state")
+    totals = totals_of(file, held, counts if exact else None)
+    found = {channel: total.count for channel, total in totals.items()}
+    if found != counts or sum(found.values()) != stated.messages:
+        raise DoubtError
+    notes = disagreements(stated, totals)
+    back = _set_back(file, held)
+    return McapIndex(channels, tuple(held), totals, notes=notes, set_back=back, declared=declared)
+
+
+def _require_as_stated(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:
+    """Holds every chunk index against the head of its chunk, and what lies between the chunks.
+
+    Raises:
+        DoubtError: a chunk is not where its index says, or not of these times; or there is a chunk
+            or a message that no index knows.
+    """
+    ordered = sorted(chunks, key=itemgetter(0))
+    if ordered[-1].offset >= file.size:
+        raise DoubtError(_OTHER_CHUNKS)
+    begins = [chunk[0] for chunk in ordered]
+    heads = [_stating(_CHUNK, chunk[1] - _HEAD_BYTES, chunk[2], chunk[3]) for chunk in ordered]
+    if file.read_each(begins, _STATED_BYTES) != heads:
+        raise DoubtError(_OTHER_CHUNKS)
+    ends = [MAGIC_SIZE, *[chunk[0] + chunk[1] + chunk[6] for chunk in ordered]]
+    begins.append(end)
+    for at, following in zip(ends, begins, strict=True):
+        if at != following:
+            _require_no_content(file, at, following)
+
+
+def _require_no_content(file: OpenFile, at: int, end: int) -> None:
+    """Holds that no chunk or message lies in this stretch of the data section.
+
+    Raises:
+        DoubtError: one does, or the stretch is not made of records.
+    """
+    while at < end:
+        opcode, length = RECORD.unpack(file.read(at, RECORD.size))
+        if opcode == Opcode.DATA_END:
+            return
+        if opcode == Opcode.MESSAGE:
+            raise DoubtError  # as any writer may write it, though few do
+        if opcode in _INDEXED:
+            raise DoubtError("its chunk indexes do not hold all of its chunks")
+        at += RECORD.size + length
+    if at > end:
+        raise DoubtError(_OTHER_CHUNKS)
+
+
+def _indexes_all(chunks: Sequence[Chunk], messages: int) -> bool:
+    """Whether the message indexes, by their size alone, hold so many messages together."""
+    indexes = sum([len(chunk.index_places or b"") for chunk in chunks]) // INDEX_OFFSET_BYTES
+    return index_bytes(indexes, messages) == sum([chunk.index_length for chunk in chunks])
+
+
+def _agrees(stated: Statistics, chunks: Sequence[Chunk], held: Sequence[Chunk]) -> bool:
+    """Whether the statistics agree with themselves and with the chunk indexes."""
+    if sum(stated.counts.values()) != stated.messages or stated.chunks != len(chunks):
+        return False
+    if not held:
+        return not stated.messages
+    starts, ends = [chunk.start for chunk in held], [chunk.end for chunk in held]
+    start, end = min(starts), max(ends)
+    if (start, end) != (stated.start, stated.end) or end >= MAX_NS:
+        return False
+    # What lies in a chunk that ends before it begins would be in no window.
+    return all(map(le, starts, ends))
+
+
+def totals_of(
+    file: OpenFile, chunks: Iterable[Chunk], counts: Mapping[int, int] | None
+) -> dict[int, Total]:
+    """Exact totals by channel, from message indexes.
+
+    Args:
+        file: the open file.
+        chunks: its chunks; those that hold messages have message indexes.
+        counts: messages by channel where that is known; only those indexes are then read that can
+            hold a channel's earliest or latest message.
+    """
+    totals: dict[int, Total] = {}
+    held = [chunk for chunk in chunks if chunk.channels]
+    if counts is None:
+        for chunk in held:
+            _take_in(file, chunk, totals)
+        return totals
+    read = _take_in_beginnings(file, held, counts, totals)
+    _take_in_ends(file, [chunk for chunk in held if chunk.offset not in read], counts, totals)
+    for channel, total in totals.items():
+        total.count = counts.get(channel, 0)
+    return totals
+
+
+def _take_in_beginnings(
+    file: OpenFile, held: Sequence[Chunk], counts: Mapping[int, int], totals: dict[int, Total]
+) -> set[int]:
+    """Reads every chunk that can hold a channel's earliest message; says which these are."""
+    read: set[int] = set()
+    # By the set of channels, since the chunks of a file mostly hold the same ones.
+    edges: dict[frozenset[int], Ns] = {}
+    settled = _NEVER
+    for chunk in sorted(held, key=attrgetter("start")):
+        if chunk.start >= settled:
+            break
+        edge = edges.get(chunk.channels)
+        if edge is None:
+            edge = edges[chunk.channels] = _latest_first(chunk.channels, counts, totals)
+        if chunk.start < edge:
+            _take_in(file, chunk, totals)
+            read.add(chunk.offset)
+            settled = _latest_first(counts, counts, totals)
+            edges.clear()
+    return read
+
+
+def _take_in_ends(
+    file: OpenFile, held: Sequence[Chunk], counts: Mapping[int, int], totals: dict[int, Total]
+) -> None:
+    """Reads every chunk that can hold a channel's latest message."""
+    edges: dict[frozenset[int], Ns] = {}
+    for chunk in sorted(held, key=attrgetter("end"), reverse=True):
+        edge = edges.get(chunk.channels)
+        if edge is None:
+            edge = edges[chunk.channels] = _earliest_last(chunk.channels, counts, totals)
+        if chunk.end > edge:
+            _take_in(file, chunk, totals)
+            edges.clear()
+
+
+def _take_in(file: OpenFile, chunk: Chunk, totals: dict[int, Total]) -> None:
+    for channel, extent in _chunk_extents(file, chunk).items():
+        _add(totals, channel, extent)
+
+
+def _latest_first(
+    channels: Iterable[int], counts: Mapping[int, int], totals: Mapping[int, Total]
+) -> Ns:
+    """A chunk of these channels that begins before it can hold an earlier message of one."""
+    firsts = [
+        totals[channel].first if channel in totals else _NEVER
+        for channel in channels
+        if channel in counts
+    ]
+    return max(firsts, default=-1)
+
+
+def _earliest_last(
+    channels: Iterable[int], counts: Mapping[int, int], totals: Mapping[int, Total]
+) -> Ns:
+    """A chunk of these channels that ends after it can hold a later message of one."""
+    lasts = [
+        totals[channel].last if channel in totals else -1
+        for channel in channels
+        if channel in counts
+    ]
+    return min(lasts, default=_NEVER)
+
+
+def add_column(totals: dict[int, Total], channel: int, column: Column) -> None:
+    """Counts a stretch's messages of one channel in."""
+    times = column.times
+    if times.size:
+        _add(totals, channel, Extent(times.size, int(times[0]), int(times[-1])))
+
+
+def _add(totals: dict[int, Total], channel: int, extent: Extent) -> None:
+    total = totals.get(channel)
+    if total is None:
+        totals[channel] = Total(*extent)
+        return
+    messages, first, last = extent
+    total.count += messages
+    # Not by min() and max(), which take longer than all the rest.
+    if first < total.first:  # noqa: PLR1730
+        total.first = first
+    if last > total.last:  # noqa: PLR1730
+        total.last = last
+
+
+def disagreements(stated: Statistics, totals: Mapping[int, Total]) -> tuple[str, ...]:
+    """A note where the messages contradict the statistics."""
+    every = totals.values()
+    counts = {channel: total.count for channel, total in totals.items()}
+    count = sum([total.count for total in every])
+    first = min([total.first for total in every], default=stated.start)
+    last = max([total.last for total in every], default=stated.end)
+    claimed = (stated.messages, stated.start, stated.end)
+    if stated.counts == counts and claimed == (count, first, last):
+        return ()
+    note = (
+        f"{WRONG_STATISTICS}: they state {stated.messages} messages from"
+        f" {_seconds(stated.start)} to {_seconds(stated.end)}; it holds {count} from"
+        f" {_seconds(first)} to {_seconds(last)}"
+    )
+    return (f"{note}; {MESSAGES_MISSING}" if stated.messages > count else note,)
+
+
+def _seconds(moment: Ns) -> str:
+    return f"{unix_from_ns(moment):.6f} s"

@@ -1,0 +1,77 @@
+"""Merging runs of messages that are each in order and may overlap in time."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from heapq import heappop, heappush
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from ros2_memory.core.timebase import Ns
+
+T = TypeVar("T")
+
+
+class Rows(NamedTuple, Generic[T]):
+    """The messages of one run in output order: log times, places, and how to fetch one by both.
+
+    For newest first the times are descending, and equal ones stand in reverse file order.
+    """
+
+    times: list[Ns]
+    places: list[int]
+    fetch: Callable[[int, Ns], T]
+
+
+class Run(NamedTuple, Generic[T]):
+    """A stretch of a file: no message in it lies outside `first` to `last` (inclusive).
+
+    `rank` is its place in the file; `rows` reads it, and is called only when its turn comes.
+    """
+
+    first: Ns
+    last: Ns
+    rank: int
+    rows: Callable[[], Rows[T]]
+
+
+def merged(runs: Iterable[Run[T]], *, newest_first: bool) -> Iterator[T]:
+    """The messages of all runs by log time, ties in file order; or exactly the reverse.
+
+    A run is read only when it can hold the next message, and let go at its end: what is held
+    are the runs that overlap in time.
+    """
+    sign = -1 if newest_first else 1
+    # Sorted so that the next to be read is the last of the list.
+    waiting = sorted(
+        ((-run.last if newest_first else run.first, sign * run.rank, run) for run in runs),
+        key=lambda entry: entry[:2],
+        reverse=True,
+    )
+    heap: list[tuple[Ns, int, int, Rows[T], list[Ns]]] = []
+    while waiting or heap:
+        while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
+            _, rank, run = waiting.pop()
+            rows = run.rows()
+            if rows.times:
+                keys = [-time for time in rows.times] if newest_first else rows.times
+                heappush(heap, (keys[0], rank, 0, rows, keys))
+            del rows, run
+        if not heap:
+            continue
+        _, rank, position, rows, keys = heappop(heap)
+        stop = len(keys)
+        if heap:
+            stop = bisect_left(keys, heap[0][0], position, stop)
+        if waiting:
+            stop = bisect_left(keys, waiting[-1][0], position, stop)
+        # At a tie with another run, the lower rank goes first, one message at a time.
+        stop = max(stop, position + 1)
+        fetch = rows.fetch
+        for place, time in zip(rows.places[position:stop], rows.times[position:stop], strict=True):
+            yield fetch(place, time)
+        if stop < len(keys):
+            heappush(heap, (keys[stop], rank, stop, rows, keys))
+        del rows, keys, fetch

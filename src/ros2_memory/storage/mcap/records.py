@@ -1,0 +1,205 @@
+"""The records of an MCAP file, from bytes (https://mcap.dev/spec).
+
+A file is magic, records, magic; a record is an opcode (1 byte), a length (8 bytes, little endian)
+and a body. What is read of every file is read with `struct`; what the bags of one robot have in
+common, and what is seldom read, by the `mcap` package.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass, field
+from functools import lru_cache
+from io import BytesIO
+from typing import TYPE_CHECKING, Final
+
+from mcap import records as mcap_records
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
+
+from ros2_memory.storage.base import Channel, Schema
+from ros2_memory.storage.errors import UnreadableError
+from ros2_memory.storage.limits import MAX_CHANNELS, MAX_DEFINITION_BYTES, MAX_NAMES_CHARS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.core.timebase import Ns
+
+__all__ = [
+    "CHUNK_TIMES",
+    "FOOTER",
+    "MAGIC",
+    "MAGIC_SIZE",
+    "MESSAGE",
+    "MESSAGE_FIELDS",
+    "RECORD",
+    "Declarations",
+    "Opcode",
+    "Statistics",
+    "framed",
+    "offered_as_latched",
+    "statistics",
+]
+
+MAGIC: Final = MCAP0_MAGIC
+MAGIC_SIZE: Final = len(MAGIC)
+RECORD: Final = struct.Struct("<BQ")
+"""Opcode and length of the body."""
+MESSAGE: Final = struct.Struct("<BQHIQQ")
+"""A message record up to its payload: opcode, length, channel, sequence, log and publish time."""
+MESSAGE_FIELDS: Final = MESSAGE.size - RECORD.size
+CHUNK_TIMES: Final = struct.Struct("<QQQI")
+"""A chunk's first and last log time, uncompressed size and CRC; compression and data follow."""
+FOOTER: Final = struct.Struct("<BQQQI")
+"""Opcode, length, start of the summary section, start of the summary offsets, summary CRC."""
+_STATISTICS: Final = struct.Struct("<QHIIIIQQI")
+"""Messages, schemas, channels, attachments, metadata, chunks, first and last log time, and the
+bytes of the counts by channel."""
+_COUNT: Final = struct.Struct("<HQ")
+_MOST_REMEMBERED: Final = 256
+_LONGEST_REMEMBERED: Final = 16 * 1024
+
+# QoS stands in a channel's metadata as YAML; parsing it costs fifty times this search. Newer
+# distros write the durability's name, older ones rmw's number for it.
+_TRANSIENT_LOCAL: Final = re.compile(r"durability:\s*(?:transient_local|1)\b")
+
+
+def offered_as_latched(qos_profiles: str) -> bool:
+    """Whether some publisher offered the topic as transient local, by rosbag2's QoS text."""
+    return _TRANSIENT_LOCAL.search(qos_profiles) is not None
+
+
+def framed(section: bytes) -> Iterator[tuple[int, bytes]]:
+    """The records of a section as (opcode, body).
+
+    Raises:
+        UnreadableError: the section does not end where a record does.
+    """
+    position, end = 0, len(section)
+    while position < end:
+        if position + RECORD.size > end:
+            raise UnreadableError("damaged: a section ends inside a record")
+        opcode, length = RECORD.unpack_from(section, position)
+        position += RECORD.size
+        if position + length > end:
+            raise UnreadableError("damaged: a record is longer than its section")
+        yield opcode, section[position : position + length]
+        position += length
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """What a file says of itself: how much it holds, and its first and last log time."""
+
+    counts: dict[int, int]
+    messages: int
+    start: Ns
+    end: Ns
+    chunks: int
+    channels: int
+
+
+def statistics(body: bytes) -> Statistics:
+    """A statistics record."""
+    messages, _, channels, _, _, chunks, start, end, size = _STATISTICS.unpack_from(body)
+    stop = _STATISTICS.size + size
+    if stop > len(body) or size % _COUNT.size:
+        raise UnreadableError("damaged: the statistics are shorter than they state")
+    pairs = _COUNT.iter_unpack(body[_STATISTICS.size : stop])
+    counts = {channel: count for channel, count in dict(pairs).items() if count}
+    return Statistics(counts, messages, start, end, chunks, channels)
+
+
+@dataclass(slots=True)
+class Declarations:
+    """The schemas and channels met so far; ids are local to one file."""
+
+    _schemas: dict[int, Schema] = field(default_factory=dict)
+    _channels: dict[int, mcap_records.Channel] = field(default_factory=dict)
+
+    def add(self, opcode: int, body: bytes) -> None:
+        """Takes note of a schema or channel record; others are ignored."""
+        if opcode == Opcode.SCHEMA:
+            number, schema = _schema(body) if _is_short(body) else _schema.__wrapped__(body)
+            self._schemas[number] = schema
+        elif opcode == Opcode.CHANNEL:
+            channel = _channel(body) if _is_short(body) else _channel.__wrapped__(body)
+            self._channels[channel.id] = channel
+
+    def agrees(self, opcode: int, body: bytes) -> bool:
+        """Whether a schema or channel record declares what is known of its number, if anything."""
+        other = Declarations()
+        other.add(opcode, body)
+        return not self._differing(other)
+
+    def update(self, other: Declarations) -> bool:
+        """Takes over what another declares; returns whether that replaced something else."""
+        differing = self._differing(other)
+        self._schemas |= other._schemas
+        self._channels |= other._channels
+        return differing
+
+    def _differing(self, other: Declarations) -> bool:
+        return any(
+            self._schemas.get(number, each) != each for number, each in other._schemas.items()
+        ) or any(
+            self._channels.get(number, each) != each for number, each in other._channels.items()
+        )
+
+    @property
+    def resolved(self) -> bool:
+        """Whether every channel's schema is known. Id 0 means a channel without one."""
+        return all(
+            channel.schema_id == 0 or channel.schema_id in self._schemas
+            for channel in self._channels.values()
+        )
+
+    def channels(self) -> dict[int, Channel]:
+        """The channels by id; one whose schema is nowhere in the file has an empty schema.
+
+        Raises:
+            UnreadableError: they are more than any robot has.
+        """
+        if len(self._channels) > MAX_CHANNELS:
+            raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
+        names = sum(
+            len(each.topic) + len(each.message_encoding) for each in self._channels.values()
+        )
+        types = sum(len(each.name) for each in self._schemas.values())
+        if names + types > MAX_NAMES_CHARS:
+            raise UnreadableError("its topics and types have longer names than any can have")
+        return {
+            number: Channel(
+                channel.topic,
+                channel.message_encoding,
+                self._schemas.get(channel.schema_id, Schema("")),
+                offered_as_latched(channel.metadata.get("offered_qos_profiles", "")),
+                tuple(channel.metadata.items()),
+            )
+            for number, channel in self._channels.items()
+        }
+
+
+# The bags of one robot declare the same, byte for byte.
+@lru_cache(_MOST_REMEMBERED)
+def _schema(body: bytes) -> tuple[int, Schema]:
+    schema: mcap_records.Schema = mcap_records.Schema.read(_stream(body))
+    return schema.id, Schema(schema.name, schema.encoding, schema.data[: MAX_DEFINITION_BYTES + 1])
+
+
+@lru_cache(_MOST_REMEMBERED)
+def _channel(body: bytes) -> mcap_records.Channel:
+    channel: mcap_records.Channel = mcap_records.Channel.read(_stream(body))
+    return channel
+
+
+def _is_short(body: bytes) -> bool:
+    """Whether it may be remembered: what is, together, stays below some MB."""
+    return len(body) <= _LONGEST_REMEMBERED
+
+
+def _stream(body: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(body))

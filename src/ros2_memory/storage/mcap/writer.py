@@ -1,0 +1,205 @@
+"""Writes MCAP files: closed, indexed, checked, and on the disk."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from mcap import records as mcap_records
+from mcap.writer import CompressionType, Writer
+
+from ros2_memory.core.errors import BagError, EpisodicError
+from ros2_memory.storage.base import ROS2_PROFILE
+from ros2_memory.storage.errors import UnreadableError, reading, reason_of
+from ros2_memory.storage.file_io import OpenFile
+from ros2_memory.storage.limits import MAX_CHUNK_MB
+from ros2_memory.storage.mcap.bag_file import McapBags
+from ros2_memory.storage.mcap.salvage import Salvage, Tally, parsed
+from ros2_memory.storage.writing import BagWriter, Rewritten
+from ros2_memory.typestore import full_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+    from pathlib import Path
+    from typing import IO
+
+    from ros2_memory.storage.base import Channel, Record, Schema
+
+CHUNK_BYTES: Final = 64 << 10
+"""Small, since whoever asks for one message has the whole of its chunk unpacked."""
+LIBRARY: Final = "ros2-memory"
+_ROS2_ENCODINGS: Final = frozenset(("ros2msg", "ros2idl", ""))
+"""Empty where the recorder found no definition."""
+
+
+class McapWriter(BagWriter):
+    """Writes `.mcap` files, chunks compressed with zstd.
+
+    Args:
+        max_chunk_mb: what one chunk of a file that is rewritten may hold, decompressed.
+    """
+
+    def __init__(self, max_chunk_mb: int = MAX_CHUNK_MB) -> None:
+        self._max_chunk_mb = max_chunk_mb
+
+    def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
+        """Writes a bag that holds these messages."""
+        with _written(path) as stream:
+            writer = _writer(stream)
+            writer.start(profile, LIBRARY)
+            channels = _Channels(writer)
+            for record in records:
+                number = channels.number_of(record.channel)
+                writer.add_message(number, record.log_time, record.payload, record.publish_time)
+            writer.finish()
+
+    def rewrite(
+        self, source: Path, target: Path, progress: Callable[[int], None] | None = None
+    ) -> Rewritten:
+        """Writes all that can be read of a file that was cut short into one that is whole."""
+        with _written(target) as stream:
+            with reading(source), OpenFile(source) as file:
+                salvage = Salvage(file, self._max_chunk_mb << 20)
+                copy = _Copy(_writer(stream))
+                tally = Tally()
+                for record in parsed(salvage.records(progress)):
+                    if tally.counts(record):
+                        copy.put(record)
+            copy.finish()
+            stream.flush()
+            notes = self._compared(source, target, tally)
+        return Rewritten(tally.messages, salvage.lost_bytes, notes)
+
+    def _compared(self, source: Path, target: Path, tally: Tally) -> tuple[str, ...]:
+        """Reads the target both as questions do and as it was written; gives the source's notes."""
+        bags = McapBags(cache_mb=1, max_chunk_mb=self._max_chunk_mb)
+        with reading(source):
+            before = bags.summarize(source)
+        after = bags.summarize(target)
+        if not after.complete or after.notes:
+            raise UnreadableError(f"what was written is not whole ({'; '.join(after.notes)})")
+        again = Tally()
+        with OpenFile(target) as file:
+            for record in parsed(Salvage(file, self._max_chunk_mb << 20).records()):
+                again.counts(record)
+        if (after.topics, again.said) != (before.topics, tally.said):
+            raise UnreadableError("what was written is not what could be read")
+        return before.notes
+
+
+class _Copy:
+    """Puts the records of another file into a writer, which numbers schemas and channels anew."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._started = False
+        self._schemas: dict[int, int] = {0: 0}
+        self._channels: dict[int, int] = {}
+
+    def put(self, record: mcap_records.McapRecord) -> None:
+        """Writes one record, whose schema or channel must have come before."""
+        if isinstance(record, mcap_records.Header):
+            self._start(record.profile, f"{record.library}, rewritten by {LIBRARY}")
+            return
+        self._start(ROS2_PROFILE, LIBRARY)
+        if isinstance(record, mcap_records.Message):
+            self._writer.add_message(
+                self._channels[record.channel_id],
+                record.log_time,
+                record.data,
+                record.publish_time,
+                record.sequence,
+            )
+        elif isinstance(record, mcap_records.Schema):
+            self._schemas[record.id] = self._writer.register_schema(
+                record.name, record.encoding, record.data
+            )
+        elif isinstance(record, mcap_records.Channel):
+            self._channels[record.id] = self._writer.register_channel(
+                record.topic,
+                record.message_encoding,
+                self._schemas.get(record.schema_id, 0),
+                record.metadata,
+            )
+        elif isinstance(record, mcap_records.Metadata):
+            self._writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, mcap_records.Attachment):
+            self._writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
+
+    def finish(self) -> None:
+        """Writes what closes the file."""
+        self._start(ROS2_PROFILE, LIBRARY)
+        self._writer.finish()
+
+    def _start(self, profile: str, library: str) -> None:
+        if not self._started:
+            self._started = True
+            self._writer.start(profile, library)
+
+
+class _Channels:
+    """Declares the channels of records in a writer, each once."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._schemas: dict[Schema, int] = {}
+        self._channels: dict[Channel, int] = {}
+
+    def number_of(self, channel: Channel) -> int:
+        """The channel's number in the file."""
+        number = self._channels.get(channel)
+        if number is None:
+            schema = _exported(channel)
+            if schema not in self._schemas:
+                self._schemas[schema] = self._writer.register_schema(
+                    schema.name, schema.encoding, schema.text
+                )
+            number = self._writer.register_channel(
+                channel.topic, channel.encoding, self._schemas[schema], dict(channel.metadata)
+            )
+            self._channels[channel] = number
+        return number
+
+
+def _exported(channel: Channel) -> Schema:
+    """The schema of a channel; a ROS 2 type is named as rosbag2 and its readers name it."""
+    schema = channel.schema
+    if channel.encoding != "cdr" or schema.encoding not in _ROS2_ENCODINGS:
+        return schema
+    return replace(schema, name=full_name(schema.name))
+
+
+def _writer(stream: IO[bytes]) -> Writer:
+    return Writer(stream, CHUNK_BYTES, CompressionType.ZSTD)
+
+
+@contextmanager
+def _written(path: Path) -> Iterator[IO[bytes]]:
+    """A stream into a file that is made, on the disk at the end, and gone after a failure.
+
+    Raises:
+        BagError: whatever went wrong inside, as far as it is not of the error tree already.
+    """
+    try:
+        stream = path.open("xb")
+    except OSError as error:
+        raise BagError(str(path), f"it cannot be made: {error.strerror or error}") from error
+    try:
+        with stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+    # The library raises whatever it runs into, such as struct.error for a negative time.
+    except Exception as error:
+        with suppress(OSError):
+            path.unlink()
+        if isinstance(error, EpisodicError):
+            raise
+        if isinstance(error, OSError):
+            reason = f"it cannot be written: {error.strerror or error}"
+            raise BagError(str(path), reason) from error
+        raise BagError(str(path), reason_of(error)) from error

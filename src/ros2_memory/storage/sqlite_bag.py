@@ -1,0 +1,405 @@
+"""The sqlite3 room: summaries, messages and log times of rosbag2's `.db3` files.
+
+Every schema version since 2018 has the tables `topics` and `messages`; which columns there are
+beyond the oldest ones, and whether definitions lie in the file, is looked up in the file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import stat
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import starmap, zip_longest
+from operator import attrgetter, eq
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.storage.base import ROS2_PROFILE, Channel, Closing, Record, Schema
+from ros2_memory.storage.cache import ByteLru, Shared
+from ros2_memory.storage.errors import ContradictionError, UnreadableError
+from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
+from ros2_memory.storage.limits import (
+    MAX_CHANNELS,
+    MAX_CHUNK_MB,
+    MAX_DEFINITION_BYTES,
+    MAX_NAMES_CHARS,
+    MAX_SECTION_BYTES,
+)
+from ros2_memory.storage.mcap.records import offered_as_latched
+from ros2_memory.storage.sqlite_guard import guard, require_plain_tables
+from ros2_memory.storage.summary import Held, bag_summary
+from ros2_memory.storage.zstd import plain_payload
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.core.model import BagSummary
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.errors import LostError
+    from ros2_memory.storage.file_io import FileKey
+
+JOURNALS: Final = ("-wal", "-journal")
+_KEPT_BYTES: Final = 16 << 20
+_PROOF_BYTES: Final = 200
+_TOTALS: Final = """
+    SELECT topic_id, count(*), min(timestamp), max(timestamp),
+           sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob'),
+           timestamp IS ? AS impossible
+    FROM messages NOT INDEXED GROUP BY topic_id, impossible
+"""
+# Without the payload, so that sorting holds none of them; it follows row by row.
+_ASCENDING: Final = """
+    SELECT timestamp, rowid, topic_id FROM messages
+    WHERE timestamp >= ? AND timestamp < ? AND topic_id IN (SELECT value FROM json_each(?))
+    ORDER BY timestamp, rowid
+"""
+_DESCENDING: Final = _ASCENDING.replace("timestamp, rowid\n", "timestamp DESC, rowid DESC\n")
+_BEHIND: Final = """
+    SELECT 1 FROM messages NOT INDEXED
+    WHERE rowid > ? AND rowid <= ? AND timestamp > ? AND timestamp < ?
+    AND topic_id IN (SELECT value FROM json_each(?)) LIMIT 1
+"""
+_LOOKED_BEHIND: Final = 128
+_WRONG_INDEX: Final = "its index by time is damaged; its messages were read without it"
+_METADATA: Final = (
+    ("offered_qos_profiles", "offered_qos_profiles"),
+    ("type_description_hash", "topic_type_hash"),
+)
+"""Columns of the table of topics, and what an MCAP file calls them in a channel's metadata."""
+_SIZE_OF_DEFINITIONS: Final = (
+    "SELECT total(length(encoded_message_definition)) FROM message_definitions"
+)
+_PAYLOAD: Final = "SELECT data, timestamp, topic_id FROM messages WHERE rowid = ?"
+
+
+_MESSAGE_COLUMNS: Final = {"topic_id", "timestamp", "data"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Topics:
+    """The channels of a file by topic id; `key` is the content of the file."""
+
+    key: FileKey
+    channels: Mapping[int, Channel]
+
+    def named(self, topics: Collection[str]) -> dict[int, Channel]:
+        return {
+            number: channel for number, channel in self.channels.items() if channel.topic in topics
+        }
+
+
+class SqliteBags:
+    """Reads sqlite3 bag files that are settled: no journal or WAL beside them.
+
+    Nothing is written or locked; a connection is opened for each call. Safe to use from several
+    threads at once. What goes wrong is raised as it comes (`faults.reading` translates it).
+
+    Args:
+        max_message_mb: what one message, or any one value of a file, may hold.
+    """
+
+    def __init__(self, max_message_mb: int = MAX_CHUNK_MB) -> None:
+        self._max_message_bytes = max_message_mb << 20
+        self._known: ByteLru[_Topics] = ByteLru(_KEPT_BYTES)
+        self._shared: Shared[Channel] = Shared(attrgetter("bytes_held"))
+        # Whether the indexes of a file give what its table holds.
+        self._proven: ByteLru[bool] = ByteLru(_KEPT_BYTES)
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Topics with exact counts and first and last log times."""
+        with self._opened(path) as (base, topics):
+            found: list[tuple[int, int, int, int, int, int]]
+            found = base.execute(_TOTALS, (MAX_NS,)).fetchall()
+            right = self._is_indexed_right(base, topics)
+        if any(wrong for *_, wrong, _ in found):
+            raise UnreadableError(
+                "damaged: messages without an integer timestamp or a binary payload"
+            )
+        rows = [row for row in found if not row[5]]
+        held = [
+            Held(topics.channels[number], count, first, last)
+            for number, count, first, last, *_ in rows
+            if number in topics.channels
+        ]
+        orphans = sum(row[1] for row in rows) - sum(each.messages for each in held)
+        notes = [] if right else [_WRONG_INDEX]
+        if orphans:
+            notes.append(f"{orphans} messages belong to no topic and were left out")
+        if impossible := sum(row[1] for row in found if row[5]):
+            notes.append(f"{impossible} messages bear no possible log time")
+        return bag_summary(held, topics.channels.values(), notes=tuple(notes))
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """The topics declared in the file."""
+        with self._opened(path) as (_, topics):
+            return list(topics.channels.values())
+
+    def profile(self, path: Path) -> str:
+        """That of ROS 2: no other program writes such files."""
+        with OpenFile(path):
+            return ROS2_PROFILE
+
+    def records(
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
+    ) -> Iterator[Record | LostError]:
+        """The messages of `topics` inside the window, in order.
+
+        An error stands for an index that is not believed; no message is lost with it.
+        """
+        if window.empty:
+            return
+        with self._opened(path) as (base, known):
+            wanted = known.named(topics)
+            right = self._is_indexed_right(base, known)
+            if not right:
+                yield ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
+            for time, row, number in _placed(
+                base, wanted, window, newest_first=newest_first, indexed=right
+            ):
+                yield self._record(base, wanted, time, row, number)
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """The latest message of the topic inside the window: what `records` begins with.
+
+        Where it is not known yet whether the indexes are right, only what this one message needs of
+        them is held against the table, which takes some microseconds.
+
+        Raises:
+            ContradictionError: the indexes do not agree with the table.
+        """
+        if window.empty:
+            return None
+        with self._opened(path) as (base, known):
+            wanted = known.named({topic})
+            right = self._proven.get(known.key)
+            found = None
+            if right is not False:
+                rows = _placed(base, wanted, window, newest_first=True, indexed=True)
+                found = rows.fetchone()
+            if right is None and (found is None or not _is_newest(base, wanted, window, found)):
+                right = self._is_indexed_right(base, known)
+            if right is False:
+                raise ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
+            return None if found is None else self._record(base, wanted, *found)
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
+        """The log times of a topic's messages inside the window, ascending."""
+        with self._opened(path) as (base, known):
+            wanted, right = known.named({topic}), self._is_indexed_right(base, known)
+            rows = _placed(base, wanted, window, indexed=right)
+            return [time for time, _, _ in rows]
+
+    def _record(
+        self,
+        base: sqlite3.Connection,
+        wanted: Mapping[int, Channel],
+        time: Ns,
+        row: int,
+        number: int,
+    ) -> Record:
+        found = base.execute(_PAYLOAD, (row,)).fetchone()
+        if found is None or not isinstance(found[0], bytes):
+            raise UnreadableError("damaged: a message without a binary payload")
+        if found[1:] != (time, number):
+            raise UnreadableError("damaged: a message is not the one that an index names")
+        channel = wanted[number]
+        payload = self._plain(found[0]) if channel.encoding == "cdr" else found[0]
+        return Record(channel, time, time, payload)
+
+    def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:
+        """Whether the indexes of a file give what its table holds; looked at once for each file."""
+        right = self._proven.get(known.key)
+        if right is None:
+            every = partial(_placed, base, known.channels, TimeWindow.everything())
+            try:
+                both = zip_longest(every(indexed=True), every(indexed=False))
+                right = all(starmap(eq, both))
+            except sqlite3.DatabaseError:
+                # An index may be malformed where the table is not.
+                right = False
+            self._proven.put(known.key, right, _PROOF_BYTES)
+        return right
+
+    def _plain(self, payload: bytes) -> bytes:
+        return plain_payload(payload, self._max_message_bytes)
+
+    @contextmanager
+    def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
+        with OpenFile(path) as file:
+            if not file.size:
+                raise UnreadableError(EMPTY_FILE)
+            key, size = file.key, file.size
+        # Immutable: nothing is locked, and no file appears beside the bag.
+        address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+        # A generator of records may be resumed on another thread.
+        with closing(sqlite3.connect(address, uri=True, check_same_thread=False)) as base:
+            # SQLite opens by name, and has by now: it must be the file that was looked at.
+            if path.lstat().st_ino != key.inode:
+                raise UnreadableError("it was replaced while it was being opened")
+            # One name that is not UTF-8 must not hide the others.
+            base.text_factory = _text
+            guard(base, self._max_message_bytes, size)
+            topics = self._known.get(key)
+            if topics is None:
+                require_plain_tables(base)
+                topics = _Topics(key, self._channels(base))
+                size = 1000 + sum(300 + c.bytes_held for c in topics.channels.values())
+                self._known.put(key, topics, size)
+            yield base, topics
+
+    def _channels(self, base: sqlite3.Connection) -> dict[int, Channel]:
+        have = _columns(base, "topics")
+        if not {"id", "name", "type"} <= have or not _columns(base, "messages") >= _MESSAGE_COLUMNS:
+            raise UnreadableError("not a rosbag2 file: it lacks the tables topics and messages")
+        definitions = _definitions(base)
+        rows = base.execute("SELECT * FROM topics ORDER BY id LIMIT ?", (MAX_CHANNELS + 1,))
+        names = [column[0] for column in rows.description]
+        channels: dict[int, Channel] = {}
+        for row in rows:
+            value = dict(zip(names, row, strict=True))
+            raw_type = str(value["type"])
+            schema = definitions.get(raw_type, Schema(_full_type(raw_type)))
+            channels[int(value["id"])] = self._shared.of(
+                Channel(
+                    str(value["name"]),
+                    # Before the column existed there was one format.
+                    str(value.get("serialization_format") or "cdr"),
+                    schema,
+                    offered_as_latched(str(value.get("offered_qos_profiles") or "")),
+                    tuple(
+                        (known, str(value[name])) for name, known in _METADATA if value.get(name)
+                    ),
+                )
+            )
+        if len(channels) > MAX_CHANNELS:
+            raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
+        if sum(len(c.topic) + len(c.type) for c in channels.values()) > MAX_NAMES_CHARS:
+            raise UnreadableError("its topics and types have longer names than any can have")
+        return channels
+
+
+def _text(raw: bytes) -> str:
+    return raw.decode("utf-8", errors="replace")
+
+
+def _placed(
+    base: sqlite3.Connection,
+    wanted: Collection[int],
+    window: TimeWindow,
+    *,
+    newest_first: bool = False,
+    indexed: bool,
+) -> sqlite3.Cursor:
+    """Log time, row and topic of the messages, in order; by an index only where that is right."""
+    query = _DESCENDING if newest_first else _ASCENDING
+    arguments = (window.start, window.stop, json.dumps(list(wanted)))
+    return base.execute(query if indexed else _without_index(query), arguments)
+
+
+def _without_index(query: str) -> str:
+    return query.replace("FROM messages", "FROM messages NOT INDEXED", 1)
+
+
+def _is_newest(
+    base: sqlite3.Connection,
+    wanted: Collection[int],
+    window: TimeWindow,
+    found: tuple[Ns, int, int],
+) -> bool:
+    """Whether a message that an index gave is the newest, as far as the table tells for little.
+
+    A message that the index lacks, or has elsewhere, or that is not found since the index is stored
+    in another order than it declares, was mostly written soon after the one given in its place.
+    """
+    time, row, _ = found
+    arguments = (row, row + _LOOKED_BEHIND, time, window.stop, json.dumps(list(wanted)))
+    return base.execute(_BEHIND, arguments).fetchone() is None
+
+
+def _columns(base: sqlite3.Connection, table: str) -> set[str]:
+    rows = base.execute("SELECT name FROM pragma_table_info(?)", (table,))
+    return {str(name) for (name,) in rows}
+
+
+def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
+    """The definitions in the file, by type name; none before schema version 4."""
+    needed = {"topic_type", "encoding", "encoded_message_definition"}
+    if not needed <= _columns(base, "message_definitions"):
+        return {}
+    (size,) = base.execute(_SIZE_OF_DEFINITIONS).fetchone()
+    if size > MAX_SECTION_BYTES:
+        raise UnreadableError("damaged: its message definitions are larger than any can be")
+    rows = base.execute(
+        "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?",
+        (MAX_CHANNELS,),
+    )
+    return {
+        str(name): Schema(
+            _full_type(str(name)), str(encoding), str(text).encode()[: MAX_DEFINITION_BYTES + 1]
+        )
+        for name, encoding, text in rows
+        if encoding in {"ros2msg", "ros2idl"}
+    }
+
+
+def _full_type(name: str) -> str:
+    """The type as it is written since 2019: `package/Name` is `package/msg/Name`."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+
+
+def journals_beside(path: Path) -> list[Path]:
+    """The journal and WAL that hold what the file itself does not, or not yet."""
+    beside = [path.with_name(path.name + suffix) for suffix in JOURNALS]
+    return [journal for journal in beside if _holds_something(journal)]
+
+
+def _holds_something(journal: Path) -> bool:
+    """A link counts, and is then refused: what it leads to may be what the file lacks."""
+    try:
+        status = journal.lstat()
+    except OSError:
+        return False
+    return stat.S_ISLNK(status.st_mode) or (stat.S_ISREG(status.st_mode) and status.st_size > 0)
+
+
+def closing_of_db3(path: Path) -> Closing:
+    """Open while a journal or WAL lies beside it, or nothing is in it."""
+    with OpenFile(path) as file:
+        unfinished = not file.size or journals_beside(path)
+    return Closing.OPEN if unfinished else Closing.CLOSED
+
+
+def settled_copy(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Path, str]:
+    """A copy in which the journal or WAL beside the file has been played back by sqlite.
+
+    Playing it back in place would write into the folder of bags.
+
+    Args:
+        path: the file.
+        folder: where the copy is made.
+        reserve: called with a number of bytes before as many are written.
+
+    Returns:
+        The copy, and a note.
+    """
+    for source in (path, *journals_beside(path)):
+        reserve(2 * source.stat().st_size)
+        with (
+            os.fdopen(open_regular(source), "rb") as plain,
+            (folder / source.name).open("wb") as out,
+        ):
+            shutil.copyfileobj(plain, out)
+    copy = folder / path.name
+    with closing(sqlite3.connect(copy)) as base:
+        guard(base, MAX_CHUNK_MB << 20, copy.stat().st_size)
+        base.execute("PRAGMA journal_mode=DELETE").fetchall()
+        base.execute("SELECT name FROM sqlite_master LIMIT 1").fetchall()
+    return copy, "its writer did not finish it: a journal lay beside it and was played back"

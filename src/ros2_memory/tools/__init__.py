@@ -1,0 +1,1 @@
+"""Tool declarations, their arguments, and replies as JSON."""

@@ -1,0 +1,75 @@
+"""What the server tells a planner before it calls any tool."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Limits
+
+_RULES: Final = """\
+What a robot saw and did in the past, from its recordings. For what it sees right now, ask \
+elsewhere: {newest} answer not_closed_yet.
+Three rules prevent most wrong calls:
+1. Times are Unix seconds. For "10 s ago" or "in the last minute" take the tools named \
+_seconds_ago, _last or recent_: they need no clock. A timestamp from a reply can be passed to any \
+other tool as it is.
+2. Use topic names as list_recorded_topics spells them; only find_* and get_value_when take globs \
+(/vision/*/scene_objects). "At" a time means the newest message at or before it, at most \
+tolerance_s old ({tolerance} s by default: give 2 for a topic that speaks once a second); the \
+detail of no_data says which tolerance_s finds it.
+3. Having nothing is an answer, no failure: {{"error": "no_data", "reason", "detail"}}. The detail \
+says what there is and what to ask instead; do not repeat the same call.
+"""
+_SEEN: Final = """\
+- "When did you last see X, and where?": find_last_match with contains on the vision topics, then \
+get_position_at with the timestamp it gives.
+"""
+_HAPPENED: Final = """\
+- "When did you last see X, and where?": find_matches; "when first, how often?": with \
+oldest_first. "What happened, where did you stop?": recap_last. "Have you been \
+here?": visits, with the frame_id that x and y are of. "How low was it?": get_topic_in_last \
+with fields and max_samples 1. "How far can I trust this?": memory_status. Each takes one call.
+"""
+_REST: Final = """\
+- Positions are metres, yaw_deg is counter-clockwise from x, both in frame_id (for {pose_topic} \
+usually where the robot was switched on, not a map). get_transform_* relates any two frames.
+- notes in a reply say what was thinned, skipped or estimated: pass on what matters. Narrow large \
+values with fields, or ask for a shorter window.
+- Tools marked Blocking search long stretches of history: ask one at a time.
+"""
+
+
+def instructions(limits: Limits, *, additions: bool = True) -> str:
+    """The rules whose neglect makes most wrong calls, with this deployment's defaults.
+
+    Clients cut instructions at about 2,000 characters; these stay below. `additions`: whether the
+    tools beyond the specification's are offered.
+    """
+    return (_RULES + (_HAPPENED if additions else _SEEN) + _REST).format(
+        newest="the newest 3 s or so are not on disk yet and"
+        if limits.include_active
+        else f"the newest {limits.split_duration_s:g} s or so are still being written and",
+        pose_topic=limits.pose_topic,
+        tolerance=f"{limits.time_tolerance_s:g}",
+    )
+
+
+PROMPT: Final = """\
+Which question answers what, in one call each:
+- Where was I 10 s ago, at a time: get_position_seconds_ago, get_position_at. How fast: \
+get_velocity_*. Another frame, such as the camera in the map: get_transform_*.
+- When did you last see X, where were you, where was it, since when: find_matches with contains \
+on the vision topics. When first, how often: with oldest_first and limit 1. When was a number \
+beyond a limit: above or below, with field.
+- What happened in the last minutes, how far did I drive, where did I stop, was there an error: \
+recap_last, or recap between two times. The shape of the way: recent_trajectory_summary.
+- Have I been here, when was I at a place, for how long, how near: visits, with the frame_id \
+that x and y are of.
+- What did a topic say: get_topic_seconds_ago, get_topic_in_last. How low or high was a \
+number: the extremes there, with fields and max_samples 1. What did it say when something \
+else held: get_value_when.
+- What do you remember at all, and how well: data_time_range, memory_status, list_recorded_topics.
+Answer with the figures of the reply as they stand: ages, durations and distances are in it.
+"""
+"""What the prompt adds to the instructions."""

@@ -1,0 +1,93 @@
+"""Answers and errors as the one JSON text that leaves: which is what, and never too long."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ros2_memory.core.errors import (
+    BagError,
+    EpisodicError,
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    QueryTimeoutError,
+    UndecodableError,
+)
+from ros2_memory.core.timebase import unix_rounded_up
+from ros2_memory.tools.extra_reply_json import shown
+from ros2_memory.tools.reply_json import file_name, fit_topics
+from ros2_memory.tools.reply_size import compact, fit
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.accounts import Account
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.tools.reply_json import Answer
+    from ros2_memory.tools.reply_size import JsonObject
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What a client receives: one text, and whether it is an error for the protocol."""
+
+    text: str
+    is_error: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Replies:
+    """Renders answers and errors. File names are shown relative to `bag_dir`, never absolute."""
+
+    bag_dir: Path
+    max_chars: int
+
+    def answer(self, answer: Answer | Account, *, from_active: bool = False) -> Reply:
+        """An answer in the shape that the tool's description promises.
+
+        Where that is an object, `from_active` is said in it if it is so.
+        """
+        value = shown(answer, self.bag_dir)
+        if isinstance(value, dict):
+            if from_active:
+                value = {**value, "from_active": True}
+            return Reply(fit(value, self.max_chars))
+        if isinstance(answer, tuple):
+            return Reply(fit_topics(answer, self.max_chars))
+        return Reply(compact(value))
+
+    def error(self, error: EpisodicError) -> Reply:
+        """An error of the tree. Having no data is an answer; the others are errors."""
+        match error:
+            case NoDataError():
+                return self._no_data(error.reason, error.detail, error.notes)
+            case UndecodableError():
+                return self._no_data(NoDataReason.UNDECODABLE, str(error))
+            case QueryTimeoutError(searched_back_to=int(back_to)):
+                return self._failure(
+                    error.code, str(error), searched_back_to=unix_rounded_up(back_to)
+                )
+            case InvalidArgumentsError() | QueryTimeoutError():
+                return self._failure(error.code, str(error))
+            case BagError():
+                name = file_name(error.path, self.bag_dir)
+                return self._failure(error.code, f"{name}: {error.reason}; ask again")
+            case _:
+                return self._failure(error.code, str(error))
+
+    def internal(self, correlation_id: str) -> Reply:
+        """A fault of this program: nothing of its inside leaves but the id that finds the log."""
+        return self._failure(
+            "internal",
+            "the question failed through a fault in this server, not in the arguments; "
+            f"its log has the cause under correlation_id {correlation_id}",
+        )
+
+    def _no_data(self, reason: NoDataReason, detail: str, notes: tuple[str, ...] = ()) -> Reply:
+        shown: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
+        return Reply(fit({**shown, "notes": [*notes]} if notes else shown, self.max_chars))
+
+    def _failure(self, code: str, detail: str, **more: JsonValue) -> Reply:
+        shown: JsonObject = {"error": code, **more, "detail": detail}
+        return Reply(fit(shown, self.max_chars), is_error=True)

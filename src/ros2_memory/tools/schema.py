@@ -1,0 +1,176 @@
+"""The signature of one tool: its JSON schema, an example, and the door for what a planner sends."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from itertools import islice
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
+
+from pydantic import ValidationError
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.text import glimpse
+from ros2_memory.tools.arguments import Arguments
+from ros2_memory.tools.reply_size import compact
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.tools.arguments import When
+    from ros2_memory.tools.reply_size import JsonObject
+
+A = TypeVar("A", bound=Arguments)
+
+_MOST_UNKNOWN_NAMED: Final = 5
+_LONGEST_NAME: Final = 64
+_KINDS: Final = {
+    "string": "a text",
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+    "array": "a list of texts",
+    "object": "an object",
+}
+
+
+class Signature(Generic[A]):
+    """Arguments of type `A`, with a `When` in the place of their moment or span."""
+
+    def __init__(self, arguments: type[A], when: type[When] | None = None) -> None:
+        self._arguments = arguments
+        self._when = when
+        self._properties: dict[str, JsonObject] = {}
+        for name, schema in _properties(arguments).items():
+            unfolded = when is not None and name == when.stands_for
+            self._properties.update(_properties(when) if when and unfolded else {name: schema})
+        self._required = [
+            name for name, schema in self._properties.items() if "default" not in schema
+        ]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The arguments in the order in which they are declared."""
+        return tuple(self._properties)
+
+    @property
+    def example(self) -> JsonObject:
+        """A call with the required arguments alone."""
+        return {name: _example(self._properties[name]) for name in self._required}
+
+    def json_schema(self) -> JsonObject:
+        """The schema that `tools/list` shows: flat, closed, and without what says nothing."""
+        properties: JsonObject = {}
+        for name, schema in self._properties.items():
+            properties[name] = {
+                key: item
+                for key, item in schema.items()
+                if key != "examples" and not (key == "default" and item in (None, []))
+            }
+        closed: JsonObject = {"additionalProperties": False}
+        if self._required:
+            closed["required"] = [*self._required]
+        return {"type": "object", "properties": properties, **closed}
+
+    def read(self, given: Mapping[str, object]) -> A:
+        """The arguments, checked. A null for an optional one counts as not given.
+
+        Raises:
+            InvalidArgumentsError: one is unknown, missing, or not what is expected; the sentence
+                names each, with what was given and an example.
+        """
+        present = {
+            name: value
+            for name, value in given.items()
+            if value is not None or name in self._required
+        }
+        problems = [*self._unknown(given), *self._missing(present)]
+        own = dict(present)
+        if self._when is not None:
+            try:
+                own[self._when.stands_for] = self._when.model_validate(present).folded()
+            except ValidationError as error:
+                problems += self._wrong(error, given)
+        try:
+            arguments = self._arguments.model_validate(own)
+        except ValidationError as error:
+            problems += self._wrong(error, given)
+        else:
+            if not problems:
+                return arguments
+        raise InvalidArgumentsError("; ".join(problems))
+
+    def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
+        unknown = (name for name in given if name not in self._properties)
+        for name in islice(unknown, _MOST_UNKNOWN_NAMED):
+            near = get_close_matches(name[:_LONGEST_NAME], self._properties, n=1)
+            hint = f"do you mean {near[0]}?" if near else f"there are: {', '.join(self.names)}"
+            hint = hint if self.names else "there are none"
+            yield f"there is no argument {glimpse(name)}; {hint}"
+        if more := sum(1 for _ in unknown):
+            yield f"and {more} more that there are not"
+
+    def _missing(self, present: Mapping[str, object]) -> Iterator[str]:
+        for name in self._required:
+            if name not in present:
+                yield f"{name} is missing: {_expected(self._properties[name])}"
+
+    def _wrong(self, error: ValidationError, given: Mapping[str, object]) -> Iterator[str]:
+        told: set[str] = set()
+        for fault in error.errors(include_url=False, include_context=False, include_input=False):
+            name = str(fault["loc"][0])
+            if fault["type"] == "missing" or name in told or name not in self._properties:
+                continue
+            told.add(name)
+            own = fault["msg"].removeprefix("Value error, ")
+            why = f", which {own}" if fault["type"] == "value_error" else ""
+            expected = _expected(self._properties[name])
+            yield f"{name} was {glimpse(given[name])}{why}; expected {expected}"
+
+
+def _properties(arguments: type[Arguments]) -> dict[str, JsonObject]:
+    """The JSON schema of each argument; an optional one has a default and no null."""
+    schema: dict[str, JsonObject] = arguments.model_json_schema().get("properties", {})
+    return {name: _flat(each) for name, each in schema.items()}
+
+
+def _flat(schema: JsonObject) -> JsonObject:
+    kinds = schema.get("anyOf")
+    kept = {key: item for key, item in schema.items() if key != "title"}
+    if isinstance(kinds, list) and {"type": "null"} in kinds:
+        del kept["anyOf"]
+        some = next(kind for kind in kinds if kind != {"type": "null"})
+        return {**(some if isinstance(some, dict) else {}), **kept}
+    return kept
+
+
+def _expected(schema: JsonObject) -> str:
+    """What an argument may be, in words."""
+    what = _kind(schema)
+    bounds = [
+        f"{word} {schema[key]:.10g}"
+        for key, word in (
+            ("minimum", "at least"),
+            ("exclusiveMinimum", "more than"),
+            ("maximum", "at most"),
+        )
+        if isinstance(schema.get(key), int | float)
+    ]
+    told = f"{what} of {' and '.join(bounds)}" if bounds else what
+    if "description" in schema:
+        told += f" ({str(schema['description']).rstrip('.')})"
+    return f"{told}, e.g. {compact(_example(schema))}" if "examples" in schema else told
+
+
+def _kind(schema: JsonObject) -> str:
+    allowed, several = schema.get("enum"), schema.get("anyOf")
+    if isinstance(allowed, list):
+        return f"one of {', '.join(compact(item) for item in allowed)}"
+    if isinstance(several, list):
+        return " or ".join(_kind(kind) for kind in several if isinstance(kind, dict))
+    return _KINDS[str(schema.get("type"))]
+
+
+def _example(schema: JsonObject) -> JsonValue:
+    examples = schema.get("examples")
+    return examples[0] if isinstance(examples, list) and examples else schema.get("default")

@@ -1,0 +1,248 @@
+"""The specification's 17 tools: names, what the planner reads, and the query behind each.
+
+A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declared once; only the
+`Variant`s differ. The order here is the order in which clients see them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ros2_memory import queries, results
+from ros2_memory.core.errors import NoDataError, NoDataReason
+from ros2_memory.core.globs import matching
+from ros2_memory.tools import extra_tools
+from ros2_memory.tools.arguments import (
+    Ago,
+    At,
+    Between,
+    Correlation,
+    Last,
+    Listing,
+    MotionAt,
+    Nothing,
+    Search,
+    TopicAt,
+    TopicOver,
+    TransformAt,
+    WayOver,
+    tested,
+)
+from ros2_memory.tools.declaration import Entry, Variant
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Call, Limits, Memory
+    from ros2_memory.tools.declaration import Tool
+
+
+def readable_tools(limits: Limits) -> tuple[Tool, ...]:
+    """What is asked by reading a resource, and no tool."""
+    return tuple(extra_tools.readable({"pose_topic": limits.pose_topic}))
+
+
+def build_tools(
+    limits: Limits, call_timeout_s: float, *, additions: bool = True, writing: bool = False
+) -> tuple[Tool, ...]:
+    """The tools, in order. The descriptions tell this deployment's defaults.
+
+    `additions`: those beyond the specification's, too; `writing`: those among them that write.
+    """
+    facts = {
+        "timeout": f"{call_timeout_s:g}",
+        "pose_topic": limits.pose_topic,
+        "tolerance": f"{limits.time_tolerance_s:g}",
+        "near": f"{limits.position_tolerance_m:g}",
+        "map_frame": limits.map_frame or "no map",
+    }
+    return (
+        *_LIST.tools(facts),
+        *_RANGE.tools(facts),
+        *_TOPIC_AT.tools(facts),
+        *_TOPIC_OVER.tools(facts),
+        *_POSITION.tools(facts),
+        *_VELOCITY.tools(facts),
+        *_TRANSFORM.tools(facts),
+        *_FRAMES.tools(facts),
+        *_LAST_MATCH.tools(facts),
+        *_VALUE_WHEN.tools(facts),
+        *_TRAJECTORY.tools(facts),
+        *(extra_tools.tools(facts, writing=writing) if additions else ()),
+    )
+
+
+def _list_topics(memory: Memory, call: Call, given: Listing) -> tuple[results.TopicRow, ...]:
+    rows = queries.list_recorded_topics(memory, call)
+    if given.pattern is None or not rows:
+        return rows
+    matched = {*matching([row.topic for row in rows], given.pattern)}
+    named = tuple(row for row in rows if row.topic in matched)
+    if not named:
+        raise NoDataError(
+            NoDataReason.TOPIC_NOT_RECORDED,
+            f"none of the {len(rows)} recorded topics matches {given.pattern}; "
+            "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
+        )
+    return named
+
+
+def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[Variant, ...]:
+    return (
+        Variant(f"get_{name}_{at}", f"{title} at a time", At, "at a Unix time"),
+        Variant(
+            f"get_{name}_seconds_ago",
+            f"{title} some seconds ago",
+            Ago,
+            "some seconds ago",
+            "age_s (before now)",
+        ),
+    )
+
+
+_LIST = Entry(
+    (Variant("list_recorded_topics", "Recorded topics"),),
+    "Every recorded topic. Ask this first when a topic's name is not known. "
+    "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; the busiest first where "
+    "they are too many.",
+    Listing,
+    _list_topics,
+)
+_RANGE = Entry(
+    (Variant("data_time_range", "Span of the memory"),),
+    "What time span the memory covers, with its holes, and what time it is now. "
+    "Reply: {{earliest, latest, now, bags, gaps, damaged, clock_faults, ...}}, times in Unix s and "
+    "local ISO, null while the memory is empty.",
+    Nothing,
+    lambda memory, call, _: queries.data_time_range(memory, call),
+)
+_TOPIC_AT = Entry(
+    _at_and_ago("topic", "A topic's value", at="at_time"),
+    "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
+    "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
+    "Reply: {{topic, type, timestamp, value}}.",
+    TopicAt,
+    lambda memory, call, given: queries.topic_value(
+        memory,
+        call,
+        given.topic,
+        given.moment,
+        tolerance_s=given.tolerance_s,
+        fields=given.fields,
+    ),
+)
+_TOPIC_OVER = Entry(
+    (
+        Variant("get_topic_in_range", "A topic over a window", Between, "between two Unix times"),
+        Variant("get_topic_in_last", "A topic over the last seconds", Last, "in the last seconds"),
+    ),
+    "What a topic said {when}: up to max_samples messages, evenly spaced over the window, first "
+    "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; with "
+    "fields of numbers extremes, too: {{field: {{min, min_at, max, max_at}}}} of all messages.",
+    TopicOver,
+    lambda memory, call, given: queries.topic_range(
+        memory,
+        call,
+        given.topic,
+        given.span,
+        max_samples=given.max_samples,
+        fields=given.fields,
+    ),
+)
+_POSITION = Entry(
+    _at_and_ago("position", "Robot position"),
+    "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
+    "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, longitude "
+    "and altitude instead of x, y, z, which are null.",
+    MotionAt,
+    lambda memory, call, given: queries.position(
+        memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
+    ),
+)
+_VELOCITY = Entry(
+    _at_and_ago("velocity", "Robot velocity"),
+    "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
+    "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
+    "x is ahead and angular z turns left.",
+    MotionAt,
+    lambda memory, call, given: queries.velocity(
+        memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
+    ),
+)
+_TRANSFORM = Entry(
+    _at_and_ago("transform", "Transform"),
+    "The pose of frame child in frame parent {when}, through any chain of frames, interpolated. "
+    "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock"
+    "}}.",
+    TransformAt,
+    lambda memory, call, given: queries.transform(
+        memory, call, given.parent, given.child, given.moment
+    ),
+)
+_FRAMES = Entry(
+    (Variant("list_frames", "Frames"),),
+    "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, static}}]}}.",
+    Nothing,
+    lambda memory, call, _: queries.frames(memory, call),
+    blocking=True,
+)
+_CONDITIONS = (
+    "contains (part of a text anywhere in the message, or an element of the list that field "
+    "names), equals (boolean, number or text; 1 and 0 are true and false), "
+    "above and below (number; field says which), near_position "
+    '({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
+)
+_LAST_MATCH = Entry(
+    (Variant("find_last_match", "Last time something held"),),
+    "When a condition last held, in all history. "
+    f"Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
+    "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
+    "read).",
+    Search,
+    lambda memory, call, given: queries.find_last_match(
+        memory,
+        call,
+        given.topic,
+        given.condition_type,
+        tested(given),
+        field=given.field,
+        fields=given.fields,
+        before_s=given.before,
+    ),
+    blocking=True,
+)
+_VALUE_WHEN = Entry(
+    (Variant("get_value_when", "A topic when another matched"),),
+    "What value_topic held when condition_topic last met a condition (as in find_last_match), "
+    "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
+    "value_timestamp, condition_topic, value_topic}}, or null as there.",
+    Correlation,
+    lambda memory, call, given: queries.value_when(
+        memory,
+        call,
+        given.value_topic,
+        given.condition_topic,
+        condition_type=given.condition_type,
+        value=tested(given),
+        field=given.field,
+        fields=given.fields,
+        before_s=given.before,
+    ),
+    blocking=True,
+)
+_TRAJECTORY = Entry(
+    (
+        Variant("trajectory_summary", "Way driven", Between, "between two Unix times"),
+        Variant(
+            "recent_trajectory_summary",
+            "Way driven lately",
+            Last,
+            "in the last seconds",
+        ),
+    ),
+    "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, avg_speed, "
+    "max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], ...}}.",
+    WayOver,
+    lambda memory, call, given: queries.trajectory_summary(
+        memory, call, given.span, topic=given.topic
+    ),
+    blocking=True,
+)

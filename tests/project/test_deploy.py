@@ -1,0 +1,166 @@
+"""What `deploy/` promises: units that systemd understands, a user, directories, an environment."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
+from ros2_memory.config import load_settings
+from ros2_memory.serving.api_token import CREDENTIAL
+from ros2_memory.settings import Ros2BagNode
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+RECORDER = DEPLOY / "ros2-memory-recorder.service"
+SERVER = DEPLOY / "ros2-memory-server.service"
+BOTH = pytest.mark.parametrize("unit", [RECORDER, SERVER], ids=lambda unit: unit.stem)
+
+
+def settings_of(unit: Path) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for line in unit.read_text().splitlines():
+        name, is_setting, value = line.partition("=")
+        if is_setting and not line.startswith("#"):
+            found.setdefault(name, []).append(value)
+    return found
+
+
+def exposure(unit: Path) -> float:
+    ran = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", unit],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    found = re.search(r"Overall exposure level for \S+: ([\d.]+)", ran.stdout)
+    assert found is not None, ran.stdout[-300:] + ran.stderr
+    return float(found[1])
+
+
+needs_analyze = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is not on this machine"
+)
+needs_sysusers = pytest.mark.skipif(
+    shutil.which("systemd-sysusers") is None, reason="systemd-sysusers is not on this machine"
+)
+
+
+@needs_analyze
+@pytest.mark.parametrize(("unit", "limit"), [(RECORDER, 3.0), (SERVER, 2.0)])
+def test_a_unit_is_exposed_by_less_than_its_limit(unit: Path, limit: float) -> None:
+    assert exposure(unit) < limit
+
+
+@BOTH
+def test_a_unit_is_ready_when_it_says_so_and_is_started_again_when_it_fails(unit: Path) -> None:
+    said = settings_of(unit)
+    assert (said["Type"], said["NotifyAccess"]) == (["notify"], ["main"])
+    assert said["Restart"] == ["on-failure"]
+    assert said["MemoryMax"]
+    assert said["TasksMax"]
+
+
+@BOTH
+def test_a_unit_takes_the_settings_of_the_machine_over_its_own(unit: Path) -> None:
+    lines = unit.read_text().splitlines()
+    own = max(n for n, line in enumerate(lines) if line.startswith("Environment="))
+    assert lines.index("EnvironmentFile=-/etc/ros2-memory/environment") > own
+
+
+def test_the_recorder_is_watched_and_tried_for_ever() -> None:
+    said = settings_of(RECORDER)
+    assert said["WatchdogSec"] == ["90"]
+    assert said["StartLimitIntervalSec"] == ["0"]
+
+
+def test_the_recorder_ends_its_child_in_order() -> None:
+    said = settings_of(RECORDER)
+    assert said["KillMode"] == ["control-group"]
+    # A child's patience is 15 s, and two of them are ended at once.
+    assert int(said["TimeoutStopSec"][0]) >= 30
+
+
+def test_the_recorder_writes_where_it_records_and_nowhere_else() -> None:
+    said = settings_of(RECORDER)
+    assert said["ReadWritePaths"] == ["/var/lib/ros2-memory/bags"]
+    assert f"MEMORY_BAG_DIR={said['ReadWritePaths'][0]}" in said["Environment"]
+    # Not below the mount point of a disk that is not there.
+    assert said["RequiresMountsFor"] == said["ReadWritePaths"]
+    assert said["MemoryDenyWriteExecute"] == ["yes"]
+
+
+def test_the_recorder_hears_publishers_of_another_user() -> None:
+    assert "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in settings_of(RECORDER)["Environment"]
+
+
+def test_the_environment_file_is_understood_by_the_program() -> None:
+    env: dict[str, str] = {}
+    for line in (DEPLOY / "environment").read_text().splitlines():
+        # The lines that are commented out are to be right when they are not.
+        text = re.sub(r"^#(?=[A-Z_]+=)", "", line)
+        if text and not text.startswith("#"):
+            name, _, value = text.partition("=")
+            env[name] = "".join(shlex.split(value))
+    assert {"ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "FASTDDS_BUILTIN_TRANSPORTS"} <= set(env)
+    env.pop("ROS_VISION_INTERFACES_PATH")
+    recorder = load_settings((), env).recorder
+    assert isinstance(recorder, Ros2BagNode)
+    assert recorder.setup_files == (Path("/opt/ros/jazzy/setup.bash"),)
+
+
+def test_the_server_listens_on_the_loopback_address_unless_it_is_given_a_token() -> None:
+    said = settings_of(SERVER)
+    assert said["IPAddressAllow"] == ["localhost"]
+    assert not [line for line in said["Environment"] if "MCP_HOST" in line]
+    # The lines that are commented out are to be right when they are not.
+    (credential,) = re.findall(r"^#LoadCredential=(\w+):", SERVER.read_text(), re.MULTILINE)
+    assert credential == CREDENTIAL
+
+
+def test_the_server_writes_where_it_asks_the_recorder_and_nowhere_else_in_the_bags() -> None:
+    said = settings_of(SERVER)
+    asks = f"/var/lib/ros2-memory/bags/{REQUESTS_FOLDER}"
+    assert said["ReadWritePaths"] == [f"-{asks}"]
+    assert said["ReadOnlyPaths"] == ["-/var/lib/ros2-memory"]
+    assert f"d {asks} " in (DEPLOY / "ros2-memory.tmpfiles.conf").read_text()
+
+
+def test_the_container_is_published_on_the_loopback_address_and_needs_a_token() -> None:
+    told = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    (service,) = told["services"].values()
+    assert service["ports"] == ["127.0.0.1:9203:9203"]
+    assert service["environment"]["MEMORY_API_TOKEN"].startswith("${MEMORY_API_TOKEN:?")
+    assert all(volume.endswith(":ro") for volume in service["volumes"])
+    assert service["read_only"] is True
+    # The bags of the units are their group's; without one given, a group that owns nothing.
+    assert service["group_add"] == ["${MEMORY_BAG_GID:-65534}"]
+
+
+@needs_sysusers
+def test_the_user_of_the_units_is_made() -> None:
+    ran = subprocess.run(
+        ["systemd-sysusers", "--dry-run", DEPLOY / "ros2-memory.sysusers.conf"],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "ros2-memory" in (DEPLOY / "ros2-memory.sysusers.conf").read_text().split()
+
+
+def test_every_directory_of_the_units_is_made_and_no_bag_is_ever_deleted() -> None:
+    lines = [
+        line.split()
+        for line in (DEPLOY / "ros2-memory.tmpfiles.conf").read_text().splitlines()
+        if not line.startswith("#")
+    ]
+    made = {line[1]: line for line in lines}
+    assert made["/var/lib/ros2-memory/bags"][3:5] == ["ros2-memory", "ros2-memory"]
+    assert {line[0] for line in lines} == {"d"}
+    assert {line[5] for line in lines} == {"-"}  # no age

@@ -1,0 +1,130 @@
+"""What README promises exists, and what exists is in README."""
+
+from __future__ import annotations
+
+import ast
+import re
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, get_type_hints
+
+import pytest
+
+from ros2_memory.history.context import Limits
+from ros2_memory.settings import Ros2BagNode, Settings
+from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.spec_tools import build_tools
+from tests.memories import ROOT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+TOOLS = build_tools(Limits(), 25.0, writing=True)
+
+
+def keys(cls: type, prefix: str = "") -> Iterator[str]:
+    hints = get_type_hints(cls)
+    for each in fields(cls):
+        name = f"{prefix}{each.name}"
+        kind = hints[each.name]
+        if is_dataclass(kind) and isinstance(kind, type):
+            yield from keys(kind, f"{name}.")
+        else:
+            section = name.partition(".")[0]
+            yield section if section in {"storage", "recorder"} else name
+
+
+@pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
+def test_readme_names_every_tool_with_all_its_arguments(tool: Tool) -> None:
+    row = next(line for line in README.splitlines() if line.startswith(f"| `{tool.name}` |"))
+    told = set(re.findall(r"(\w+)[?=,`]", row.split("|")[2]))
+    properties = tool.schema.get("properties")
+    assert isinstance(properties, dict)
+    assert set(properties) - told == set()
+
+
+def test_readme_lists_no_tool_that_does_not_exist() -> None:
+    section = README.partition("| tool |")[2].partition("\n\n")[0]
+    rows = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
+    assert rows == [tool.name for tool in TOOLS]
+
+
+@pytest.mark.parametrize("key", sorted(set(keys(Settings))))
+def test_readme_names_every_configuration_key(key: str) -> None:
+    assert f"`{key}`" in README
+
+
+@pytest.mark.parametrize(
+    "variable",
+    re.findall(r"^([A-Z_]+)=", (ROOT / ".env.example").read_text(encoding="utf-8"), re.MULTILINE),
+)
+def test_readme_names_every_environment_variable(variable: str) -> None:
+    assert f"`{variable}`" in README
+
+
+def test_every_key_that_readme_tells_of_exists() -> None:
+    sections = {each.name for each in fields(Settings)}
+    told = set(re.findall(r"`(\w+\.\w+)(?:=[^`]*)?`", README))
+    known = set(keys(Settings)) | {f"recorder.{each.name}" for each in fields(Ros2BagNode)}
+    known.add("recorder.json")  # a file
+    assert {key for key in told if key.split(".")[0] in sections} <= known
+
+
+DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+NAMED = sorted(
+    {
+        (document.name, reference)
+        for document in DOCUMENTS
+        for reference in re.findall(
+            r"tests/[\w/]+\.py(?:::\w+)*", document.read_text(encoding="utf-8")
+        )
+    }
+)
+
+
+def held_by(path: Path) -> set[str]:
+    """What a file of tests holds: `test_x`, `TestY`, `TestY::test_x`."""
+    held = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            held.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            held |= {
+                f"{node.name}::{inner.name}"
+                for inner in node.body
+                if isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef)
+            }
+    return held
+
+
+@pytest.mark.parametrize(("document", "reference"), NAMED)
+def test_every_test_that_a_document_names_exists(document: str, reference: str) -> None:
+    file, _, name = reference.partition("::")
+    assert (ROOT / file).is_file(), f"{document} names {file}"
+    if name:
+        assert name.rpartition("::")[2].startswith("test_"), f"{document} names {reference}"
+        assert name in held_by(ROOT / file), f"{document} names {reference}"
+
+
+def anchors(path: Path) -> set[str]:
+    """What the headings of a page are linked to as."""
+    headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: document.name)
+def test_every_file_that_a_document_links_to_or_names_exists(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    linked = re.findall(r"\]\((?!https?://|#)([^)#\s]+)", text)
+    named = re.findall(r"`((?:docs|deploy|tests|benchmarks|config)/[\w./-]+\.\w+)`", text)
+    folder = document.parent
+    assert [each for each in linked if not (folder / each).exists()] == []
+    led = re.findall(r"\]\((?!https?://)([^)#\s]*)#([^)\s]+)\)", text)
+    lost = [
+        (path, anchor)
+        for path, anchor in led
+        if anchor not in anchors(folder / path if path else document)
+    ]
+    assert lost == []
+    assert [each for each in named if not (ROOT / each).exists()] == []

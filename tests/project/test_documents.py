@@ -1,0 +1,249 @@
+"""Every command, JSON, YAML and SQL in README and docs/ is run, or compared with the code.
+
+What cannot be run here stands in `NOT_RUN`, with the reason.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import anyio
+import duckdb
+import pytest
+import yaml
+from mcp import Client
+from mcp.client.stdio import StdioServerParameters, stdio_client
+
+from ros2_memory.config import load_settings
+from ros2_memory.serving.web_app import STREAM_PATH
+from tests.documented import START_S, write_history
+from tests.memories import ROOT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+DOCUMENTS: Final = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PROGRAMS: Final = Path(sys.executable).parent
+ELSEWHERE: Final = {
+    "README.md/From the command line": "tests/project/test_readme_commands.py",
+    "tools.md": "tests/project/test_reference.py",
+    "errors.md": "tests/project/test_reference.py",
+    "files.md": "tests/project/test_reference.py",
+    "metrics.md/Scraping": "tests/project/test_metrics_page.py",
+    "metrics.md/Alerts": "tests/project/test_metrics_page.py",
+    "tls.md/nginx": "tests/integration/test_proxy.py",
+    "tls.md/Caddy": "tests/integration/test_proxy.py",
+}
+"""Where blocks of a page, or of a section of it, are held by another test."""
+NOT_RUN: Final = {
+    r"sudo |journalctl ": "changes the machine: systemd, for root",
+    r"docker |.* docker compose ": "needs Docker",
+    r"pip install |python3 -m venv |\. ~/ros2-memory/bin/activate": "installs from the network",
+    r"curl ": "asks a server on another machine, or one that a service manager started",
+    r"ros2-memory demo": "tests/integration/test_demo.py runs it",
+    r"ros2-memory --install-completion": "writes into the user's shell configuration",
+    r"(\w+=\d+ )?uv run ": "these are the tests, and measurements",
+}
+"""Lines that begin so are not run, for this reason."""
+MAY_FAIL: Final = {"ros2-memory doctor"}
+"""Where the tests run there is no ROS, which the doctor reports by its exit code."""
+BOUND_S: Final = 240
+"""How long a block may take where the machine is busy."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    page: str
+    section: str
+    language: str
+    text: str
+
+    @property
+    def lines(self) -> list[str]:
+        """Its commands, a continued one in one line."""
+        joined = self.text.replace("\\\n", " ")
+        return [line for line in joined.splitlines() if line and not line.startswith("#")]
+
+    @property
+    def holder(self) -> str | None:
+        """The other test that holds it, if there is one."""
+        return ELSEWHERE.get(self.page) or ELSEWHERE.get(f"{self.page}/{self.section}")
+
+
+def blocks_of(path: Path) -> Iterator[Block]:
+    heading = ""
+    text = path.read_text(encoding="utf-8")
+    for found in re.finditer(
+        r"^##+ ([^\n]+)$|^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL
+    ):
+        if found[1]:
+            heading = found[1]
+        else:
+            yield Block(path.name, heading, found[2], found[3])
+
+
+BLOCKS: Final = [block for path in DOCUMENTS for block in blocks_of(path)]
+
+
+def of(language: str) -> list[Any]:
+    return [
+        pytest.param(block, id=f"{block.page}:{block.section}:{number}")
+        for number, block in enumerate(BLOCKS)
+        if block.language == language and block.holder is None
+    ]
+
+
+def reason_not_to_run(line: str) -> str | None:
+    reasons = (reason for start, reason in NOT_RUN.items() if re.match(start, line))
+    return next(reasons, None)
+
+
+@pytest.fixture(scope="module")
+def history(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_history(tmp_path_factory.mktemp("history") / "bags")
+
+
+@pytest.fixture
+def home(tmp_path: Path, history: Path) -> Path:
+    """A user's home with bags in it."""
+    for place in ("bags", "robot", "fleet/r1", "fleet/r2"):
+        shutil.copytree(history, tmp_path / place)
+    return tmp_path
+
+
+def environment(home: Path) -> dict[str, str]:
+    ours = ("MEMORY_", "MCP_", "ROS_")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
+    return {**kept, "HOME": str(home), "PATH": f"{PROGRAMS}{os.pathsep}{kept.get('PATH', '')}"}
+
+
+def test_every_block_is_of_a_language_that_is_held_here() -> None:
+    known = {"sh", "json", "yaml", "sql", "text"}
+    assert {block.language for block in BLOCKS if block.holder is None} <= known
+
+
+@pytest.mark.parametrize("start", NOT_RUN)
+def test_no_reason_not_to_run_a_command_has_outlived_it(start: str) -> None:
+    lines = [line for block in BLOCKS if block.language == "sh" for line in block.lines]
+    assert any(re.match(start, line) for line in lines)
+
+
+@pytest.mark.parametrize("block", of("sh"))
+def test_every_command_runs(block: Block, home: Path) -> None:
+    script: list[str] = []
+    for line in block.lines:
+        if reason_not_to_run(line):
+            continue
+        if "ros2-memory-server" in line:
+            serve([*script, f"exec env {line}"], home)
+        elif "ros2-memory-recorder" in line:
+            # No ROS here: what it is told is checked, and tests/integration runs it with a double.
+            script.append(line.replace("ros2-memory-recorder", "ros2-memory config show"))
+        elif line.partition("#")[0].strip() in MAY_FAIL:
+            script.append(f"{line} || test $? -le 2")
+        else:
+            script.append(re.sub(r"(ros2-memory watch)\b", r"\1 --count 1", line))
+    done = run(script, home)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def run(script: list[str], home: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["bash", "-euc", "\n".join(script)],
+        cwd=home,
+        env=environment(home),
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+
+
+def serve(script: list[str], home: Path) -> None:
+    """Runs a server until it listens, on any port that is free, and ends it."""
+    anywhere = re.sub(r" server\.port=\d+", "", "\n".join(script)) + " server.port=0"
+    with subprocess.Popen(
+        ["bash", "-euc", anywhere],
+        cwd=home,
+        env=environment(home),
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as server:
+        assert server.stderr is not None
+        said = []
+        for line in server.stderr:
+            said.append(line)
+            if '"listening"' in line:
+                break
+        server.terminate()
+        server.stderr.read()
+        assert server.wait(BOUND_S) == 0, said
+        assert '"listening"' in said[-1], said
+
+
+@pytest.mark.parametrize("block", of("json"))
+def test_every_server_that_a_desktop_client_is_told_of_starts_and_answers(
+    block: Block, home: Path
+) -> None:
+    servers = json.loads(block.text)["mcpServers"]
+    for name, entry in servers.items():
+        own = {key: value.replace("/home/me", str(home)) for key, value in entry["env"].items()}
+        program = str(PROGRAMS / entry["command"])
+        told = anyio.run(asked, program, entry.get("args", []), {**environment(home), **own})
+        assert told["name"] == name
+        assert told["reply"]["bags"] == 6
+
+
+async def asked(program: str, arguments: list[str], env: Mapping[str, str]) -> dict[str, Any]:
+    server = StdioServerParameters(command=program, args=arguments, env=dict(env))
+    with Path(os.devnull).open("w", encoding="utf-8") as log:
+        async with Client(stdio_client(server, errlog=log)) as client:
+            result = await client.call_tool("data_time_range", {})
+            [content] = result.content
+            text: Any = content
+            return {
+                "name": client.server_info and client.server_info.name,
+                "reply": json.loads(text.text),
+            }
+
+
+@pytest.mark.parametrize("block", of("yaml"))
+def test_every_yaml_is_what_its_reader_takes(block: Block, tmp_path: Path) -> None:
+    content = yaml.safe_load(block.text)
+    if isinstance(content, list):
+        served = load_settings(["server.transport=sse"], env={}).server
+        for entry in content:
+            assert entry["transport"] == "sse"
+            # Behind a proxy with TLS it is the port of that.
+            port = "" if entry["url"].startswith("https://") else f":{served.port}"
+            assert re.fullmatch(rf"https?://[\w.-]+{port}{STREAM_PATH}", entry["url"])
+        return
+    [(key, value)] = content.items()
+    shipped = {"topics": "topics.yaml", "schemas": "message_schemas.yaml"}[key]
+    like = yaml.safe_load((ROOT / "config" / shipped).read_text(encoding="utf-8"))[key]
+    assert type(value) is type(like)
+    if key == "schemas":
+        assert value.items() <= like.items()
+
+
+def test_the_queries_over_a_fleet_tell_what_each_robot_did(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks = [block for block in BLOCKS if block.page == "fleet.md"]
+    [export] = [block for block in blocks if "--parquet" in block.text]
+    assert run(export.lines, home).returncode == 0
+    monkeypatch.chdir(home)
+    far, seen = (duckdb.execute(each.text).fetchall() for each in blocks if each.language == "sql")
+    assert far == [("r1", pytest.approx(19.95)), ("r2", pytest.approx(19.95))]
+    first, last = START_S + 22, START_S + 38
+    assert seen == [("r1", first, last, 18), ("r2", first, last, 18)]

@@ -1,0 +1,128 @@
+"""What programs do not import, which would have them start later, and take more memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from ros2_memory.core.timebase import NS_PER_S
+from tests.bags import odom, text, write_mcap
+from tests.owned import own_all
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+T0: Final = 1_700_000_000 * NS_PER_S
+SERVING: Final = {"mcp", "mcp_types", "sse_starlette", "starlette", "uvicorn"}
+ANSWERING: Final = {
+    "anyio",
+    "numpy",
+    "rosbags",
+    *(
+        f"ros2_memory.{room}"
+        for room in ("catalogue", "history.context", "queries", "serving.dispatch", "tools")
+    ),
+}
+CONFIGURING: Final = {"hydra", "omegaconf", "yaml"}
+LOOKING: Final = {"rich", "structlog"}
+DELETING: Final = {
+    "ros2_memory.recorder.housekeeping",
+    "ros2_memory.retention.repair",
+    "ros2_memory.retention.saved_moments",
+    "ros2_memory.storage.mcap.writer",
+    "ros2_memory.upkeep",
+}
+RECORDING: Final = {
+    f"ros2_memory.{room}" for room in ("recorder.ros2bag", "recorder.supervisor", "retention.clear")
+}
+PEOPLE: Final = {"pyarrow", "ros2_memory.cli", "ros2_memory.demo", "typer"}
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> dict[str, str]:
+    messages = [odom(T0 + n * NS_PER_S, float(n), 0.0) for n in range(5)]
+    write_mcap(tmp_path / "bags" / "rec_0" / "rec_0.mcap", [*messages, text(T0, "a word")])
+    own_all(tmp_path / "bags")
+    return {
+        **os.environ,
+        "MEMORY_BAG_DIR": str(tmp_path / "bags"),
+        "MEMORY_DEPLOYMENT": "robot",
+        "MEMORY_CONFIG_OVERRIDES": "data.now=latest",
+        "XDG_CACHE_HOME": str(tmp_path / "cache"),
+    }
+
+
+def imported(program: str, env: dict[str, str]) -> list[list[str]]:
+    """Modules that are there at each `seen()` of a program, in an interpreter of its own."""
+    begun = "import json, sys\ntold = []\ndef seen():\n    told.append([*sys.modules])\n"
+    ended = "\nsys.stderr.write(chr(10) + json.dumps(told))"
+    done = subprocess.run(
+        [sys.executable, "-c", begun + program + ended],
+        env=env,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    told: list[list[str]] = json.loads(done.stderr.splitlines()[-1])
+    return told
+
+
+def of_commands(commands: Sequence[Sequence[str]], env: dict[str, str]) -> list[list[str]]:
+    """Modules that are there after each of these commands, run one after another."""
+    return imported(
+        "from ros2_memory import cli\n"
+        f"for words in {[[*words] for words in commands]}:\n"
+        "    assert cli.main(words) == 0, words\n"
+        "    seen()\n",
+        env,
+    )
+
+
+def test_a_command_imports_what_it_needs(env: dict[str, str]) -> None:
+    """Each is run after those that need less, in one interpreter: it need not start for each."""
+    without = {
+        ("--help",): SERVING | ANSWERING | CONFIGURING | LOOKING | DELETING | RECORDING,
+        ("--version",): SERVING | ANSWERING | CONFIGURING | LOOKING | DELETING | RECORDING,
+        ("config", "show"): SERVING | ANSWERING | DELETING | RECORDING,
+        ("index",): SERVING | DELETING | RECORDING,
+        ("topics",): SERVING | DELETING | RECORDING,
+        ("info",): SERVING | DELETING | RECORDING,
+        ("ask", "get_position_seconds_ago", "seconds_ago=0"): SERVING | DELETING | RECORDING,
+        ("forget", "--last", "100", "--dry-run"): SERVING | RECORDING,
+    }
+    for (words, absent), there in zip(without.items(), of_commands([*without], env), strict=True):
+        assert absent & {*there} == set(), words
+
+
+def test_a_name_is_completed_without_importing_what_has_it(env: dict[str, str]) -> None:
+    completing = {"COMP_WORDS": "ros2-memory to", "COMP_CWORD": "1"}
+    ((*there,),) = of_commands([[]], env | completing | {"_ROS2_MEMORY_COMPLETE": "complete_bash"})
+    assert (SERVING | ANSWERING | CONFIGURING | LOOKING) & {*there} == set()
+
+
+def test_the_recorder_imports_nothing_that_answers(env: dict[str, str]) -> None:
+    ((*there,),) = imported("import ros2_memory.recorder.__main__\nseen()\n", env)
+    rooms = {
+        f"ros2_memory.{room}" for room in ("bootstrap", "catalogue", "history.context", "queries")
+    }
+    assert (SERVING | PEOPLE | rooms | {"anyio"}) & {*there} == set()
+
+
+def test_the_server_imports_nothing_that_records_deletes_or_is_for_people(
+    env: dict[str, str],
+) -> None:
+    program = "from ros2_memory import server\nseen()\n"
+    ((*there,),) = imported(program, env)
+    observing = {"opentelemetry.sdk", "prometheus_client", "ros2_memory.observability.prometheus"}
+    assert (DELETING | RECORDING | PEOPLE | observing | {"httpx", "jsonschema"}) & {*there} == set()
+
+
+def test_what_tests_start_need_not_compile_what_it_imports() -> None:
+    asked = [sys.executable, "-c", "import sys; print(sys.dont_write_bytecode)"]
+    assert subprocess.check_output(asked, text=True) == "False\n"

@@ -1,0 +1,127 @@
+"""docs/reference says what the code does. `UPDATE_DOCS=1` writes the parts that are made of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from functools import cache
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.core.errors import EpisodicError, NoDataReason
+from ros2_memory.history.context import Limits
+from ros2_memory.tools.resources import SCHEMA, STATUS, TOPICS
+from ros2_memory.tools.spec_tools import build_tools
+from tests import reference
+from tests.documented import CALLS, MISTAKES, replies, shown_files, write_history
+from tests.memories import ROOT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+FOLDER = ROOT / "docs" / "reference"
+TOOLS = build_tools(Limits(), 25.0, writing=True)
+HOW = "write it anew with `UPDATE_DOCS=1 uv run pytest -n0 tests/project/test_reference.py`"
+
+
+@cache
+def page(name: str) -> str:
+    return (FOLDER / f"{name}.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mapping[str, str]]:
+    """What the server says to every call of the page, where the time zone is UTC."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TZ", "UTC")
+        time.tzset()
+        yield replies(write_history(tmp_path_factory.mktemp("history") / "bags"))
+    time.tzset()
+
+
+def compare(name: str, part: str, expected: str) -> None:
+    """Holds a part of a page to what it has to be, or writes it."""
+    text = page(name)
+    said = reference.section(text, part)
+    if reference.without_sizes(said) == reference.without_sizes(expected):
+        return
+    if os.environ.get("UPDATE_DOCS"):
+        (FOLDER / f"{name}.md").write_text(
+            reference.with_section(text, part, expected), encoding="utf-8"
+        )
+        page.cache_clear()
+        return
+    assert reference.without_sizes(said) == reference.without_sizes(expected), HOW
+
+
+def test_every_tool_stands_there_with_its_arguments_a_call_and_its_reply(
+    answers: Mapping[str, str],
+) -> None:
+    assert list(CALLS) == [tool.name for tool in TOOLS]
+    compare("tools", "tools", reference.told_tools(TOOLS, answers))
+
+
+@pytest.mark.parametrize("name", sorted(set(CALLS)))
+def test_every_call_that_is_shown_has_an_answer(name: str, answers: Mapping[str, str]) -> None:
+    assert "error" not in json.loads(answers[name])
+
+
+def test_every_key_stands_there_with_its_default_and_what_it_may_hold() -> None:
+    told = reference.told_configuration()
+    named = set(re.findall(r"^\| `([\w.]+)` \|", told, re.MULTILINE))
+    assert named == reference.configured_keys(), "each key in config/ has a comment on its line"
+    compare("configuration", "keys", told)
+
+
+def test_every_preset_and_every_variable_stands_there() -> None:
+    presets = {path.stem for path in (ROOT / "config" / "deployment").glob("*.yaml")}
+    told = set(re.findall(r"^\| `(\w+)` \|", page("configuration"), re.MULTILINE))
+    assert presets <= told
+    example = (ROOT / ".env.example").read_text(encoding="utf-8")
+    for variable in re.findall(r"^([A-Z_]+)=", example, re.MULTILINE):
+        assert f"`{variable}`" in page("configuration")
+
+
+def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
+    told = dict(re.findall(r"^\| `(episodic://\S+)` \| (.+) \|$", page("tools"), re.MULTILINE))
+    assert set(told) == {each.uri for each in (TOPICS, STATUS, SCHEMA)}
+    for each in (TOPICS, STATUS):
+        assert told[each.uri] == f"`{each.tool}`"
+
+
+def test_every_command_stands_there_with_its_exit_codes() -> None:
+    compare("commands", "exits", reference.told_exits())
+
+
+def test_every_log_event_stands_there_with_its_fields() -> None:
+    expected = reference.told_events(page("log-events"))
+    compare("log-events", "events", expected)
+    assert "| ? |" not in expected, "say in docs/reference/log-events.md what the event means"
+
+
+def test_every_error_code_and_every_reason_stands_there() -> None:
+    def codes(cls: type[EpisodicError]) -> set[str]:
+        return {cls.code}.union(*(codes(each) for each in cls.__subclasses__()))
+
+    tables = set(re.findall(r"^\| `(\w+)` \|", page("errors"), re.MULTILINE))
+    tables -= {"error", "reason"}  # their heads
+    expected = codes(EpisodicError) - {"no_data"} | {reason.value for reason in NoDataReason}
+    assert tables == expected
+
+
+@pytest.mark.parametrize("part", sorted(MISTAKES))
+def test_every_error_that_is_shown_is_what_the_server_says(
+    part: str, answers: Mapping[str, str]
+) -> None:
+    tool, given = MISTAKES[part]
+    call = json.dumps({"name": tool, "arguments": given})
+    compare("errors", part, f"```json\n{call}\n```\n\n{reference.shown(answers[part])}")
+
+
+def test_every_file_that_is_shown_is_what_the_recorder_writes(tmp_path: Path) -> None:
+    for part, text in shown_files(tmp_path).items():
+        compare("files", part, reference.shown(text))

@@ -1,0 +1,241 @@
+"""What the repository promises about itself: the wheel, the gates, the units, the examples."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from ros2_memory import config
+from ros2_memory.serving import api_token
+
+ROOT = Path(__file__).resolve().parents[2]
+GATES = (
+    "uv sync --locked",
+    ".ci/browser",
+    "uv run ruff check",
+    "uv run ruff format --check",
+    "uv run mypy",
+    "uv run lint-imports",
+    "uv run pytest --cov",
+    "uv run pip-audit --strict",
+)
+SERVER_UNIT = ROOT / "deploy/ros2-memory-server.service"
+UNITS = sorted((ROOT / "deploy").glob("*.service"))
+
+
+def systemd_version() -> int:
+    if shutil.which("systemd-analyze") is None:
+        return 0
+    ran = subprocess.run(["systemd-analyze", "--version"], check=True, capture_output=True)
+    found = re.match(rb"systemd (\d+)", ran.stdout)
+    return int(found[1]) if found else 0
+
+
+needs_systemd = pytest.mark.skipif(
+    systemd_version() < 250, reason="systemd-analyze 250 or newer is not on this machine"
+)
+
+
+def read_yaml(name: str) -> Any:
+    return yaml.safe_load((ROOT / name).read_text())
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    folder = tmp_path_factory.mktemp("wheel")
+    built = subprocess.run(
+        ["uv", "build", "--quiet", "--wheel", "--out-dir", folder, ROOT],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert built.returncode == 0, built.stderr
+    (path,) = folder.glob("*.whl")
+    return zipfile.ZipFile(path)
+
+
+class TestWheel:
+    def test_ships_the_whole_configuration(self, wheel: zipfile.ZipFile) -> None:
+        prefix = "ros2_memory/_config/"
+        shipped = {
+            name.removeprefix(prefix) for name in wheel.namelist() if name.startswith(prefix)
+        }
+        files = (ROOT / "config").rglob("*.yaml")
+        assert shipped == {str(path.relative_to(ROOT / "config")) for path in files}
+
+    def test_loads_its_configuration_without_a_checkout(
+        self, wheel: zipfile.ZipFile, tmp_path: Path
+    ) -> None:
+        wheel.extractall(tmp_path / "installed")
+        program = (
+            "from ros2_memory.config import config_dir, load_settings, load_message_schemas\n"
+            "settings = load_settings((), {'MEMORY_DEPLOYMENT': 'replay'})\n"
+            "print(config_dir({}), settings.server.name, bool(load_message_schemas(settings)))\n"
+        )
+        ran = subprocess.run(
+            [sys.executable, "-c", program],
+            check=True,
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            env={"PYTHONPATH": str(tmp_path / "installed")},
+        )
+        folder = tmp_path / "installed/ros2_memory/_config"
+        assert ran.stdout.split() == [str(folder), "episodic", "True"]
+
+    def test_has_the_typing_marker_and_the_licence(self, wheel: zipfile.ZipFile) -> None:
+        names = wheel.namelist()
+        assert "ros2_memory/py.typed" in names
+        assert any(name.endswith("licenses/LICENSE") for name in names)
+
+    def test_ships_the_page(self, wheel: zipfile.ZipFile) -> None:
+        page = ROOT / "src/ros2_memory/serving/page/index.html"
+        assert wheel.read("ros2_memory/serving/page/index.html") == page.read_bytes()
+
+    def test_has_nothing_but_the_package(self, wheel: zipfile.ZipFile) -> None:
+        tops = {name.split("/")[0] for name in wheel.namelist()}
+        assert {re.sub(r"-.*\.", ".", top) for top in tops} == {
+            "ros2_memory",
+            "ros2_memory.dist-info",
+        }
+
+
+class TestGates:
+    def test_the_script_runs_each(self) -> None:
+        script = (ROOT / ".ci/run").read_text()
+        assert [gate for gate in GATES if gate not in script] == []
+
+    def test_readme_the_script_and_the_workflow_test_with_one_command(self) -> None:
+        (command,) = re.findall(r"\npip install uv && (.+)\n", (ROOT / "README.md").read_text())
+        assert command in GATES
+        assert f"\ngate pytest {command}\n" in (ROOT / ".ci/run").read_text()
+        steps = read_yaml(".github/workflows/ci.yml")["jobs"]["gates"]["steps"]
+        assert [step["run"] for step in steps if "pytest" in step.get("run", "")] == [command]
+
+    @pytest.mark.parametrize("name", ["run", "newest", "browser"])
+    def test_the_scripts_are_sound_bash_and_executable(self, name: str) -> None:
+        subprocess.run(["bash", "-n", ROOT / ".ci" / name], check=True)
+        assert (ROOT / ".ci" / name).stat().st_mode & 0o111
+
+    def test_the_newest_releases_that_are_allowed_are_tried_weekly_by_the_script_for_it(
+        self,
+    ) -> None:
+        workflow = read_yaml(".github/workflows/newest.yml")
+        (job,) = workflow["jobs"].values()
+        assert ".ci/newest" in {step.get("run") for step in job["steps"]}
+        assert "schedule" in workflow[True]  # YAML 1.1 reads the key "on" so
+        script = (ROOT / ".ci/newest").read_text()
+        assert re.findall(r"uv (?:sync|lock|run)", script) == []  # these go by uv.lock
+
+    def test_the_workflow_runs_each_on_both_pythons_for_every_change(self) -> None:
+        workflow = read_yaml(".github/workflows/ci.yml")
+        job = workflow["jobs"]["gates"]
+        commands = "\n".join(step.get("run", "") for step in job["steps"])
+        assert [gate for gate in GATES if gate not in commands] == []
+        assert job["strategy"]["matrix"]["python"] == ["3.11", "3.12"]
+        assert set(workflow[True]) == {"pull_request", "push"}  # YAML 1.1 reads the key "on" so
+
+    def test_dependencies_are_looked_at_weekly(self) -> None:
+        updates = read_yaml(".github/dependabot.yml")["updates"]
+        assert {entry["package-ecosystem"] for entry in updates} == {"uv", "github-actions"}
+        assert {entry["schedule"]["interval"] for entry in updates} == {"weekly"}
+
+    def test_pre_commit_has_every_hook(self) -> None:
+        repos = read_yaml(".pre-commit-config.yaml")["repos"]
+        assert {hook["id"] for repo in repos for hook in repo["hooks"]} == {
+            "trailing-whitespace",
+            "end-of-file-fixer",
+            "check-yaml",
+            "check-toml",
+            "check-merge-conflict",
+            "check-added-large-files",
+            "ruff",
+            "ruff-format",
+            "mypy",
+        }
+
+    def test_every_room_stands_in_the_import_contracts(self) -> None:
+        contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+        (layers,) = [each for each in contracts["contracts"] if each["type"] == "layers"]
+        assert layers["exhaustive"] is True
+        assert layers["containers"] == ["ros2_memory"]
+
+
+class TestExamples:
+    def test_the_environment_example_names_every_variable_that_is_read(self) -> None:
+        source = Path(config.__file__).read_text() + Path(api_token.__file__).read_text()
+        read = set(re.findall(r'"((?:MCP|MEMORY|ROS)_[A-Z_]+)"', source))
+        lines = (ROOT / ".env.example").read_text().splitlines()
+        assert {line.split("=")[0] for line in lines if line and line[0] != "#"} == read
+
+    def test_the_environment_example_sets_nothing(self) -> None:
+        values = dict(
+            line.split("=", 1)
+            for line in (ROOT / ".env.example").read_text().splitlines()
+            if line and line[0] != "#"
+        )
+        assert config.load_settings((), values) == config.load_settings((), {})
+
+    def test_every_key_of_the_configuration_is_explained(self) -> None:
+        lines = (ROOT / "config/config.yaml").read_text().splitlines()
+        keys = [line for line in lines if re.match(r"  \w+: ", line)]
+        assert len(keys) > 25
+        assert [line for line in keys if " # " not in line] == []
+
+    def test_the_shipped_topics_are_distinct_names(self) -> None:
+        topics = read_yaml("config/topics.yaml")["topics"]
+        assert len(set(topics)) == len(topics) > 0
+        assert all(re.fullmatch(r"(/\w+)+", topic) for topic in topics)
+
+
+class TestUnits:
+    HARDENING = (
+        "NoNewPrivileges=yes",
+        "PrivateTmp=yes",
+        "ProtectSystem=strict",
+        "User=ros2-memory",
+        "StandardError=journal",
+        "RestartPreventExitStatus=2",
+    )
+
+    def test_there_is_one_for_the_server(self) -> None:
+        assert SERVER_UNIT in UNITS
+
+    @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+    def test_each_is_hardened(self, unit: Path) -> None:
+        lines = unit.read_text().splitlines()
+        assert [each for each in self.HARDENING if each not in lines] == []
+
+    @needs_systemd
+    @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+    def test_each_is_understood_by_systemd(self, unit: Path, tmp_path: Path) -> None:
+        copy = tmp_path / unit.name
+        # The program is not installed here, and its absence is no fault of the unit.
+        copy.write_text(re.sub(r"(?m)^(Exec\w+)=.*", r"\1=/bin/true", unit.read_text()))
+        ran = subprocess.run(
+            ["systemd-analyze", "verify", "--man=no", copy],
+            check=False,
+            capture_output=True,
+            text=True,
+        )
+        complaints = [line for line in ran.stderr.splitlines() if unit.name in line]
+        assert complaints == []
+
+    @needs_systemd
+    def test_the_server_is_exposed_by_less_than_two_of_ten(self) -> None:
+        ran = subprocess.run(
+            ["systemd-analyze", "security", "--offline=true", "--threshold=20", SERVER_UNIT],
+            check=False,
+            capture_output=True,
+            text=True,
+        )
+        assert ran.returncode == 0, ran.stdout[-200:] + ran.stderr

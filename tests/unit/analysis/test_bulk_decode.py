@@ -1,0 +1,211 @@
+"""Messages of one mould say together what they say one by one."""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from ros2_memory.analysis.bulk_decode import mould_of
+from ros2_memory.analysis.conditions import (
+    Condition,
+    Contains,
+    Equals,
+    NearPosition,
+)
+from ros2_memory.catalogue.digest import Digester
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import (
+    Msg,
+    detections,
+    header,
+    make,
+    odom,
+    quaternion,
+    text,
+    tf,
+    transform,
+    twist,
+    write_mcap,
+)
+from tests.memories import extractor
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.storage.base import Layout, Record
+
+S = 10**9
+T0 = 1_700_000_000 * S
+
+ODD = (math.nan, math.inf, -math.inf, 1e300, 0.0)
+
+
+class OneByOne(McapReader):
+    """Tells no layout, so that every message is decoded."""
+
+    def layout(self, record: Record) -> Layout | None:
+        return None
+
+
+def both(path: Path) -> tuple[Digest, Digest]:
+    readers = (McapReader(), OneByOne())
+    at_once, singly = (Digester(reader, extractor(), 10.0).digest(path) for reader in readers)
+    return at_once, singly
+
+
+def assert_alike(path: Path) -> None:
+    for at_once, singly in zip(*(each.topics for each in both(path)), strict=True):
+        assert at_once.topic == singly.topic
+        assert at_once.poses == singly.poses
+        assert at_once.edges == singly.edges
+        assert at_once.kept == singly.kept
+        one, other = at_once.evidence, singly.evidence
+        assert (one.words, one.texts, one.booleans, one.box, one.open) == (
+            other.words,
+            other.texts,
+            other.booleans,
+            other.box,
+            other.open,
+        )
+        assert one.low <= other.low
+        assert one.high >= other.high
+        assert one.numbers is None or set(one.numbers) == set(other.numbers or ())
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_bag_has_the_same_digest_either_way(tmp_path: Path, seed: int) -> None:
+    draw = random.Random(seed)
+    messages: list[Msg] = []
+    for n in range(draw.randint(40, 120)):
+        at = T0 + n * S // 20
+        x = draw.choice([draw.uniform(-2, 2), draw.uniform(-2, 2), math.nan, 90.0])
+        messages.append(odom(at, x, 1.0, draw.uniform(-3, 3), vx=draw.choice([0.3, math.nan])))
+        child = draw.choice(["base_link", "base_link", "arm"])
+        messages.append(tf(at, transform(at, "odom", child, (x, 0.0, 0.0), 0.2)))
+        speed = make("geometry_msgs/msg/Twist", **vars(twist(x, 0.1)))
+        messages.append(Msg("/cmd_vel", "geometry_msgs/msg/Twist", at, speed))
+        labels = draw.choice([["cup"], ["cup", "person"]])
+        messages.append(detections(at, labels, at=(x, 0.0, draw.choice([0.0, math.nan]))))
+        messages.append(text(at, draw.choice(["a", "b"])))
+        if draw.random() < 0.02:
+            broken = b"\x00\x01\x00\x00\xff\xff\xff\x7f"
+            messages.append(Msg("/chatter", "std_msgs/msg/String", at, broken))
+    assert_alike(write_mcap(tmp_path / "bag.mcap", messages))
+
+
+def test_a_transform_that_is_valid_in_some_messages_only_is_not_lost(tmp_path: Path) -> None:
+    nowhere = transform(T0, "odom", "base_link", (math.nan, 0.0, 0.0))
+    somewhere = transform(T0, "odom", "base_link", (1.0, 0.0, 0.0))
+    for first, later in ((nowhere, somewhere), (somewhere, nowhere)):
+        messages = [tf(T0 + n, later if n > 5 else first) for n in range(60)]
+        path = write_mcap(tmp_path / "bag.mcap", messages)
+        assert_alike(path)
+        [topic] = both(path)[0].topics
+        assert topic.edges is not None
+        assert topic.edges.pairs == (("odom", "base_link"),)
+
+
+def test_whole_numbers_that_change_are_seen(tmp_path: Path) -> None:
+    messages = []
+    for n in range(60):
+        box = np.array([n, 2, 3, 4], dtype=np.int32)
+        seen = detections(T0 + n, ["cup"])
+        seen.body.detections[0].bbox = box  # type: ignore[attr-defined]
+        messages.append(seen)
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    assert_alike(path)
+    [topic] = both(path)[0].topics
+    assert all(Equals(n).may_match(topic.evidence) for n in range(60))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_a_message_of_a_mould_holds_is_never_ruled_out(tmp_path: Path, seed: int) -> None:
+    draw = random.Random(seed)
+    places = [
+        (draw.choice([draw.uniform(-5, 5), *ODD]), draw.choice([draw.uniform(-5, 5), *ODD]))
+        for _ in range(50)
+    ]
+    messages = [odom(T0 + n, x, y, 0.3, vx=x) for n, (x, y) in enumerate(places)]
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    assert_alike(path)
+    reader = McapReader()
+    [topic] = Digester(reader, extractor(), 10.0).digest(path).topics
+    for record in reader.records(path, ["/odom"], TimeWindow.everything()):
+        value = extractor().exact(reader.decode(record), record.channel.type)
+        x, y = places[record.log_time - T0]
+        for test in (Equals(x), NearPosition(x, y, None, 0.1), Contains("odom")):
+            for field in (None, "position", "position.x"):
+                condition = Condition(test, field)
+                if condition.matches(value):
+                    assert condition.may_match(topic.evidence)
+
+
+def first_record(tmp_path: Path, *messages: Msg) -> tuple[McapReader, Record]:
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    reader = McapReader()
+    return reader, next(reader.records(path, [messages[0].topic], TimeWindow.everything()))
+
+
+def test_the_numbers_of_an_odometry_are_found_where_they_lie(tmp_path: Path) -> None:
+    reader, record = first_record(tmp_path, odom(T0, 1.5, -2.5, 0.5, vx=0.25))
+    mould = mould_of(reader, extractor(), record)
+    assert mould is not None
+    _, rows = mould.those_like(record, [record], [0])
+    assert mould.frame_id == "odom"
+    [pose] = mould.poses(rows)
+    assert pose is not None
+    assert pose.position == (1.5, -2.5, 0.0)
+    assert pose.orientation == pytest.approx((0.0, 0.0, math.sin(0.25), math.cos(0.25)), abs=1e-12)
+    assert mould.velocities(rows) == [(0.25, 0.0, 0.0)]
+
+
+def test_messages_that_differ_in_more_than_numbers_are_not_of_one_mould(tmp_path: Path) -> None:
+    reader, record = first_record(tmp_path, odom(T0, 1.0, 0.0))
+    mould = mould_of(reader, extractor(), record)
+    assert mould is not None
+    payload = record.payload.replace(b"odom", b"abcd")
+    others = [record, record._replace(payload=payload), record._replace(payload=payload[:-8])]
+    chosen, rows = mould.those_like(record, others, [0, 1, 2])
+    assert (chosen, len(rows)) == ([0], 1)
+
+
+def test_what_cannot_be_walked_has_no_mould(tmp_path: Path) -> None:
+    reader, record = first_record(tmp_path, text(T0, "no numbers in it"))
+    assert (
+        mould_of(reader, extractor(), record._replace(payload=record.payload + b"12345678")) is None
+    )
+    big_endian = record._replace(payload=b"\x00\x00" + record.payload[2:])
+    assert reader.layout(big_endian) is None
+
+
+def test_a_pose_array_has_every_place_in_its_box(tmp_path: Path) -> None:
+    def poses(n: int) -> Msg:
+        held = [
+            make(
+                "geometry_msgs/msg/Pose",
+                position=make("geometry_msgs/msg/Point", x=float(n), y=float(k), z=0.0),
+                orientation=quaternion(0.1),
+            )
+            for k in range(3)
+        ]
+        body = make("geometry_msgs/msg/PoseArray", header=header(T0, "map"), poses=held)
+        return Msg("/poses", "geometry_msgs/msg/PoseArray", T0 + n, body)
+
+    path = write_mcap(tmp_path / "bag.mcap", [poses(n) for n in range(60)])
+    assert_alike(path)
+    [topic] = both(path)[0].topics
+    assert topic.evidence.box is not None
+    assert topic.evidence.box[:4] == (0.0, 59.0, 0.0, 2.0)
+
+
+def test_a_message_without_numbers_is_a_mould_too(tmp_path: Path) -> None:
+    same = [replace(text(T0 + n, "same")) for n in range(60)]
+    path = write_mcap(tmp_path / "bag.mcap", same)
+    assert_alike(path)

@@ -1,0 +1,240 @@
+from __future__ import annotations
+
+from bisect import bisect_left
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.intervals import (
+    FLICKER_NS,
+    SILENCE_NS,
+    Part,
+    Presence,
+    Seen,
+    Watcher,
+    joined,
+    united,
+)
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+
+Messages = list[tuple[int, tuple[str, ...]]]
+
+MESSAGES = st.lists(
+    st.tuples(
+        st.sampled_from([0, 1, NS_PER_S, FLICKER_NS, FLICKER_NS + 1, SILENCE_NS, SILENCE_NS + 1]),
+        st.sets(st.sampled_from("abc")).map(lambda labels: tuple(sorted(labels))),
+    ),
+    min_size=1,
+    max_size=30,
+)
+
+
+@st.composite
+def histories(draw: st.DrawFn, begin: int = 0) -> Messages:
+    """Messages with silences and equal times."""
+    time, messages = begin, []
+    for wait, labels in draw(MESSAGES):
+        time += wait
+        messages.append((time, labels))
+    return messages
+
+
+def watched(messages: Messages, at_most: int = 1000) -> Part:
+    watcher = Watcher(at_most)
+    for time, labels in messages:
+        watcher.add(time, labels)
+    part = watcher.part()
+    assert part is not None
+    return part
+
+
+def by_hand(messages: Messages) -> list[Presence]:
+    """From the sentence that says what a presence is."""
+    found: list[Presence] = []
+    for label in "abc":
+        row: list[int] = []  # places of the messages of one presence
+        for nth, (time, labels) in enumerate(messages):
+            if label not in labels:
+                continue
+            if row:
+                apart = time - messages[row[-1]][0]
+                follows = row[-1] == nth - 1 and apart <= SILENCE_NS
+                if not (follows or apart <= FLICKER_NS):
+                    found.append(Presence(label, messages[row[0]][0], messages[row[-1]][0]))
+                    row = []
+            row.append(nth)
+        if row:
+            found.append(Presence(label, messages[row[0]][0], messages[row[-1]][0]))
+    return sorted(found, key=lambda each: (each.first, each.label))
+
+
+@given(histories())
+def test_a_thing_is_in_view_as_long_as_it_is_missed_for_a_moment_only(messages: Messages) -> None:
+    part = watched(messages)
+    assert list(part.seen.presences()) == by_hand(messages)
+    assert (part.first, part.last) == (messages[0][0], messages[-1][0])
+
+
+@given(histories(), st.data())
+def test_where_messages_are_cut_into_parts_changes_nothing(
+    messages: Messages, data: st.DataObject
+) -> None:
+    cuts = sorted(
+        data.draw(st.sets(st.integers(1, len(messages) - 1), max_size=6))
+        if len(messages) > 1
+        else []
+    )
+    edges = zip([0, *cuts], [*cuts, len(messages)], strict=True)
+    parts = [watched(messages[begin:end]) for begin, end in edges]
+    assert joined(parts) == watched(messages)
+    if len(parts) > 2:
+        at = data.draw(st.integers(1, len(parts) - 1))
+        assert joined([joined(parts[:at]), joined(parts[at:])]) == watched(messages)
+
+
+@given(st.lists(histories(), min_size=1, max_size=3))
+def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
+    topics: list[Messages],
+) -> None:
+    each = [watched(messages).seen for messages in topics]
+    together = united(each)
+    spans = [one for seen in each for one in seen.presences()]
+    for presence in together.presences():
+        mine = [
+            one
+            for one in spans
+            if one.label == presence.label
+            and presence.first <= one.first
+            and one.last <= presence.last
+        ]
+        assert (min(one.first for one in mine), max(one.last for one in mine)) == presence[1:]
+        mine.sort(key=lambda one: one.first)
+        for nth in range(1, len(mine)):
+            assert mine[nth].first - max(one.last for one in mine[:nth]) <= FLICKER_NS
+    for label in "abc":
+        own = [one for one in together.presences() if one.label == label]
+        assert all(after.first - before.last > FLICKER_NS for before, after in pairwise(own))
+        inside = [one for one in spans if one.label == label]
+        for one in inside:
+            at = bisect_left([other.last for other in own], one.last)
+            assert own[at].first <= one.first
+
+
+def test_what_lasted_longest_comes_first_and_of_equals_the_earliest() -> None:
+    seen = watched([(0, ("b", "a")), (NS_PER_S, ("a",)), (20 * NS_PER_S, ("c",))]).seen
+    assert [each.label for each in seen.longest(3)] == ["a", "b", "c"]
+    assert [each.label for each in seen.longest(1)] == ["a"]
+
+
+def test_the_most_lasting_are_kept_in_order_with_the_names_that_they_need() -> None:
+    late = 40 * NS_PER_S
+    seen = watched(
+        [(0, ("b",)), (1, ("b",)), (20 * NS_PER_S, ("a",)), (late, ("c",)), (late + 1, ("c",))]
+    ).seen
+    assert seen.labels == ("a", "b", "c")
+    kept = seen.most_lasting(2)
+    assert kept.labels == ("b", "c")
+    assert kept.presences() == (
+        Presence("b", 0, 1),
+        Presence("c", late, late + 1),
+    )
+    assert [each.label for each in seen.most_lasting(1).presences()] == ["b"]
+    assert seen.most_lasting(3) is seen
+
+
+def test_presences_without_some_things_are_those_of_the_others() -> None:
+    seen = watched([(0, ("a", "b")), (20 * NS_PER_S, ("a",))]).seen
+    assert seen.without({"a", "x"}).presences() == (Presence("b", 0, 0),)
+    assert seen.without({"x"}) is seen
+
+
+def each_s(begin: float, end: float, period: float, *labels: str) -> Messages:
+    return [
+        (round((begin + n * period) * NS_PER_S), labels) for n in range(int((end - begin) / period))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("messages", "is_seen"),
+    [
+        (each_s(0, 65, 0.2, "a"), True),
+        (each_s(0.5, 64.5, 0.2, "a"), True),
+        (each_s(0, 66, 3, "a"), True),
+        (each_s(12, 17, 0.2, "a"), False),
+        (each_s(2, 65, 0.2, "a"), False),
+        (each_s(0, 63, 0.2, "a"), False),
+        (each_s(0, 30, 0.2, "a") + each_s(32, 65, 0.2, "a"), False),
+        (each_s(0, 30, 0.2, "a") + each_s(30.6, 65, 0.2, "a"), True),
+        (each_s(0, 30, 0.2, "a") + each_s(30, 32, 0.2) + each_s(32, 65, 0.2, "a"), False),
+        (each_s(0, 65, 0.2, "b"), False),
+        (each_s(30, 31, 1, "a"), False),
+    ],
+)
+def test_a_thing_is_seen_throughout_where_it_is_seen_at_the_usual_rate(
+    messages: Messages, is_seen: bool
+) -> None:
+    seen = watched(messages).seen
+    assert ("a" in seen.throughout(0, 65 * NS_PER_S)) is is_seen
+    half = len(messages) // 2 or 1
+    parts = [watched(part) for part in (messages[:half], messages[half:]) if part]
+    assert ("a" in joined(parts).seen.throughout(0, 65 * NS_PER_S)) is is_seen
+
+
+def test_a_thing_that_is_not_seen_any_more_is_not_there_still() -> None:
+    messages = each_s(0, 20, 0.2, "a")
+    last = messages[-1][0]
+    seen = watched(messages).seen
+    assert seen.at_end(last, last + NS_PER_S) == ["a"]
+    assert seen.at_end(last, last + 2 * NS_PER_S) == []
+    assert seen.at_end(last - 1, last) == []
+
+
+@given(histories())
+def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
+    messages: Messages,
+) -> None:
+    seen = watched(messages).seen
+    start, end = messages[0][0], messages[-1][0]
+    for label in seen.throughout(start, end):
+        times = [time for time, labels in messages if label in labels]
+        usual = (times[-1] - times[0]) / (len(times) - 1)
+        edges = [start, *times, end]
+        assert max(b - a for a, b in pairwise(edges)) <= max(NS_PER_S, 3 * usual)
+
+
+def test_nothing_seen_is_joined_to_nothing_seen() -> None:
+    nothing = watched([(0, ())])
+    assert joined([nothing, watched([(1, ())])]) == Part(0, 1, Seen())
+    assert united([]) == Seen()
+    assert Seen().longest(3) == ()
+
+
+def test_times_at_either_end_of_what_can_be_said_are_far_apart() -> None:
+    ends = [watched([(time, ("a",))]) for time in (MIN_NS, MAX_NS)]
+    assert joined(ends).seen.size == 2
+    assert united([each.seen for each in ends]).size == 2
+
+
+def test_presences_are_counted_beyond_what_may_be_held() -> None:
+    watcher = Watcher(2)
+    for nth in range(6):
+        watcher.add(nth * 20 * NS_PER_S, ["a"])
+    assert watcher.left_out == 3
+    part = watcher.part()
+    assert part is not None
+    assert part.seen.size == 3
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        Seen((), watched([(0, ("a",))]).seen.rows),
+        Seen(("a",), watched([(0, ("a", "b"))]).seen.rows),
+        Seen(("a",), b"rows"),
+    ],
+)
+def test_rows_without_a_name_are_told_from_sound_ones(seen: Seen) -> None:
+    assert not seen.is_sound
+    assert watched([(0, ("a", "b"))]).seen.is_sound

@@ -1,0 +1,345 @@
+from __future__ import annotations
+
+import math
+import random
+from itertools import pairwise
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.standstills import (
+    LARGEST_M,
+    SHORTEST_NS,
+    Standstill,
+    StandstillBuilder,
+    StandstillCollector,
+)
+from ros2_memory.catalogue.codec import packed_standstills, unpacked_standstills
+from ros2_memory.core.timebase import NS_PER_S
+
+Poses = list[tuple[int, tuple[float, float, float]]]
+S = NS_PER_S
+
+
+class World(NamedTuple):
+    """A robot that drives along x, and the times (s) at which it stands, in closed form."""
+
+    poses: Poses
+    standing: list[tuple[float, float]]
+    period: float
+
+
+def world(
+    legs: list[tuple[float, float]], *, hz: float = 50, begin: float = 100.0, noise: float = 0.0
+) -> World:
+    """Legs of (seconds, metres per second), one after another, from `begin` on.
+
+    `noise`: standard deviation (m) of what is added to each axis of each pose.
+    """
+    edges = [begin]
+    places = [0.0]
+    for seconds, speed in legs:
+        edges.append(edges[-1] + seconds)
+        places.append(places[-1] + seconds * speed)
+    draw = random.Random(7)
+    poses: Poses = []
+    leg = 0
+    for nth in range(int((edges[-1] - begin) * hz) + 1):
+        time = begin + nth / hz
+        while leg + 1 < len(legs) and time >= edges[leg + 1]:
+            leg += 1
+        x = places[leg] + (time - edges[leg]) * legs[leg][1]
+        place = (x, 2.0, 0.0)
+        if noise:
+            place = (x + draw.gauss(0, noise), 2.0 + draw.gauss(0, noise), draw.gauss(0, noise))
+        poses.append((round(time * S), place))
+    standing = [span for span, leg in zip(pairwise(edges), legs, strict=True) if leg[1] == 0]
+    return World(poses, standing, 1 / hz)
+
+
+def standstills_of(poses: Poses) -> tuple[Standstill, ...]:
+    builder = StandstillBuilder()
+    for time, position in poses:
+        builder.add(time, position)
+    return builder.standstills()
+
+
+CUTS = st.lists(st.floats(0, 1), max_size=8)
+"""Where a history is cut into bags, as parts of it."""
+
+
+def cuts_of(poses: Poses, parts: list[float]) -> list[int]:
+    return sorted({max(1, int(part * (len(poses) - 1))) for part in parts})
+
+
+def from_bags(poses: Poses, cuts: list[int]) -> tuple[Standstill, ...]:
+    """From bags that end before the poses at these places, as the catalogue gives them back."""
+    builder = StandstillBuilder()
+    for begin, end in pairwise([0, *cuts, len(poses)]):
+        collector = StandstillCollector()
+        for time, position in poses[begin:end]:
+            collector.add(time, position)
+        digest = collector.digest()
+        if digest is not None:
+            again = unpacked_standstills(packed_standstills(digest))
+            assert again == digest
+            builder.join(again)
+    return builder.standstills()
+
+
+def spans(standstills: tuple[Standstill, ...]) -> list[tuple[float, float]]:
+    return [(each.start / S, each.end / S) for each in standstills]
+
+
+def stood(standstills: tuple[Standstill, ...]) -> float:
+    return sum(end - start for start, end in spans(standstills))
+
+
+LEGS = st.lists(
+    st.tuples(
+        st.one_of(st.just(0.0), st.floats(2.9, 4.1), st.floats(4.1, 30.0)),
+        st.floats(1.0, 6.0),
+        st.sampled_from([-1.0, -0.4, 0.03, 0.05, 0.1, 0.5, 1.5]),
+    ),
+    min_size=1,
+    max_size=5,
+)
+
+
+@st.composite
+def worlds(draw: st.DrawFn, noise: float = 0.0) -> World:
+    """Standstills of 2.9 s and more at any phase, between drives."""
+    legs = [(1.5, 0.5)]
+    for standing, driving, speed in draw(LEGS):
+        legs += [(standing, 0.0)] if standing else []
+        legs += [(driving, speed)]
+    return world(
+        legs,
+        hz=draw(st.sampled_from([10, 20, 33, 50])),
+        begin=draw(st.floats(100.0, 110.0)),
+        noise=noise,
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(worlds())
+def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
+    period = made.period + 1e-6
+    found = spans(standstills_of(made.poses))
+    for start, end in found:
+        began, ended = min(made.standing, key=lambda span: abs(span[0] - start))
+        assert abs(start - began) <= period
+        assert abs(end - ended) <= period
+    long = [span for span in made.standing if span[1] - span[0] >= 3 + 2 * period]
+    possible = [span for span in made.standing if span[1] - span[0] >= 3 - 2 * period]
+    assert len(long) <= len(found) <= len(possible)
+
+
+@settings(max_examples=150, deadline=None)
+@given(worlds(), CUTS)
+def test_where_a_history_is_cut_into_bags_changes_no_end_by_more_than_a_message(
+    made: World, parts: list[float]
+) -> None:
+    cuts = cuts_of(made.poses, parts)
+    whole, cut = spans(standstills_of(made.poses)), spans(from_bags(made.poses, cuts))
+    sure = [span for span in whole if span[1] - span[0] >= 3 + 2 * made.period]
+    assert len(cut) >= len(sure)
+    for span in cut:
+        near = min(made.standing, key=lambda each: abs(each[0] - span[0]))
+        assert abs(span[0] - near[0]) <= made.period + 1e-6
+        assert abs(span[1] - near[1]) <= made.period + 1e-6
+
+
+@settings(max_examples=25, deadline=None)
+@given(worlds(noise=0.01), CUTS)
+def test_noise_is_cut_into_bags_as_it_is_found_without_cuts(
+    made: World, parts: list[float]
+) -> None:
+    cuts = cuts_of(made.poses, parts)
+    whole, cut = standstills_of(made.poses), from_bags(made.poses, cuts)
+    assert len(whole) == len(cut)
+    for one, other in zip(whole, cut, strict=True):
+        assert abs(one.start - other.start) <= made.period * S + 1
+        assert abs(one.end - other.end) <= made.period * S + 1
+
+
+@pytest.mark.parametrize("bag_s", [None, 1.0, 10.0, 60.0])
+def test_an_hour_of_standing_with_noise_of_a_centimetre_is_one_standstill(
+    bag_s: float | None,
+) -> None:
+    poses = world([(3600.0, 0.0)], noise=0.01).poses
+    cuts = [] if bag_s is None else list(range(int(bag_s * 50), len(poses), int(bag_s * 50)))
+    [found] = standstills_of(poses) if bag_s is None else from_bags(poses, cuts)
+    assert (found.end - found.start) / S == pytest.approx(3600, abs=0.1)
+    assert found.box.diagonal < 0.05
+    assert math.dist(found.box.centre, (0, 2, 0)) < 0.01
+
+
+@pytest.mark.parametrize("speed", [0.004, 0.005, 0.0065, 0.008, 0.01, 0.015, 0.02, 0.03, 0.05])
+@pytest.mark.parametrize("hz", [10, 50])
+def test_a_robot_that_creeps_does_not_stand(speed: float, hz: int) -> None:
+    poses = world([(361.0, speed)], hz=hz).poses
+    assert standstills_of(poses) == ()
+    assert from_bags(poses, list(range(77, len(poses), 150))) == ()
+
+
+@pytest.mark.parametrize("speed", [0.004, 0.005, 0.008])
+@pytest.mark.parametrize("noise", [0.0, 0.001])
+def test_a_creep_between_two_stops_is_parted_from_both(speed: float, noise: float) -> None:
+    made = world([(20.0, 0.0), (60.0, speed), (20.0, 0.0)], hz=20, noise=noise)
+    cuts = list(range(77, len(made.poses), 150))
+    for found in (standstills_of(made.poses), from_bags(made.poses, cuts)):
+        assert stood(found) == pytest.approx(40, abs=14)
+        assert all(each.end / S <= 127 or each.start / S >= 173 for each in found)
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.03, 0.05])
+def test_a_robot_that_creeps_under_noise_does_not_stand(speed: float) -> None:
+    made = world([(361.0, speed)], noise=0.01)
+    assert stood(standstills_of(made.poses)) < 4
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    st.floats(0.0, 0.06),
+    st.sampled_from([0.0, 0.001, 0.01]),
+    st.lists(st.integers(1, 5999), max_size=4, unique=True),
+)
+def test_the_box_of_a_standstill_does_not_grow_with_time(
+    speed: float, noise: float, cuts: list[int]
+) -> None:
+    poses = world([(120.0, speed)], noise=noise).poses
+    for found in (standstills_of(poses), from_bags(poses, sorted(cuts))):
+        for each in found:
+            inside = [place for time, place in poses if each.start <= time <= each.end]
+            farthest = max(math.dist(each.box.centre, place) for place in inside)
+            assert farthest <= LARGEST_M / 2 + 6 * noise + 0.005
+
+
+def test_a_standstill_that_drifts_away_ends_where_the_next_one_begins() -> None:
+    found = standstills_of(world([(300.0, 0.002)]).poses)
+    assert len(found) > 4
+    assert all(one.end == other.start for one, other in pairwise(found))
+    assert stood(found) == pytest.approx(300, abs=0.5)
+
+
+def test_standstills_among_noise_are_found_to_a_few_messages() -> None:
+    legs = [(4.0, 0.5), (8.0, 0.0), (4.0, -0.5), (3.6, 0.0), (4.0, 0.3), (30.0, 0.0), (2.0, 1.0)]
+    made = world(legs, noise=0.01)
+    found = spans(standstills_of(made.poses))
+    assert len(found) == 3
+    for span, truth in zip(found, made.standing, strict=True):
+        assert span == pytest.approx(truth, abs=0.35)
+
+
+def test_poses_once_a_second_of_a_robot_that_drives_are_no_standstill() -> None:
+    assert standstills_of(world([(30, 0.5)], hz=1).poses) == ()
+
+
+def test_poses_once_a_second_of_a_robot_that_stands_are_one_standstill() -> None:
+    poses = world([(29, 0.0)], hz=1).poses
+    for cuts in ([], [3], [1, 2, 3, 4], [9, 14, 20]):
+        [found] = from_bags(poses, cuts)
+        assert found.end - found.start == 29 * S
+
+
+def test_a_silence_ends_a_standstill() -> None:
+    poses = world([(5, 0.0)]).poses + world([(5, 0.0)], begin=200).poses
+    assert spans(standstills_of(poses)) == [(100.0, 105.0), (200.0, 205.0)]
+    for cuts in ([251], [100, 251, 400], [240, 260]):
+        assert spans(from_bags(poses, cuts)) == [(100.0, 105.0), (200.0, 205.0)]
+
+
+def test_a_jump_ends_a_standstill() -> None:
+    made = world([(5, 0.0)]).poses
+    poses = made + [(time + 5 * S + S // 50, (x + 3, y, z)) for time, (x, y, z) in made]
+    assert [round(each.box.centre[0], 3) for each in standstills_of(poses)] == [0.0, 3.0]
+
+
+@given(worlds(), CUTS)
+@settings(max_examples=30, deadline=None)
+def test_standstills_are_in_order_apart_and_long(made: World, parts: list[float]) -> None:
+    found = from_bags(made.poses, cuts_of(made.poses, parts))
+    times = {time for time, _ in made.poses}
+    for each in found:
+        assert each.end - each.start >= SHORTEST_NS
+        assert {each.start, each.end} <= times
+    assert all(one.end <= other.start for one, other in pairwise(found))
+
+
+@st.composite
+def restless(draw: st.DrawFn) -> Poses:
+    """A robot that stands under noise of any size at any rate, whose position may toggle."""
+    rate = draw(st.sampled_from([1, 2, 4, 5, 10, 20, 50]))
+    noise = draw(st.sampled_from([0.0, 0.003, 0.01, 0.015, 0.02, 0.03, 0.2]))
+    toggle = draw(st.sampled_from([0.0, 0.01, 0.03, 0.05]))
+    random_draw = random.Random(draw(st.integers(0, 10_000)))
+    begin = draw(st.integers(100 * S, 101 * S))
+    return [
+        (
+            begin + nth * S // rate,
+            (
+                random_draw.gauss(0, noise) + random_draw.choice([0.0, toggle]),
+                random_draw.gauss(0, noise),
+                0.0,
+            ),
+        )
+        for nth in range(min(60 * rate, 1500))
+    ]
+
+
+def check_disjoint(found: tuple[Standstill, ...], poses: Poses) -> None:
+    assert all(poses[0][0] <= each.start < each.end <= poses[-1][0] for each in found)
+    assert all(one.end <= other.start for one, other in pairwise(found))
+    assert sum(each.end - each.start for each in found) <= poses[-1][0] - poses[0][0]
+
+
+@settings(max_examples=150, deadline=None)
+@given(restless(), CUTS)
+def test_standstills_under_any_noise_are_in_order_and_disjoint(
+    poses: Poses, parts: list[float]
+) -> None:
+    check_disjoint(standstills_of(poses), poses)
+    check_disjoint(from_bags(poses, cuts_of(poses, parts)), poses)
+
+
+@pytest.mark.parametrize("noise", [0.015, 0.02])
+@pytest.mark.parametrize("bag_s", [None, 7])
+def test_a_robot_that_stands_under_noise_does_not_stand_longer_than_there_are_poses(
+    noise: float, bag_s: int | None
+) -> None:
+    poses = world([(1800.0, 0.0)], hz=10, noise=noise).poses
+    found = from_bags(poses, [] if bag_s is None else [*range(bag_s * 10, 18_000, bag_s * 10)])
+    check_disjoint(found, poses)
+    assert stood(found) > 900
+
+
+def test_any_number_of_poses_at_one_time_are_held_as_few() -> None:
+    collector = StandstillCollector()
+    for nth in range(20_000):
+        collector.add(S, (nth * 0.1, 0.0, 0.0))
+    digest = collector.digest()
+    assert digest is not None
+    assert len(digest.head) < 40_000
+
+
+def test_a_single_pose_is_no_standstill() -> None:
+    assert standstills_of([(S, (0.0, 0.0, 0.0))]) == ()
+
+
+def test_without_poses_there_is_no_digest() -> None:
+    assert StandstillCollector().digest() is None
+
+
+def test_bytes_that_are_no_digest_are_refused() -> None:
+    collector = StandstillCollector()
+    for time, position in world([(9, 0.0)]).poses:
+        collector.add(time, position)
+    digest = collector.digest()
+    assert digest is not None
+    packed = packed_standstills(digest)
+    for wrong in (b"", packed[:-5], packed[:9] + b"x" + packed[10:]):
+        with pytest.raises(ValueError, match="not a digest of standstills"):
+            unpacked_standstills(wrong)

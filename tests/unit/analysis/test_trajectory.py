@@ -1,0 +1,427 @@
+from __future__ import annotations
+
+import json
+import math
+import random
+from itertools import accumulate, pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.trajectory import (
+    TOLERANCE_M,
+    PoseCollector,
+    Trajectory,
+    TrajectoryBuilder,
+)
+from ros2_memory.core.model import Pose
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
+from tests.real_messages import messages
+from tests.shared_bags import REAL, needs_real
+from tests.strategies import points
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from ros2_memory.core.model import Vector3
+
+S = NS_PER_S
+MS = NS_PER_MS
+START = 1_700_000_000 * S
+LIMIT_MPS = 10.0
+
+
+def driven(
+    positions: Iterable[Vector3], step_ns: int = S, speeds: Iterable[float] | None = None
+) -> list[tuple[int, Pose, float | None]]:
+    """Poses at even steps of log time, with the messages' own speeds where given."""
+    stated = iter(speeds) if speeds is not None else None
+    return [
+        (START + index * step_ns, Pose(position, None), next(stated) if stated else None)
+        for index, position in enumerate(positions)
+    ]
+
+
+def along_x(*metres: float) -> list[Vector3]:
+    return [(x, 0.0, 0.0) for x in metres]
+
+
+def summarise(
+    poses: Iterable[tuple[int, Pose, float | None]],
+    max_plausible_speed_mps: float,
+    max_waypoints: int = 50,
+    tolerance_m: float = TOLERANCE_M,
+) -> Trajectory:
+    builder = TrajectoryBuilder(max_plausible_speed_mps, max_waypoints, tolerance_m)
+    for time, pose, speed in poses:
+        builder.add(time, pose, speed)
+    return builder.result()
+
+
+def path_length(positions: Iterable[Vector3]) -> float:
+    return math.fsum(math.dist(a, b) for a, b in pairwise(positions))
+
+
+def off_polyline(position: Vector3, vertices: Sequence[Vector3]) -> float:
+    """Distance from a polyline, written independently of the code under test."""
+    p = np.array(position)
+    starts = np.array(vertices[:-1] or vertices)
+    ways = np.array(vertices[1:] or vertices) - starts
+    squared = np.maximum((ways * ways).sum(axis=1), 1e-300)
+    ratios = np.clip(((p - starts) * ways).sum(axis=1) / squared, 0.0, 1.0)
+    return float(np.linalg.norm(starts + ratios[:, None] * ways - p, axis=1).min())
+
+
+def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
+    vertices = [waypoint.position for waypoint in found.waypoints]
+    return max(off_polyline(position, vertices) for position in positions)
+
+
+# Distance and speed
+
+
+def test_a_known_path_has_its_length_duration_and_mean_speed() -> None:
+    square: list[Vector3] = [(0, 0, 0), (3, 0, 0), (3, 4, 0), (0, 4, 0), (0, 0, 0)]
+    found = summarise(driven(square, 2 * S), LIMIT_MPS)
+    assert (found.distance_m, found.duration_s, found.poses) == (14.0, 8.0, 5)
+    assert found.avg_speed == 14.0 / 8.0
+    assert found.max_speed == 2.0
+    assert found.max_speed_from == "positions"
+
+
+def test_poses_at_ten_hertz_each_tell_a_speed() -> None:
+    found = summarise(driven(along_x(0, 0.1, 0.2, 0.7, 0.8), 100 * MS), LIMIT_MPS)
+    assert found.max_speed == pytest.approx(5.0)
+
+
+def test_height_counts_in_the_length() -> None:
+    assert summarise(driven([(0, 0, 0), (0, 3, 4)]), LIMIT_MPS).distance_m == 5.0
+
+
+# Of these none is at the origin, where odometry may have begun anew.
+elsewhere = points.map(lambda point: (abs(point[0]) + 10, point[1], point[2]))
+
+
+@given(st.lists(elsewhere, min_size=2, max_size=15))
+def test_of_few_poses_the_distance_is_the_plain_length(
+    positions: list[Vector3],
+) -> None:
+    found = summarise(driven(positions), 1e9)
+    assert found.distance_m == pytest.approx(path_length(positions), rel=1e-12)
+    assert found.jumps == 0
+    assert found.max_speed >= found.avg_speed
+
+
+@given(st.lists(elsewhere, min_size=1, max_size=7), st.lists(elsewhere, max_size=7))
+def test_distances_of_two_parts_that_share_a_pose_add_up(
+    before: list[Vector3], after: list[Vector3]
+) -> None:
+    whole = summarise(driven([*before, *after]), 1e9).distance_m
+    parts = [summarise(driven(part), 1e9).distance_m for part in (before, [before[-1], *after])]
+    assert whole == pytest.approx(sum(parts), rel=1e-9, abs=1e-9)
+
+
+def test_no_pose_makes_an_empty_trajectory() -> None:
+    assert summarise([], LIMIT_MPS) == Trajectory(
+        0.0, 0.0, 0.0, 0.0, "positions", (), 0.0, 0, 0, 0, 0.0
+    )
+
+
+def test_one_pose_is_a_place_without_a_way() -> None:
+    found = summarise(driven(along_x(2.0)), LIMIT_MPS)
+    assert (found.distance_m, found.duration_s, found.avg_speed) == (0.0, 0.0, 0.0)
+    assert [waypoint.position for waypoint in found.waypoints] == [(2.0, 0.0, 0.0)]
+
+
+def test_the_highest_speed_is_the_messages_own_where_they_state_one() -> None:
+    found = summarise(driven(along_x(0, 1, 2), speeds=[0.5, 1.25, 1.0]), LIMIT_MPS)
+    assert (found.max_speed, found.max_speed_from) == (1.25, "twist")
+
+
+def test_a_speed_that_is_no_number_is_not_the_highest() -> None:
+    found = summarise(driven(along_x(0, 1, 2), speeds=[math.nan, 1.25, math.inf]), LIMIT_MPS)
+    assert found.max_speed == 1.25
+
+
+def test_a_twist_that_nobody_fills_in_does_not_say_that_a_moving_robot_stood() -> None:
+    moved = summarise(driven(along_x(0, 1, 3), speeds=[0.0, 0.0, 0.0]), LIMIT_MPS)
+    assert (moved.max_speed, moved.max_speed_from) == (2.0, "positions")
+    stood = summarise(driven(along_x(1, 1, 1), speeds=[0.0, 0.0, 0.0]), LIMIT_MPS)
+    assert (stood.max_speed, stood.max_speed_from) == (0.0, "twist")
+
+
+def test_poses_that_arrive_in_a_burst_do_not_make_the_robot_fast() -> None:
+    # 1 m/s at 50 Hz; half a second of it is delivered within 25 ms, as after a stalled transport.
+    even = [(START + i * 20 * MS, (i * 0.02, 0.0, 0.0)) for i in range(200)]
+    late = START + 125 * 20 * MS
+    burst = [
+        (late - (125 - i) * MS if 100 <= i < 125 else time, position)
+        for i, (time, position) in enumerate(even)
+    ]
+    found = summarise([(time, Pose(position, None), None) for time, position in burst], LIMIT_MPS)
+    assert found.jumps == 0
+    assert found.distance_m == pytest.approx(199 * 0.02)
+    assert found.max_speed < 6.0
+
+
+def test_poses_of_one_moment_are_a_way_and_no_division_by_zero() -> None:
+    found = summarise(driven(along_x(0.0, 0.3, 0.6), 0), LIMIT_MPS)
+    assert (found.distance_m, found.duration_s, found.avg_speed) == (0.6, 0.0, 0.0)
+    assert (found.jumps, found.max_speed) == (0, 0.0)
+
+
+# Jumps and invalid poses
+
+
+def test_a_jump_is_left_out_of_distance_and_speed_and_is_counted() -> None:
+    found = summarise(driven(along_x(0, 1, 101, 102, 2, 3)), LIMIT_MPS)
+    assert (found.jumps, found.jumped_m) == (2, 200.0)
+    assert found.distance_m == 3.0
+    assert found.max_speed == 1.0
+    assert found.duration_s == 5.0
+
+
+def test_both_ends_of_a_jump_are_drawn_and_nothing_between_them() -> None:
+    found = summarise(driven(along_x(0, 1, 2, 102, 103, 104, 5, 6)), LIMIT_MPS)
+    assert [(point.position[0], point.jump) for point in found.waypoints] == [
+        (0.0, False),
+        (2.0, False),
+        (102.0, True),
+        (104.0, False),
+        (5.0, True),
+        (6.0, False),
+    ]
+
+
+def test_a_robot_that_stands_before_and_after_a_jump_is_drawn_until_it_jumps() -> None:
+    poses = driven([*[(0.001 * (i % 2), 0.0, 0.0) for i in range(9)], *along_x(90, 90, 91)])
+    found = summarise(poses, LIMIT_MPS)
+    assert [(point.time, point.jump) for point in found.waypoints] == [
+        (poses[0][0], False),
+        (poses[8][0], False),
+        (poses[9][0], True),
+        (poses[-1][0], False),
+    ]
+
+
+def test_of_more_jumps_than_can_be_drawn_the_longest_are() -> None:
+    jumping = [100.0 * (n % 2) + n * (n == 31) for n in range(60)]
+    found = summarise(driven(along_x(*jumping)), LIMIT_MPS, 12)
+    assert found.jumps == 59
+    assert len(found.waypoints) <= 12
+    assert sum(point.jump for point in found.waypoints) == 5
+    assert 131.0 in [point.position[0] for point in found.waypoints if point.jump]
+
+
+@given(
+    st.lists(st.sampled_from([0.0, 0.5, 1.0, 40.0, 90.0]), min_size=2, max_size=40),
+    st.integers(1, 38),
+)
+def test_jumps_are_drawn_alike_pose_by_pose_and_from_parts(steps: list[float], cut: int) -> None:
+    poses = driven(along_x(*accumulate(steps)))
+    builder, digests = TrajectoryBuilder(LIMIT_MPS, 200), []
+    for part in (poses[:cut], poses[cut:]):
+        collector = PoseCollector(LIMIT_MPS)
+        for time, pose, speed in part:
+            collector.add(time, pose, speed)
+        digests.append(collector.digest())
+    for digest in digests:
+        builder.join(digest)
+    whole, joined = summarise(poses, LIMIT_MPS, 200), builder.result()
+    drawable = all(digest.jumps <= 15 for digest in digests)
+    assert [point.position for point in joined.waypoints if point.jump] == [
+        point.position for point in whole.waypoints if point.jump
+    ] or not drawable
+
+
+def test_a_path_in_very_many_pieces_is_held_in_bounded_memory() -> None:
+    builder = TrajectoryBuilder(LIMIT_MPS)
+    for n in range(6000):
+        builder.add(n * S, Pose((100.0 * (n % 3), 0.0, 0.0), None))
+    assert builder.vertices < 25_000
+    found = builder.result()
+    assert (found.jumps, len(found.waypoints) <= 50) == (5999, True)
+
+
+def test_exactly_the_plausible_speed_is_no_jump() -> None:
+    found = summarise(driven(along_x(*(0.1 * i for i in range(50))), 10 * MS * 10), 1.0)
+    assert found.jumps == 0
+
+
+@pytest.mark.parametrize(("step_m", "jumps"), [(0.99, 0), (1.01, 1)])
+def test_a_step_is_granted_the_jitter_of_its_arrival(step_m: float, jumps: int) -> None:
+    assert summarise(driven(along_x(0.0, step_m), MS), LIMIT_MPS).jumps == jumps
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_pose_that_is_no_place_is_left_out_and_counted(bad: float, axis: int) -> None:
+    position = [1.0, 0.0, 0.0]
+    position[axis] = bad
+    poses = driven([(0.0, 0.0, 0.0), (position[0], position[1], position[2]), (2.0, 0.0, 0.0)])
+    found = summarise(poses, LIMIT_MPS)
+    assert (found.poses, found.invalid, found.distance_m) == (2, 1, 2.0)
+    assert all(math.isfinite(part) for point in found.waypoints for part in point.position)
+
+
+def test_only_invalid_poses_make_an_empty_trajectory() -> None:
+    found = summarise(driven([(math.nan, 0.0, 0.0)] * 3), LIMIT_MPS)
+    assert (found.poses, found.invalid, found.waypoints) == (0, 3, ())
+
+
+# Waypoints
+
+
+@given(st.lists(points, min_size=1, max_size=60), st.integers(2, 60))
+def test_no_pose_lies_farther_from_the_waypoints_than_is_told(
+    positions: list[Vector3], at_most: int
+) -> None:
+    found = summarise(driven(positions), LIMIT_MPS, at_most)
+    assert farthest_off(positions, found) <= found.waypoint_error_m + 1e-7
+    assert len(found.waypoints) <= at_most
+    assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most or found.jumps
+
+
+@given(st.lists(points, min_size=1, max_size=60), st.floats(0.01, 100.0))
+def test_enough_waypoints_stay_within_the_tolerance(
+    positions: list[Vector3], tolerance_m: float
+) -> None:
+    found = summarise(driven(positions), LIMIT_MPS, 1000, tolerance_m)
+    assert found.waypoint_error_m <= tolerance_m * (1 + 1e-9)
+    assert farthest_off(positions, found) <= tolerance_m + 1e-7
+
+
+@given(st.lists(points, min_size=2, max_size=60))
+def test_waypoints_are_recorded_poses_from_the_first_to_the_last(positions: list[Vector3]) -> None:
+    poses = driven(positions)
+    recorded = {time: pose.position for time, pose, _ in poses}
+    found = summarise(poses, LIMIT_MPS).waypoints
+    assert all(recorded[waypoint.time] == waypoint.position for waypoint in found)
+    times = [waypoint.time for waypoint in found]
+    assert times == sorted(set(times))
+    assert (times[0], times[-1]) == (poses[0][0], poses[-1][0])
+
+
+def test_a_straight_way_needs_its_ends_only() -> None:
+    found = summarise(driven(along_x(*range(100))), LIMIT_MPS)
+    assert [waypoint.position[0] for waypoint in found.waypoints] == [0, 99]
+
+
+def test_a_waypoint_carries_its_heading_where_the_pose_has_one() -> None:
+    x, y, z, w = 0.0, 0.0, math.sin(0.25), math.cos(0.25)
+    poses = [
+        (START, Pose((0.0, 0.0, 0.0), (2 * x, 2 * y, 2 * z, 2 * w)), None),
+        (START + S, Pose((1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)), None),
+        (START + 2 * S, Pose((1.0, 1.0, 0.0), None), None),
+    ]
+    headings = [waypoint.yaw_rad for waypoint in summarise(poses, LIMIT_MPS).waypoints]
+    assert headings == [pytest.approx(0.5), None, None]
+
+
+def test_the_end_of_a_long_stand_is_the_last_waypoint() -> None:
+    poses = driven([*along_x(0, 1), *[(1.0, 0.001 * (i % 3), 0.0) for i in range(50)]])
+    assert summarise(poses, LIMIT_MPS).waypoints[-1].time == poses[-1][0]
+
+
+# Long ways
+
+
+def _noisy_laps(count: int, noise_m: float) -> list[Vector3]:
+    draw = random.Random(3)
+    return [
+        (
+            5 * math.sin(i / 800) + draw.gauss(0, noise_m),
+            5 * math.sin(i / 400) + draw.gauss(0, noise_m),
+            draw.gauss(0, noise_m),
+        )
+        for i in range(count)
+    ]
+
+
+@pytest.mark.parametrize(("noise_m", "count"), [(0.0, 30_000), (0.05, 60_000)])
+def test_a_long_way_is_drawn_in_bounded_memory(noise_m: float, count: int) -> None:
+    positions = _noisy_laps(count, noise_m)
+    builder = TrajectoryBuilder(LIMIT_MPS, 2000)
+    held = 0
+    for time, pose, speed in driven(positions, 20 * MS):
+        builder.add(time, pose, speed)
+        held = max(held, builder.vertices)
+    found = builder.result()
+    assert held <= 25_000
+    assert found.path_sum_m == pytest.approx(path_length(positions), rel=1e-9)
+    assert farthest_off(positions[::37], found) <= found.waypoint_error_m + 1e-9
+    assert found.waypoint_error_m < (0.05 if noise_m == 0 else 1.0)
+
+
+def test_a_summary_may_be_read_while_poses_still_come() -> None:
+    builder = TrajectoryBuilder(LIMIT_MPS)
+    poses = driven(along_x(0, 1, 2, 2, 2))
+    for time, pose, _ in poses[:3]:
+        builder.add(time, pose)
+    assert builder.result() == summarise(poses[:3], LIMIT_MPS)
+    for time, pose, _ in poses[3:]:
+        builder.add(time, pose)
+    assert builder.result() == summarise(poses, LIMIT_MPS)
+
+
+@pytest.mark.parametrize(
+    "limits", [(0.0, 50, 0.05), (math.nan, 50, 0.05), (10.0, 1, 0.05), (10.0, 50, 0.0)]
+)
+def test_limits_that_allow_nothing_are_refused(limits: tuple[float, int, float]) -> None:
+    with pytest.raises(ValueError, match="a trajectory needs"):
+        TrajectoryBuilder(*limits)
+
+
+# Public robots
+
+PUBLIC = {
+    ("plotjuggler_pose_db3", "/pose"): "rosbag2_2020_05_03-09_38_43_0.db3",
+    ("mobrob_odom_mcap", "/odom"): "odom_bag_0.mcap",
+    ("cougars_auv_mcap", "/coug2/dvl/dead_reckoning"): "SO_bag_0.mcap",
+    ("cougars_auv_mcap", "/coug2/gps_odom"): "SO_bag_0.mcap",
+    ("novatel_customtypes_nometa_db3", "/novatel/oem7/odom"): "bestpos.db3",
+}
+
+
+def _recorded(name: str, topic: str) -> list[tuple[int, Pose, float | None]]:
+    poses: list[tuple[int, Pose, float | None]] = []
+    for log_time, message in messages(f"{name}/{PUBLIC[name, topic]}", topic):
+        speed = None
+        if hasattr(message, "twist"):
+            linear = message.twist.twist.linear
+            speed = math.hypot(linear.x, linear.y, linear.z)
+        pose = message.pose
+        while hasattr(pose, "pose"):
+            pose = pose.pose
+        position, q = pose.position, pose.orientation
+        held = Pose((position.x, position.y, position.z), (q.x, q.y, q.z, q.w))
+        poses.append((log_time, held, speed))
+    return poses
+
+
+@needs_real
+@pytest.mark.parametrize(("name", "topic"), PUBLIC)
+def test_ways_of_public_robots_are_as_long_as_independent_tools_say(name: str, topic: str) -> None:
+    expected = json.loads((REAL / "expected.json").read_text())[name]["expected"]["trajectories"]
+    poses = _recorded(name, topic)
+    found = summarise(poses, LIMIT_MPS, 1000)
+    assert found.poses == expected[topic]["n"]
+    assert found.jumps == 0
+    assert found.distance_m == pytest.approx(
+        expected[topic]["path_length_3d_m_log_order"], abs=1e-6
+    )
+    assert farthest_off([pose.position for _, pose, _ in poses], found) <= 0.05
+
+
+@needs_real
+def test_the_nan_positions_of_a_public_robot_are_counted_and_make_no_way() -> None:
+    poses = [
+        (log_time, Pose((p.x, p.y, p.z), None), None)
+        for log_time, message in messages("cougars_auv_mcap/SO_bag_0.mcap", "/coug2/odom")
+        for p in (message.pose.pose.position,)
+    ]
+    found = summarise(poses, LIMIT_MPS)
+    assert (found.invalid, found.poses, found.distance_m) == (3, 0, 0.0)

@@ -1,0 +1,465 @@
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyped]
+
+from ros2_memory.analysis.transform_tree import (
+    TF_CACHE_NS,
+    FrameEdge,
+    FrameGraph,
+    agreeing_clock,
+)
+from ros2_memory.core.errors import NoDataError, NoDataReason
+from ros2_memory.core.geometry import IDENTITY, invert
+from ros2_memory.core.model import StampedTransform, Transform
+from ros2_memory.core.timebase import NS_PER_S, ns_from_unix
+from tests.real_messages import stamped_transforms
+from tests.shared_bags import REAL, needs_real
+from tests.strategies import transforms
+
+S = NS_PER_S
+FILES = {
+    "evo_tf_example_db3": "evo_tf_example_db3/tf_example.db3",
+    "cougars_auv_mcap": "cougars_auv_mcap/SO_bag_0.mcap",
+}
+
+
+def edge(
+    parent: str,
+    child: str,
+    time: int,
+    transform: Transform | float = IDENTITY,
+    *,
+    log_time: int | None = None,
+    static: bool = False,
+) -> StampedTransform:
+    """An edge stamped at `time`; a number stands for a shift along x."""
+    held = (
+        transform
+        if isinstance(transform, Transform)
+        else Transform((transform, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    )
+    return StampedTransform(
+        parent, child, time, time if log_time is None else log_time, held, static
+    )
+
+
+def shift(graph: FrameGraph, parent: str, child: str, time: int) -> float:
+    return graph.lookup(parent, child, time).transform.translation[0]
+
+
+def refusal(graph: FrameGraph, parent: str, child: str, time: int) -> NoDataError:
+    with pytest.raises(NoDataError) as refused:
+        graph.lookup(parent, child, time)
+    return refused.value
+
+
+def moving(child: str = "base", parent: str = "odom") -> list[StampedTransform]:
+    """One metre a second along x, at 100 to 105 s."""
+    return [edge(parent, child, (100 + i) * S, float(i)) for i in range(6)]
+
+
+# Composition
+
+
+@st.composite
+def trees(draw: st.DrawFn) -> list[StampedTransform]:
+    """A random tree of static edges: the parent of frame i is some earlier frame."""
+    count = draw(st.integers(2, 8))
+    return [
+        edge(f"f{draw(st.integers(0, i - 1))}", f"f{i}", 0, draw(transforms), static=True)
+        for i in range(1, count)
+    ]
+
+
+def matrix(t: Transform) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    homogeneous = np.eye(4)
+    homogeneous[:3, :3] = Rotation.from_quat(t.rotation).as_matrix()
+    homogeneous[:3, 3] = t.translation
+    return homogeneous
+
+
+@given(trees(), st.data())
+def test_a_lookup_is_the_product_of_the_matrices_on_the_way(
+    tree: list[StampedTransform], data: st.DataObject
+) -> None:
+    in_root = {"f0": np.eye(4)}
+    for held in tree:
+        in_root[held.child] = in_root[held.parent] @ matrix(held.transform)
+    names = st.sampled_from(sorted(in_root))
+    parent, child = data.draw(names), data.draw(names)
+    found = FrameGraph(tree).lookup(parent, child, 5).transform
+    assert np.allclose(matrix(found), np.linalg.inv(in_root[parent]) @ in_root[child], atol=1e-7)
+
+
+@given(trees(), st.data())
+def test_a_lookup_backwards_is_the_inverse(
+    tree: list[StampedTransform], data: st.DataObject
+) -> None:
+    graph = FrameGraph(tree)
+    names = st.sampled_from(graph.names())
+    a, b = data.draw(names), data.draw(names)
+    forth, back = graph.lookup(a, b, 5).transform, graph.lookup(b, a, 5).transform
+    assert np.allclose(matrix(forth), matrix(invert(back)), atol=1e-7)
+
+
+def test_a_frame_in_itself_is_the_identity_whenever_it_is_asked() -> None:
+    assert FrameGraph(moving()).lookup("base", "base", 7).transform == IDENTITY
+
+
+def test_frames_on_two_branches_meet_at_their_common_ancestor() -> None:
+    # The edge above the common ancestor knows nothing of this time, and need not.
+    graph = FrameGraph(
+        [
+            edge("map", "odom", 1 * S),
+            edge("odom", "base", 100 * S, 3.0),
+            edge("base", "laser", 0, 0.5, static=True),
+            edge("base", "camera", 0, 2.0, static=True),
+        ]
+    )
+    assert shift(graph, "laser", "camera", 100 * S) == 1.5
+    assert shift(graph, "odom", "camera", 100 * S) == 5.0
+
+
+def test_an_answer_carries_the_time_that_was_asked() -> None:
+    assert FrameGraph(moving()).lookup("odom", "base", 102 * S + 7).time == 102 * S + 7
+
+
+# Interpolation
+
+
+@given(transforms, transforms, st.integers(0, TF_CACHE_NS))
+def test_between_two_messages_translation_is_linear_and_rotation_slerp(
+    first: Transform, second: Transform, after: int
+) -> None:
+    start = 1_700_000_000 * S
+    graph = FrameGraph([edge("a", "b", start, first), edge("a", "b", start + TF_CACHE_NS, second)])
+    found = graph.lookup("a", "b", start + after).transform
+    ratio = after / TF_CACHE_NS
+    ends = Rotation.from_quat([first.rotation, second.rotation])
+    line = np.array(first.translation) * (1 - ratio) + np.array(second.translation) * ratio
+    assert found.translation == pytest.approx(tuple(line), abs=1e-8)
+    if (ends[0].inv() * ends[1]).magnitude() < math.pi - 1e-3:
+        expected = Slerp([0, 1], ends)(ratio)
+        assert (Rotation.from_quat(found.rotation).inv() * expected).magnitude() < 1e-6
+
+
+@given(st.permutations(moving()), st.integers(100 * S, 105 * S))
+def test_messages_may_come_in_any_order(shuffled: list[StampedTransform], time: int) -> None:
+    assert shift(FrameGraph(shuffled), "odom", "base", time) == pytest.approx(time / S - 100)
+
+
+def test_at_a_messages_own_time_its_transform_holds_exactly() -> None:
+    odd = Transform((0.1, 0.2, 0.3), (0.5, 0.5, 0.5, 0.5))
+    graph = FrameGraph([edge("a", "b", 1, 1.0), edge("a", "b", 2, odd), edge("a", "b", 3, 1.0)])
+    assert graph.lookup("a", "b", 2).transform == odd
+
+
+def test_of_two_messages_for_one_time_the_later_received_holds() -> None:
+    first, second = edge("a", "b", 5, 1.0, log_time=10), edge("a", "b", 5, 2.0, log_time=11)
+    for order in ([first, second], [second, first]):
+        assert shift(FrameGraph(order), "a", "b", 5) == 2.0
+
+
+def test_of_two_transforms_in_one_message_the_last_holds() -> None:
+    assert shift(FrameGraph([edge("a", "b", 5, 1.0), edge("a", "b", 5, 2.0)]), "a", "b", 5) == 2.0
+
+
+def test_a_quaternion_that_is_not_of_unit_length_is_normalised() -> None:
+    graph = FrameGraph([edge("a", "b", 0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 2.0, 2.0)))])
+    assert graph.lookup("a", "b", 0).transform.rotation == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
+    assert graph.skipped == 0
+
+
+# Parents that change
+
+
+def picked_up() -> FrameGraph:
+    """A cup stands on the table (at 1 m) at 10 and 12 s, and is in the gripper at 14 and 16 s."""
+    return FrameGraph(
+        [
+            edge("map", "table", 0, 1.0, static=True),
+            edge("map", "gripper", 0, 5.0, static=True),
+            edge("table", "cup", 10 * S, 0.0),
+            edge("table", "cup", 12 * S, 0.2),
+            edge("gripper", "cup", 14 * S, 0.0),
+            edge("gripper", "cup", 16 * S, 0.2),
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("second", "place"), [(11, 1.1), (12, 1.2), (13, 1.2), (14, 5.0), (15, 5.1)]
+)
+def test_between_two_parents_the_earlier_message_holds_as_it_is(second: int, place: float) -> None:
+    assert shift(picked_up(), "map", "cup", second * S) == pytest.approx(place)
+
+
+def test_every_pair_that_ever_was_is_listed() -> None:
+    assert picked_up().frames() == [
+        FrameEdge("gripper", "cup", static=False),
+        FrameEdge("map", "gripper", static=True),
+        FrameEdge("map", "table", static=True),
+        FrameEdge("table", "cup", static=False),
+    ]
+    assert picked_up().names() == ["cup", "gripper", "map", "table"]
+
+
+def test_frames_that_the_tree_connects_only_at_other_times_are_not_connected_then() -> None:
+    graph = FrameGraph(
+        [edge("a", "cup", 10 * S), edge("a", "cup", 12 * S), edge("b", "cup", 14 * S)]
+    )
+    assert shift(graph, "b", "cup", 14 * S) == 0.0
+    refused = refusal(graph, "b", "cup", 11 * S)
+    assert refused.reason is NoDataReason.FRAMES_NOT_CONNECTED
+    assert "were not connected at 11.000000" in refused.detail
+
+
+@pytest.mark.parametrize("static", [True, False])
+def test_a_loop_is_an_answer_and_not_an_endless_walk(static: bool) -> None:
+    graph = FrameGraph(
+        [
+            edge("b", "a", 5, 1.0, static=static),
+            edge("c", "b", 5, 1.0, static=static),
+            edge("b", "c", 5, 1.0, static=static),
+            edge("other", "thing", 5, static=static),
+        ]
+    )
+    assert refusal(graph, "thing", "a", 5).reason is NoDataReason.FRAMES_NOT_CONNECTED
+    assert shift(graph, "b", "a", 5) == 1.0
+
+
+# Static transforms
+
+
+@pytest.mark.parametrize("time", [0, 10**18, 2**62])
+def test_a_static_transform_holds_at_all_times(time: int) -> None:
+    graph = FrameGraph([edge("base", "laser", 500 * S, 0.3, static=True)])
+    assert shift(graph, "base", "laser", time) == 0.3
+
+
+def test_of_several_static_transforms_the_newest_received_holds() -> None:
+    older = edge("base", "laser", 900, 1.0, log_time=10, static=True)
+    again = edge("base", "laser", 900, 3.0, log_time=10, static=True)
+    assert shift(FrameGraph([older, again]), "base", "laser", 0) == 3.0
+    newer = edge("torso", "laser", 5, 2.0, log_time=20, static=True)
+    for order in ([older, newer], [newer, older]):
+        graph = FrameGraph(order)
+        assert shift(graph, "torso", "laser", 0) == 2.0
+        assert graph.frames() == [FrameEdge("torso", "laser", static=True)]
+
+
+def test_a_child_published_both_ways_is_dynamic_where_its_messages_reach() -> None:
+    graph = FrameGraph([edge("odom", "base", 0, 9.0, static=True), *moving()])
+    assert shift(graph, "odom", "base", 102 * S) == 2.0
+    assert shift(graph, "odom", "base", 99 * S) == 9.0
+    assert graph.frames() == [FrameEdge("odom", "base", static=False)]
+
+
+# What is left out
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        edge("odom", "base", 103 * S + 1, math.nan),
+        edge("odom", "base", 103 * S + 1, math.inf),
+        edge("odom", "base", 103 * S + 1, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))),
+        edge("odom", "base", 103 * S + 1, Transform((0.0, 0.0, 0.0), (0.0, 0.0, math.nan, 1.0))),
+        edge("base", "/base", 103 * S + 1),
+        edge("", "base", 103 * S + 1),
+        edge("odom", "/", 103 * S + 1),
+    ],
+)
+def test_a_transform_that_says_nothing_is_left_out_and_counted(bad: StampedTransform) -> None:
+    graph = FrameGraph([*moving(), bad])
+    assert graph.skipped == 1
+    assert graph.names() == ["base", "odom"]
+    assert shift(graph, "odom", "base", 103 * S + 1) == pytest.approx(3.0)
+
+
+def test_a_leading_slash_is_no_part_of_a_name() -> None:
+    graph = FrameGraph([edge("/odom", "base", 5, 1.0), edge("base", "/laser", 5, 1.0)])
+    assert graph.names() == ["base", "laser", "odom"]
+    assert shift(graph, "odom", "/laser", 5) == 2.0
+
+
+# Refusals
+
+
+def test_an_unknown_frame_is_named_with_those_spelled_alike() -> None:
+    graph = FrameGraph([edge("odom", "base_link", 5), edge("base_link", "robot1/camera", 5)])
+    refused = refusal(graph, "odom", "bas_link", 5)
+    assert refused.reason is NoDataReason.FRAME_UNKNOWN
+    assert "'bas_link'" in refused.detail
+    assert "similar: base_link" in refused.detail
+    assert "robot1/camera" in refusal(graph, "Camera", "odom", 5).detail
+
+
+def test_an_unknown_frame_that_is_like_none_is_told_which_there_are() -> None:
+    refused = refusal(FrameGraph(moving()), "odom", "zzz", 5)
+    assert "there are: base, odom" in refused.detail
+    many = FrameGraph([edge("odom", f"wheel_{i:02}", 5) for i in range(30)])
+    assert refusal(many, "odom", "zzz", 5).detail.endswith("and 19 more")
+
+
+def test_an_unknown_frame_in_itself_is_unknown_too() -> None:
+    assert refusal(FrameGraph(moving()), "x", "x", 5).reason is NoDataReason.FRAME_UNKNOWN
+
+
+def test_without_any_transform_every_frame_is_unknown() -> None:
+    refused = refusal(FrameGraph([]), "odom", "base", 5)
+    assert refused.reason is NoDataReason.FRAME_UNKNOWN
+    assert "no transform at all" in refused.detail
+
+
+def test_frames_of_two_trees_are_told_their_roots() -> None:
+    graph = FrameGraph([*moving(), edge("map", "goal", 5), edge("goal", "tip", 5)])
+    refused = refusal(graph, "tip", "base", 102 * S)
+    assert refused.reason is NoDataReason.FRAMES_NOT_CONNECTED
+    assert "'tip' stands in the tree of 'map', 'base' in that of 'odom'" in refused.detail
+    assert "connected to 'base': odom" in refused.detail
+
+
+@pytest.mark.parametrize(("time", "off"), [(90 * S, "10.000 s after"), (107 * S, "2.000 s before")])
+def test_nothing_is_extrapolated_and_the_range_of_the_edge_is_told(time: int, off: str) -> None:
+    graph = FrameGraph([*moving(), edge("map", "odom", 0, static=True)])
+    refused = refusal(graph, "map", "base", time)
+    assert refused.reason is NoDataReason.OUTSIDE_RANGE
+    assert "no transform of 'base' in 'odom'" in refused.detail
+    assert f"100.000000 to 105.000000 (Unix seconds), {off} the time asked" in refused.detail
+    assert refusal(graph, "base", "map", time).detail == refused.detail
+
+
+def test_a_single_message_answers_at_its_own_time_only() -> None:
+    graph = FrameGraph([edge("odom", "base", 5 * S, 1.0)])
+    assert shift(graph, "odom", "base", 5 * S) == 1.0
+    assert "only at 5.000000" in refusal(graph, "odom", "base", 6 * S).detail
+
+
+def test_a_gap_wider_than_the_cache_is_told_with_both_its_edges() -> None:
+    graph = FrameGraph([edge("odom", "base", 100 * S, 1.0), edge("odom", "base", 111 * S, 2.0)])
+    refused = refusal(graph, "odom", "base", 104 * S)
+    assert refused.reason is NoDataReason.GAP
+    assert "100.000000 (4.000 s before) and 111.000000 (7.000 s after)" in refused.detail
+    assert "10.000 s is not interpolated" in refused.detail
+
+
+def test_a_refusal_names_the_parent_of_the_nearest_message() -> None:
+    assert "of 'cup' in 'table' at 9.0" in refusal(picked_up(), "map", "cup", 9 * S).detail
+    assert "of 'cup' in 'gripper' at 17.0" in refusal(picked_up(), "map", "cup", 17 * S).detail
+    graph = FrameGraph([edge("a", "cup", 0), edge("b", "cup", 20 * S), edge("c", "cup", 21 * S)])
+    assert "of 'cup' in 'a' at 5.0" in refusal(graph, "a", "cup", 5 * S).detail
+
+
+def test_the_width_of_a_gap_is_the_callers_to_choose() -> None:
+    pair = [edge("odom", "base", 100 * S, 0.0), edge("odom", "base", 104 * S, 1.0)]
+    assert shift(FrameGraph(pair), "odom", "base", 102 * S) == 0.5
+    narrow = FrameGraph(pair, cache_ns=3 * S)
+    assert refusal(narrow, "odom", "base", 102 * S).reason is NoDataReason.GAP
+
+
+@given(st.integers(1_600_000_000 * S, 1_800_000_000 * S), st.integers(11 * S, 10**6 * S))
+def test_every_time_that_a_refusal_offers_can_be_asked(first: int, width: int) -> None:
+    graph = FrameGraph([edge("odom", "base", first), edge("odom", "base", first + width)])
+    for asked in (first - 60 * S, first + width // 2, first + width + 60 * S):
+        detail = refusal(graph, "odom", "base", asked).detail
+        offered = [float(text) for text in re.findall(r"\d{10}\.\d{6}", detail)]
+        assert len(offered) == 3  # the time asked, and both of those offered
+        for seconds in offered[1:]:
+            assert graph.lookup("odom", "base", ns_from_unix(seconds)).transform == IDENTITY
+
+
+# Clocks
+
+
+def replayed(off: int, count: int = 5) -> list[StampedTransform]:
+    return [replace(held, log_time=held.stamp + off) for held in moving()[:count]]
+
+
+@pytest.mark.parametrize("off", [0, 20_000_000, -S, 2 * S])
+def test_stamps_near_log_time_are_the_clock(off: int) -> None:
+    assert agreeing_clock(replayed(off)) == "stamp"
+
+
+@pytest.mark.parametrize("off", [2 * S + 1, -3 * S, 515_219 * S])
+def test_stamps_of_another_clock_give_way_to_log_time(off: int) -> None:
+    assert agreeing_clock(replayed(off)) == "log"
+
+
+def test_a_few_odd_stamps_do_not_decide() -> None:
+    assert agreeing_clock([*replayed(0, 4), *replayed(99 * S, 2)]) == "stamp"
+
+
+def test_static_transforms_say_nothing_of_the_clock() -> None:
+    latched = [edge("a", "b", 0, log_time=10**18, static=True) for _ in range(9)]
+    assert agreeing_clock([*latched, *replayed(0)]) == "stamp"
+    assert agreeing_clock(latched) == "stamp"
+
+
+def test_the_tolerance_between_the_clocks_can_be_chosen() -> None:
+    assert agreeing_clock(replayed(S), tolerance_ns=S // 2) == "log"
+
+
+def test_a_graph_on_log_time_is_asked_in_log_time() -> None:
+    graph = FrameGraph(replayed(1000 * S), "log")
+    assert graph.clock == "log"
+    assert shift(graph, "odom", "base", 1101 * S) == 1.0
+    assert refusal(graph, "odom", "base", 101 * S).reason is NoDataReason.OUTSIDE_RANGE
+
+
+# Public robots
+
+
+def _expected() -> list[object]:
+    if not REAL.is_dir():
+        return []
+    sets = json.loads((REAL / "expected.json").read_text())
+    return [
+        pytest.param(name, case, id=f"{name}-{case['target']}-{case['source']}-{case['stamp_ns']}")
+        for name in FILES
+        for case in sets[name]["expected"]["tf_lookup"]
+    ]
+
+
+@needs_real
+@pytest.mark.parametrize(("name", "case"), _expected())
+def test_lookups_on_public_bags_are_those_of_independent_tools(
+    name: str, case: dict[str, object]
+) -> None:
+    graph = FrameGraph(stamped_transforms(FILES[name]), "stamp")
+    target, source, stamp = str(case["target"]), str(case["source"]), case["stamp_ns"]
+    assert isinstance(stamp, int)
+    if "error" not in case:
+        found = graph.lookup(target, source, stamp).transform
+        assert found.translation == pytest.approx(case["translation"], abs=2e-6)
+        turned = Rotation.from_quat(found.rotation).inv() * Rotation.from_quat(case["q_xyzw"])
+        assert turned.magnitude() < 5e-6
+        return
+    refused = refusal(graph, target, source, stamp)
+    if case["error"] == "not connected":
+        assert refused.reason is NoDataReason.FRAME_UNKNOWN
+    else:
+        assert refused.reason is NoDataReason.OUTSIDE_RANGE
+
+
+@needs_real
+def test_the_clock_of_a_replayed_robot_is_log_time() -> None:
+    assert agreeing_clock(stamped_transforms(FILES["cougars_auv_mcap"])) == "log"
+    assert agreeing_clock(stamped_transforms(FILES["evo_tf_example_db3"])) == "stamp"
+
+
+def test_a_yaw_between_two_messages_turns_the_shorter_way() -> None:
+    turns = [(0.0, 0.0, math.sin(half), math.cos(half)) for half in (1.5, -1.5)]
+    ends = [Transform((0.0, 0.0, 0.0), turn) for turn in turns]
+    graph = FrameGraph([edge("a", "b", 0, ends[0]), edge("a", "b", 2, ends[1])])
+    turned = Rotation.from_quat(graph.lookup("a", "b", 1).transform.rotation)
+    assert abs(turned.as_euler("xyz")[2]) == pytest.approx(math.pi)

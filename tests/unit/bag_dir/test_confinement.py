@@ -1,0 +1,491 @@
+"""Nothing outside the bag directory is opened or deleted, whatever lies or is asked for inside it.
+
+What a program opens is heard from the interpreter itself (`sys.addaudithook`), so that no way of
+opening a file is forgotten here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.durable_write import write_durably
+from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.lock import BagDirLock
+from ros2_memory.bag_dir.request_queue import Mailbox, Slot
+from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.catalogue.file import open_file
+from ros2_memory.cli.recovery import recover
+from ros2_memory.config import load_settings
+from ros2_memory.core import directories
+from ros2_memory.core.errors import BagError, RecorderError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.endpoint import build_server
+from ros2_memory.history.context import Limits
+from ros2_memory.index.file_state import files_in_metadata
+from ros2_memory.index.scan import Tree
+from ros2_memory.recorder import ros2bag
+from ros2_memory.recorder.handover.recovery import settle_all
+from ros2_memory.retention.clear import clear_bags, remove_if_empty
+from ros2_memory.storage.file_io import OpenFile
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.tools.spec_tools import build_tools
+from ros2_memory.upkeep import build_repairer
+from tests.bags import boolean, text, write_db3, write_mcap
+from tests.keeping import keeper_of
+from tests.questions import ANSWERED, T0, T0_S, write_run
+
+if TYPE_CHECKING:
+    from ros2_memory.serving.mcp_server import EpisodicServer
+    from ros2_memory.settings import Settings
+
+SECRET = "/outside/secret"  # noqa: S105  the name of a topic
+HEARD = {
+    "open",
+    "os.listdir",
+    "os.scandir",
+    "sqlite3.connect",
+    "os.remove",
+    "os.rmdir",
+    "os.rename",
+}
+
+_heard: list[str] | None = None
+
+
+def _hear(event: str, arguments: tuple[Any, ...]) -> None:
+    if _heard is not None and event in HEARD and isinstance(arguments[0], str | bytes | Path):
+        _heard.append(f"{event} {os.fsdecode(arguments[0])}")
+
+
+sys.addaudithook(_hear)
+
+
+@contextmanager
+def hearing() -> Iterator[list[str]]:
+    """What was opened, listed or deleted, by name."""
+    global _heard  # noqa: PLW0603  a hook cannot be taken away again
+    _heard = []
+    try:
+        yield _heard
+    finally:
+        _heard = None
+
+
+def settings_for(bag_dir: Path, *overrides: str) -> Settings:
+    wanted = ["recorder=none", "storage=rosbag2", "data.now=latest", *overrides]
+    return load_settings(wanted, {"MEMORY_BAG_DIR": str(bag_dir)})
+
+
+@contextmanager
+def asking(bag_dir: Path) -> Iterator[EpisodicServer]:
+    settings = settings_for(bag_dir)
+    memory = build_memory(settings)
+    filler = build_filler(settings, memory)
+    for bag in filler.waiting():
+        filler.digest(bag)
+    server = build_server(settings, memory)
+    try:
+        yield server
+    finally:
+        server.dispatcher.stop()
+
+
+async def told(server: EpisodicServer, name: str, given: dict[str, Any]) -> str:
+    result = await server.call_tool(name, given)
+    return json.dumps([block.model_dump() for block in result.content])
+
+
+@pytest.fixture
+def bags(tmp_path: Path) -> Path:
+    write_run(tmp_path / "bags")
+    return tmp_path / "bags"
+
+
+@pytest.fixture
+def outside(tmp_path: Path) -> Path:
+    """Bags elsewhere, of every kind, with a topic that no answer may name."""
+    folder = tmp_path / "outside" / "rec"
+    secret = [text(T0 + n * NS_PER_S, f"secret {n}", SECRET) for n in range(5)]
+    write_mcap(folder / "rec_0.mcap", secret)
+    write_db3(folder / "rec_1.db3", secret)
+    (folder / "metadata.yaml").write_text("relative_file_paths: [rec_0.mcap]\n")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+LINKS = {
+    "a file": lambda bags, rec: (bags / "run/x.mcap").symlink_to(rec / "rec_0.mcap"),
+    "a db3 file": lambda bags, rec: (bags / "x.db3").symlink_to(rec / "rec_1.db3"),
+    "a directory": lambda bags, rec: (bags / "rec").symlink_to(rec),
+    "a relative one": lambda bags, rec: (bags / "rec").symlink_to("../outside/rec"),
+    "a directory of directories": lambda bags, rec: (bags / "more").symlink_to(rec.parent),
+    "a chain": lambda bags, rec: [
+        (bags / "one").symlink_to(rec),
+        (bags / "two").symlink_to("one"),
+        (bags / "x.mcap").symlink_to("two/rec_0.mcap"),
+    ],
+    "the catalogue's folder": lambda bags, rec: (bags / ".episodic").symlink_to(rec),
+    "metadata": lambda bags, rec: (bags / "run/metadata.yaml").symlink_to(rec / "metadata.yaml"),
+    "a journal": lambda bags, rec: [
+        write_db3(bags / "own.db3", [boolean(T0, data=True)]),
+        (bags / "own.db3-wal").symlink_to(rec / "rec_1.db3"),
+    ],
+}
+
+
+@pytest.mark.parametrize("link", LINKS.values(), ids=LINKS)
+async def test_no_tool_reads_what_a_link_leads_to(bags: Path, outside: Path, link: Any) -> None:
+    link(bags, outside)
+    before = contents(outside)
+    with hearing() as heard, asking(bags) as server:
+        for name, given, _ in ANSWERED:
+            assert SECRET not in await told(server, name, given)
+        for name in ("get_topic_in_range", "get_topic_at_time"):
+            given = {"topic": SECRET, "start": T0_S, "end": T0_S + 9}
+            if name == "get_topic_at_time":
+                given = {"topic": SECRET, "timestamp": T0_S + 3}
+            assert "secret 1" not in await told(server, name, given)
+        assert "topic_not_recorded" in await told(server, name, given)
+    assert [each for each in heard if "outside" in each or "/rec_" in each] == []
+    assert contents(outside) == before
+
+
+async def test_a_directory_that_a_link_replaced_since_it_was_listed_is_not_read(
+    bags: Path, outside: Path
+) -> None:
+    write_mcap(bags / "rec" / "rec_0.mcap", [text(T0, "own", "/own")])
+    settings = settings_for(bags, "reader.index_refresh_s=1000")
+    memory = build_memory(settings)
+    server = build_server(settings, memory)
+    assert "/own" in await told(server, "list_recorded_topics", {})
+    shutil.rmtree(bags / "rec")
+    (bags / "rec").symlink_to(outside)
+    given = {"topic": SECRET, "start": T0_S, "end": T0_S + 9}
+    with hearing() as heard:
+        assert "secret 1" not in await told(server, "get_topic_in_range", given)
+        given["topic"] = "/own"
+        answer = await told(server, "get_topic_in_range", given)
+    assert [each for each in heard if "rec_0" in each] == []
+    assert "symbolic link" in answer
+    server.dispatcher.stop()
+
+
+@pytest.mark.parametrize("reader", [McapReader, Rosbag2Reader])
+def test_a_file_that_a_link_replaced_since_it_was_listed_is_not_read(
+    bags: Path, outside: Path, reader: type[McapReader | Rosbag2Reader]
+) -> None:
+    path = bags / "run" / "run_0.mcap"
+    path.unlink()
+    path.symlink_to(outside / "rec_0.mcap")
+    for ask in (reader().summarize, reader().closing, reader().channels):
+        with pytest.raises(BagError, match="symbolic link, which is not followed"):
+            ask(path)
+
+
+def test_a_folder_that_a_link_replaces_during_a_look_is_not_listed(
+    bags: Path, outside: Path
+) -> None:
+    tree = Tree(bags)
+    tree.walk(T0, ())
+    (bags / "run").rename(bags / "gone")
+    (bags / "run").symlink_to(outside)
+    # As if the link had come after the bag directory was listed.
+    tree._folders[str(bags)].mtime_ns = bags.stat().st_mtime_ns
+    tree._folders[str(bags)].trusted = True
+    walked = tree.walk(T0, ())
+    assert not [path for path in walked.looked_at if "rec_0" in path]
+    assert str(bags / "run/run_0.mcap") in walked.gone
+
+
+@pytest.mark.parametrize(
+    "path", ["../outside/rec/rec_0.mcap", "run/../../outside/rec/rec_0.mcap", "/etc/passwd"]
+)
+def test_the_reader_of_a_bag_directory_opens_nothing_beside_it(
+    bags: Path, outside: Path, path: str
+) -> None:
+    reader = ConfinedReader(McapReader(), bags)
+    with pytest.raises(BagError, match="does not lie in the bag directory"):
+        reader.summarize(bags / path)
+    with pytest.raises(BagError, match="does not lie in the bag directory"):
+        reader.newest(bags / path, "/odom", TimeWindow.everything())
+
+
+async def test_the_bag_directory_may_be_a_link_itself(bags: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(bags, target_is_directory=True)
+    with asking(tmp_path / "link") as server:
+        assert "/odom" in await told(server, "list_recorded_topics", {})
+        given = {"topic": "/odom", "timestamp": T0_S + 5}
+        assert "position" in await told(server, "get_topic_at_time", given)
+
+
+class TestDeletions:
+    """What deletes: retention has its tests beside it (`test_housekeeping.py`)."""
+
+    @pytest.mark.parametrize("link", LINKS.values(), ids=LINKS)
+    def test_a_wipe_leaves_what_a_link_leads_to(self, bags: Path, outside: Path, link: Any) -> None:
+        link(bags, outside)
+        before = contents(outside)
+        clear_bags(bags)
+        assert contents(outside) == before
+
+    def test_a_wipe_leaves_what_takes_a_directory_s_place_meanwhile(
+        self, bags: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        write_mcap(bags / "rec" / "rec_0.mcap", [text(T0, "own", "/own")])
+        before, real = contents(outside), os.open
+        done: list[str] = []
+
+        def swapping(path: Any, flags: int, *rest: Any, **more: Any) -> int:
+            if path == "rec" and not done:
+                done.append(path)
+                (bags / "rec").rename(bags / "moved")
+                (bags / "rec").symlink_to(outside)
+            return real(path, flags, *rest, **more)
+
+        monkeypatch.setattr(os, "open", swapping)
+        wiped = clear_bags(bags)
+        assert done
+        assert contents(outside) == before
+        assert len(wiped.faults) == 1
+
+    @pytest.mark.parametrize("link", LINKS.values(), ids=LINKS)
+    def test_a_repair_leaves_what_a_link_leads_to(
+        self, bags: Path, outside: Path, link: Any
+    ) -> None:
+        cut = outside / "rec_0.mcap"
+        cut.write_bytes(cut.read_bytes()[:-100])
+        (outside / "rec_9.mcap").touch()
+        link(bags, outside)
+        before = contents(outside)
+        lines: list[str] = []
+        recover(bags, lines.append, force=True)
+        assert contents(outside) == before
+
+    def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
+        self, bags: Path, outside: Path
+    ) -> None:
+        cut = outside / "rec_0.mcap"
+        cut.write_bytes(cut.read_bytes()[:-100])
+        (outside / "rec_9.mcap").touch()
+        (bags / "linked").symlink_to(outside)
+        before = contents(outside)
+        for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
+            with pytest.raises(RecorderError, match="symbolic link") as refused:
+                recover(path, lambda _: None, force=True)
+            assert str(path.resolve()) in str(refused.value)
+            if path.suffix:
+                with pytest.raises(BagError, match="behind a symbolic link"):
+                    build_repairer().repair(path)
+        assert contents(outside) == before
+
+    def test_a_repair_leaves_a_directory_that_a_link_replaced_since(
+        self, bags: Path, outside: Path
+    ) -> None:
+        (outside / "run_0.mcap").write_bytes(b"")
+        (outside / ".run_0.mcap.repair").write_bytes(b"kept")
+        before = contents(outside)
+        house = keeper_of(bags)
+        shutil.rmtree(bags / "run")
+        (bags / "run").symlink_to(outside)
+        assert not house._repair(bags / "run/run_0.mcap")
+        house._repair_recording(bags, bags / "run")
+        assert not remove_if_empty(bags / "run")
+        assert contents(outside) == before
+
+    def test_no_metadata_is_corrected_behind_a_link(self, bags: Path, outside: Path) -> None:
+        before = contents(outside)
+        (bags / "linked").symlink_to(outside)
+        with pytest.raises(OSError, match="symbolic link"):
+            build_repairer().correct_metadata(bags / "linked")
+        assert contents(outside) == before
+
+    def test_nothing_is_asked_for_or_answered_behind_a_link(
+        self, bags: Path, outside: Path
+    ) -> None:
+        (outside / "requests").mkdir()
+        (outside / "requests" / f"{'0' * 32}.json").write_text("{}")
+        before = contents(outside)
+        (bags / ".episodic").symlink_to(outside)
+        with pytest.raises(OSError, match="symbolic link"):
+            Slot(bags, "label", 0, 1, 2).post()
+        mailbox = Mailbox(bags)
+        mailbox.open()
+        assert not mailbox.has_mail()
+        assert contents(outside) == before
+
+    def test_no_bag_of_a_moment_is_linked_behind_a_link(self, bags: Path, outside: Path) -> None:
+        before = contents(outside)
+        (bags / "moments").mkdir()
+        (bags / "moments/a").symlink_to(outside)
+        with pytest.raises(OSError, match="symbolic link"):
+            directories.make(bags, bags / "moments/a/rec_0")
+        assert contents(outside) == before
+
+    def test_a_repair_of_a_link_by_name_is_refused(self, bags: Path, outside: Path) -> None:
+        (outside / "rec_0.mcap").write_bytes(b"")
+        (bags / "x.mcap").symlink_to(outside / "rec_0.mcap")
+        with pytest.raises(BagError, match="not a regular file"):
+            build_repairer().repair(bags / "x.mcap")
+        assert (outside / "rec_0.mcap").exists()
+
+    def test_a_catalogue_behind_a_link_is_neither_written_nor_set_aside(
+        self, bags: Path, outside: Path
+    ) -> None:
+        (outside / "catalogue.sqlite").write_text("somebody's own")
+        before = contents(outside)
+        (bags / ".episodic").symlink_to(outside)
+        (bags / "own").mkdir()
+        for name in ("catalogue.sqlite", "catalogue.sqlite-wal", "catalogue.sqlite-shm"):
+            link = bags / "own" / name
+            link.symlink_to(outside / "catalogue.sqlite")
+            refused = open_file([bags / "own" / "catalogue.sqlite"])
+            assert "symbolic link" in str(refused)
+            link.unlink()
+        assert "symbolic link" in str(open_file([bags / ".episodic" / "catalogue.sqlite"]))
+        assert contents(outside) == before
+
+
+class TestWhatTheRecorderKeepsBesideBags:
+    def test_no_sidecar_is_read_through_a_link(self, bags: Path, outside: Path) -> None:
+        (outside / "other.json").write_text('{"format": 1}')
+        (bags / "run/handover.json").symlink_to(outside / "other.json")
+        (bags / "recorder.json").symlink_to(outside / "other.json")
+        (bags / "run/metadata.yaml").symlink_to(outside / "metadata.yaml")
+        with hearing():
+            assert "symbolic links" in (read_handover(bags / "run").problem or "")
+            assert read_heartbeat(bags).heartbeat is None
+            assert files_in_metadata(bags / "run/metadata.yaml") == frozenset()
+
+    def test_nothing_is_written_through_a_link(self, bags: Path, outside: Path) -> None:
+        kept = outside / "metadata.yaml"
+        before = contents(outside)
+        (bags / ".recorder.json.tmp").symlink_to(kept)
+        with pytest.raises(OSError, match="symbolic links"):
+            write_durably(bags / "recorder.json", "{}")
+        (bags / "recorder.json").symlink_to(kept)
+        write_durably(bags / "recorder.json", "{}")
+        (bags / "recorder.lock").symlink_to(outside / "lock")
+        with pytest.raises(RecorderError, match="cannot be opened"):
+            BagDirLock.acquire(bags)
+        with pytest.raises(BagError, match="File exists"):
+            _write_through(bags / "x.mcap", kept)
+        assert contents(outside) == before
+
+    def test_old_logs_of_ros_are_deleted_and_none_behind_a_link(
+        self, bags: Path, outside: Path
+    ) -> None:
+        for folder in (bags / ".ros_log", outside / "logs"):
+            folder.mkdir()
+            for number in range(ros2bag.LOGS_KEPT + 3):
+                (folder / f"{number}.log").touch()
+        before = contents(outside)
+        ros2bag._prune(bags / ".ros_log")
+        assert len(list((bags / ".ros_log").iterdir())) == ros2bag.LOGS_KEPT
+        shutil.rmtree(bags / ".ros_log")
+        (bags / ".ros_log").symlink_to(outside / "logs")
+        ros2bag._prune(bags / ".ros_log")
+        assert contents(outside) == before
+
+    def test_no_handover_is_settled_behind_a_link(self, bags: Path, outside: Path) -> None:
+        sidecar = {
+            "format": 1,
+            "state": "counts",
+            "clock": "publish",
+            "next": "rec_2",
+            "notes": [],
+        }
+        (outside / "handover.json").write_text(json.dumps(sidecar))
+        assert read_handover(outside).problem is None
+        before = contents(outside)
+        (bags / "rec").symlink_to(outside)
+        settle_all(bags, McapReader())
+        assert contents(outside) == before
+
+    @pytest.mark.parametrize("name", ["..", ".", "a/b", "/etc", ""])
+    def test_a_sidecar_names_no_recording_elsewhere(self, bags: Path, name: str) -> None:
+        (bags / "run/handover.json").write_text(
+            json.dumps(
+                {"format": 1, "state": "counts", "clock": "publish", "next": name, "notes": []}
+            )
+        )
+        assert "name of a recording" in (read_handover(bags / "run").problem or "")
+
+
+def _write_through(link: Path, target: Path) -> None:
+    link.symlink_to(target)
+    McapWriter().write(link, [])
+
+
+class TestArguments:
+    TOOLS = build_tools(Limits(), 25.0)
+
+    @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
+    def test_no_tool_takes_a_path(self, tool: Any) -> None:
+        for name, shape in tool.schema.get("properties", {}).items():
+            assert not {"path", "file", "dir", "directory", "folder", "url", "uri", "bag"} & set(
+                name.lower().split("_")
+            )
+            assert shape.get("format") not in {"path", "file-path", "directory-path", "uri"}
+
+    HOSTILE = (
+        "/etc/passwd",
+        "../../../../../../etc/passwd",
+        "../outside/rec/rec_0.mcap",
+        "run/run_0.mcap",
+        "file:///proc/self/environ",
+        "std_msgs/msg/../../../../etc/passwd",
+        "*/../../*",
+        "~/.ssh/id_rsa",
+        "$(cat ${HOME}/secret)",
+    )
+
+    async def test_no_text_of_a_caller_reaches_the_file_system(
+        self, bags: Path, outside: Path
+    ) -> None:
+        calls = [
+            (name, given | {key: hostile})
+            for hostile in self.HOSTILE
+            for name, given, _ in ANSWERED
+            for key, value in [*given.items(), ("path", "")]
+            if isinstance(value, str)
+        ]
+        with asking(bags) as server:
+            # Once without being heard: modules are loaded then.
+            for name, given, _ in ANSWERED:
+                await told(server, name, given)
+            with hearing() as heard:
+                for name, given in calls:
+                    await told(server, name, given)
+                for hostile in self.HOSTILE:
+                    await told(server, hostile, {})
+            assert [each for each in heard if str(bags) not in each and "sqlite3" not in each] == []
+            assert [each for each in heard if "passwd" in each or "outside" in each] == []
+
+
+def test_a_hard_link_is_read_since_it_is_a_file_of_the_directory(bags: Path, outside: Path) -> None:
+    os.link(outside / "rec_0.mcap", bags / "run" / "hard.mcap")
+    with OpenFile(bags / "run" / "hard.mcap") as file:
+        assert file.size
+    clear_bags(bags)
+    assert (outside / "rec_0.mcap").exists()

@@ -1,0 +1,194 @@
+"""`handover.json`: which messages of two recordings count, and what may stand in the file."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.handover_file import (
+    Counting,
+    CutClock,
+    Exclusion,
+    Handover,
+    Overlap,
+    read_handover,
+    write_handover,
+    write_handovers,
+)
+from ros2_memory.bag_dir.layout import HANDOVER_FILE
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+
+MOMENTS = st.integers(MIN_NS, MAX_NS)
+OVERLAPS = st.builds(
+    Overlap,
+    st.none() | MOMENTS,
+    st.none() | MOMENTS,
+    st.lists(st.text(min_size=1, max_size=5), max_size=3).map(tuple),
+)
+NAMES = st.none() | st.from_regex(r"rec_[0-9]{1,3}", fullmatch=True)
+HANDOVERS = st.builds(
+    Handover,
+    state=st.sampled_from(Counting),
+    clock=st.sampled_from(CutClock),
+    previous=NAMES,
+    counts_from=st.none() | MOMENTS,
+    begin=st.none() | OVERLAPS,
+    next=NAMES,
+    counts_until=st.none() | MOMENTS,
+    end=st.none() | OVERLAPS,
+    notes=st.lists(st.text(max_size=9), max_size=2).map(tuple),
+)
+
+FULL = Handover(
+    previous="rec_1",
+    counts_from=1_000,
+    begin=Overlap(900, 1_100, ("rec_2_0.mcap",)),
+    next="rec_3",
+    counts_until=9_000,
+    end=Overlap(8_900, 9_500, ("rec_2_7.mcap", "rec_2_8.mcap")),
+    notes=("a note",),
+)
+
+
+def excluded(handover: Handover, file: str, publish_time: int, log_time: int) -> bool:
+    return any(each.excludes(publish_time, log_time) for each in handover.exclusions(file))
+
+
+class TestCounting:
+    def test_without_a_sidecar_everything_counts(self, tmp_path: Path) -> None:
+        handover, problem = read_handover(tmp_path)
+        assert problem is None
+        assert handover == Handover()
+        assert handover.exclusions("rec_1_0.mcap") == ()
+        assert not handover.hides_all
+
+    def test_what_was_published_before_the_cut_counts_in_the_recording_before(self) -> None:
+        assert excluded(FULL, "rec_2_0.mcap", 999, 1_005)
+        assert not excluded(FULL, "rec_2_0.mcap", 1_000, 1_005)
+
+    def test_what_was_published_at_the_cut_or_later_counts_in_the_next(self) -> None:
+        assert not excluded(FULL, "rec_2_7.mcap", 8_999, 9_005)
+        assert excluded(FULL, "rec_2_7.mcap", 9_000, 9_005)
+
+    def test_a_file_that_was_not_open_in_an_overlap_counts_whole(self) -> None:
+        assert FULL.exclusions("rec_2_3.mcap") == ()
+
+    def test_a_message_received_outside_the_overlap_counts_whenever_it_was_published(self) -> None:
+        assert not excluded(FULL, "rec_2_0.mcap", 10, 899)
+        assert not excluded(FULL, "rec_2_0.mcap", 10, 1_100)
+        assert not excluded(FULL, "rec_2_8.mcap", 9_400, 8_899)
+        assert not excluded(FULL, "rec_2_8.mcap", 9_400, 9_500)
+
+    def test_a_bound_that_is_not_given_does_not_bind(self) -> None:
+        loose = replace(FULL, begin=Overlap(None, None, ("rec_2_0.mcap",)))
+        assert excluded(loose, "rec_2_0.mcap", 10, MIN_NS)
+        assert excluded(loose, "rec_2_0.mcap", 10, MAX_NS - 1)
+
+    @pytest.mark.parametrize("state", [Counting.PENDING, Counting.VOID])
+    def test_a_recording_that_did_not_take_over_counts_for_nothing(self, state: Counting) -> None:
+        assert Handover(state=state, previous="rec_1").hides_all
+
+    @given(
+        cut=st.integers(0, 100),
+        publish_time=st.integers(0, 100),
+        log_times=st.tuples(st.integers(0, 100), st.integers(0, 100)),
+    )
+    def test_in_the_overlap_a_message_counts_in_exactly_one_of_the_two(
+        self, cut: int, publish_time: int, log_times: tuple[int, int]
+    ) -> None:
+        old = Handover(next="b", counts_until=cut, end=Overlap(0, 101, ("a_9.mcap",)))
+        new = Handover(previous="a", counts_from=cut, begin=Overlap(0, 101, ("b_0.mcap",)))
+        in_old = not excluded(old, "a_9.mcap", publish_time, log_times[0])
+        in_new = not excluded(new, "b_0.mcap", publish_time, log_times[1])
+        assert in_old != in_new
+
+    def test_an_exclusion_is_half_open_in_both_times(self) -> None:
+        window = Exclusion(10, 20, 100, 200)
+        inside = [(10, 100), (19, 199)]
+        outside = [(9, 100), (20, 100), (10, 99), (10, 200)]
+        assert [window.excludes(*each) for each in inside] == [True, True]
+        assert [window.excludes(*each) for each in outside] == [False] * 4
+
+
+class TestFile:
+    @given(handover=HANDOVERS)
+    def test_what_is_written_is_read(
+        self, tmp_path_factory: pytest.TempPathFactory, handover: Handover
+    ) -> None:
+        folder = tmp_path_factory.mktemp("recording")
+        write_handover(folder, handover)
+        assert read_handover(folder) == (handover, None)
+
+    def test_it_names_the_moments_it_counts_from_and_until(self, tmp_path: Path) -> None:
+        write_handover(tmp_path, FULL)
+        content = json.loads((tmp_path / HANDOVER_FILE).read_text())
+        assert content["counts_from_ns"] == 1_000
+        assert content["counts_until_ns"] == 9_000
+        assert (content["clock"], content["previous"], content["next"]) == (
+            "publish",
+            "rec_1",
+            "rec_3",
+        )
+
+    def test_it_leaves_nothing_else_behind(self, tmp_path: Path) -> None:
+        write_handover(tmp_path, FULL)
+        write_handover(tmp_path, Handover())
+        assert [path.name for path in tmp_path.iterdir()] == [HANDOVER_FILE]
+
+    def test_one_that_cannot_be_written_is_told(self, tmp_path: Path) -> None:
+        with pytest.raises(RecorderError, match=r"handover\.json cannot be written"):
+            write_handover(tmp_path / "gone", FULL)
+
+    @pytest.mark.parametrize(
+        ("change", "reason"),
+        [
+            ({"format": 2}, "format is 2"),
+            ({"state": "maybe"}, "maybe"),
+            ({"clock": "sun"}, "sun"),
+            ({"previous": "../elsewhere"}, "previous must be the name"),
+            ({"previous": ""}, "previous must be the name"),
+            ({"counts_from_ns": 1.5}, "counts_from_ns must be nanoseconds"),
+            ({"counts_from_ns": True}, "counts_from_ns must be nanoseconds"),
+            ({"counts_until_ns": 2**63}, "counts_until_ns must be nanoseconds"),
+            ({"begin": []}, "begin must be a JSON object"),
+            ({"end": {"files": "x"}}, "files must be a list"),
+            ({"notes": [1]}, "notes must be a list"),
+        ],
+    )
+    def test_what_it_cannot_mean_is_told_and_then_everything_counts(
+        self, tmp_path: Path, change: dict[str, object], reason: str
+    ) -> None:
+        write_handover(tmp_path, FULL)
+        path = tmp_path / HANDOVER_FILE
+        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+        handover, problem = read_handover(tmp_path)
+        assert handover == Handover()
+        assert problem is not None
+        assert reason in problem
+
+    @pytest.mark.parametrize("text", [b"", b"[1]", b"{", b"\xff", b"[" * 100_000, b" " * (2 << 20)])
+    def test_any_bytes_are_read_without_failing(self, tmp_path: Path, text: bytes) -> None:
+        (tmp_path / HANDOVER_FILE).write_bytes(text)
+        handover, problem = read_handover(tmp_path)
+        assert handover == Handover()
+        assert problem is not None
+
+    def test_a_fifo_in_its_place_is_not_waited_for(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / HANDOVER_FILE)
+        assert read_handover(tmp_path).problem is not None
+
+    def test_a_pair_is_written_whole_or_not_at_all(self, tmp_path: Path) -> None:
+        old, new = tmp_path / "old", tmp_path / "new"
+        new.mkdir()
+        write_handover(new, Handover(state=Counting.PENDING))
+        # The old one cannot be written: its directory is not there.
+        with pytest.raises(RecorderError):
+            write_handovers({new: Handover(counts_from=5), old: Handover(counts_until=5)})
+        assert read_handover(new).handover == Handover(state=Counting.PENDING)

@@ -1,0 +1,181 @@
+"""A bag that moments keep is one bag, whichever of its names the index meets first."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.stand_in import StandInReader
+from ros2_memory.core.errors import BagVanishedError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call
+from ros2_memory.overview import list_recorded_topics
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import odom, write_mcap
+from tests.memories import memory_of
+from tests.unit.index.test_unchanged_bags import Start
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+
+
+class TestNames:
+    def test_a_kept_bag_answers_after_where_it_was_recorded_and_after_earlier_moments(
+        self, tmp_path: Path
+    ) -> None:
+        names = KeptNames(tmp_path)
+        recorded, first, second = (
+            f"{tmp_path}/{name}"
+            for name in ("r/r_0.mcap", "moments/a/r/r_0.mcap", "moments/b/r/r_0.mcap")
+        )
+        for path in (second, recorded, first):
+            names.enter(path)
+        assert names.before(recorded) == []
+        assert names.before(first) == [recorded]
+        assert names.before(second) == [recorded, first]
+        assert names.of(recorded) == names.of(first) == {first, second}
+        names.leave(first)
+        names.leave(first)
+        assert names.before(second) == [recorded]
+        assert names.known == {second}
+        names.leave(second)
+        assert list(names.of(recorded)) == []
+
+    def test_what_lies_in_no_moment_is_its_own_name(self, tmp_path: Path) -> None:
+        names = KeptNames(tmp_path)
+        for path in (f"{tmp_path}/moments/x.mcap", f"{tmp_path}/a/moments/b/x.mcap"):
+            assert names.recorded_as(path) == path
+
+
+def keep(start: Start, moment: str, *splits: int) -> None:
+    """Links some of the known bags into a moment."""
+    folder = start.bag_dir / "moments" / moment / "rec"
+    folder.mkdir(parents=True)
+    for split in splits:
+        os.link(start.bag_dir / "rec" / f"rec_{split}.mcap", folder / f"rec_{split}.mcap")
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Start:
+    begun = Start(tmp_path)
+    begun.remember()
+    return begun
+
+
+class TestAQuestionMeanwhile:
+    """The index looks every few seconds; a bag may have gone from where it was since."""
+
+    def test_a_kept_bag_is_read_under_its_other_name(self, tmp_path: Path) -> None:
+        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+        linked = tmp_path / "moments/one/rec/rec_0.mcap"
+        linked.parent.mkdir(parents=True)
+        os.link(recorded, linked)
+        reader = StandInReader(ConfinedReader(McapReader(), tmp_path), tmp_path)
+        everything = TimeWindow.everything()
+
+        def read(path: Path) -> tuple[object, ...]:
+            return (
+                [each.log_time for each in reader.records(path, ["/odom"], everything)],
+                reader.newest(path, "/odom", everything) is not None,
+                list(reader.log_times(path, "/odom", everything)),
+                [channel.topic for channel in reader.channels(path)],
+            )
+
+        before = read(recorded)
+        assert before == ([S], True, [S], ["/odom"])
+        begun = reader.records(recorded, ["/odom"], everything)
+        recorded.unlink()
+        assert [each.log_time for each in begun] == [S]
+        assert read(recorded) == before
+        # The index is told how it is.
+        with pytest.raises(BagVanishedError):
+            reader.summarize(recorded)
+        os.link(linked, recorded)
+        linked.unlink()
+        assert read(linked) == before
+        recorded.unlink()
+        with pytest.raises(BagVanishedError):
+            read(recorded)
+
+
+class TestTheIndex:
+    """Bags that the catalogue knows are taken over unread; what is kept is weighed beside them."""
+
+    def test_a_kept_bag_that_is_known_by_its_own_name_is_no_second_one(self, start: Start) -> None:
+        before = [bag.file for bag in start.index()[0].refresh().bags]
+        keep(start, "one", 1, 2)
+        keep(start, "two", 2, 3)
+        start.age()
+        assert [bag.file for bag in start.index()[0].refresh().bags] == before
+        assert start.index()[0].refresh() == start.read()
+
+    def test_it_answers_when_the_other_has_gone_under_a_running_index(self, start: Start) -> None:
+        index, _ = start.index()
+        before = index.refresh()
+        keep(start, "one", 1, 2)
+        keep(start, "two", 2, 3)
+        index.refresh()
+        for split in (1, 2):
+            (start.bag_dir / "rec" / f"rec_{split}.mcap").unlink()
+        after = index.refresh()
+        assert [bag[5:7] for bag in after.bags] == [bag[5:7] for bag in before.bags]
+        assert [bag.file for bag in after.bags][1:3] == [
+            f"{start.bag_dir}/moments/one/rec/rec_{split}.mcap" for split in (1, 2)
+        ]
+        start.remember()
+        assert [bag.file for bag in start.index()[0].refresh().bags] == [
+            bag.file for bag in after.bags
+        ]
+        shutil.rmtree(start.bag_dir / "moments/one")
+        assert len(index.refresh().bags) == 5
+        assert index.refresh().bags == start.read().bags
+
+    def test_one_that_is_recorded_anew_under_its_name_is_another(self, start: Start) -> None:
+        keep(start, "one", 1)
+        recorded = start.bag_dir / "rec/rec_1.mcap"
+        shutil.copy(recorded, start.bag_dir / "copy")
+        (start.bag_dir / "copy").replace(recorded)
+        assert len(start.read().bags) == 7
+
+
+class TestOtherNames:
+    def test_a_hard_link_beside_its_original_is_no_second_bag(self, tmp_path: Path) -> None:
+        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+        memory = memory_of(tmp_path)
+        assert [bag.file for bag in memory.index.refresh().bags] == [str(recorded)]
+        linked = tmp_path / "rec/rec_0_link.mcap"
+        os.link(recorded, linked)
+        (tmp_path / "z/backup").mkdir(parents=True)
+        os.link(recorded, tmp_path / "z/backup/rec_0.mcap")
+        for index in (memory.index, memory_of(tmp_path).index):
+            assert [bag.file for bag in index.refresh().bags] == [str(recorded)]
+        [row] = list_recorded_topics(memory, Call())
+        assert row.count == 1
+        recorded.unlink()
+        assert [bag.file for bag in memory.index.refresh().bags] == [str(linked)]
+        linked.unlink()
+        assert len(memory.index.refresh().bags) == 1
+
+    def test_a_hard_link_with_an_earlier_name_takes_over(self, tmp_path: Path) -> None:
+        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+        memory = memory_of(tmp_path)
+        memory.index.refresh()
+        outer = tmp_path / "a.mcap"
+        os.link(recorded, outer)
+        assert [bag.file for bag in memory.index.refresh().bags] == [str(outer)]
+
+    @pytest.mark.parametrize("name", [".x.mcap", ".x.db3", ".x.mcap.zstd", ".X.MCAP"])
+    def test_a_hidden_file_is_no_bag(self, tmp_path: Path, name: str) -> None:
+        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
+        shutil.copy(recorded, tmp_path / "rec" / name)
+        (tmp_path / "rec/.y.mcap").symlink_to(recorded)
+        snapshot = memory_of(tmp_path).index.refresh()
+        assert [bag.file for bag in snapshot.bags] == [str(recorded)]
+        assert (snapshot.unread, snapshot.damaged) == ((), ())

@@ -1,0 +1,247 @@
+"""What the recorder says of itself, and how little of it is believed."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.heartbeat import (
+    HEARTBEAT_FILE,
+    Heartbeat,
+    RecorderState,
+    read_heartbeat,
+    write_heartbeat,
+)
+from ros2_memory.core.errors import RecorderError
+from tests.faults.small_disk import filled, needs_mounts, small_disk
+
+S = 10**9
+NOW = 1_800_000_000 * S
+BEAT = Heartbeat(
+    pid=4711,
+    updated=NOW,
+    state=RecorderState.RECORDING,
+    recordings=("rec_1", "day/rec_2"),
+    since=NOW - 60 * S,
+    bytes_written=123_456,
+    subscribed=("/odom", "/tf"),
+    silent=("/tf",),
+    last_error=None,
+    interval_s=2.0,
+)
+
+beats = st.builds(
+    Heartbeat,
+    pid=st.integers(1, 2**22),
+    updated=st.integers(-(2**63), 2**63 - 1),
+    state=st.sampled_from(RecorderState),
+    recordings=st.lists(st.text()).map(tuple),
+    since=st.integers(-(2**63), 2**63 - 1),
+    bytes_written=st.integers(0, 2**63 - 1),
+    subscribed=st.lists(st.text()).map(tuple),
+    silent=st.lists(st.text()).map(tuple),
+    last_error=st.none() | st.text(),
+    interval_s=st.floats(0.001, 3600),
+    restarts=st.integers(0, 2**63 - 1),
+    missing=st.lists(st.text()).map(tuple),
+    age_held=st.none() | st.text(),
+)
+
+
+def test_that_of_an_older_recorder_is_read(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, replace(BEAT, restarts=3, missing=("/gone",), age_held="2 bags"))
+    content = json.loads((tmp_path / HEARTBEAT_FILE).read_text())
+    assert (content.pop("restarts"), content.pop("missing")) == (3, ["/gone"])
+    assert content.pop("age_held") == "2 bags"
+    (tmp_path / HEARTBEAT_FILE).write_text(json.dumps(content))
+    assert read_heartbeat(tmp_path) == (BEAT, None)
+
+
+@given(beat=beats)
+def test_what_was_written_is_read(
+    beat: Heartbeat, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("bags")
+    write_heartbeat(folder, beat)
+    assert read_heartbeat(folder) == (beat, None)
+
+
+def test_a_heartbeat_leaves_no_other_file(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, BEAT)
+    write_heartbeat(tmp_path, replace(BEAT, state=RecorderState.STOPPED))
+    assert [path.name for path in tmp_path.iterdir()] == [HEARTBEAT_FILE]
+    read = read_heartbeat(tmp_path).heartbeat
+    assert read is not None
+    assert read.state is RecorderState.STOPPED
+
+
+def test_a_reader_of_the_old_heartbeat_keeps_the_whole_of_it(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, BEAT)
+    with (tmp_path / HEARTBEAT_FILE).open(encoding="utf-8") as old:
+        write_heartbeat(tmp_path, replace(BEAT, pid=9))
+        assert json.load(old)["pid"] == 4711
+
+
+def test_a_heartbeat_that_cannot_be_written_says_where_and_why(tmp_path: Path) -> None:
+    with pytest.raises(RecorderError, match=r"recorder\.json cannot be written: No such file"):
+        write_heartbeat(tmp_path / "missing", BEAT)
+
+
+def test_a_failed_write_leaves_the_old_heartbeat_and_nothing_beside_it(tmp_path: Path) -> None:
+    (tmp_path / HEARTBEAT_FILE / "in the way").mkdir(parents=True)
+    with pytest.raises(RecorderError, match="cannot be written"):
+        write_heartbeat(tmp_path, BEAT)
+    assert [path.name for path in tmp_path.iterdir()] == [HEARTBEAT_FILE]
+
+
+def test_without_a_file_the_reason_says_that_nobody_records(tmp_path: Path) -> None:
+    assert read_heartbeat(tmp_path) == (
+        None,
+        "there is no recorder.json: no recorder has written here",
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "no heartbeat"),
+        (b"\xff\xfe\x00", "no heartbeat"),
+        (b"{", "no heartbeat"),
+        (b"[]", "not a JSON object"),
+        (b"null", "not a JSON object"),
+        (b"[" * 100_000, "no heartbeat"),
+        (b'{"pid": ' + b"9" * 5000 + b"}", "no heartbeat"),
+        (b" " * 2_000_000, "larger than"),
+    ],
+)
+def test_a_file_that_is_no_heartbeat_is_told_apart(
+    tmp_path: Path, content: bytes, reason: str
+) -> None:
+    (tmp_path / HEARTBEAT_FILE).write_bytes(content)
+    read = read_heartbeat(tmp_path)
+    assert read.heartbeat is None
+    assert reason in (read.reason or "")
+
+
+def test_a_directory_or_a_pipe_of_that_name_does_not_stall_the_reader(tmp_path: Path) -> None:
+    (tmp_path / "a" / HEARTBEAT_FILE).mkdir(parents=True)
+    (tmp_path / "b").mkdir()
+    os.mkfifo(tmp_path / "b" / HEARTBEAT_FILE)
+    for folder in ("a", "b"):
+        read = read_heartbeat(tmp_path / folder)
+        assert read.heartbeat is None
+        assert read.reason
+
+
+@pytest.mark.parametrize("key", sorted({*BEAT.__slots__} - {"restarts", "missing", "age_held"}))
+def test_a_missing_key_is_named(tmp_path: Path, key: str) -> None:
+    assert key in (_reason_without(tmp_path, key) or "")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("pid", True),
+        ("pid", 0),
+        ("pid", "4711"),
+        ("updated", 1.5),
+        ("updated", 2**63),
+        ("state", "asleep"),
+        ("state", ["recording"]),
+        ("recordings", "rec_1"),
+        ("recordings", [1]),
+        ("since", None),
+        ("bytes_written", -1),
+        ("subscribed", None),
+        ("silent", {"/odom": 1}),
+        ("last_error", 5),
+        ("interval_s", "2"),
+        ("interval_s", True),
+        ("interval_s", 0),
+        ("interval_s", -1),
+        ("interval_s", float("nan")),
+        ("interval_s", float("inf")),
+        ("interval_s", 10**400),
+        ("interval_s", 1e9),
+    ],
+)
+def test_a_value_of_the_wrong_kind_is_named(tmp_path: Path, key: str, value: object) -> None:
+    read = _read_with(tmp_path, key, value)
+    assert read is not None
+    assert key in read
+
+
+def test_keys_of_another_version_are_passed_over(tmp_path: Path) -> None:
+    assert _read_with(tmp_path, "mood", "fine") is None
+
+
+@given(
+    content=st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+        lambda inner: st.lists(inner) | st.dictionaries(st.sampled_from(BEAT.__slots__), inner),
+    )
+)
+def test_any_json_is_read_without_a_crash(
+    content: object, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("bags")
+    (folder / HEARTBEAT_FILE).write_text(json.dumps(content), encoding="utf-8")
+    heartbeat, reason = read_heartbeat(folder)
+    assert (heartbeat is None) == (reason is not None)
+
+
+@pytest.mark.parametrize(
+    ("interval_s", "away_s", "live"),
+    [
+        (2.0, 0, True),
+        (2.0, 15, True),
+        (2.0, 15.001, False),
+        (2.0, -15, True),
+        (2.0, -15.001, False),
+        (10.0, 30, True),
+        (10.0, 30.001, False),
+        (10.0, -30.001, False),
+    ],
+)
+def test_it_is_live_for_three_intervals_and_at_least_15_s_on_either_side(
+    interval_s: float, away_s: float, live: bool
+) -> None:
+    beat = replace(BEAT, interval_s=interval_s)
+    assert beat.is_live(NOW + round(away_s * S)) is live
+
+
+def _raw() -> dict[str, object]:
+    return {name: getattr(BEAT, name) for name in BEAT.__slots__}
+
+
+def _read_with(folder: Path, key: str, value: object) -> str | None:
+    (folder / HEARTBEAT_FILE).write_text(json.dumps({**_raw(), key: value}), encoding="utf-8")
+    return read_heartbeat(folder).reason
+
+
+def _reason_without(folder: Path, key: str) -> str | None:
+    fields = {name: value for name, value in _raw().items() if name != key}
+    (folder / HEARTBEAT_FILE).write_text(json.dumps(fields), encoding="utf-8")
+    return read_heartbeat(folder).reason
+
+
+@needs_mounts
+def test_on_a_full_disk_the_one_that_lies_there_is_overwritten(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", "128k") as disk:
+        write_heartbeat(disk, replace(BEAT, last_error="x" * 700))
+        with filled(disk):
+            for error in ("the disk is full", None):
+                with pytest.raises(RecorderError, match="No space left"):
+                    write_heartbeat(disk, replace(BEAT, last_error=error))
+                assert read_heartbeat(disk).heartbeat == replace(BEAT, last_error=error)
+            with pytest.raises(RecorderError, match="No space left"):
+                write_heartbeat(disk, replace(BEAT, last_error="y" * 10_000))
+            assert read_heartbeat(disk).heartbeat == replace(BEAT, last_error=None)
+        write_heartbeat(disk, BEAT)
+        assert read_heartbeat(disk).heartbeat == BEAT

@@ -1,0 +1,50 @@
+"""The names of what the recorder puts into the bag directory."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from ros2_memory.bag_dir.layout import (
+    HANDOVER_FILE,
+    LOCK_FILE,
+    METADATA_FILE,
+    OWN_FILES,
+    QOS_FILE,
+    STORAGE_FILE,
+    bag_kind,
+    node_name,
+    recording_name,
+)
+from ros2_memory.core.timebase import NS_PER_S
+
+NOW = 1_795_150_800 * NS_PER_S + 999_999_999
+
+
+def test_a_recording_is_named_by_its_utc_second(tmp_path: Path) -> None:
+    assert recording_name(NOW, tmp_path) == "rec_20261120T050000Z"
+
+
+def test_a_name_that_is_taken_gets_a_number(tmp_path: Path) -> None:
+    names = []
+    for _ in range(4):
+        name = recording_name(NOW, tmp_path)
+        (tmp_path / name).mkdir()
+        names.append(name.removeprefix("rec_20261120T050000Z"))
+    assert names == ["", "_2", "_3", "_4"]
+
+
+def test_a_clock_before_1970_still_gives_a_name(tmp_path: Path) -> None:
+    assert recording_name(-1, tmp_path) == "rec_19691231T235959Z"
+
+
+def test_each_recording_has_a_node_of_its_own_with_a_valid_name(tmp_path: Path) -> None:
+    (tmp_path / recording_name(NOW, tmp_path)).mkdir()
+    names = [node_name("rec_20261120T050000Z"), node_name(recording_name(NOW, tmp_path))]
+    assert len(set(names)) == 2
+    assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) for name in names)
+
+
+def test_the_index_takes_none_of_it_for_a_bag() -> None:
+    names = {*OWN_FILES, HANDOVER_FILE, LOCK_FILE, METADATA_FILE, QOS_FILE, STORAGE_FILE}
+    assert [name for name in names if bag_kind(name)] == []

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import json
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.layout import MOMENT_FILE, bag_kind
+from ros2_memory.bag_dir.moment_file import (
+    Keepsake,
+    Wish,
+    fault_of_label,
+    folder_name,
+    held_in,
+    make_folder,
+    read_keepsake,
+    write_keepsake,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+T0 = 1_795_150_800 * S  # 2026-11-20T05:00:00Z
+NUMBER = "0123456789abcdef" * 2
+
+
+def wish(label: str = "charger found", number: str = NUMBER) -> Wish:
+    return Wish(number, label, T0 - 30 * S, T0, T0)
+
+
+class TestLabels:
+    @pytest.mark.parametrize(
+        "label", ["a", "Küche, 2. Stock", "充電 /../ etc", "x" * 120, "it's 🙂"]
+    )
+    def test_what_people_write_is_one(self, label: str) -> None:
+        assert fault_of_label(label) is None
+
+    @pytest.mark.parametrize(
+        "label",
+        ["", "  ", "x" * 121, "two\nlines", "tab\t", "nul\0", "\u202eedoc", "\ud800", "\u2028"],
+    )
+    def test_what_cannot_be_seen_or_is_too_long_is_none(self, label: str) -> None:
+        assert fault_of_label(label)
+
+    @given(st.text(max_size=130))
+    def test_any_of_them_names_a_folder_that_is_safe(self, label: str) -> None:
+        name = folder_name(wish(label))
+        assert re.fullmatch(r"20261120T050000Z-[a-z0-9]+(-[a-z0-9]+)*", name)
+        assert bag_kind(name) is None
+        assert len(name) < 64
+
+    def test_a_folder_is_called_by_time_and_label(self) -> None:
+        assert folder_name(wish("Küche, 2. Stock")) == "20261120T050000Z-kuche-2-stock"
+        assert folder_name(wish("充電")) == "20261120T050000Z-moment"
+
+
+class TestFolders:
+    def test_two_of_one_label_and_second_have_their_own(self, tmp_path: Path) -> None:
+        names = [make_folder(tmp_path, wish()).name for _ in range(3)]
+        assert names == [f"20261120T050000Z-charger-found{end}" for end in ("", "_2", "_3")]
+
+    def test_none_is_made_through_a_link(self, tmp_path: Path) -> None:
+        elsewhere = tmp_path / "elsewhere"
+        elsewhere.mkdir()
+        (tmp_path / "moments").symlink_to(elsewhere)
+        with pytest.raises(OSError, match="symbolic link"):
+            make_folder(tmp_path, wish())
+        assert list(held_in(tmp_path)) == []
+
+
+class TestMomentFiles:
+    @given(
+        st.text(min_size=1, max_size=120).filter(lambda text: not fault_of_label(text)),
+        st.booleans(),
+        st.lists(st.text(st.characters(exclude_categories=["Cs"])), max_size=3),
+    )
+    def test_what_is_written_is_read(
+        self, tmp_path_factory: pytest.TempPathFactory, label: str, pending: bool, said: list[str]
+    ) -> None:
+        folder = tmp_path_factory.mktemp("moment")
+        keepsake = Keepsake(*wish(label), pending, tuple(said))
+        write_keepsake(folder, keepsake)
+        assert read_keepsake(folder) == keepsake
+        complete = json.loads((folder / MOMENT_FILE).read_text())["complete"]
+        assert complete == (not pending and not said)
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "",
+            "[]",
+            "[" * 100_000,
+            '{"format": 2}',
+            '{"format": 1}',
+            json.dumps(
+                {
+                    "format": 1,
+                    "request": NUMBER,
+                    "label": "a",
+                    "start_ns": 5,
+                    "end_ns": 4,
+                    "requested_ns": 5,
+                    "pending": False,
+                    "missing": [],
+                }
+            ),
+        ],
+    )
+    def test_what_says_something_else_is_no_moment(self, tmp_path: Path, text: str) -> None:
+        folder = make_folder(tmp_path, wish())
+        (folder / MOMENT_FILE).write_text(text)
+        assert read_keepsake(folder) is None
+        assert list(held_in(tmp_path)) == []

@@ -1,0 +1,631 @@
+"""The list of a bag directory's own recordings: whatever stops the recorder, and wherever."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import structlog
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from ros2_memory.bag_dir import own_recordings
+from ros2_memory.bag_dir.layout import LIST_FILE
+from ros2_memory.bag_dir.own_recordings import Identity, OwnRecordings, identity_of
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.retention.repair import Repairer
+from ros2_memory.storage.mcap.embedded import custom_data
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.owned import OURS, embedding, lines, own_all
+from tests.recorder_world import World
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, MutableMapping
+    from pathlib import Path
+
+A, B, C = "rec_20260921T101320Z", "rec_20260921T102320Z", "rec_20260921T103320Z"
+
+
+def claimed(bag_dir: Path) -> OwnRecordings:
+    """The list after a start of the recorder."""
+    own = OwnRecordings(bag_dir)
+    own.claim(custom_data)
+    return own
+
+
+def restored(folder: Path) -> None:
+    """Deletes a directory and puts a copy of it in its place, as a backup program does."""
+    aside = folder.parent.parent / "backup"
+    shutil.copytree(folder, aside)
+    shutil.rmtree(folder)
+    shutil.copytree(aside, folder)
+    shutil.rmtree(aside)
+
+
+def spoil(path: Path, fault: str) -> None:
+    """Has a bag file damaged, or of a kind in which nothing that is embedded is looked for."""
+    data = bytearray(path.read_bytes())
+    if fault == "cut":
+        path.write_bytes(data[:40])
+    elif fault == "zeroed":
+        data[30:60] = bytes(30)
+        path.write_bytes(data)
+    elif fault == "flipped":  # the opcode of the record behind the header
+        data[8 + 9 + int.from_bytes(data[9:17], "little")] ^= 4
+        path.write_bytes(data)
+    elif fault == "db3":
+        path.unlink()
+        path.with_suffix(".db3").write_bytes(b"SQLite format 3\0")
+    elif fault == "compressed":
+        path.unlink()
+        path.with_name(path.name + ".zstd").write_bytes(b"\x28\xb5\x2f\xfd" + data[:50])
+    elif fault == "link":
+        path.rename(path.parents[1] / path.name)
+        path.symlink_to(path.parents[1] / path.name)
+    elif fault == "empty":
+        path.write_bytes(b"")
+    else:
+        path.unlink()
+
+
+def told(logs: list[MutableMapping[str, Any]], event: str) -> list[MutableMapping[str, Any]]:
+    return [each for each in logs if each["event"] == event]
+
+
+class TestWhatARecorderLists:
+    def test_the_name_before_the_child_starts_and_its_directory_once_it_is_there(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        listed_at_start: list[list[dict[str, Any]]] = []
+        start = world._start
+
+        def starting(name: str, directory: Path) -> Any:
+            assert not directory.exists()
+            listed_at_start.append(lines(tmp_path))
+            return start(name, directory)
+
+        world.supervisor._crew._start_child = starting
+        world.supervisor.start()
+        [recorder] = world.recorders
+        name = recorder.directory.name
+        [header, entry] = listed_at_start[0]
+        assert list(header) == ["bag_dir_id"]
+        assert entry == {"recording": name}
+        world.run(2)
+        assert lines(tmp_path)[-1]["inode"] == recorder.directory.stat().st_ino
+        assert OwnRecordings(tmp_path).owns(recorder.directory)
+        world.supervisor.stop()
+
+    def test_both_recordings_of_a_handover(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(60)
+        world.supervisor.stop()
+        made = [each.directory for each in world.recorders if each.directory.exists()]
+        assert len(made) > 2
+        own = OwnRecordings(tmp_path)
+        assert all(own.owns(directory) for directory in made)
+
+    def test_one_whose_child_dies_at_once(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(0.25)
+        world.recorders[0].die()
+        world.run(1)
+        assert OwnRecordings(tmp_path).owns(world.recorders[0].directory)
+        world.supervisor.stop()
+
+    def test_nothing_is_recorded_that_cannot_be_listed(self, tmp_path: Path) -> None:
+        (tmp_path / ".episodic").write_text("in the way")
+        world = World(tmp_path)
+        with pytest.raises(RecorderError, match=r"recordings\.jsonl cannot be (read|written)"):
+            world.supervisor.start()
+        assert world.recorders == []
+
+    def test_the_list_is_not_written_through_a_link(self, tmp_path: Path) -> None:
+        (tmp_path / "elsewhere").mkdir()
+        bags = tmp_path / "bags"
+        bags.mkdir()
+        (bags / ".episodic").symlink_to(tmp_path / "elsewhere")
+        with pytest.raises(RecorderError, match="symbolic link"):
+            OwnRecordings(bags).begin(A)
+        assert [*(tmp_path / "elsewhere").iterdir()] == []
+
+    def test_a_list_that_is_deleted_while_recording_is_written_again_whole(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(5)
+        shutil.rmtree(tmp_path / ".episodic")
+        world.run(40)
+        world.supervisor.stop()
+        made = [each.directory for each in world.recorders if each.directory.exists()]
+        assert len(made) > 1
+        own = OwnRecordings(tmp_path)
+        assert all(own.owns(directory) for directory in made)
+
+    def test_the_list_stays_small_over_years(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(own_recordings, "_SPARE_LINES", 20)
+        own = OwnRecordings(tmp_path)
+        longest = 0
+        for number in range(200):
+            name = f"rec_{number}"
+            own.begin(name)
+            (tmp_path / name).mkdir()
+            own.complete(name)
+            if number >= 3:
+                (tmp_path / f"rec_{number - 3}").rmdir()
+            longest = max(longest, len(lines(tmp_path)))
+        assert longest <= 2 * 20
+        assert all(own.owns(tmp_path / f"rec_{number}") for number in range(197, 200))
+
+    def test_entries_of_what_has_gone_are_dropped_at_a_start(self, tmp_path: Path) -> None:
+        for name in (A, B):
+            embedding(tmp_path / name / f"{name}_0.mcap", OURS)
+        own_all(tmp_path)
+        shutil.rmtree(tmp_path / A)
+        before = lines(tmp_path)[0]
+        claimed(tmp_path)
+        header, entry = lines(tmp_path)
+        assert header == before
+        assert entry["recording"] == B
+
+    def test_two_programs_that_write_lose_nothing(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(own_recordings, "_SPARE_LINES", 5)
+        own_all(tmp_path)
+        for writer in range(3):
+            for number in range(20):
+                (tmp_path / f"w{writer}_{number}").mkdir()
+
+        def write(writer: int) -> None:
+            own = OwnRecordings(tmp_path)
+            for number in range(20):
+                own.complete(f"w{writer}_{number}")
+
+        threads = [threading.Thread(target=write, args=(writer,)) for writer in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        own = OwnRecordings(tmp_path)
+        assert all(own.owns(tmp_path / f"w{w}_{n}") for w in range(3) for n in range(20))
+
+
+class TestWhatAKillLeaves:
+    """The steps of a recording: list it, start the child, which makes it, list its directory."""
+
+    def test_before_it_is_listed_there_is_nothing(self, tmp_path: Path) -> None:
+        own = claimed(tmp_path)
+        assert lines(tmp_path) == [{"bag_dir_id": own.bag_dir_id}]
+
+    def test_listed_and_not_made(self, tmp_path: Path) -> None:
+        claimed(tmp_path).begin(A)
+        claimed(tmp_path)
+        assert len(lines(tmp_path)) == 1
+
+    def test_made_and_its_directory_not_listed(self, tmp_path: Path) -> None:
+        own = claimed(tmp_path)
+        own.begin(A)
+        assert own.bag_dir_id is not None
+        embedding(tmp_path / A / f"{A}_0.mcap", {**OURS, "bag_dir_id": own.bag_dir_id})
+        (tmp_path / A / f"{A}_1.mcap").touch()
+        assert not OwnRecordings(tmp_path).owns(tmp_path / A)
+        assert claimed(tmp_path).owns(tmp_path / A)
+        assert OwnRecordings(tmp_path).owns(tmp_path / A)
+
+    @pytest.mark.parametrize(
+        "embedded",
+        [None, {}, {"robot": "r1"}, OURS, {**OURS, "bag_dir_id": "0" * 32}],
+        ids=["nothing", "no custom data", "another program's", "no id", "another directory's id"],
+    )
+    def test_what_lies_there_is_not_what_the_child_made(
+        self, tmp_path: Path, embedded: dict[str, str] | None
+    ) -> None:
+        own = claimed(tmp_path)
+        own.begin(A)
+        assert own.bag_dir_id is not None
+        embedding(tmp_path / A / f"{A}_0.mcap", {**OURS, "bag_dir_id": own.bag_dir_id})
+        embedding(tmp_path / A / f"{A}_1.mcap", embedded)
+        with structlog.testing.capture_logs() as logs:
+            assert not claimed(tmp_path).owns(tmp_path / A)
+        [warned] = told(logs, "recording_not_claimed")
+        assert warned["recording"] == A
+        assert "ros2-memory adopt" in warned["reason"]
+
+    def test_a_directory_without_a_byte_is_not_claimed(self, tmp_path: Path) -> None:
+        claimed(tmp_path).begin(A)
+        (tmp_path / A).mkdir()
+        (tmp_path / A / f"{A}_0.mcap").touch()
+        assert not claimed(tmp_path).owns(tmp_path / A)
+
+    @settings(max_examples=60, deadline=None)
+    @given(cut=st.integers(0, 200), junk=st.sampled_from([b"", b"\0\0\0\0", b"{", b"[" * 5000]))
+    def test_a_power_cut_amid_an_append_costs_that_line_alone(
+        self, tmp_path_factory: pytest.TempPathFactory, cut: int, junk: bytes
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        for name in (A, B):
+            (bag_dir / name).mkdir()
+        own = claimed(bag_dir)
+        own.begin(A)
+        own.complete(A)
+        path = bag_dir / LIST_FILE
+        whole = path.read_bytes()
+        own.begin(B)
+        torn = path.read_bytes()[len(whole) :]
+        path.write_bytes(whole + torn[: min(cut, len(torn))] + junk)
+        later = claimed(bag_dir)
+        assert later.owns(bag_dir / A)
+        later.begin(C)
+        (bag_dir / C).mkdir()
+        later.complete(C)
+        again = OwnRecordings(bag_dir)
+        assert again.owns(bag_dir / A)
+        assert again.owns(bag_dir / C)
+        assert not again.owns(bag_dir / B)
+        assert again.exists()
+        assert again.bag_dir_id == own.bag_dir_id
+
+    @settings(max_examples=100, deadline=None)
+    @given(data=st.binary(max_size=300))
+    def test_whatever_stands_in_the_list_no_directory_is_made_up(
+        self, tmp_path_factory: pytest.TempPathFactory, data: bytes
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        (bag_dir / ".episodic").mkdir()
+        (bag_dir / A).mkdir()
+        (bag_dir / LIST_FILE).write_bytes(data)
+        assert not OwnRecordings(bag_dir).owns(bag_dir / A)
+
+    @pytest.mark.parametrize(
+        "line",
+        [
+            {"recording": "../x", "inode": 1},
+            {"recording": "", "inode": 1},
+            {"recording": "/x", "inode": 1},
+            {"recording": "a//b", "inode": 1},
+            {"recording": "a", "inode": True},
+            {"recording": "a", "inode": "1"},
+            {"recording": 5},
+            {"bag_dir_id": "../.."},
+            [],
+            None,
+        ],
+    )
+    def test_a_line_that_says_nothing_is_left_out_and_told(self, tmp_path: Path, line: Any) -> None:
+        own_all(tmp_path)
+        with (tmp_path / LIST_FILE).open("a") as stream:
+            stream.write(json.dumps(line) + "\n")
+        with structlog.testing.capture_logs() as logs:
+            assert not OwnRecordings(tmp_path).names()
+        assert told(logs, "recordings_list_damaged")
+
+    def test_a_list_that_cannot_be_written_is_known_all_the_same(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        own = OwnRecordings(tmp_path)
+
+        def full(*_: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        with monkeypatch.context() as patch, structlog.testing.capture_logs() as logs:
+            patch.setattr(own_recordings, "write_durably", full)
+            own.claim(custom_data)
+            assert told(logs, "recordings_not_listed")
+            assert own.owns(tmp_path / A)
+            with pytest.raises(RecorderError, match="No space left"):
+                own.begin(B)
+        own.begin(B)
+        assert [each.get("recording") for each in lines(tmp_path)] == [None, A, B]
+
+
+class TestCopies:
+    def test_a_restored_directory_is_foreign_until_it_is_adopted(self, tmp_path: Path) -> None:
+        bags = tmp_path / "bags"
+        embedding(bags / A / f"{A}_0.mcap", OURS)
+        own = own_all(bags)
+        assert own.owns(bags / A)
+        # ext4 gives it the same inode number: the generation tells, where there is one.
+        restored(bags / A)
+        if identity_of(bags / A) == Identity((bags / A).stat().st_ino):
+            pytest.skip("this file system has no generations, so numbers alone may be equal")
+        assert not own.owns(bags / A)
+        own_all(bags)
+        assert own.owns(bags / A)
+
+    def test_a_whole_bag_directory_that_was_copied_is_foreign(self, tmp_path: Path) -> None:
+        for name in (A, B):
+            embedding(tmp_path / "bags" / name / f"{name}_0.mcap", OURS)
+        own_all(tmp_path / "bags")
+        shutil.copytree(tmp_path / "bags", tmp_path / "disk")
+        own = claimed(tmp_path / "disk")
+        assert not any(own.owns(tmp_path / "disk" / name) for name in (A, B))
+
+    def test_one_that_was_moved_under_another_name_is_foreign(self, tmp_path: Path) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        own = own_all(tmp_path)
+        (tmp_path / A).rename(tmp_path / "saved")
+        assert not own.owns(tmp_path / "saved")
+
+    def test_a_link_to_one_is_foreign(self, tmp_path: Path) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        own = own_all(tmp_path)
+        (tmp_path / A).rename(tmp_path / "elsewhere")
+        (tmp_path / A).symlink_to(tmp_path / "elsewhere")
+        assert not own.owns(tmp_path / A)
+
+    def test_a_repaired_recording_stays_its_recorders(self, tmp_path: Path) -> None:
+        path = embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        own = own_all(tmp_path)
+        path.write_bytes(path.read_bytes()[:-500])
+        assert Repairer(McapReader(), McapWriter()).repair(path)
+        assert own.owns(tmp_path / A)
+        assert custom_data(path) == OURS
+
+
+class TestVersionsBeforeTheList:
+    """Adopted once: by name, and by who names them or by what every file carries."""
+
+    def beat(self, bag_dir: Path, *names: str) -> None:
+        (bag_dir / "recorder.json").write_text(
+            json.dumps(
+                {
+                    "pid": 7,
+                    "updated": 1,
+                    "state": "stopped",
+                    "recordings": names,
+                    "since": 1,
+                    "bytes_written": 0,
+                    "subscribed": [],
+                    "silent": [],
+                    "last_error": None,
+                    "interval_s": 2.0,
+                }
+            )
+        )
+
+    def hand_over(self, bag_dir: Path, name: str, following: str) -> None:
+        (bag_dir / name / "handover.json").write_text(
+            json.dumps(
+                {"format": 1, "state": "counts", "clock": "publish", "next": following, "notes": []}
+            )
+        )
+
+    def test_one_whose_every_file_carries_what_our_child_embeds(self, tmp_path: Path) -> None:
+        for number in range(3):
+            embedding(tmp_path / A / f"{A}_{number}.mcap", OURS)
+        (tmp_path / A / f"{A}_3.mcap").touch()
+        with structlog.testing.capture_logs() as logs:
+            assert claimed(tmp_path).owns(tmp_path / A)
+        [event] = told(logs, "recordings_adopted")
+        assert (event["recordings"], event["names"]) == (1, [A])
+        assert lines(tmp_path)[1]["adopted"] is True
+
+    def test_one_that_was_cut_short(self, tmp_path: Path) -> None:
+        path = embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        path.write_bytes(path.read_bytes()[:-300])
+        assert claimed(tmp_path).owns(tmp_path / A)
+
+    def test_one_that_the_heartbeat_names(self, tmp_path: Path) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", None)
+        self.beat(tmp_path, A, "session_mcap")
+        embedding(tmp_path / "session_mcap" / "s_0.mcap", None)
+        own = claimed(tmp_path)
+        assert own.owns(tmp_path / A)
+        assert not own.owns(tmp_path / "session_mcap")
+
+    def test_one_that_a_handover_names(self, tmp_path: Path) -> None:
+        for name in (A, B, C):
+            embedding(tmp_path / name / f"{name}_0.mcap", None)
+        self.hand_over(tmp_path, A, B)
+        own = claimed(tmp_path)
+        assert [own.owns(tmp_path / name) for name in (A, B, C)] == [False, True, False]
+
+    @pytest.mark.parametrize("embedded", [None, {}, {"recorded_by": "someone"}])
+    def test_one_of_which_a_single_file_is_anothers_is_foreign(
+        self, tmp_path: Path, embedded: Mapping[str, str] | None
+    ) -> None:
+        for number in range(3):
+            embedding(tmp_path / A / f"{A}_{number}.mcap", OURS if number else embedded)
+        assert not claimed(tmp_path).owns(tmp_path / A)
+
+    def test_one_of_another_name_or_place_is_foreign(self, tmp_path: Path) -> None:
+        for folder in ("session_mcap", f"old/{A}"):
+            embedding(tmp_path / folder / "s_0.mcap", OURS)
+        (tmp_path / "elsewhere").mkdir()
+        (tmp_path / "bags").mkdir()
+        embedding(tmp_path / "elsewhere" / "s_0.mcap", OURS)
+        (tmp_path / B).symlink_to(tmp_path / "elsewhere")
+        assert not claimed(tmp_path).names()
+
+    def test_one_of_a_version_with_the_list_was_copied_here(self, tmp_path: Path) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", {**OURS, "bag_dir_id": "1" * 32})
+        embedding(tmp_path / B / f"{B}_0.mcap", {**OURS, "bag_dir_id": "1" * 32})
+        self.hand_over(tmp_path, A, B)
+        assert not claimed(tmp_path).names()
+
+    @pytest.mark.parametrize("named_by", ["heartbeat", "handover"])
+    @pytest.mark.parametrize("damaged", [0, 1])
+    @pytest.mark.parametrize("fault", ["cut", "zeroed", "flipped", "db3", "link", "compressed"])
+    def test_a_copy_of_which_one_file_cannot_be_read_is_foreign(
+        self, tmp_path: Path, fault: str, damaged: int, named_by: str
+    ) -> None:
+        for number in range(3):
+            embedding(tmp_path / B / f"{B}_{number}.mcap", {**OURS, "bag_dir_id": "1" * 32})
+        if named_by == "heartbeat":
+            self.beat(tmp_path, B)
+        else:
+            (tmp_path / A).mkdir()
+            self.hand_over(tmp_path, A, B)
+        spoil(tmp_path / B / f"{B}_{damaged}.mcap", fault)
+        assert not claimed(tmp_path).owns(tmp_path / B)
+
+    @pytest.mark.parametrize("fault", ["cut", "zeroed", "flipped", "db3", "link", "compressed"])
+    @pytest.mark.parametrize("embedded", [None, OURS])
+    def test_one_that_is_named_and_cannot_be_read_is_foreign_and_told(
+        self, tmp_path: Path, fault: str, embedded: Mapping[str, str] | None
+    ) -> None:
+        for name in (A, B):
+            embedding(tmp_path / name / f"{name}_0.mcap", embedded)
+            embedding(tmp_path / name / f"{name}_1.mcap", embedded)
+        self.beat(tmp_path, A, B)
+        spoil(tmp_path / A / f"{A}_1.mcap", fault)
+        with structlog.testing.capture_logs() as logs:
+            own = claimed(tmp_path)
+        assert [*own.names()] == [B]
+        [warned] = told(logs, "recordings_not_adopted")
+        assert (warned["recordings"], warned["log_level"]) == (1, "warning")
+        [reason] = warned["reasons"]
+        assert reason.startswith(f"{A}: {A}_1.")
+        assert "cannot be read as far as" in reason
+        assert "ros2-memory adopt" in warned["advice"]
+
+    @pytest.mark.parametrize("embedded", [None, OURS])
+    def test_one_that_ends_in_a_torn_split_is_adopted_as_far_as_it_can_be_read(
+        self, tmp_path: Path, embedded: Mapping[str, str] | None
+    ) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", embedded)
+        torn = embedding(tmp_path / A / f"{A}_1.mcap", embedded)
+        (tmp_path / A / f"{A}_2.mcap").touch()
+        self.beat(tmp_path, A)
+        begins = torn.read_bytes().index(b"/chatter") - 100  # within the first chunk
+        torn.write_bytes(torn.read_bytes()[: begins + 150])
+        assert claimed(tmp_path).owns(tmp_path / A)
+
+    def test_a_named_one_that_carries_another_programs_name_is_foreign(
+        self, tmp_path: Path
+    ) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", {"recorded_by": "someone"})
+        self.beat(tmp_path, A)
+        assert not claimed(tmp_path).owns(tmp_path / A)
+
+    @settings(max_examples=60, deadline=None)
+    @given(
+        faults=st.lists(
+            st.tuples(
+                st.integers(0, 3), st.sampled_from(["cut", "zeroed", "db3", "gone", "empty"])
+            ),
+            max_size=4,
+            unique_by=lambda fault: fault[0],
+        )
+    )
+    def test_no_copy_that_carries_an_id_is_adopted_whatever_was_damaged(
+        self, tmp_path_factory: pytest.TempPathFactory, faults: list[tuple[int, str]]
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        for number in range(4):
+            embedding(bag_dir / A / f"{A}_{number}.mcap", {**OURS, "bag_dir_id": "1" * 32}, size=2)
+        self.beat(bag_dir, A)
+        for number, fault in faults:
+            spoil(bag_dir / A / f"{A}_{number}.mcap", fault)
+        if any(path.stat().st_size for path in (bag_dir / A).iterdir()):
+            assert not claimed(bag_dir).owns(bag_dir / A)
+
+    @settings(max_examples=300, deadline=None)
+    @given(at=st.integers(0, 10_000), bit=st.integers(0, 7))
+    def test_no_copy_of_a_single_file_is_adopted_whichever_bit_is_wrong(
+        self, tmp_path_factory: pytest.TempPathFactory, at: int, bit: int
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        path = bag_dir / A / f"{A}_0.mcap"
+        embedding(path, {**OURS, "bag_dir_id": "1" * 32}, size=2)
+        self.beat(bag_dir, A)
+        data = bytearray(path.read_bytes())
+        data[at % (data.index(b"jazzy") + 5)] ^= 1 << bit
+        path.write_bytes(data)
+        assert not claimed(bag_dir).owns(bag_dir / A)
+
+    def test_it_happens_once(self, tmp_path: Path) -> None:
+        claimed(tmp_path)
+        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        assert not claimed(tmp_path).owns(tmp_path / A)
+
+    def test_a_recording_that_cannot_be_looked_into_stops_nothing(self, tmp_path: Path) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        embedding(tmp_path / B / f"{B}_0.mcap", OURS)
+
+        def failing(path: Path) -> dict[str, str] | None:
+            if path.parent.name == A:
+                raise OSError(5, "Input/output error")
+            return custom_data(path)
+
+        own = OwnRecordings(tmp_path)
+        own.claim(failing)
+        assert [*own.names()] == [B]
+
+    def test_what_would_be_adopted_is_known_without_a_list_and_nothing_is_written(
+        self, tmp_path: Path
+    ) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        own = OwnRecordings(tmp_path)
+        own.suppose(custom_data)
+        assert own.owns(tmp_path / A)
+        assert not (tmp_path / ".episodic").exists()
+
+
+class TestEmbedded:
+    """None where it cannot be known, which is not the same as nothing."""
+
+    @pytest.mark.parametrize("custom", [None, {}])
+    def test_nothing_where_a_file_can_be_read_and_has_none(
+        self, tmp_path: Path, custom: Mapping[str, str] | None
+    ) -> None:
+        assert custom_data(embedding(tmp_path / "a_0.mcap", custom)) == {}
+
+    def test_nothing_in_a_file_of_humble(self, tmp_path: Path) -> None:
+        path = tmp_path / "a_0.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start("ros2", "libmcap 0.8.0")
+            writer.add_metadata("rosbag2", {"ROS_DISTRO": "humble"})
+            writer.finish()
+        assert custom_data(path) == {}
+
+    def test_wherever_a_file_was_cut_it_is_what_was_embedded_or_unknown(
+        self, tmp_path: Path
+    ) -> None:
+        path = embedding(tmp_path / "a_0.mcap", OURS, size=2)
+        data, found = path.read_bytes(), []
+        for length in range(len(data)):
+            path.write_bytes(data[:length])
+            found.append(custom_data(path))
+        known = found.index(OURS)
+        assert found == [None] * known + [OURS] * (len(data) - known)
+        assert data[known - 20 : known].endswith(b"ros_distro: jazzy\n"[-8:])
+
+    def test_unknown_of_what_is_no_bag(self, tmp_path: Path) -> None:
+        path = tmp_path / "x.mcap"
+        for data in (b"", b"\x89MCAP0\r\n", b"no bag", b"\x89MCAP0\r\n" + b"\x0c" + b"\xff" * 8):
+            path.write_bytes(data)
+            assert custom_data(path) is None
+
+    def test_a_second_metadata_record_is_found(self, tmp_path: Path) -> None:
+        path = embedding(tmp_path / "a" / "a_0.mcap", {"recorded_by": "x: y # 'z'"[:1]})
+        assert custom_data(path) == {"recorded_by": "x"}
+
+    def test_a_file_that_is_not_there_is_an_error(self, tmp_path: Path) -> None:
+        with pytest.raises(OSError, match="No such file"):
+            custom_data(tmp_path / "x.mcap")
+
+    @settings(max_examples=100, deadline=None)
+    @given(at=st.integers(0, 400), value=st.integers(0, 255))
+    def test_a_damaged_file_never_raises_more_than_an_oserror(
+        self, tmp_path_factory: pytest.TempPathFactory, at: int, value: int
+    ) -> None:
+        path = embedding(tmp_path_factory.mktemp("bag") / "a_0.mcap", OURS, size=2)
+        data = bytearray(path.read_bytes())
+        data[at % len(data)] = value
+        path.write_bytes(data)
+        assert custom_data(path) in (None, OURS) or isinstance(custom_data(path), dict)

@@ -1,0 +1,85 @@
+"""What is settled of a run is not asked for again; what is not, is."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.queries import list_recorded_topics, trajectory_summary
+from tests.bags import odom, write_mcap
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+    from ros2_memory.index.segment import Run
+
+T0 = 1_700_000_000 * 10**9
+
+
+def recorded(bag_dir: Path, bags: int = 2) -> tuple[Memory, Run]:
+    for n in range(bags):
+        write_mcap(bag_dir / "rec" / f"rec_{n}.mcap", [odom(T0 + n, 0.0, 0.0)])
+    memory = memory_of(bag_dir)
+    [run] = memory.index.snapshot().runs
+    return memory, run
+
+
+def test_a_run_of_which_every_bag_has_an_entry_is_settled_once_it_was_looked_at(
+    tmp_path: Path,
+) -> None:
+    memory, run = recorded(tmp_path)
+    recall = recalling(memory, tmp_path).recall
+    assert recall is not None
+    notes = recall.notes(run, recall.as_of())
+    assert len(notes.numbers) == 2
+    assert recall.settled(run) is notes
+
+
+def test_a_run_with_a_bag_without_an_entry_is_not_settled(tmp_path: Path) -> None:
+    memory, run = recorded(tmp_path)
+    recall = recalling(memory, tmp_path, part=0.5).recall
+    assert recall is not None
+    assert len(recall.notes(run, recall.as_of()).numbers) == 1
+    assert recall.settled(run) is None
+
+
+def test_what_a_catalogue_said_that_is_no_more_does_not_settle_anything(tmp_path: Path) -> None:
+    memory, run = recorded(tmp_path)
+    recall = recalling(memory, tmp_path).recall
+    assert recall is not None
+    recall.notes(run, recall.as_of())
+    (tmp_path / FOLDER / FILE).unlink()
+    recall.catalogue.look_after()
+    recall.as_of()
+    assert recall.settled(run) is None
+    assert not recall.notes(run, recall.as_of()).numbers
+
+
+@pytest.mark.parametrize("answer", ["", "x", "7", "[]", '["zz", 1, 2]', '{"a": [[1], 2]}'])
+def test_what_cannot_be_read_of_what_was_worked_out_is_worked_out_again(
+    tmp_path: Path, answer: str
+) -> None:
+    for recording in ("a", "b"):
+        messages = [odom(T0 + n, 0.1 * n, 0.0) for n in range(5)]
+        write_mcap(tmp_path / recording / f"{recording}_0.mcap", messages)
+    memory = recalling(memory_of(tmp_path), tmp_path)
+
+    def told() -> object:
+        way = trajectory_summary(memory, Call(), Span(start_s=0.0, end_s=9e9))
+        return list_recorded_topics(memory, Call()), way
+
+    before = told()
+    with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
+        changed = base.execute("UPDATE remembered SET answer = ?", (answer,)).rowcount
+        base.commit()
+    assert changed == 2
+    assert told() == before

@@ -1,0 +1,242 @@
+"""With a catalogue every question is answered as without one."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, assume, example, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory import queries
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.view import View
+from ros2_memory.insights.recap import recap
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import McapLayout, boolean, odom, write_mcap
+from tests.histories import S, write_history
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from random import Random
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.context import Memory
+
+Question = tuple[str, "Callable[[Memory, Call], object]"]
+
+TOPICS = (
+    "/odom",
+    "/tf",
+    "/tf_static",
+    "/dock",
+    "/vision/*",
+    "/mixed",
+    "/chatter",
+    "/status",
+    "/foreign",
+    "/bumper",
+    "/*",
+    "/nowhere",
+)
+CONDITIONS: tuple[tuple[str, JsonValue], ...] = (
+    ("contains", "scissors"),
+    ("contains", "person"),
+    ("contains", "-"),
+    ("contains", "never"),
+    ("contains", "docked"),
+    ("contains", 2),
+    ("contains", "1"),
+    ("contains", "true"),
+    ("equals", True),
+    ("equals", 1),
+    ("equals", "0"),
+    ("equals", 0.4),
+    ("equals", "cup"),
+    ("equals", 3),
+    ("above", 0.4),
+    ("below", "2.5"),
+    ("near_position", {"x": 0.5, "y": 0.5}),
+    ("near_position", {"x": 500.0, "y": 0.0}),
+    ("near_position", {"x": 80, "y": 0.5, "z": 1.0}),
+)
+
+FIELDS = ("goal", "detections.label", "detections.bbox", "position", "value", "data", "nowhere")
+
+
+def questions(moments: list[int], draw: Random) -> Iterator[Question]:
+    yield "topics", queries.list_recorded_topics
+    yield "range", queries.data_time_range
+    yield "frames", queries.frames
+    for at in [(each + draw.choice([0, S // 3])) / 1e9 for each in draw.sample(moments, 2)]:
+        moment = Moment(at_s=at)
+        for topic in ("/odom", "/dock", "/mixed", "/status"):
+            yield f"{topic} at {at}", partial(_value, topic, moment)
+        yield f"position {at}", partial(_position, moment)
+        yield f"velocity {at}", partial(_velocity, moment)
+        for child in ("laser", "base_link"):
+            yield f"{child} {at}", partial(_transform, child, moment)
+    for first, last in (sorted(draw.sample(moments, 2)), (min(moments), max(moments))):
+        span = Span(start_s=first / 1e9, end_s=last / 1e9)
+        for topic in ("/odom", "/chatter", "/dock"):
+            yield f"{topic} in {span}", partial(_range, topic, span)
+            yield f"way of {topic} in {span}", partial(_way, topic, span)
+        yield f"recap of {span}", partial(_recap, span)
+    for topic in TOPICS:
+        for kind, wanted in draw.sample(CONDITIONS, 4):
+            for field in (
+                None,
+                draw.choice(["goal", "detections.label", "position", "value", "data", "nowhere"]),
+            ):
+                before = draw.choice([None, None, draw.choice(moments) / 1e9])
+                yield (
+                    f"last {topic} {kind} {wanted} {field} {before}",
+                    partial(_match, topic, kind, wanted, field, before),
+                )
+        yield f"all {topic} {kind} {wanted}", partial(_matches, topic, kind, wanted, before)
+    yield "odom when", partial(_when, "/chatter")
+
+
+def _value(topic: str, moment: Moment, memory: Memory, call: Call) -> object:
+    return queries.topic_value(memory, call, topic, moment, tolerance_s=2.0)
+
+
+def _position(moment: Moment, memory: Memory, call: Call) -> object:
+    return queries.position(memory, call, moment)
+
+
+def _velocity(moment: Moment, memory: Memory, call: Call) -> object:
+    return queries.velocity(memory, call, moment)
+
+
+def _transform(child: str, moment: Moment, memory: Memory, call: Call) -> object:
+    return queries.transform(memory, call, "odom", child, moment)
+
+
+def _range(topic: str, span: Span, memory: Memory, call: Call) -> object:
+    return queries.topic_range(memory, call, topic, span, max_samples=5)
+
+
+def _recap(span: Span, memory: Memory, call: Call) -> object:
+    return recap(memory, call, span)
+
+
+def _way(topic: str, span: Span, memory: Memory, call: Call) -> object:
+    return queries.trajectory_summary(memory, call, span, topic=topic)
+
+
+def _match(
+    topic: str,
+    kind: str,
+    wanted: JsonValue,
+    field: str | None,
+    before: float | None,
+    memory: Memory,
+    call: Call,
+) -> object:
+    return queries.find_last_match(
+        memory,
+        call,
+        topic,
+        kind,
+        wanted,
+        field=field,
+        before_s=before,
+    )
+
+
+def _matches(
+    topic: str, kind: str, wanted: JsonValue, end: float | None, memory: Memory, call: Call
+) -> object:
+    return find_matches(memory, call, topic, kind, wanted, end_s=end, limit=3)
+
+
+def _when(topic: str, memory: Memory, call: Call) -> object:
+    return queries.value_when(
+        memory, call, "/odom", topic, condition_type="contains", value="scissors"
+    )
+
+
+def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
+    try:
+        return repr(ask(memory, Call()))
+    except EpisodicError as error:
+        said = getattr(error, "reason", ""), str(error), getattr(error, "notes", ())
+        return f"{type(error).__name__}: {said}"
+
+
+@pytest.mark.parametrize("clock", ["auto", "stamp"])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 1.0, 0.5]))
+@example(seed=572545084, part=1.0)
+@example(seed=246, part=1.0)
+@example(seed=11445, part=1.0)
+def test_every_question_is_answered_as_without_a_catalogue(
+    clock: str, seed: int, part: float
+) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        moments = write_history(bag_dir, draw).moments
+        limits = Limits(tf_clock=clock)  # type: ignore[arg-type]
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()), limits=limits)
+        recalled = recalling(replace(plain), bag_dir, part=part)
+        for asked, ask in questions(moments, draw):
+            assert answer(recalled, ask) == answer(plain, ask), (seed, part, asked)
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32))
+def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed: int) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        moments = write_history(bag_dir, draw).moments
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        recalled = recalling(replace(plain), bag_dir)
+        for _ in range(60):
+            stop = draw.choice(moments) + draw.choice([0, 1, 10**6])
+            start = draw.choice([MIN_NS, stop - draw.choice([1, 10**8, 3 * 10**9, 10**11])])
+            for memory in (plain, recalled):
+                asked = View(memory, Call())
+                assume(asked.snapshot.topics())  # not where each bag was spoilt
+                topic = draw.choice(asked.snapshot.topics())
+                window = TimeWindow(start, stop)
+                first = next(View(memory, Call()).stream([topic], window, newest_first=True), None)
+                assert asked.newest(topic, window) == first, (seed, topic, window)
+
+
+def test_a_latched_message_received_again_is_no_event_with_a_catalogue_either(
+    tmp_path: Path,
+) -> None:
+    """What one bag says of such a topic alone is not what counts in it."""
+    layout = McapLayout(latched=frozenset({"/docked"}))
+    first = [boolean(S, False, "/docked"), boolean(5 * S, True, "/docked")]
+    write_mcap(tmp_path / "a" / "a_0.mcap", first, layout)
+    again = [
+        replace(each, log_time=600 * S + n, publish_time=each.log_time)
+        for n, each in enumerate(first)
+    ]
+    write_mcap(
+        tmp_path / "b" / "b_0.mcap", [odom(600 * S, 0, 0), *again, odom(601 * S, 0, 0)], layout
+    )
+    plain = memory_of(tmp_path)
+    recalled = recalling(replace(plain), tmp_path)
+    told = [recap(memory, Call(), Span(start_s=590.0, end_s=610.0)) for memory in (plain, recalled)]
+    assert told[0] == told[1]
+    assert told[0].events == ()
+    flipped = recap(recalled, Call(), Span(start_s=0.0, end_s=610.0)).events
+    assert [each.start for each in flipped if each.kind == "flip"] == [5 * S]

@@ -1,0 +1,130 @@
+"""A week of bags that only the catalogue knows: questions about all of it read no bag."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import pytest
+
+from ros2_memory import queries
+from ros2_memory.catalogue.digest import Digest, Digester
+from ros2_memory.catalogue.lookup import Recall
+from ros2_memory.catalogue.store import BagKey, Catalogue
+from ros2_memory.core.model import BagFile, BagState, BagSummary
+from ros2_memory.core.timebase import NS_PER_S, FixedClock
+from ros2_memory.history.context import Call, Limits, Memory
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.index.snapshot import Snapshot
+from tests.bags import detections, odom, tf, transform
+from tests.fakes import FakeReader
+from tests.memories import extractor
+
+if TYPE_CHECKING:
+    from ros2_memory.analysis.odometry import PoseDigest, Stop
+    from ros2_memory.recorder.index_manager import IndexManager
+
+BAGS = 60_480
+T0_S = 1_700_000_000
+T0 = T0_S * NS_PER_S
+SPLIT = 10 * NS_PER_S
+SCENE = "/vision/scene/scene_objects"
+BAG_DIR = Path("/no/such/folder")
+
+
+class Still:
+    """An index that stands still."""
+
+    def __init__(self, snapshot: Snapshot) -> None:
+        self._snapshot = snapshot
+        self.bag_dir = BAG_DIR
+
+    def snapshot(self, reach: int | None = None) -> Snapshot:
+        return self._snapshot
+
+
+def hour_bag() -> Digest:
+    reader = FakeReader()
+    messages = [odom(T0 + n * NS_PER_S, n / 10, 0.0, vx=0.1) for n in range(10)]
+    messages.append(detections(T0, ["cup", "person"], at=(1.0, 0.0, 0.0)))
+    messages.append(tf(T0, transform(T0, "odom", "base_link", (0.0, 0.0, 0.0))))
+    path = reader.add(Path("bag.mcap"), messages)
+    return Digester(reader, extractor(), 10.0).digest(path)
+
+
+def later(digest: Digest, by: int) -> Digest:
+    """What a bag would have held some time later, a metre on for each bag."""
+    shifted = [
+        replace(each, first=each.first + by, last=each.last + by) for each in digest.summary.topics
+    ]
+    topics = tuple(
+        replace(each, poses=None if each.poses is None else moved(each.poses, by))
+        for each in digest.topics
+    )
+    return Digest(BagSummary(tuple(shifted)), topics)
+
+
+def moved(poses: PoseDigest, by: int) -> PoseDigest:
+    def stop(at: Stop | None) -> Stop | None:
+        if at is None:
+            return None
+        x, y, z = at.position
+        return at._replace(time=at.time + by, position=(x + by / SPLIT, y, z))
+
+    return replace(
+        poses,
+        first=stop(poses.first),
+        last=stop(poses.last),
+        vertices=tuple(
+            (time + by, (x + by / SPLIT, y, z), turn) for time, (x, y, z), turn in poses.vertices
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def week() -> tuple[Memory, FakeReader]:
+    catalogue, first = Catalogue([], "week"), hour_bag()
+    bags: list[BagFile] = []
+    entries: list[tuple[BagKey, Digest]] = []
+    for number in range(BAGS):
+        digest = later(first, number * SPLIT)
+        path = BAG_DIR / f"rec_{number // 360}" / f"rec_{number}.mcap"
+        summary = digest.summary
+        bags.append(BagFile(str(path), 1, T0, BagState.CLOSED, summary, summary.start, summary.end))
+        entries.append((BagKey.of(bags[-1], BAG_DIR), digest))
+    assert catalogue.put_all(entries)
+    index = cast("IndexManager", Still(Snapshot(tuple(bags))))
+    reader = FakeReader()
+    clock = FixedClock(T0 + BAGS * SPLIT)
+    recall = Recall(catalogue, BAG_DIR)
+    return Memory(index, reader, extractor(), clock, Limits(), recall), reader
+
+
+def test_what_was_never_seen_is_told_of_a_week_without_reading_a_bag(
+    week: tuple[Memory, FakeReader],
+) -> None:
+    memory, reader = week
+    found = queries.find_last_match(memory, Call(), SCENE, "contains", "unicorn")
+    assert (found.found, found.notes) == (None, ())
+    assert reader.opened == []
+
+
+def test_frames_of_a_week_are_listed_without_reading_a_bag(
+    week: tuple[Memory, FakeReader],
+) -> None:
+    memory, reader = week
+    [edge] = queries.frames(memory, Call()).edges
+    assert (edge.parent, edge.child, edge.static) == ("odom", "base_link", False)
+    assert reader.opened == []
+
+
+def test_the_way_of_an_hour_is_summed_without_reading_a_bag(
+    week: tuple[Memory, FakeReader],
+) -> None:
+    memory, reader = week
+    hour = Span(start_s=float(T0_S + 360 * 100), end_s=float(T0_S + 360 * 100 + 3599))
+    told = queries.trajectory_summary(memory, Call(), hour)
+    assert told.trajectory.poses == 3600
+    assert told.trajectory.distance_m == pytest.approx(3599 * 0.1, rel=1e-6)
+    assert reader.opened == []

@@ -1,0 +1,299 @@
+"""`ros2-memory`: what its commands that only look print, and how they end."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+import yaml
+
+from ros2_memory import cli
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.cli.app import COMMANDS
+from ros2_memory.cli.ask import complete, parsed
+from ros2_memory.cli.exits import epilog
+from ros2_memory.cli.output import cell, plain
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.timebase import NS_PER_S
+from tests.bags import odom, text, write_mcap
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0 = 1_700_000_000 * NS_PER_S
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two bags, ten seconds of odometry at 10 Hz in each, an hour apart; and two words."""
+    for number in range(2):
+        start = T0 + number * 3600 * NS_PER_S
+        messages = [odom(start + n * NS_PER_S // 10, float(number), n / 10) for n in range(100)]
+        messages.append(text(start + NS_PER_S, "scissors \x1b[31mred"))
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "replay")
+    monkeypatch.setenv("COLUMNS", "160")
+    return tmp_path
+
+
+class TestAsk:
+    def test_with_json_the_reply_is_what_a_client_receives(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_position_seconds_ago", "seconds_ago=0", "--json"]) == 0
+        reply = json.loads(capsys.readouterr().out)
+        assert (reply["x"], reply["topic"]) == (1.0, "/odom")
+
+    def test_an_object_is_taken_as_it_is(self, capsys: Capture) -> None:
+        asked = '{"topic": "/chatter", "seconds": 4000}'
+        assert cli.main(["ask", "get_topic_in_last", asked, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["total"] == 2
+
+    def test_people_read_lines_and_tables_with_local_times(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_topic_in_last", "topic=/chatter", "seconds=4000"]) == 0
+        shown = capsys.readouterr().out
+        assert "std_msgs/msg/String" in shown
+        assert "2023-11-1" in shown
+        assert "1700000001" not in shown
+
+    def test_what_was_recorded_cannot_command_the_terminal(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_topic_in_last", "topic=/chatter", "seconds=4000"]) == 0
+        shown = capsys.readouterr().out
+        assert "\x1b" not in shown
+        assert "\\x1b[31mred" in shown
+
+    def test_an_error_is_shown_and_the_exit_code_is_1(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_topic_in_last", "topic=/nowhere", "seconds=1"]) == 1
+        assert "topic_not_recorded" in capsys.readouterr().out
+
+    def test_a_name_that_no_tool_has_lists_those_that_are(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "where_am_i"]) == 1
+        assert "get_position_seconds_ago" in capsys.readouterr().err
+
+    def test_without_a_name_the_tools_are_listed_with_their_arguments(
+        self, capsys: Capture
+    ) -> None:
+        assert cli.main(["ask"]) == 0
+        assert "seconds_ago, topic?, tolerance_s?" in capsys.readouterr().out
+
+    def test_what_is_no_argument_is_refused_with_the_form_it_has(self, capsys: Capture) -> None:
+        assert cli.main(["ask", "get_position_seconds_ago", "10"]) == 2
+        assert "seconds_ago=10" in capsys.readouterr().err
+
+    def test_settings_reach_the_tool(self, capsys: Capture) -> None:
+        words = ["ask", "get_position_seconds_ago", "seconds_ago=0", "--json"]
+        assert cli.main([*words, "--set", "data.pose_topic=/amcl_pose"]) == 1
+        assert "/amcl_pose" in capsys.readouterr().out
+
+    def test_shells_complete_its_tools(self) -> None:
+        assert complete("get_pos") == ["get_position_at", "get_position_seconds_ago"]
+
+
+class TestArguments:
+    def test_values_are_json_where_they_read_so_and_text_elsewhere(self) -> None:
+        given = ["a=1", "b=true", "c=scissors", 'd={"x": 1}', "e=null", "f=1=2", "g="]
+        assert parsed(given, {}) == {
+            "a": 1,
+            "b": True,
+            "c": "scissors",
+            "d": {"x": 1},
+            "e": None,
+            "f": "1=2",
+            "g": "",
+        }
+
+    def test_what_a_tool_takes_as_text_stays_text(self) -> None:
+        schema = {"properties": {"topic": {"type": "string"}}}
+        assert parsed(["topic=7"], schema) == {"topic": "7"}
+
+    @pytest.mark.parametrize("given", [["{]"], ["=1"], ["seconds"]])
+    def test_anything_else_is_refused(self, given: list[str]) -> None:
+        with pytest.raises(InvalidArgumentsError):
+            parsed(given, {})
+
+
+class TestTopics:
+    def test_rates_do_not_count_the_time_between_bags(self, capsys: Capture) -> None:
+        assert cli.main(["topics", "--json"]) == 0
+        rows = {row["topic"]: row for row in json.loads(capsys.readouterr().out)}
+        assert rows["/odom"]["rate_hz"] == pytest.approx(10.0)
+        assert rows["/odom"]["count"] == 200
+        assert rows["/chatter"]["rate_hz"] is None
+
+    def test_they_are_a_table(self, capsys: Capture) -> None:
+        assert cli.main(["topics"]) == 0
+        assert "nav_msgs/msg/Odometry" in capsys.readouterr().out
+
+    def test_of_an_empty_memory_the_exit_code_is_1(self, tmp_path: Path, capsys: Capture) -> None:
+        (tmp_path / "none").mkdir()
+        assert cli.main(["topics", "--bag-dir", str(tmp_path / "none")]) == 1
+        assert "nothing is recorded in" in capsys.readouterr().out
+
+
+class TestInfo:
+    def test_it_tells_the_range_the_gaps_and_the_bags(self, capsys: Capture) -> None:
+        assert cli.main(["info", "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["data_time_range"]["earliest"] == 1_700_000_000.0
+        assert told["data_time_range"]["bags"] == 2
+        assert len(told["data_time_range"]["gaps"]) == 1
+        assert told["memory_status"]["budget"]["max_gb"] is None
+
+    @pytest.mark.parametrize("there", [True, False])
+    def test_of_a_memory_without_bags_the_exit_code_is_1(
+        self, there: bool, tmp_path: Path, capsys: Capture
+    ) -> None:
+        folder = tmp_path / "none"
+        if there:
+            folder.mkdir()
+        assert cli.main(["info", "--bag-dir", str(folder)]) == 1
+        assert "bags" in capsys.readouterr().out
+
+    def test_where_nothing_is_recorded_there_is_no_budget(self, capsys: Capture) -> None:
+        assert cli.main(["info"]) == 0
+        shown = capsys.readouterr().out
+        assert "nothing is recorded or deleted here" in " ".join(shown.split())
+        assert "grows" not in shown
+
+    def test_it_lists_recordings_that_overlap_and_are_answered_together(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        messages = [odom(T0 + n * NS_PER_S // 10, 0.0, 0.0) for n in range(20, 120)]
+        write_mcap(bag_dir / "other" / "other_0.mcap", messages)
+        assert cli.main(["info", "--json"]) == 0
+        (pair,) = json.loads(capsys.readouterr().out)["overlapping_recordings"]
+        assert (pair["recording"], pair["and"]) == ("other", "rec")
+        assert (pair["from"], pair["to"]) == (1_700_000_002.0, 1_700_000_009.9)
+        assert cli.main(["info"]) == 0
+        assert "overlapping_recordings" in capsys.readouterr().out
+
+    def test_it_says_until_when_a_fresh_file_without_an_end_counts_as_being_written(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        copy = write_mcap(bag_dir / "copy" / "copy_0.mcap", [odom(time.time_ns(), 0.0, 0.0)])
+        copy.write_bytes(copy.read_bytes()[:-20])
+        assert cli.main(["info", "--json"]) == 0
+        (row,) = json.loads(capsys.readouterr().out)["counted_as_active"]
+        assert row["file"] == "copy/copy_0.mcap"
+        assert row["until"] == pytest.approx(copy.stat().st_mtime + 30.0)
+
+    def test_where_something_is_it_says_for_how_long_the_budget_lasts(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        now = time.time_ns()
+        write_heartbeat(
+            bag_dir,
+            Heartbeat(
+                pid=os.getpid(),
+                updated=now,
+                state=RecorderState.RECORDING,
+                recordings=("rec",),
+                since=now,
+                bytes_written=0,
+                subscribed=(),
+                silent=(),
+                last_error=None,
+                interval_s=2.0,
+            ),
+        )
+        assert cli.main(["info", "deployment=robot", "retention.max_total_gb=2.0"]) == 0
+        shown = capsys.readouterr().out
+        assert "of 2 GB" in shown
+        assert "full in" in shown
+
+
+class TestConfig:
+    def test_it_is_shown_as_yaml_that_a_program_would_take(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        assert cli.main(["config", "show", "server.port=9300"]) == 0
+        shown = yaml.safe_load(capsys.readouterr().out)
+        assert shown["server"]["port"] == 9300
+        assert shown["recording"]["bag_dir"] == str(bag_dir)
+        assert shown["storage"]["_target_"].startswith("ros2_memory.")
+
+    def test_a_token_is_not(self, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+        monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
+        assert cli.main(["config", "show"]) == 0
+        shown = capsys.readouterr().out
+        assert "MEMORY_API_TOKEN is set" in shown
+        assert "a-secret" not in shown
+
+    @pytest.mark.parametrize(
+        ("key", "who"),
+        [
+            ("deployment", "by MEMORY_DEPLOYMENT "),
+            ("storage", "deployment/robot.yaml "),
+            ("recorder", "by MEMORY_CONFIG_OVERRIDES "),
+            ("server.port", "on the command line "),
+            ("server.name", "config.yaml "),
+            ("server.transport", "deployment/robot.yaml "),
+            ("reader.include_active", "deployment/robot_live.yaml "),
+            ("reader.custom_msg_paths", "config.yaml, and by ROS_VISION_INTERFACES_PATH "),
+            ("recording.bag_dir", "by MEMORY_BAG_DIR "),
+            ("recorder._target_", "recorder/none.yaml "),
+            ("storage.cache_mb", "as reader.chunk_cache_mb "),
+        ],
+    )
+    def test_sources_say_in_a_line_which_file_or_variable_set_a_key(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: Capture, bag_dir: Path, key: str, who: str
+    ) -> None:
+        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot_live")
+        monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "recorder=none")
+        monkeypatch.setenv("ROS_VISION_INTERFACES_PATH", str(bag_dir))
+        assert cli.main(["config", "show", "--sources", "server.port=9300"]) == 0
+        rows = capsys.readouterr().out.splitlines()
+        assert rows[0].startswith("# files are those of ")
+        (row,) = [each for each in rows if each.partition(" ")[0] == key]
+        assert row.partition(" ")[2].lstrip().startswith(who)
+
+    def test_a_wrong_key_is_named_and_the_exit_code_is_2(self, capsys: Capture) -> None:
+        assert cli.main(["config", "show", "server.prot=1"]) == 2
+        assert "server.prot" in capsys.readouterr().err
+
+
+class TestTheProgram:
+    def test_a_command_that_there_is_not_ends_with_2(self, capsys: Capture) -> None:
+        assert cli.main(["fly"]) == 2
+        assert "fly" in capsys.readouterr().err
+
+    def test_warnings_are_one_sentence_and_with_v_the_events(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        for name in "ab":
+            (bag_dir / "rec" / f"{name}.mcap").write_bytes(b"")
+            os.utime(bag_dir / "rec" / f"{name}.mcap", (1_700_000_000,) * 2)
+        assert cli.main(["topics"]) == 0
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "2 warnings logged (2 x bag_damaged); -v shows" in line
+        assert cli.main(["topics", "-v", "logging.level=warning"]) == 0
+        told = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+        assert [each["event"] for each in told] == ["bag_damaged", "bag_damaged"]
+
+    @pytest.mark.parametrize("command", COMMANDS)
+    def test_the_help_of_every_command_says_what_its_exit_codes_mean(
+        self, capsys: Capture, command: str
+    ) -> None:
+        assert cli.main([command, "--help"]) == 0
+        assert " ".join(capsys.readouterr().out.split()).endswith(epilog(command))
+
+    def test_it_tells_its_version(self, capsys: Capture) -> None:
+        assert cli.main(["--version"]) == 0
+        assert capsys.readouterr().out.startswith("ros2-memory ")
+
+    def test_it_runs_as_a_module_and_a_pipe_gets_whole_lines(self, bag_dir: Path) -> None:
+        program = [sys.executable, "-m", "ros2_memory.cli", "topics", "--bag-dir", str(bag_dir)]
+        done = subprocess.run(program, capture_output=True, text=True, check=True, timeout=60)
+        assert "/chatter" in done.stdout
+        assert done.stderr == ""
+        assert "\x1b" not in done.stdout
+
+    def test_control_characters_are_spelled(self) -> None:
+        assert plain("a\x07\u202eb ß") == "a\\x07\\u202eb ß"
+        assert cell([1.5, "x"]) == "1.5, x"
+        assert cell([]) == cell(None) == "-"

@@ -1,0 +1,398 @@
+"""`ros2-memory doctor`: every fault has a finding that says what to do, and an exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from mcap.writer import Writer
+
+from ros2_memory import cli
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.core.timebase import NS_PER_S
+from tests import stub_ros2
+from tests.bags import McapLayout, Msg, odom, write_mcap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Capture = pytest.CaptureFixture[str]
+
+
+class Answering(BaseHTTPRequestHandler):
+    """What stands for the server's `/health`."""
+
+    reply = b'{"status": "ok"}'
+    asks_for: str | None = None
+
+    def do_GET(self) -> None:
+        shown = self.headers["Authorization"]
+        taken = shown is None or self.asks_for in (None, shown)
+        self.send_response(200 if taken else 401)
+        self.end_headers()
+        self.wfile.write(self.reply)
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
+        pass
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    Answering.reply, Answering.asks_for = b'{"status": "ok"}', None
+    with HTTPServer(("127.0.0.1", 0), Answering) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        yield server.server_port
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> Path:
+    """A bag directory of a robot with which all is well, and the settings that lead there."""
+    bag_dir = tmp_path / "bags"
+    now = time.time_ns()
+    messages = [odom(now - (60 - n) * NS_PER_S, n / 10, 0.0) for n in range(50)]
+    write_mcap(bag_dir / "rec" / "rec_0.mcap", messages)
+    (tmp_path / "bin").mkdir()
+    stub_ros2.install(tmp_path / "bin" / "ros2")
+    (tmp_path / "topics.yaml").write_text("topics: [/odom]\n")
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    monkeypatch.setenv("MCP_PORT", str(port))
+    overrides = [f"recording.topics_file={tmp_path / 'topics.yaml'}", "retention.max_total_gb=0.01"]
+    monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", " ".join([*overrides, "retention.min_free_gb=0"]))
+    beat(bag_dir)
+    return bag_dir
+
+
+def beat(bag_dir: Path, state: RecorderState = RecorderState.RECORDING, **more: Any) -> None:
+    now = time.time_ns()
+    fields: dict[str, Any] = {
+        "pid": os.getpid(),
+        "updated": now,
+        "recordings": ("rec",),
+        "since": now,
+        "bytes_written": 0,
+        "subscribed": ("/odom",),
+        "silent": (),
+        "last_error": None,
+        "interval_s": 2.0,
+    }
+    write_heartbeat(bag_dir, Heartbeat(state=state, **(fields | more)))
+
+
+def examined(capsys: Capture, *overrides: str) -> tuple[int, dict[str, list[dict[str, str]]]]:
+    """The exit code, and by concern the findings that are not in order."""
+    code = cli.main(["doctor", "--json", *overrides])
+    wrong: dict[str, list[dict[str, str]]] = {}
+    for each in json.loads(capsys.readouterr().out)["findings"]:
+        if each["level"] != "ok":
+            assert each["do"], each
+            wrong.setdefault(each["about"], []).append(each)
+    return code, wrong
+
+
+def test_where_all_is_well_the_exit_code_is_0(robot: Path, capsys: Capture) -> None:
+    assert examined(capsys) == (0, {})
+
+
+def test_people_read_a_line_for_each_concern(robot: Path, capsys: Capture) -> None:
+    assert cli.main(["doctor"]) == 0
+    told = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    about = ["config", "bag_dir", "disk", "clock", "bags", "ros", "recorder", "topics", "extras"]
+    assert told == [["ok", each] for each in [*about, "server"]]
+
+
+def test_a_refused_configuration_is_an_error(capsys: Capture) -> None:
+    code, wrong = examined(capsys, "server.prot=1")
+    assert code == 2
+    assert "server.prot" in wrong["config"][0]["seen"]
+
+
+def test_a_missing_directory_of_bags_is_an_error_where_nothing_is_recorded(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    gone = f"recording.bag_dir={tmp_path / 'gone'}"
+    code, wrong = examined(capsys, gone, "deployment=query_only", "server.transport=stdio")
+    assert code == 2
+    assert "MEMORY_BAG_DIR" in wrong["bag_dir"][0]["do"]
+
+
+@pytest.mark.parametrize(
+    ("override", "code", "words"),
+    [
+        ("retention.min_free_gb=1000000.0", 2, "recording pauses"),
+        ("retention.max_total_gb=1000000.0", 1, "lower retention.max_total_gb"),
+    ],
+)
+def test_a_disk_without_the_room_that_is_asked_of_it_is_told(
+    robot: Path, capsys: Capture, override: str, code: int, words: str
+) -> None:
+    ended, wrong = examined(capsys, override)
+    assert ended == code
+    assert words in wrong["disk"][0]["do"]
+
+
+def test_of_bags_that_are_not_there_nothing_is_used(tmp_path: Path, capsys: Capture) -> None:
+    with (tmp_path / "other.bin").open("wb") as other:
+        other.truncate(10**8)
+    cli.main(["doctor", "--json", f"recording.bag_dir={tmp_path / 'gone'}"])
+    seen = {each["about"]: each["seen"] for each in json.loads(capsys.readouterr().out)["findings"]}
+    assert "; 0.0 of 5 GB used" in seen["disk"]
+
+
+def test_data_from_the_future_means_that_the_clock_is_wrong(robot: Path, capsys: Capture) -> None:
+    ahead = time.time_ns() + 7200 * NS_PER_S
+    for path in robot.glob("rec/*.mcap"):
+        path.unlink()
+    write_mcap(robot / "rec" / "rec_1.mcap", [odom(ahead, 0.0, 0.0)])
+    code, wrong = examined(capsys)
+    assert code > 0
+    assert "chrony" in wrong["clock"][0]["do"]
+
+
+def lay(robot: Path, name: str, content: bytes) -> None:
+    path = robot / name / f"{name}_0.mcap"
+    path.parent.mkdir()
+    path.write_bytes(content)
+    hour_ago = time.time() - 3600
+    os.utime(path, (hour_ago, hour_ago))
+
+
+def test_bags_that_a_crash_cut_lead_to_recover(robot: Path, capsys: Capture) -> None:
+    whole = (robot / "rec" / "rec_0.mcap").read_bytes()
+    for name, content in (("cut", whole[: len(whole) // 2]), ("empty", b""), ("begun", whole[:40])):
+        lay(robot, name, content)
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert wrong["bags"][0]["do"] == f"ros2-memory recover {robot}"
+
+
+def test_recover_is_not_advised_for_files_that_it_refuses(robot: Path, capsys: Capture) -> None:
+    lay(robot, "letter", b"a letter")
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert "recover" not in wrong["bags"][0]["do"]
+    assert wrong["bags"][0]["do"].startswith("copy them anew")
+    assert "letter_0.mcap (not an MCAP file" in wrong["bags"][0]["seen"]
+    whole = (robot / "rec" / "rec_0.mcap").read_bytes()
+    lay(robot, "cut", whole[: len(whole) // 2])
+    _, wrong = examined(capsys)
+    assert wrong["bags"][0]["do"].startswith(
+        f"ros2-memory recover {robot}; 1 of them it cannot repair: "
+    )
+
+
+def test_msg_folders_are_advised_for_what_they_would_mend_alone(
+    robot: Path, capsys: Capture
+) -> None:
+    path = robot / "other" / "other_0.mcap"
+    path.parent.mkdir()
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="", library="test")
+        schema = writer.register_schema("keelson.Envelope", "protobuf", b"")
+        channel = writer.register_channel("/keelson", "protobuf", schema)
+        now = time.time_ns() - 3600 * NS_PER_S
+        writer.add_message(channel, now, b"\x08\x01", now)
+        writer.finish()
+    _, wrong = examined(capsys)
+    [told] = wrong["bags"]
+    assert "/keelson (its message encoding 'protobuf' is not read" in told["seen"]
+    assert ".msg" not in told["do"]
+    foreign = Msg("/foreign", "nobody_msgs/msg/Unknown", now, b"\x00\x01\x00\x00abc")
+    write_mcap(robot / "odd" / "odd_0.mcap", [foreign], McapLayout(definitions=False))
+    _, wrong = examined(capsys)
+    by_topic = {each["seen"].split("(")[0]: each["do"] for each in wrong["bags"]}
+    assert "reader.custom_msg_paths" in by_topic["1 topic cannot be decoded: /foreign "]
+    assert ".msg" not in by_topic["1 topic cannot be decoded: /keelson "]
+
+
+def test_an_empty_directory_is_not_in_order(robot: Path, capsys: Capture) -> None:
+    (robot / "rec" / "rec_0.mcap").unlink()
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert wrong["bags"][0]["seen"].startswith("no bag is here")
+
+
+def test_files_that_metadata_lists_and_are_not_there_are_counted(
+    robot: Path, capsys: Capture
+) -> None:
+    names = "".join(f"  - rec_{n}.mcap\n" for n in range(13))
+    text = f"rosbag2_bagfile_information:\n  version: 4\n  relative_file_paths:\n{names}"
+    metadata = robot / "rec" / "metadata.yaml"
+    metadata.write_text(f"{text}  message_count: 300\n")
+    hour_ago = time.time() - 3600
+    os.utime(metadata, (hour_ago, hour_ago))
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert wrong["bags"][0]["seen"] == (
+        "metadata.yaml of rec lists 12 files that are not there and 250 messages that no file here "
+        "holds"
+    )
+
+
+@pytest.mark.parametrize(
+    ("state", "more", "code"),
+    [
+        (RecorderState.STOPPED, {}, 1),
+        (RecorderState.PAUSED, {"last_error": "the disk is full"}, 2),
+        (RecorderState.RECORDING, {"updated": time.time_ns() - 3600 * NS_PER_S}, 2),
+        (RecorderState.RECORDING, {"silent": ("/scan",)}, 1),
+        (RecorderState.RECORDING, {"last_error": "ros2 bag record died"}, 1),
+    ],
+)
+def test_a_recorder_that_does_not_record_is_told(
+    robot: Path, capsys: Capture, state: RecorderState, more: dict[str, Any], code: int
+) -> None:
+    beat(robot, state, **more)
+    ended, wrong = examined(capsys)
+    assert (ended, [*wrong]) == (code, ["recorder"])
+
+
+def test_where_no_recorder_ever_wrote_it_says_how_to_start_one(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot / "recorder.json").unlink()
+    code, wrong = examined(capsys)
+    assert code == 2
+    assert "systemctl start" in wrong["recorder"][0]["do"]
+
+
+def test_a_missing_setup_file_is_named(robot: Path, capsys: Capture) -> None:
+    code, wrong = examined(capsys, "recorder.setup_files=[/opt/ros/none/setup.bash]")
+    assert code == 2
+    assert "/opt/ros/none/setup.bash" in wrong["ros"][0]["seen"]
+    assert "recorder.setup_files" in wrong["ros"][0]["do"]
+
+
+def test_a_topic_that_is_listed_and_not_recorded_is_told_with_what_is_like_it(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot.parent / "topics.yaml").write_text("topics: [/odom, /odom_, /vision/*/objects]\n")
+    code, wrong = examined(capsys)
+    assert code == 1
+    assert [each["seen"].split()[0] for each in wrong["topics"]] == ["/odom_", "/vision/*/objects"]
+    assert "is it /odom?" in wrong["topics"][0]["do"]
+
+
+class TestTheServer:
+    def test_where_nothing_answers_it_says_how_to_start_it(
+        self, robot: Path, capsys: Capture
+    ) -> None:
+        code, wrong = examined(capsys, "server.port=1")
+        assert code == 2
+        assert "ros2-memory-server" in wrong["server"][0]["do"]
+
+    def test_another_program_is_recognised(self, robot: Path, capsys: Capture) -> None:
+        Answering.reply = b"<html>a printer</html>"
+        code, wrong = examined(capsys)
+        assert code == 2
+        assert "another program" in wrong["server"][0]["seen"]
+
+    def test_a_token_that_it_does_not_take_is_told_as_such(
+        self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    ) -> None:
+        Answering.asks_for = f"Bearer {'s' * 32}"
+        monkeypatch.setenv("MEMORY_API_TOKEN", "t" * 32)
+        code, wrong = examined(capsys)
+        assert code == 1
+        assert "takes another token" in wrong["server"][0]["seen"]
+        monkeypatch.setenv("MEMORY_API_TOKEN", "s" * 32)
+        assert examined(capsys) == (0, {})
+
+    def test_its_problems_are_told(self, robot: Path, capsys: Capture) -> None:
+        Answering.reply = b'{"status": "degraded", "problems": ["the bag directory is gone"]}'
+        code, wrong = examined(capsys)
+        assert code == 1
+        assert "the bag directory is gone" in wrong["server"][0]["seen"]
+
+
+def test_runs_that_are_answered_together_are_told(robot: Path, capsys: Capture) -> None:
+    write_mcap(
+        robot / "other" / "other_0.mcap",
+        [odom(time.time_ns() - (60 - n) * NS_PER_S, 0.0, 0.0) for n in range(50)],
+    )
+    code, wrong = examined(capsys)
+    (finding,) = wrong["bags"]
+    assert code == 1
+    assert "recordings other and rec overlap from 20" in finding["seen"]
+
+
+def test_a_fresh_file_without_an_end_is_told_until_when_it_counts_as_being_written(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot / "recorder.json").unlink()
+    path = write_mcap(robot / "copy" / "copy_0.mcap", [odom(time.time_ns(), 0.0, 0.0)])
+    path.write_bytes(path.read_bytes()[:-20])
+    code, wrong = examined(capsys, "recorder=none")
+    (finding,) = wrong["bags"]
+    assert code == 1
+    assert "copy/copy_0.mcap has no end and was written lately: until 20" in finding["seen"]
+
+
+@pytest.mark.parametrize(("recorder", "is_active"), [("none", False), ("ros2bag", True)])
+def test_a_copy_of_older_data_is_not_being_written_where_nobody_writes(
+    robot: Path, capsys: Capture, recorder: str, is_active: bool
+) -> None:
+    (robot / "recorder.json").unlink()
+    path = write_mcap(
+        robot / "copy" / "copy_0.mcap", [odom(10**18 + n, 0.0, 0.0) for n in range(9)]
+    )
+    path.write_bytes(path.read_bytes()[:-20])
+    _, wrong = examined(capsys, f"recorder={recorder}")
+    seen = " ".join(each["seen"] for each in wrong["bags"])
+    assert ("counts as still being written" in seen) is is_active
+    assert ("0 damaged and 1 unfinished" in seen) is not is_active
+
+
+def test_a_topic_that_nobody_offers_and_restarts_are_told(robot: Path, capsys: Capture) -> None:
+    beat(robot, missing=("/odom", "/gone"), restarts=1, last_error="it died")
+    code, wrong = examined(capsys)
+    assert code == 1
+    seen = [each["seen"] for each in wrong["topics"]]
+    assert [each.split()[0] for each in seen] == ["/odom", "/gone"]
+    assert all("no publisher has offered it since the recorder started" in each for each in seen)
+    assert "start ros2 bag record anew 1 time; its last error" in wrong["recorder"][0]["seen"]
+
+
+class TestExtras:
+    def test_what_the_configuration_asks_for_must_be_installed(
+        self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "prometheus_client", None)
+        monkeypatch.setitem(sys.modules, "opentelemetry.sdk", None)
+        code, wrong = examined(capsys, "server.metrics=true", "server.traces=true")
+        assert code == 2
+        seen = [each["seen"].partition(",")[0] for each in wrong["extras"]]
+        assert seen == [
+            "server.metrics=true needs prometheus_client",
+            "server.traces=true needs opentelemetry.sdk",
+        ]
+        assert all("pip install 'ros2-memory[observability]'" in e["do"] for e in wrong["extras"])
+
+    def test_what_is_installed_is_in_order(self, robot: Path, capsys: Capture) -> None:
+        pytest.importorskip("prometheus_client")
+        assert examined(capsys, "server.metrics=true") == (0, {})
+
+    def test_metrics_without_http_are_told(self, robot: Path, capsys: Capture) -> None:
+        pytest.importorskip("prometheus_client")
+        code, wrong = examined(capsys, "server.metrics=true", "server.transport=stdio")
+        assert code == 2
+        assert "has no /metrics" in wrong["extras"][0]["seen"]
+
+    def test_parquet_is_asked_for_by_nobody(
+        self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    ) -> None:
+        monkeypatch.setitem(sys.modules, "pyarrow", None)
+        assert cli.main(["doctor"]) == 0
+        assert "pip install 'ros2-memory[parquet]'" in capsys.readouterr().out

@@ -1,0 +1,452 @@
+"""`ros2-memory export`: what comes out is what was recorded, and other programs read it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import duckdb
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+
+from ros2_memory import cli
+from ros2_memory.cli.export import as_mcap
+from ros2_memory.cli.windows import unix_of
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import View
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    odom,
+    text,
+    tf,
+    transform,
+    typestore,
+    write_db3,
+    write_mcap,
+)
+from tests.mcap_surgery import raw_mcap
+from tests.memories import memory_of
+from tests.shared_bags import REAL, RECORDED, needs_real, needs_recorded
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from mcap.writer import Writer as McapFile
+
+    from ros2_memory.history.duplicates import Found
+
+T0 = 1_700_000_000 * NS_PER_S
+Capture = pytest.CaptureFixture[str]
+Row = tuple[str, int, bytes]
+
+
+def driven(start: int, number: int) -> list[Msg]:
+    """Ten seconds of odometry at 10 Hz around a corner, and a word a second."""
+    messages: list[Msg] = []
+    for n in range(100):
+        at = start + n * NS_PER_S // 10
+        x, y = (n / 20, 0.1) if n < 50 else (2.5, 0.1 + (n - 50) / 20)
+        messages.append(odom(at, x + number / 7, y))
+        if n % 10 == 0:
+            messages.append(text(at, f"word {number} {n} ü"))
+    return messages
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two recordings, the second on another day (UTC)."""
+    folder = tmp_path / "bags"
+    for number, start in enumerate((T0, T0 + 86_400 * NS_PER_S)):
+        write_mcap(folder / f"rec_{number}" / f"rec_{number}_0.mcap", driven(start, number))
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "replay")
+    return folder
+
+
+def left(path: Path) -> None:
+    """Nobody has written to the file for an hour."""
+    hour_ago = time.time() - 3600
+    os.utime(path, (hour_ago, hour_ago))
+
+
+def read(path: Path) -> list[Row]:
+    """Topic, log time and payload of all messages of a file, by plain rosbags."""
+    with Reader(path) as reader:
+        return [(connection.topic, at, bytes(raw)) for connection, at, raw in reader.messages()]
+
+
+def exported(bag_dir: Path, out: Path, *words: str) -> Path:
+    """The file that an export of the whole folder makes."""
+    asked = ["export", "--mcap", str(out), "--bag-dir", str(bag_dir), "deployment=replay", *words]
+    assert cli.main(asked) == 0
+    return out
+
+
+def profile_of(path: Path) -> str:
+    with path.open("rb") as stream:
+        profile: str = make_reader(stream).get_header().profile
+    return profile
+
+
+def names_of(path: Path) -> dict[str, str]:
+    """The types of topics, by plain mcap."""
+    with path.open("rb") as stream:
+        return {
+            channel.topic: schema.name
+            for schema, channel, _ in make_reader(stream).iter_messages()
+            if schema is not None
+        }
+
+
+def things(writer: McapFile) -> None:
+    schema = writer.register_schema("Thing", "jsonschema", b'{"type": "object"}')
+    channel = writer.register_channel("/thing", "json", schema)
+    writer.add_message(channel, T0, b'{"x": 1}', T0)
+
+
+class TestMcap:
+    def test_plain_rosbags_reads_the_very_messages_of_the_window(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        out = tmp_path / "out.mcap"
+        start, end = str(T0 / NS_PER_S + 2), str(T0 / NS_PER_S + 5)
+        assert cli.main(["export", "--mcap", str(out), "--start", start, "--end", end]) == 0
+        source = read(bag_dir / "rec_0" / "rec_0_0.mcap")
+        wanted = [row for row in source if T0 + 2 * NS_PER_S <= row[1] <= T0 + 5 * NS_PER_S]
+        assert read(out) == wanted
+        assert len(wanted) == 35
+        assert "35 messages" in capsys.readouterr().out
+
+    def test_publish_times_definitions_and_what_publishers_offer_stay(self, tmp_path: Path) -> None:
+        published = T0 - 5 * NS_PER_S
+        message = Msg("/word", "std_msgs/msg/String", T0, text(T0, "x").body, published)
+        folder = tmp_path / "bags"
+        write_mcap(
+            folder / "rec" / "rec_0.mcap", [message], McapLayout(latched=frozenset({"/word"}))
+        )
+        out = tmp_path / "out.mcap"
+        words = ["export", "--mcap", str(out), "--bag-dir", str(folder), "deployment=replay"]
+        assert cli.main(words) == 0
+        with Reader(out) as reader:
+            connection = reader.connections[0]
+            assert connection.msgtype == "std_msgs/msg/String"
+            assert "string data" in connection.msgdef.data
+            assert "transient_local" in str(connection.ext).lower()
+        (record,) = McapReader().records(out, ["/word"], TimeWindow.everything())
+        assert (record.log_time, record.publish_time) == (T0, published)
+
+    def test_what_two_recordings_hold_is_there_once(self, bag_dir: Path, tmp_path: Path) -> None:
+        copies = [
+            Msg(each.topic, each.type, each.log_time + 1000, each.body, each.published)
+            for each in driven(T0, 0)
+        ]
+        write_mcap(bag_dir / "rec_2" / "rec_2_0.mcap", copies)
+        out = tmp_path / "out.mcap"
+        assert cli.main(["export", "--mcap", str(out), "--end", str(T0 / NS_PER_S + 60)]) == 0
+        assert read(out) == read(bag_dir / "rec_0" / "rec_0_0.mcap")
+
+    def test_what_latched_messages_held_at_the_start_comes_along_where_it_is_asked_for(
+        self, bag_dir: Path, tmp_path: Path
+    ) -> None:
+        mounts = [
+            tf(at, transform(at, "base_link", child, (x, 0.0, 0.0)), topic="/tf_static")
+            for at, child, x in (
+                (T0, "laser", 0.1),
+                (T0 + 1, "camera", 0.2),
+                (T0 + 2, "laser", 0.3),
+            )
+        ]
+        write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [*mounts, *driven(T0 + 3, 0)])
+        words = ["export", "--start", str(T0 / NS_PER_S + 5), "--end", str(T0 / NS_PER_S + 6)]
+        assert cli.main([*words, "--mcap", str(tmp_path / "without.mcap")]) == 0
+        assert cli.main([*words, "--mcap", str(tmp_path / "with.mcap"), "--latched"]) == 0
+        held = [row for row in read(tmp_path / "with.mcap") if row[0] == "/tf_static"]
+        assert [at for _, at, _ in held] == [T0 + 1, T0 + 2]
+        rest = [row for row in read(tmp_path / "with.mcap") if row[0] != "/tf_static"]
+        assert rest == read(tmp_path / "without.mcap")
+
+    def test_that_nothing_but_latched_messages_of_before_was_found_is_told(
+        self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        mount = tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
+        write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [mount, *driven(T0 + 3, 0)])
+        after = str(T0 / NS_PER_S + 5000)
+        words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--start", after, "--latched"]
+        assert cli.main([*words, "--end", str(T0 / NS_PER_S + 6000)]) == 0
+        assert {row[0] for row in read(tmp_path / "out.mcap")} == {"/tf_static"}
+        assert "no message lies in the window" in capsys.readouterr().err
+
+    def test_only_the_topics_that_were_asked_for(self, bag_dir: Path, tmp_path: Path) -> None:
+        out = tmp_path / "out.mcap"
+        assert cli.main(["export", "--mcap", str(out), "--topic", "/chat*", "--last", "20"]) == 0
+        assert {row[0] for row in read(out)} == {"/chatter"}
+
+    @pytest.mark.parametrize("profile", ["", "px4", "ros2"])
+    def test_the_profile_stays(self, tmp_path: Path, profile: str) -> None:
+        folder = tmp_path / "bags"
+        raw_mcap(folder / "rec_0.mcap", things, profile=profile)
+        assert profile_of(exported(folder, tmp_path / "out.mcap")) == profile
+
+    def test_bags_of_two_profiles_have_none_together_and_each_its_own(self, tmp_path: Path) -> None:
+        folder = tmp_path / "bags"
+        raw_mcap(folder / "json_0.mcap", things, profile="")
+        write_mcap(folder / "rec_0.mcap", driven(T0, 0))
+        assert profile_of(exported(folder, tmp_path / "all.mcap")) == ""
+        ours = exported(folder, tmp_path / "ours.mcap", "--topic", "/odom")
+        assert profile_of(ours) == "ros2"
+        assert len(read(ours)) == 100
+
+    def test_types_are_named_as_other_readers_know_them(self, tmp_path: Path) -> None:
+        folder = tmp_path / "bags"
+
+        def fill(writer: McapFile) -> None:
+            old = writer.register_schema("std_msgs/String", "ros2msg", b"string data\n")
+            bare = writer.register_schema("std_msgs/Bool", "", b"")
+            json_schema = writer.register_schema("shop/Thing", "jsonschema", b"{}")
+            for topic, encoding, number, payload in (
+                ("/word", "cdr", old, text(T0, "x").payload),
+                ("/on", "cdr", bare, boolean(T0, data=True).payload),
+                ("/thing", "json", json_schema, b"{}"),
+            ):
+                writer.add_message(
+                    writer.register_channel(topic, encoding, number), T0, payload, T0
+                )
+
+        raw_mcap(folder / "rec_0.mcap", fill, profile="ros2")
+        out = exported(folder, tmp_path / "out.mcap")
+        assert names_of(out) == {
+            "/word": "std_msgs/msg/String",
+            "/on": "std_msgs/msg/Bool",
+            "/thing": "shop/Thing",
+        }
+        ours = exported(folder, tmp_path / "ours.mcap", "--topic", "/word")
+        with Reader(ours) as reader:
+            [(connection, _, raw)] = reader.messages()
+            assert connection.msgtype == "std_msgs/msg/String"
+            message = typestore().deserialize_cdr(raw, connection.msgtype)
+            assert getattr(message, "data", None) == "x"
+
+    @needs_real
+    @pytest.mark.parametrize("name", sorted(path.name for path in REAL.glob("*/")))
+    def test_other_programs_open_what_comes_of_public_robots_bags(
+        self, tmp_path: Path, name: str
+    ) -> None:
+        files = [each for each in sorted((REAL / name).iterdir()) if Rosbag2Reader().reads(each)]
+        for number, file in enumerate(files):
+            # Each by itself: in two recordings a message that is the same counts once.
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            left(Path(shutil.copyfile(file, folder / file.name)))
+            out = tmp_path / f"{number}.mcap"
+            self.require_the_same(folder, out)
+
+    @needs_recorded
+    @pytest.mark.parametrize("name", ["session_mcap", "session_sqlite3", "session_zstd_file"])
+    def test_other_programs_open_what_comes_of_a_recorded_session(
+        self, tmp_path: Path, name: str
+    ) -> None:
+        self.require_the_same(RECORDED / name, tmp_path / "out.mcap")
+
+    def require_the_same(self, folder: Path, out: Path) -> None:
+        """Exports a folder; `mcap`, and where it can `rosbags`, count the same in the file."""
+        reader = Rosbag2Reader()
+        expected: Counter[str] = Counter()
+        profiles: set[str] = set()
+        readable_by_rosbags = True
+        for bag in memory_of(folder, storage="rosbag2").index.refresh().bags:
+            expected.update({each.topic: each.count for each in bag.summary.topics})
+            profiles.add(reader.profile(bag.path))
+            for channel in reader.channels(bag.path):
+                of_ros2 = channel.schema.encoding in {"", "ros2msg", "ros2idl"}
+                readable_by_rosbags &= channel.encoding == "cdr" and of_ros2
+        words = ["export", "--mcap", str(out), "--bag-dir", str(folder), "deployment=replay"]
+        code = cli.main([*words, "storage=rosbag2"])
+        if not expected:
+            assert code != 0
+            assert not out.exists()
+            return
+        with out.open("rb") as stream:
+            plain = make_reader(stream)
+            summary = plain.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            assert summary.statistics.message_count == expected.total()
+            assert Counter(channel.topic for _, channel, _ in plain.iter_messages()) == expected
+        assert {profile_of(out)} == profiles
+        if readable_by_rosbags and profiles == {"ros2"}:
+            assert Counter(topic for topic, _, _ in read(out)) == expected
+
+    def test_sqlite_bags_become_mcap(self, tmp_path: Path) -> None:
+        left(write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", driven(T0, 0)))
+        out = tmp_path / "out.mcap"
+        words = ["export", "--mcap", str(out), "--bag-dir", str(tmp_path / "bags")]
+        assert cli.main([*words, "deployment=replay"]) == 0
+        assert len(read(out)) == 110
+
+    def test_a_file_is_never_overwritten(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        out = tmp_path / "out.mcap"
+        out.write_text("a letter")
+        assert cli.main(["export", "--mcap", str(out)]) == 2
+        assert out.read_text() == "a letter"
+        assert str(out) in capsys.readouterr().err
+
+    def test_an_interrupted_export_leaves_nothing(self, bag_dir: Path, tmp_path: Path) -> None:
+        def interrupted() -> Iterator[Found]:
+            view = View(memory_of(bag_dir), Call())
+            yield from view.stream(["/odom"], TimeWindow.everything())
+            raise KeyboardInterrupt
+
+        folder = tmp_path / "out"
+        folder.mkdir()
+        with pytest.raises(KeyboardInterrupt):
+            as_mcap(folder / "out.mcap", interrupted())
+        assert [*folder.iterdir()] == []
+
+    def test_of_a_window_without_messages_no_file_is_made(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        out = tmp_path / "out.mcap"
+        assert cli.main(["export", "--mcap", str(out), "--end", "1000"]) == 2
+        assert "no message" in capsys.readouterr().err
+        assert not out.exists()
+
+    def test_what_could_not_be_read_is_told_and_the_exit_code_is_1(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        source = bag_dir / "rec_0" / "rec_0_0.mcap"
+        left(write_mcap(source, driven(T0, 0), McapLayout(finish=False, chunk_size=500)))
+        assert cli.main(["export", "--mcap", str(tmp_path / "out.mcap")]) == 1
+        assert "rec_0_0.mcap" in capsys.readouterr().err
+
+    def test_a_file_of_the_window_that_is_not_read_at_all_is_told_and_the_exit_code_is_1(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        source = bag_dir / "rec_0" / "rec_0_0.mcap"
+        source.write_bytes(b"no MCAP file")
+        at = T0 / NS_PER_S + 10
+        os.utime(source, (at, at))
+        assert cli.main(["export", "--mcap", str(tmp_path / "out.mcap")]) == 1
+        assert "rec_0_0.mcap" in capsys.readouterr().err
+
+
+class TestParquet:
+    def test_duckdb_computes_the_way_that_trajectory_summary_tells(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        start, end = T0 / NS_PER_S, T0 / NS_PER_S + 60
+        asked = json.dumps({"start": start, "end": end})
+        assert cli.main(["ask", "trajectory_summary", asked, "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)["distance_m"]
+        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 0
+        ((length,),) = queried(
+            tmp_path / "rows",
+            """
+            SELECT sum(sqrt((x - px)^2 + (y - py)^2 + (z - pz)^2)) FROM (
+              SELECT x, y, z, lag(x) OVER way AS px, lag(y) OVER way AS py, lag(z) OVER way AS pz
+              FROM memory
+              WHERE topic = '/odom' AND recording = 'rec_0'
+              WINDOW way AS (PARTITION BY recording ORDER BY log_time)
+            )
+            """,
+        )
+        assert length == pytest.approx(told, abs=1e-3)
+        assert told > 4
+
+    def test_there_is_a_row_for_each_message_by_recording_and_date(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 0
+        assert "220 messages in 2 files" in capsys.readouterr().out
+        rows = queried(
+            tmp_path / "rows",
+            "SELECT recording, CAST(date AS VARCHAR), count(*) FROM memory GROUP BY ALL ORDER BY 1",
+        )
+        assert rows == [("rec_0", "2023-11-14", 110), ("rec_1", "2023-11-15", 110)]
+
+    def test_times_are_exact_and_values_are_json(self, bag_dir: Path, tmp_path: Path) -> None:
+        words = ["export", "--parquet", str(tmp_path / "rows"), "--robot", "r2"]
+        assert cli.main([*words, "--topic", "/chatter", "--end", str(T0 / NS_PER_S)]) == 0
+        rows = queried(
+            tmp_path / "rows",
+            "SELECT robot, type, epoch_ns(log_time), epoch_ns(publish_time), value->>'value', x "
+            "FROM memory",
+        )
+        assert rows == [("r2", "std_msgs/msg/String", T0, T0, "word 0 0 ü", None)]
+
+    def test_nothing_can_stand_there_twice(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+    ) -> None:
+        words = ["export", "--parquet", str(tmp_path / "rows")]
+        assert cli.main(words) == 0
+        assert cli.main(words) == 2
+        assert "twice" in capsys.readouterr().err
+        assert len([*tmp_path.glob("rows/*/*/*")]) == 2
+
+    def test_what_cannot_be_decoded_has_a_row_that_says_why(
+        self, tmp_path: Path, capsys: Capture
+    ) -> None:
+        odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\x00\x01\x00\x00\x00")
+        layout = McapLayout(definitions=False)
+        write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [odd], layout)
+        words = ["export", "--parquet", str(tmp_path / "rows"), "--bag-dir", str(tmp_path / "bags")]
+        assert cli.main([*words, "deployment=replay"]) == 0
+        ((reason, value),) = queried(tmp_path / "rows", "SELECT undecodable, value FROM memory")
+        assert reason
+        assert value is None
+
+    def test_without_the_optional_part_it_says_how_to_get_it(
+        self, bag_dir: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
+        monkeypatch.setitem(sys.modules, "pyarrow", None)
+        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 2
+        assert "ros2-memory[parquet]" in capsys.readouterr().err
+
+
+def queried(folder: Path, query: str) -> list[tuple[object, ...]]:
+    """What DuckDB gives for a query over `memory`, the dataset of a folder."""
+    dataset = f"read_parquet('{folder}/**/*.parquet', hive_partitioning = true)"
+    rows: list[tuple[object, ...]] = duckdb.execute(query.replace("memory", dataset)).fetchall()
+    return rows
+
+
+class TestWindows:
+    @pytest.mark.parametrize(
+        "words",
+        [
+            [],
+            ["--mcap", "a", "--parquet", "b"],
+            ["--mcap", "a", "--last", "5", "--start", "1"],
+            ["--mcap", "a", "--last", "0"],
+            ["--mcap", "a", "--start", "yesterday"],
+            ["--mcap", "a", "--start", "2", "--end", "1"],
+            ["--mcap", "a", "--topic", "/nothing"],
+        ],
+    )
+    def test_what_makes_no_sense_is_refused(
+        self, bag_dir: Path, capsys: Capture, words: list[str]
+    ) -> None:
+        assert cli.main(["export", *words]) == 2
+        assert capsys.readouterr().err
+
+    def test_times_are_unix_seconds_or_iso(self) -> None:
+        assert unix_of("1700000000.5") == 1_700_000_000.5
+        assert unix_of("2023-11-14T22:13:20+00:00") == 1_700_000_000
+        with pytest.raises(InvalidArgumentsError):
+            unix_of("noon")

@@ -1,0 +1,339 @@
+"""`ros2-memory forget`: deletes what lies in a window, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import time
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import pytest
+import yaml
+
+from ros2_memory import cli
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.lock import BagDirLock
+from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import McapLayout, odom, text, tf, transform, write_mcap
+from tests.owned import OURS, embedding, own_all
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0 = 1_700_000_000 * NS_PER_S
+Capture = pytest.CaptureFixture[str]
+
+
+def left(path: Path) -> Path:
+    """Nobody has written to the file for an hour."""
+    hour_ago = time.time() - 3600
+    os.utime(path, (hour_ago, hour_ago))
+    return path
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Four bags of ten seconds, ten seconds apart, in two recordings; /tf_static in the first."""
+    for number in range(4):
+        start = T0 + number * 20 * NS_PER_S
+        messages = [odom(start + n * NS_PER_S, n / 10, 0.0) for n in range(10)]
+        messages.append(text(start + NS_PER_S, f"secret{number}"))
+        if number == 0:
+            mount = transform(start, "base_link", "laser", (0.1, 0.0, 0.2))
+            messages.insert(0, tf(start, mount, topic="/tf_static"))
+        left(write_mcap(tmp_path / f"rec_{number // 2}" / f"rec_{number}.mcap", messages))
+    own_all(tmp_path)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    return tmp_path
+
+
+def forget(first: float, last: float, *more: str) -> int:
+    """`ros2-memory forget`, from and to so many seconds after the first message."""
+    start, end = T0 / NS_PER_S + first, T0 / NS_PER_S + last
+    return cli.main(["forget", "--start", str(start), "--end", str(end), *more])
+
+
+def bags(bag_dir: Path) -> list[str]:
+    return sorted(path.name for path in bag_dir.glob("rec_*/*.mcap"))
+
+
+def known(bag_dir: Path) -> int:
+    """How many bags the catalogue knows."""
+    with closing(sqlite3.connect(bag_dir / FOLDER / FILE)) as base:
+        return int(base.execute("SELECT count(*) FROM bags").fetchone()[0])
+
+
+def test_bags_that_lie_wholly_inside_go(bag_dir: Path, capsys: Capture) -> None:
+    assert forget(20, 55, "--yes") == 0
+    assert bags(bag_dir) == ["rec_0.mcap", "rec_3.mcap"]
+    assert "deleted: 2 bags" in capsys.readouterr().out
+
+
+def test_what_reaches_beyond_the_window_stays_and_is_named(bag_dir: Path, capsys: Capture) -> None:
+    assert forget(25, 55, "--yes") == 1
+    assert bags(bag_dir) == ["rec_0.mcap", "rec_1.mcap", "rec_3.mcap"]
+    assert "stays: rec_0/rec_1.mcap: it reaches beyond the window" in capsys.readouterr().out
+
+
+def test_a_dry_run_only_tells(bag_dir: Path, capsys: Capture) -> None:
+    assert forget(20, 35, "--dry-run") == 0
+    told = capsys.readouterr().out
+    assert "would be deleted: 1 bag" in told
+    assert "rec_0/rec_1.mcap" in told
+    assert len(bags(bag_dir)) == 4
+
+
+@pytest.mark.parametrize(
+    ("answer", "left_over", "code"), [("y\n", 3, 0), ("n\n", 4, 1), ("", 4, 1)]
+)
+def test_it_asks_before(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, answer: str, left_over: int, code: int
+) -> None:
+    read, write = os.pipe()
+    os.write(write, answer.encode())
+    os.close(write)
+    with os.fdopen(read) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        assert forget(20, 35) == code
+    assert len(bags(bag_dir)) == left_over
+
+
+def test_a_recording_without_a_bag_goes_too(bag_dir: Path) -> None:
+    (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    assert forget(40, 75, "--yes") == 0
+    assert not (bag_dir / "rec_1").exists()
+    assert (bag_dir / "rec_0").is_dir()
+
+
+def test_latched_messages_that_later_answers_need_are_carried_on(
+    bag_dir: Path, capsys: Capture
+) -> None:
+    assert forget(0, 15, "--yes") == 0
+    assert "1 latched message is carried on" in capsys.readouterr().out
+    (record,) = McapReader().records(
+        bag_dir / "latched" / "carried.mcap", ["/tf_static"], TimeWindow.everything()
+    )
+    assert record.log_time == T0
+    asked = json.dumps({"parent": "base_link", "child": "laser", "timestamp": T0 / NS_PER_S + 25})
+    assert cli.main(["ask", "get_transform_at", asked, "--json"]) == 0
+
+
+def test_what_was_carried_on_from_the_window_is_told(bag_dir: Path, capsys: Capture) -> None:
+    forget(0, 15, "--yes")
+    capsys.readouterr()
+    assert forget(0, 15, "--yes") == 1
+    assert "latched messages that later answers need" in capsys.readouterr().out
+    assert (bag_dir / "latched" / "carried.mcap").is_file()
+
+
+def test_beside_a_recorder_bags_with_latched_messages_stay(bag_dir: Path, capsys: Capture) -> None:
+    lock = BagDirLock.acquire(bag_dir)
+    try:
+        assert forget(0, 35, "--yes") == 1
+    finally:
+        lock.release()
+    assert bags(bag_dir) == ["rec_0.mcap", "rec_2.mcap", "rec_3.mcap"]
+    assert "stop it for a moment" in capsys.readouterr().out
+
+
+def test_a_bag_that_is_being_written_stays(bag_dir: Path, capsys: Capture) -> None:
+    start = T0 + 80 * NS_PER_S
+    path = bag_dir / "rec_1" / "rec_4.mcap"
+    write_mcap(path, [odom(start, 0.0, 0.0)], McapLayout(finish=False, chunk_size=10))
+    assert forget(60, 100, "--yes") == 1
+    assert bags(bag_dir) == ["rec_0.mcap", "rec_1.mcap", "rec_2.mcap", "rec_4.mcap"]
+    assert "rec_4.mcap" in capsys.readouterr().out
+
+
+def test_a_bag_with_another_name_is_told(bag_dir: Path, capsys: Capture) -> None:
+    (bag_dir / "moments" / "20231114T221320Z-x" / "rec_0").mkdir(parents=True)
+    kept = bag_dir / "moments" / "20231114T221320Z-x" / "rec_0" / "rec_1.mcap"
+    kept.hardlink_to(bag_dir / "rec_0" / "rec_1.mcap")
+    assert forget(20, 35, "--yes") == 1
+    assert kept.is_file()
+    assert "moment" in capsys.readouterr().out
+    assert forget(20, 35, "--yes") == 1
+    assert kept.is_file()
+    assert "delete the moment's folder" in capsys.readouterr().out
+
+
+def test_the_catalogue_forgets_with_them(bag_dir: Path, capsys: Capture) -> None:
+    assert cli.main(["index"]) == 0
+    assert known(bag_dir) == 4
+    assert forget(20, 35, "--yes") == 0
+    assert known(bag_dir) == 3
+    asked = json.dumps({"topic": "/chatter", "condition_type": "contains", "value": "secret1"})
+    assert cli.main(["ask", "find_last_match", asked, "--json"]) == 0
+    assert capsys.readouterr().out.strip().splitlines()[-1] == "null"
+
+
+@pytest.mark.parametrize("deployment", ["query_only", "replay"])
+def test_bags_that_others_record_are_refused(
+    bag_dir: Path, capsys: Capture, deployment: str
+) -> None:
+    assert forget(0, 100, "--yes", f"deployment={deployment}") == 2
+    assert "recorder=none" in capsys.readouterr().err
+    assert len(bags(bag_dir)) == 4
+
+
+def test_without_a_window_nothing_is_forgotten(bag_dir: Path, capsys: Capture) -> None:
+    assert cli.main(["forget", "--yes"]) == 2
+    assert cli.main(["forget", "--yes", "--start", "0"]) == 2
+    assert "--last" in capsys.readouterr().err
+    assert len(bags(bag_dir)) == 4
+
+
+def test_of_an_empty_window_it_says_so(bag_dir: Path, capsys: Capture) -> None:
+    assert forget(-100, -50, "--yes") == 0
+    assert "no closed bag" in capsys.readouterr().out
+
+
+def test_of_a_recording_that_has_gone_no_metadata_is_told(bag_dir: Path, capsys: Capture) -> None:
+    (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    assert forget(40, 75, "--yes") == 0
+    assert "metadata.yaml" not in capsys.readouterr().out
+
+
+class TestForeignBags:
+    """Bags that this deployment's recorder did not make."""
+
+    def test_they_stay_and_are_named_with_what_to_do(self, bag_dir: Path, capsys: Capture) -> None:
+        (bag_dir / "rec_1").rename(bag_dir / "session")
+        (bag_dir / "rec_0" / "rec_1.mcap").rename(bag_dir / "loose.mcap")
+        assert forget(0, 100, "--yes") == 1
+        assert sorted(path.name for path in bag_dir.rglob("*.mcap")) == [
+            "carried.mcap",
+            "loose.mcap",
+            "rec_2.mcap",
+            "rec_3.mcap",
+        ]
+        told = capsys.readouterr().out
+        assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in told
+        assert "`ros2-memory adopt session` first" in told
+        assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in told
+
+    def test_one_that_was_adopted_goes(self, bag_dir: Path) -> None:
+        (bag_dir / "rec_1").rename(bag_dir / "session")
+        assert cli.main(["adopt", "session"]) == 0
+        assert forget(40, 100, "--yes") == 0
+        assert not (bag_dir / "session").exists()
+
+    def test_with_delete_they_go_too(self, bag_dir: Path) -> None:
+        (bag_dir / "rec_1").rename(bag_dir / "session")
+        assert forget(40, 100, "--yes", "retention.foreign=delete") == 0
+        assert not (bag_dir / "session").exists()
+
+    def test_recordings_of_before_the_list_are_known_by_what_they_carry(
+        self, bag_dir: Path
+    ) -> None:
+        shutil.rmtree(bag_dir / ".episodic")
+        name = "rec_20231114T221320Z"
+        path = embedding(bag_dir / name / f"{name}_0.mcap", OURS, start=T0 + 200 * NS_PER_S)
+        left(path)
+        assert forget(190, 300, "--yes") == 0
+        assert not path.exists()
+        assert forget(0, 100, "--yes") == 1
+        assert len(bags(bag_dir)) == 4
+
+    def test_a_copy_without_its_list_of_which_one_file_is_damaged_stays(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        shutil.rmtree(bag_dir / ".episodic")
+        name = "rec_20231114T221320Z"
+        for number in range(2):
+            path = bag_dir / name / f"{name}_{number}.mcap"
+            start = T0 + (200 + 20 * number) * NS_PER_S
+            embedding(path, {**OURS, "bag_dir_id": "1" * 32}, start=start)
+        first = bag_dir / name / f"{name}_0.mcap"
+        first.write_bytes(first.read_bytes()[:20])
+        left(first), left(path)
+        write_heartbeat(
+            bag_dir, Heartbeat(1, T0, RecorderState.STOPPED, (name,), T0, 0, (), (), None, 2.0)
+        )
+        assert forget(190, 300, "--yes") == 1
+        assert path.exists()
+        assert (
+            f"stays: {name}/{path.name}: this recorder did not make it" in capsys.readouterr().out
+        )
+
+    def test_one_that_took_the_place_of_another_while_it_was_asked_stays(
+        self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def meanwhile(*_: object, **__: object) -> None:
+            shutil.copytree(bag_dir / "rec_1", bag_dir / "copy")
+            (bag_dir / "rec_1").rename(bag_dir.parent / "away")
+            (bag_dir / "copy").rename(bag_dir / "rec_1")
+
+        monkeypatch.setattr("typer.confirm", meanwhile)
+        forget(40, 100)
+        assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
+
+
+class TestMetadata:
+    @pytest.fixture
+    def metadata(self, bag_dir: Path) -> Path:
+        """That of the first recording, as its recorder would have left it."""
+        starts = [T0, T0 + 20 * NS_PER_S]
+        counts = {"/odom": 20, "/chatter": 2, "/tf_static": 1}
+        info = {
+            "version": 5,
+            "storage_identifier": "mcap",
+            "duration": {"nanoseconds": 29 * NS_PER_S},
+            "starting_time": {"nanoseconds_since_epoch": T0},
+            "message_count": 23,
+            "topics_with_message_count": [
+                {"topic_metadata": {"name": name}, "message_count": count}
+                for name, count in counts.items()
+            ],
+            "relative_file_paths": ["rec_0.mcap", "rec_1.mcap"],
+            "files": [
+                {
+                    "path": f"rec_{number}.mcap",
+                    "starting_time": {"nanoseconds_since_epoch": start},
+                    "duration": {"nanoseconds": 9 * NS_PER_S},
+                    "message_count": 12 - number,
+                }
+                for number, start in enumerate(starts)
+            ],
+        }
+        path = bag_dir / "rec_0" / "metadata.yaml"
+        path.write_text(yaml.safe_dump({"rosbag2_bagfile_information": info}))
+        return path
+
+    def test_it_lists_what_is_left(self, metadata: Path, capsys: Capture) -> None:
+        assert forget(0, 15, "--yes") == 0
+        info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
+        assert (info["relative_file_paths"], info["message_count"]) == (["rec_1.mcap"], 11)
+        assert "rec_0/metadata.yaml lists what is left" in capsys.readouterr().out
+
+    def test_where_that_cannot_be_it_says_so_and_what_to_do(
+        self, metadata: Path, capsys: Capture
+    ) -> None:
+        metadata.write_text(metadata.read_text().replace("message_count: 12", "message_count: 13"))
+        before = metadata.read_text()
+        assert forget(0, 15, "--yes") == 0
+        told = capsys.readouterr().out
+        assert "rec_0/metadata.yaml still lists what was deleted (its numbers" in told
+        assert f"ros2 bag reindex {metadata.parent}" in told
+        assert metadata.read_text() == before
+
+    def test_that_of_a_recording_that_is_being_written_is_its_recorders(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        now = time.time_ns()
+        beat = Heartbeat(1, now, RecorderState.RECORDING, ("rec_0",), now, 0, (), (), None, 2.0)
+        write_heartbeat(bag_dir, beat)
+        assert forget(20, 35, "--yes") == 0
+        assert "rec_0/metadata.yaml will list what was deleted" in capsys.readouterr().out
+
+    def test_a_dry_run_leaves_it(self, metadata: Path) -> None:
+        before = metadata.read_text()
+        assert forget(0, 15, "--dry-run") == 0
+        assert metadata.read_text() == before

@@ -1,0 +1,94 @@
+"""Replies as people read them, in a terminal of 80 columns and in a wide one."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import pytest
+from rich.console import Console
+
+from ros2_memory.cli.output import cell, moment, show
+
+if TYPE_CHECKING:
+    from ros2_memory.core.model import JsonValue
+
+T0 = 1_700_000_000.25
+
+
+def shown(value: JsonValue, width: int = 80, now: float | None = None) -> str:
+    stream = io.StringIO()
+    show(Console(file=stream, width=width), value, now)
+    lines = [line.rstrip() for line in stream.getvalue().splitlines()]
+    assert all(len(line) <= width for line in lines)
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        ({"x": 1.5, "y": 2, "z": 0.0}, "x 1.5, y 2"),
+        ({"x": 1.5, "y": 2, "z": 0.4, "yaw_deg": 90.0}, "x 1.5, y 2, z 0.4, yaw_deg 90"),
+        ({"x": 1.5, "y": 2, "frame_id": "map"}, "x 1.5, y 2 (map)"),
+        ({"x": 0, "y": 0, "z": 0, "w": 1}, "x 0, y 0, z 0, w 1"),
+        ({"value": "cup"}, "cup"),
+        ({"label": "cup", "score": 0.9}, "label: cup; score: 0.9"),
+        ({"label": "cup", "at": {"x": 1, "y": 2}}, "label: cup; at (x 1, y 2)"),
+        ([{"label": "cup"}, {"label": "\x1b[0m"}], "label: cup | label: \\x1b[0m"),
+        ([], "-"),
+        ({}, "-"),
+    ],
+)
+def test_objects_in_a_cell_are_words(value: JsonValue, told: str) -> None:
+    assert cell(value) == told
+
+
+def test_a_moment_has_its_local_time_and_its_age() -> None:
+    told = shown({"timestamp": T0, "first": T0 - 7200.0, "next": T0 + 60.0}, now=T0)
+    assert told.splitlines()[0].split(maxsplit=1) == ["timestamp", moment(T0)]
+    assert f"{moment(T0 - 7200)} (2.0 h ago)" in told
+    assert f"{moment(T0 + 60)} (in 60.0 s)" in told
+
+
+def test_ages_count_from_the_now_that_a_reply_states() -> None:
+    assert "(10.0 s ago)" in shown({"now": T0, "latest": T0 - 10.0}, now=T0 + 500.0)
+
+
+def test_moments_in_notes_are_local_times() -> None:
+    told = shown({"notes": [f"the memory ends at {T0:.6f}", "2 of 1300000000 samples"]})
+    assert f"the memory ends at {moment(T0)}" in told
+    assert "1300000000 samples" in told
+
+
+def test_long_times_are_in_a_unit_that_suits_them() -> None:
+    rows: JsonValue = [{"topic": "/a", "ago_s": 186_462_260.5}, {"topic": "/b", "ago_s": 12.25}]
+    told = shown({"duration_s": 7500.0, "total": 7500, "topics": rows}).split()
+    assert told[:4] == ["duration_s", "2.1", "h", "total"]
+    assert told[-3:] == ["days", "/b", "12.25"]
+
+
+def test_what_there_is_not_is_said_in_words() -> None:
+    assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
+    assert shown([]) == "none"
+
+
+def test_a_table_for_which_there_is_room_has_a_row_for_each() -> None:
+    rows: JsonValue = [{"topic": "/odom", "last": T0, "count": n} for n in range(3)]
+    told = shown({"topics": rows})
+    assert told.count(moment(T0)) == 3
+
+
+def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time() -> None:
+    rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
+    told = shown(rows)
+    day, _, time = moment(T0).partition(" ")
+    assert [line.count(day) for line in told.splitlines() if day in line] == [2]
+    assert [line.count(time) for line in told.splitlines() if time in line] == [2]
+    assert "12345" in told
+
+
+def test_rows_that_are_too_wide_for_a_table_stand_one_below_the_other() -> None:
+    row: JsonValue = {f"a_key_with_a_long_name_{n}": n for n in range(6)}
+    told = shown([row, row])
+    assert told.count("a_key_with_a_long_name_5  5") == 2
+    assert shown([row, row], width=200).count("a_key_with_a_long_name_5") == 1

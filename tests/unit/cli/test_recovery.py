@@ -1,0 +1,288 @@
+from __future__ import annotations
+
+import io
+import os
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+
+from ros2_memory import cli
+from ros2_memory.cli.recovery import Outcome, recover
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import McapLayout, odom, typestore, write_db3, write_mcap
+from tests.keeping import copied, files_in, later, recording_now
+from tests.limits import files_limited_to
+from tests.shared_bags import RECORDED, needs_recorded
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+T0 = 1_790_000_000 * S
+ODOMETRY = "nav_msgs/msg/Odometry"
+MESSAGES = [odom(T0 + n * S // 20, n / 20, 0.0) for n in range(100)]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def left_open(path: Path) -> Path:
+    return write_mcap(path, MESSAGES, McapLayout(chunk_size=2000, finish=False))
+
+
+def recovered(path: Path, *, seconds_later: int = 60, **more: bool) -> tuple[Outcome, list[str]]:
+    said: list[str] = []
+    outcome = recover(path, said.append, stream=io.StringIO(), clock=later(seconds_later), **more)
+    return outcome, said
+
+
+def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> None:
+    whole = write_mcap(tmp_path / "a/a_0.mcap", MESSAGES)
+    cut = left_open(tmp_path / "a/a_1.mcap")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/b_0.mcap").write_bytes(b"")
+    before = whole.stat(), whole.read_bytes()
+    count = McapReader().summarize(cut).count
+    outcome, said = recovered(tmp_path)
+    assert outcome == Outcome(whole=1, repaired=1, removed=1, failed=0, messages=count)
+    assert McapReader().summarize(cut).complete
+    stat, content = before
+    after = whole.stat()
+    assert (after.st_ino, after.st_mtime_ns) == (stat.st_ino, stat.st_mtime_ns)
+    assert whole.read_bytes() == content
+    assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "a/metadata.yaml", "b"]
+    assert said[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
+    assert said[1] == "b/b_0.mcap: empty, removed"
+    assert said[2] == f"{tmp_path / 'a/metadata.yaml'}: written anew, with what the files hold"
+    assert said[-1] == str(outcome)
+
+
+class TestMetadata:
+    """Plain rosbags opens what was recovered as a recording, with the right counts."""
+
+    def test_of_a_recording_that_was_killed_is_made(self, tmp_path: Path) -> None:
+        write_mcap(tmp_path / "rec/rec_0.mcap", MESSAGES)
+        cut = left_open(tmp_path / "rec/rec_1.mcap")
+        write_mcap(tmp_path / "rec/.rec_0.mcap.tmp", MESSAGES)
+        recovered(tmp_path)
+        expected = 100 + McapReader().summarize(cut).count
+        assert counted(tmp_path / "rec") == {"/odom": expected}
+
+    def test_that_speaks_of_more_than_there_is_is_corrected(self, tmp_path: Path) -> None:
+        with Writer(tmp_path / "rec", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            store = typestore()
+            odometry = writer.add_connection("/odom", ODOMETRY, typestore=store)
+            writer.add_connection("/quiet", "std_msgs/msg/String", typestore=store)
+            for each in MESSAGES:
+                writer.write(odometry, each.log_time, each.payload)
+            writer.set_custom_data("robot", "seven")
+        cut = left_open(tmp_path / "rec/rec.mcap")
+        os.truncate(cut, cut.stat().st_size - 3000)
+        (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
+        _, said = recovered(tmp_path / "rec")
+        assert any("metadata.yaml: written anew" in line for line in said)
+        held = McapReader().summarize(tmp_path / "rec/rec.mcap")
+        assert 0 < held.count < 100
+        assert counted(tmp_path / "rec") == {"/odom": held.count, "/quiet": 0}
+        assert "robot: seven" in (tmp_path / "rec/metadata.yaml").read_text()
+        with Reader(tmp_path / "rec") as reader:
+            assert (reader.start_time, reader.end_time) == (held.start, held.end + 1)
+
+    def test_is_left_and_that_is_said_while_a_file_is_not_whole(self, tmp_path: Path) -> None:
+        left_open(tmp_path / "rec/rec_0.mcap")
+        (tmp_path / "rec/rec_1.mcap").write_bytes(b"a letter")
+        (tmp_path / "rec/metadata.yaml").write_text("as it was\n")
+        _, said = recovered(tmp_path)
+        assert any(
+            "metadata.yaml NOT CORRECTED: " in line and "rec_1.mcap" in line for line in said
+        )
+        assert (tmp_path / "rec/metadata.yaml").read_text() == "as it was\n"
+
+    @pytest.mark.parametrize(
+        ("text", "reason"),
+        [
+            ("{", "no YAML"),
+            ("rosbag2_bagfile_information: {}", "not of plain MCAP files"),
+            ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "plain MCAP"),
+            (
+                "rosbag2_bagfile_information: {storage_identifier: mcap, version: 4}",
+                "it is of version 4",
+            ),
+        ],
+    )
+    def test_of_another_form_stays(self, tmp_path: Path, text: str, reason: str) -> None:
+        left_open(tmp_path / "rec/rec_0.mcap")
+        (tmp_path / "rec/metadata.yaml").write_text(text)
+        _, said = recovered(tmp_path)
+        assert any("NOT CORRECTED" in line and reason in line for line in said)
+        assert (tmp_path / "rec/metadata.yaml").read_text() == text
+
+    def test_of_files_with_other_names_is_not_made(self, tmp_path: Path) -> None:
+        left_open(tmp_path / "rec/field trip.mcap")
+        _, said = recovered(tmp_path)
+        assert any("ros2 bag reindex" in line for line in said)
+        assert files_in(tmp_path) == ["rec", "rec/field trip.mcap"]
+
+    @needs_recorded
+    @pytest.mark.parametrize("name", ["session_killed", "session_killed_chunk64k", "session_mcap"])
+    def test_of_a_recorded_session(self, tmp_path: Path, name: str) -> None:
+        folder = tmp_path / name
+        copied(RECORDED / name, folder)
+        if name == "session_mcap":
+            last = folder / f"{name}_6.mcap"
+            last.write_bytes(last.read_bytes()[:-2000])
+        outcome, _ = recovered(folder, force=True)
+        assert outcome.failed == 0
+        found = [McapReader().summarize(each) for each in folder.glob("*.mcap")]
+        expected: Counter[str] = Counter()
+        for summary in found:
+            expected.update({each.topic: each.count for each in summary.topics})
+        assert {topic: n for topic, n in counted(folder).items() if n} == expected
+        for each in folder.glob("*.mcap"):
+            with each.open("rb") as stream:
+                plain = make_reader(stream).get_summary()
+                assert plain is not None
+                assert plain.statistics is not None
+                assert plain.statistics.message_count == McapReader().summarize(each).count
+
+
+def counted(recording: Path) -> dict[str, int]:
+    """Messages by topic as plain rosbags states them, each of which it also yields."""
+    with Reader(recording) as reader:
+        stated = {each.topic: each.msgcount for each in reader.connections}
+        read = Counter(connection.topic for connection, _, _ in reader.messages())
+        assert reader.message_count == read.total()
+        assert +Counter(stated) == read
+    return stated
+
+
+def test_a_single_file_is_repaired_whatever_its_name(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "field trip.bag")
+    outcome, _ = recovered(path)
+    assert outcome.repaired == 1
+    assert McapReader().summarize(path).complete
+
+
+def test_a_whole_file_is_said_to_be(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a_0.mcap", MESSAGES)
+    outcome, said = recovered(path)
+    assert outcome == Outcome(whole=1)
+    assert said[0].endswith("whole already: there is nothing to repair")
+
+
+def test_what_is_no_mcap_file_is_said_to_be_none_and_stays(tmp_path: Path) -> None:
+    path = tmp_path / "a_0.mcap"
+    path.write_bytes(b"a letter")
+    outcome, said = recovered(tmp_path)
+    assert outcome == Outcome(failed=1)
+    assert said[0] == "a_0.mcap: NOT REPAIRED: not an MCAP file: it does not begin as one"
+    assert path.read_bytes() == b"a letter"
+
+
+def test_an_empty_file_that_may_be_anything_stays(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_bytes(b"")
+    outcome, said = recovered(path)
+    assert outcome.failed == 1
+    assert "its name does not end in .mcap" in said[0]
+    assert path.exists()
+
+
+def test_what_a_recorder_is_writing_is_left_alone(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "rec/rec_0.mcap")
+    recording_now(tmp_path, "rec", clock=later(60))
+    for asked in (tmp_path, path.parent, path):
+        outcome, said = recovered(asked, force=True)
+        assert outcome.failed == 1
+        assert "the recorder (process 1) is writing it" in said[0]
+    assert not McapReader().summarize(path).complete
+
+
+def test_what_a_process_has_open_is_left_alone(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "rec/rec_0.mcap")
+    with path.open("rb"):
+        outcome, said = recovered(path, force=True)
+    assert outcome.failed == 1
+    assert "a process has it open" in said[0]
+
+
+def test_what_changed_a_moment_ago_is_left_alone_unless_that_is_forced(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "rec/rec_0.mcap")
+    outcome, said = recovered(path, seconds_later=3)
+    assert outcome.failed == 1
+    assert "--force" in said[0]
+    outcome, _ = recovered(path, seconds_later=3, force=True)
+    assert outcome.repaired == 1
+
+
+def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
+    write_db3(tmp_path / "a/a_0.db3", MESSAGES)
+    outcome, said = recovered(tmp_path)
+    assert outcome == Outcome()
+    assert said[0].startswith("1 bag file of another kind was left alone")
+
+
+def test_what_is_not_there_cannot_be_repaired(tmp_path: Path) -> None:
+    with pytest.raises(RecorderError, match="no such file or directory"):
+        recovered(tmp_path / "gone")
+
+
+def test_on_a_full_disk_the_original_stays(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    before = path.read_bytes()
+    with files_limited_to(1000):
+        outcome, said = recovered(path)
+    assert outcome.failed == 1
+    assert "cannot be written" in said[0]
+    assert path.read_bytes() == before
+
+
+def test_a_terminal_sees_how_far_it_is_and_then_a_clean_line(tmp_path: Path) -> None:
+    for name in ("a/a_0.mcap", "a/a_1.mcap"):
+        left_open(tmp_path / name)
+    terminal = Terminal()
+    recover(tmp_path, lambda _: None, stream=terminal, clock=later(60))
+    shown = terminal.getvalue()
+    assert "  0% a/a_0.mcap" in shown
+    assert " 50% a/a_1.mcap" in shown
+    assert shown.endswith("\r\x1b[K")
+
+
+def test_nothing_but_a_terminal_sees_it(tmp_path: Path) -> None:
+    left_open(tmp_path / "a_0.mcap")
+    stream = io.StringIO()
+    recover(tmp_path, lambda _: None, stream=stream, clock=later(60))
+    assert stream.getvalue() == ""
+
+
+class TestTheProgram:
+    def test_exits_0_where_nothing_is_left_unfinished(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        left_open(tmp_path / "a_0.mcap")
+        assert cli.main(["recover", str(tmp_path), "--force"]) == 0
+        assert "1 repaired" in capsys.readouterr().out
+
+    def test_exits_1_where_a_file_could_not_be_repaired(self, tmp_path: Path) -> None:
+        (tmp_path / "a_0.mcap").write_bytes(b"a letter")
+        assert cli.main(["recover", str(tmp_path)]) == 1
+
+    def test_exits_2_where_there_is_nothing(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert cli.main(["recover", str(tmp_path / "gone")]) == 2
+        assert "ros2-memory recover: " in capsys.readouterr().err
+
+
+@needs_recorded
+def test_what_killed_recorders_left(tmp_path: Path) -> None:
+    for name in ("session_killed", "session_killed_chunk64k", "extra/full_truncated"):
+        copied(RECORDED / name, tmp_path / name.rpartition("/")[2])
+    outcome, _ = recovered(tmp_path, force=True)
+    assert outcome == Outcome(whole=4, repaired=2, removed=1, messages=251 + 94)

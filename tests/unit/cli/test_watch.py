@@ -1,0 +1,151 @@
+"""`ros2-memory watch`: what is not as usual is seen, on a terminal and in a log."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import cli
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.cli.output import span
+from ros2_memory.cli.watch import AS_USUAL, Course
+from ros2_memory.core.timebase import NS_PER_S
+from tests.bags import boolean, odom, text, write_mcap
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(autouse=True)
+def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A minute at 10 Hz, in which one topic falls silent and another becomes slow."""
+    now = time.time_ns()
+    for number in range(6):
+        start = now - (60 - number * 10) * NS_PER_S
+        messages = [odom(start + n * NS_PER_S // 10, 0.0, 0.0) for n in range(100)]
+        words = range(0, 100, 10) if number < 3 else ()
+        messages += [text(start + n * NS_PER_S // 10, "x") for n in words]
+        bumps = range(0, 100, 10 if number < 5 else 50)
+        messages += [boolean(start + n * NS_PER_S // 10, data=True) for n in bumps]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "query_only")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("rate", "usual", "age_s", "judged"),
+    [
+        (20.0, 20.0, 0.0, AS_USUAL),
+        (9.9, 20.0, 0.0, "slow"),
+        (41.0, 20.0, 0.0, "fast"),
+        (0.0, 20.0, 11.0, "silent"),
+        (0.0, 0.1, 60.0, AS_USUAL),
+        (0.0, 0.1, 101.0, "silent"),
+        (0.1, 0.4, 5.0, AS_USUAL),
+        (0.0, None, 1000.0, AS_USUAL),
+    ],
+)
+def test_a_course_is_judged_by_what_is_usual(
+    rate: float, usual: float | None, age_s: float, judged: str
+) -> None:
+    assert Course("/x", rate, usual, age_s).judged == judged
+
+
+def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(capsys: Capture) -> None:
+    assert cli.main(["watch", "--count", "2", "--every", "0.01"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2
+    assert "1 topic as usual" in lines[0]
+    assert "/chatter silent (0 Hz, usually 1" in lines[0]
+    assert "/bumper slow (0.2 Hz" in lines[0]
+    assert "/odom" not in lines[0]
+
+
+def test_an_empty_memory_can_be_watched(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "none").mkdir()
+    assert cli.main(["watch", "--count", "1", "--bag-dir", str(tmp_path / "none")]) == 0
+    assert "no data" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["--every", "0"], ["--count", "0"]])
+def test_what_makes_no_sense_is_refused(capsys: Capture, words: list[str]) -> None:
+    assert cli.main(["watch", *words]) == 2
+    assert "more than 0" in capsys.readouterr().err
+
+
+def test_a_terminal_gets_a_table() -> None:
+    ours, theirs = pty.openpty()
+    program = [sys.executable, "-m", "ros2_memory.cli", "watch", "--count", "1"]
+    env = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
+    with subprocess.Popen(program, stdout=theirs, stderr=subprocess.PIPE, env=env) as process:
+        os.close(theirs)
+        shown = b""
+        try:
+            while some := os.read(ours, 4096):
+                shown += some
+        except OSError:  # the other end is closed
+            pass
+        os.close(ours)
+        assert process.wait(60) == 0
+    assert b"/odom" in shown
+    assert b"usually" in shown
+    assert b"silent" in shown
+
+
+def test_restarts_and_topics_that_nobody_offers_are_told(bag_dir: Path, capsys: Capture) -> None:
+    now = time.time_ns()
+    beat = Heartbeat(
+        1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, ("/gone", "/lost")
+    )
+    write_heartbeat(bag_dir, beat)
+    assert cli.main(["watch", "--count", "1"]) == 0
+    told = capsys.readouterr().out
+    assert "recorder: recording, restarted 2 times;" in told
+    assert "offered by no publisher: /gone, /lost" in told
+
+
+class TestOldData:
+    @pytest.fixture
+    def old(self, tmp_path: Path) -> Path:
+        folder = tmp_path / "old"
+        messages = [odom((1_700_000_000 * 10 + n) * NS_PER_S // 10, 0.0, 0.0) for n in range(100)]
+        write_mcap(folder / "rec" / "rec_0.mcap", messages)
+        os.utime(folder / "rec" / "rec_0.mcap", (1_700_000_010,) * 2)
+        return folder
+
+    def test_is_not_judged_by_what_is_usual(self, old: Path, capsys: Capture) -> None:
+        assert cli.main(["watch", "--count", "1", "--bag-dir", str(old)]) == 0
+        told = capsys.readouterr().out
+        assert "as usual" not in told
+        assert "days old; nothing comes in: 1 topic not judged" in told
+
+    def test_is_as_old_as_the_tools_say(self, old: Path, capsys: Capture) -> None:
+        words = ["watch", "--count", "1", "--bag-dir", str(old), "data.now=latest"]
+        assert cli.main(words) == 0
+        told = capsys.readouterr().out
+        assert "which is now (data.now=latest); nothing comes in" in told
+        assert "days old" not in told
+
+
+@pytest.mark.parametrize(
+    ("seconds", "told"),
+    [
+        (0.04, "0.0 s"),
+        (119.0, "119.0 s"),
+        (600.0, "10 min"),
+        (18_000.0, "5.0 h"),
+        (864_000.0, "10 days"),
+        (-30.0, "-30.0 s"),
+    ],
+)
+def test_a_duration_has_the_unit_that_suits_it(seconds: float, told: str) -> None:
+    assert span(seconds) == told

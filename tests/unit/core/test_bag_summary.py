@@ -1,0 +1,62 @@
+"""What a bag holds, as numbers and a shape."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+
+moments = st.integers(MIN_NS, MAX_NS)
+topics = st.builds(
+    lambda name, kind, count, ends, latched: TopicSummary(
+        name, kind, "cdr", count, min(ends), max(ends), latched
+    ),
+    st.sampled_from(["/a", "/b", "/c"]),
+    st.sampled_from(["std_msgs/msg/Bool", "std_msgs/msg/String"]),
+    st.integers(1, 2**40),
+    st.tuples(moments, moments),
+    st.booleans(),
+)
+several = st.lists(topics, max_size=6, unique_by=lambda each: (each.topic, each.type)).map(tuple)
+
+
+@given(several)
+def test_topics_come_back_as_they_were_given(given_topics: tuple[TopicSummary, ...]) -> None:
+    summary = BagSummary(given_topics, ("/quiet",), False, ("odd",))
+    assert summary.topics == given_topics
+    assert (summary.silent, summary.complete, summary.notes) == (("/quiet",), False, ("odd",))
+    assert summary.count == sum(each.count for each in given_topics)
+    assert summary.empty == (not given_topics)
+
+
+@given(several.filter(bool))
+def test_a_summary_spans_its_topics_and_each_topic_its_types(
+    given_topics: tuple[TopicSummary, ...],
+) -> None:
+    summary = BagSummary(given_topics)
+    assert summary.start == min(each.first for each in given_topics)
+    assert summary.end == max(each.last for each in given_topics)
+    for name in {each.topic for each in given_topics}:
+        alike = [each for each in given_topics if each.topic == name]
+        assert list(summary.of(name)) == alike
+        ends = min(each.first for each in alike), max(each.last for each in alike)
+        assert summary.span_of([name, "/nowhere"]) == ends
+    assert summary.of("/nowhere") == ()
+
+
+@given(several, several)
+def test_summaries_are_equal_where_they_say_the_same(
+    one: tuple[TopicSummary, ...], other: tuple[TopicSummary, ...]
+) -> None:
+    assert (BagSummary(one) == BagSummary(other)) == (one == other)
+    assert hash(BagSummary(one)) == hash(BagSummary(tuple(one)))
+
+
+def test_summaries_of_equal_numbers_differ_by_what_else_they_say() -> None:
+    summary = BagSummary((TopicSummary("/a", "std_msgs/msg/Bool", "cdr", 1, 2, 3),))
+    assert summary != summary.replaced(complete=False)
+    assert summary != summary.replaced(notes=("odd",))
+    assert summary.replaced(notes=("odd",)).replaced(notes=()) == summary
+    assert summary.replaced(topics=()).empty

@@ -1,0 +1,118 @@
+"""Directories nested deeper than a program's stack, its open files or a path can be."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bootstrap import build_memory, way_of_reading
+from ros2_memory.cli.findings import _size
+from ros2_memory.cli.recovery import recover
+from ros2_memory.config import load_settings
+from ros2_memory.core import directories
+from ros2_memory.retention.clear import clear_bags
+from tests.bags import odom, write_mcap
+from tests.keeping import keeper_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+DEEP = 1200
+
+
+@contextmanager
+def within(root: Path, depth: int, name: str) -> Iterator[int]:
+    """The innermost of so many nested directories, made where they are not."""
+    current = os.open(root, os.O_RDONLY)
+    for _ in range(depth):
+        with suppress(FileExistsError):
+            os.mkdir(name, dir_fd=current)
+        inner = os.open(name, os.O_RDONLY, dir_fd=current)
+        os.close(current)
+        current = inner
+    try:
+        yield current
+    finally:
+        os.close(current)
+
+
+def put(root: Path, bag: Path, depth: int = DEEP, name: str = "d") -> None:
+    with within(root, depth, name) as inner:
+        os.link(bag, "deep.mcap", dst_dir_fd=inner)
+
+
+def is_there(root: Path, depth: int = DEEP, name: str = "d") -> bool:
+    with within(root, depth, name) as inner:
+        return "deep.mcap" in os.listdir(inner)  # noqa: PTH208 - a descriptor has no path
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    return write_mcap(tmp_path / "bag.mcap", [odom(1_790_000_000 * 10**9, 1.0, 2.0)])
+
+
+@pytest.fixture
+def bags(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "bags"
+    folder.mkdir()
+    yield folder
+    # pytest would recurse.
+    subprocess.run(["rm", "-rf", str(folder)], check=True)
+
+
+@pytest.mark.parametrize("name", ["d", "a_name_that_makes_paths_of_33_kB"], ids=["short", "long"])
+def test_they_are_cleared_at_startup(bags: Path, bag: Path, name: str) -> None:
+    put(bags, bag, name=name)
+    wiped = clear_bags(bags)
+    assert (wiped.files, wiped.faults, wiped.more) == (1, [], 0)
+    assert not is_there(bags, name=name)
+
+
+def test_what_cannot_be_deleted_is_named_a_hundred_times_and_counted(
+    bags: Path, bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(130):
+        os.link(bag, bags / f"{number}.mcap")
+
+    def refused(path: object, *, dir_fd: int) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "unlink", refused)
+    wiped = clear_bags(bags)
+    assert (wiped.files, len(wiped.faults), wiped.more) == (0, 100, 30)
+    assert f"{bags}/" in wiped.faults[0]
+
+
+def test_they_are_scanned_repaired_measured_and_counted(
+    bags: Path, bag: Path, tmp_path: Path
+) -> None:
+    put(bags, bag)
+    memory = build_memory(load_settings([f"recording.bag_dir={bags}"], {"XDG_CACHE_HOME": ""}))
+    assert len(memory.index.snapshot().bags) == 1
+    keeper_of(bags).apply(bags)
+    lines: list[str] = []
+    assert recover(bags, lines.append).whole == 1
+    assert _size(bags) >= bag.stat().st_size
+
+
+def test_definitions_of_messages_are_found(tmp_path: Path, bags: Path) -> None:
+    with within(bags, DEEP, "d") as inner:
+        os.mkdir("msg", dir_fd=inner)
+        os.close(os.open("msg/Deep.msg", os.O_CREAT | os.O_WRONLY, dir_fd=inner))
+    settings = load_settings([f"recording.bag_dir={tmp_path}", f"reader.custom_msg_paths=[{bags}]"])
+    assert way_of_reading(settings, {})
+    build_memory(settings)
+
+
+def test_all_of_it_is_removed(bags: Path, bag: Path, tmp_path: Path) -> None:
+    put(bags, bag)
+    put(bags, bag, 3, "shallow")
+    (bags / "link").symlink_to(tmp_path)
+    directories.remove(bags)
+    assert not bags.exists()
+    assert bag.exists()

@@ -1,0 +1,238 @@
+"""Log events: where they go and what they look like."""
+
+from __future__ import annotations
+
+import json
+import logging
+import warnings
+from collections import Counter
+from datetime import UTC, datetime
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+import structlog
+from mcp.server import streamable_http as transport
+
+from ros2_memory.core import logging_setup
+from ros2_memory.core.logging_setup import configure_logging, get_logger
+from ros2_memory.core.withheld import withheld_warnings, withhold_warnings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture(autouse=True)
+def restored_logging() -> Iterator[None]:
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    # pytest's own handlers stand on the root logger, and the set-up closes what it replaces.
+    root.handlers = []
+    yield
+    root.level, root.handlers = level, handlers
+    logging.getLogger(transport.__name__).setLevel(logging.NOTSET)
+    logging.captureWarnings(capture=False)
+    structlog.reset_defaults()
+
+
+def events(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
+    out, err = capsys.readouterr()
+    assert out == ""
+    return [json.loads(line) for line in err.splitlines()]
+
+
+def fail(reason: str) -> None:
+    secret = "hunter" + str(len("ab"))
+    assert secret
+    raise ValueError(reason)
+
+
+def log_failure(reason: str) -> None:
+    try:
+        fail(reason)
+    except ValueError:
+        get_logger("ours").exception("scan failed")
+
+
+def test_an_event_is_one_json_object_on_stderr_with_utc_time(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log = get_logger("ros2_memory.index")
+    configure_logging("info", "json")
+    log.info("indexed", bags=3, duration_ms=1.5)
+    (event,) = events(capsys)
+    stamp = datetime.fromisoformat(event.pop("timestamp"))
+    assert stamp.tzinfo == UTC
+    assert event == {
+        "event": "indexed",
+        "bags": 3,
+        "duration_ms": 1.5,
+        "logger": "ros2_memory.index",
+        "level": "info",
+    }
+
+
+def test_what_libraries_log_has_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("info", "json")
+    logging.getLogger("uvicorn.error").warning("port %d is busy", 9203)
+    (event,) = events(capsys)
+    assert datetime.fromisoformat(event.pop("timestamp")).tzinfo == UTC
+    assert event == {"event": "port 9203 is busy", "logger": "uvicorn.error", "level": "warning"}
+
+
+@pytest.mark.parametrize(
+    ("level", "told"),
+    [("debug", ["info", "warning"]), ("info", ["warning"]), ("error", [])],
+)
+def test_the_end_of_a_request_is_no_event_and_a_warning_of_its_library_is(
+    level: Literal["debug", "info", "error"], told: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    theirs = logging.getLogger(transport.__name__)
+    assert transport.logger is theirs
+    configure_logging(level, "json")
+    theirs.info("Terminating session: None")
+    theirs.warning("a stream was closed")
+    assert [event["level"] for event in events(capsys)] == told
+
+
+def test_warnings_have_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
+    # Left on by another test, it would be taken for on here, where warnings go elsewhere.
+    logging.captureWarnings(capture=False)
+    configure_logging("info", "json")
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        logging.captureWarnings(capture=True)
+        warnings.warn("the disk is slow", UserWarning, stacklevel=1)
+    (event,) = events(capsys)
+    assert event["logger"] == "py.warnings"
+    assert "the disk is slow" in event["event"]
+
+
+def test_a_bound_correlation_id_joins_every_event(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("info", "json")
+    with structlog.contextvars.bound_contextvars(call_id="c1"):
+        get_logger("ours").info("read")
+        logging.getLogger("theirs").info("read")
+    get_logger("ours").info("idle")
+    assert [event.get("call_id") for event in events(capsys)] == ["c1", "c1", None]
+
+
+def test_events_below_the_level_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("warning", "json")
+    for log in (get_logger("ours"), logging.getLogger("theirs")):
+        log.info("small")
+        log.warning("large")
+    assert [event["event"] for event in events(capsys)] == ["large", "large"]
+
+
+def test_an_exception_is_one_line_of_json(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("info", "json")
+    log_failure("bad bag")
+    (event,) = events(capsys)
+    assert event["level"] == "error"
+    assert "ValueError: bad bag" in event["exception"]
+
+
+@pytest.mark.parametrize("layout", ["json", "pretty"])
+def test_an_exception_does_not_show_local_variables(
+    layout: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    configure_logging("info", "json" if layout == "json" else "pretty")
+    log_failure("bad bag")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "ValueError: bad bag" in err
+    assert "hunter2" not in err
+
+
+def test_pretty_events_are_for_people_and_plain_without_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    configure_logging("debug", "pretty")
+    get_logger("ours").debug("read", bags=3)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "read" in err
+    assert "bags=3" in err
+    assert "\x1b" not in err
+
+
+def test_a_second_configuration_replaces_the_first(capsys: pytest.CaptureFixture[str]) -> None:
+    log = get_logger("ours")
+    configure_logging("error", "json")
+    log.info("early")
+    configure_logging("info", "json")
+    log.info("late")
+    assert [event["event"] for event in events(capsys)] == ["late"]
+
+
+def test_withheld_warnings_are_counted_by_event_and_errors_are_shown(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    configure_logging("warning", "json")
+    withhold_warnings()
+    get_logger("ours").warning("bag_damaged", path="a")
+    get_logger("ours").warning("bag_damaged", path="b")
+    logging.getLogger("theirs").warning("100 %% of %s", "it")
+    get_logger("ours").error("not_deleted")
+    assert withheld_warnings() == {"bag_damaged": 2, "theirs": 1}
+    assert withheld_warnings() == {}
+    assert [each["event"] for each in events(capsys)] == ["not_deleted"]
+
+
+def test_what_a_library_repeats_is_logged_now_and_then(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(logging_setup, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    configure_logging("info", "json")
+    for second in range(25):
+        now[0] = float(second)
+        for logger in ("uvicorn.error", "asyncio", "mcp.server.sse"):
+            logging.getLogger(logger).warning("Invalid HTTP request received.")
+        logging.getLogger("asyncio").error("Fatal error: protocol.data_received() call %d", second)
+        get_logger("ros2_memory.test").warning("ours")
+    told = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    counts = Counter(each["logger"] for each in told)
+    ours = {"ros2_memory.test": 25}
+    assert counts == {"uvicorn.error": 3, "asyncio": 6, "mcp.server.sse": 3, **ours}
+    seen = [each.get("suppressed") for each in told if each["logger"] == "uvicorn.error"]
+    assert seen == [None, 9, 9]
+
+
+def test_refusals_are_counted_between_what_is_logged() -> None:
+    now = [0.0]
+    refusals = logging_setup.Refusals(lambda: now[0])
+    counts = []
+    for second in range(25):
+        now[0] = float(second)
+        counts.append(refusals.count("a"))
+    assert [each for each in counts if each] == [1, 10, 10]
+    assert refusals.count("b") == 1
+
+
+def test_nothing_that_is_logged_is_endless(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging("debug", "json")
+    long = "x" * 1_000_000
+    logging.getLogger("mcp.server.sse").debug(f"Received JSON: {long}")
+    get_logger("ros2_memory.test").info("ours", reason=long)
+    fault = ValueError(f"{long}the end")
+    get_logger("ros2_memory.test").error("failed", exc_info=fault)
+    told = events(capsys)
+    assert len(told) == 3
+    assert all(len(json.dumps(each)) < 2 * logging_setup.LONGEST for each in told)
+    assert told[2]["exception"].endswith("the end")
+
+
+@pytest.mark.parametrize("level", ["debug", "info"])
+def test_without_arguments_the_library_shows_nothing_of_a_message(
+    level: Literal["debug", "info"], capsys: pytest.CaptureFixture[str]
+) -> None:
+    configure_logging(level, "json", arguments=False)
+    theirs = logging.getLogger("mcp.server.sse")
+    theirs.debug("Received JSON: %s", "s3cret")
+    theirs.warning("Rejecting message for session %s: credential does not match", "s3cret")
+    theirs.error("Failed to parse message", exc_info=ValueError("s3cret"))
+    told = events(capsys)
+    assert [each["level"] for each in told] == ["warning", "error"]
+    assert "s3cret" not in str(told)

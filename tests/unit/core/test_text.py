@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+
+from ros2_memory.core.text import glimpse
+from tests.hostile import DEEP, MEGABYTE, nested, values
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        ("yesterday", '"yesterday"'),
+        (1.5, "1.5"),
+        (True, "true"),
+        (None, "null"),
+        (math.nan, "NaN"),
+        ([1, {"a": "b"}], '[1, {"a": "b"}]'),
+        (nested(DEEP), '[[["…"]]]'),
+        (nested(DEEP, kind="object"), '{"x": {"x": {"x": "…"}}}'),
+        (list(range(100)), '[0, 1, 2, 3, 4, 5, 6, 7, "…"]'),
+        (10**4000, '"a number of 4000 digits"'),
+        ("\ud800", '"\\ud800"'),
+        ("a\x00b", '"a\\u0000b"'),
+        (object(), '"a object"'),
+    ],
+)
+def test_a_value_is_shown_in_a_few_words(value: object, shown: str) -> None:
+    assert glimpse(value) == shown
+
+
+def test_a_long_text_is_cut() -> None:
+    assert glimpse("x" * MEGABYTE, 20) == '"' + "x" * 18 + "…"
+
+
+@given(value=values)
+def test_nothing_is_shown_longer_than_asked_or_as_something_that_is_not_text(value: object) -> None:
+    shown = glimpse(value, 60)
+    assert len(shown) <= 60
+    shown.encode()

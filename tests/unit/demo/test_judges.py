@@ -1,0 +1,170 @@
+"""The demo's questions, asked of a memory over the demo's own bags: right, and able to be wrong."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+from dataclasses import dataclass
+
+import pytest
+
+from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.model import JsonValue
+from ros2_memory.core.timebase import NS_PER_S, Deadline, FixedClock, WallClock
+from ros2_memory.demo.answer_checks import Asked
+from ros2_memory.demo.published_topics import Timeline
+from ros2_memory.demo.questions import QUESTIONS, judged
+from ros2_memory.demo.recording import DemoRecorder
+from ros2_memory.history.context import Call
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.spec_tools import build_tools
+from tests.memories import memory_of
+
+BY_WORDS = {question.words: question for question in QUESTIONS}
+PATHS_THAT_COUNT = {
+    "How far back do you remember?": ["earliest", "latest"],
+    "What do you remember?": ["0.topic", "1.type", "3.count", "4.last_ts"],
+    "Where was I 10 s ago?": ["x", "y", "z", "yaw_deg", "timestamp", "frame_id"],
+    "And how fast?": ["linear.x", "angular.z", "timestamp"],
+    "What objects did you see at the front door?": [
+        "timestamp",
+        "value_timestamp",
+        "value.detections.0.label",
+    ],
+    "When was the path last clear?": ["timestamp", "value.value"],
+    "How far have I driven in the last minute?": [
+        "distance_m",
+        "avg_speed",
+        "max_speed",
+        "duration_s",
+        "start",
+        "end",
+    ],
+    "When did you last see scissors?": ["timestamp", "topic", "value.detections.0.label"],
+    "And where were you then?": ["timestamp", "value_timestamp", "value.position.x"],
+    "When were you last at the kitchen counter?": ["timestamp", "value.position.y"],
+    "Where in the flat was the camera 10 s ago?": [
+        "translation.x",
+        "translation.y",
+        "translation.z",
+        "yaw_deg",
+        "timestamp",
+    ],
+    "Which frames do you know?": ["transforms.0.parent", "transforms.3.static"],
+    "How full was the battery half a minute ago?": ["timestamp", "value.percentage"],
+    "What did you say you saw in the last 20 s?": [
+        "total",
+        "samples.0.timestamp",
+        "samples.2.value.value",
+        "samples.3.timestamp",
+    ],
+    "What did the camera's pictures show?": ["error", "reason"],
+}
+
+
+@dataclass(frozen=True)
+class Replied:
+    """What the memory answers to every question, and the circumstances."""
+
+    texts: dict[str, str]
+    asked: Asked
+
+
+@pytest.fixture(scope="module")
+def replied(tmp_path_factory: pytest.TempPathFactory) -> Replied:
+    """Every reply at one moment, 123 s into a recording whose last split is open."""
+    folder = tmp_path_factory.mktemp("bags")
+    now = WallClock().now()
+    timeline = Timeline(now - 145 * NS_PER_S, now - 123 * NS_PER_S)
+    recorder = DemoRecorder(folder / "flat", timeline, clock=FixedClock(now))
+    recorder.write_until(now)
+    for path in folder.rglob("*.mcap"):
+        os.utime(path, ns=(now, now))  # however long it took to write them
+    memory = memory_of(folder, clock=FixedClock(now))
+    tools = {tool.name: tool for tool in build_tools(memory.limits, 25.0)}
+    replies = Replies(folder, 24_000)
+    texts = {}
+    for question in QUESTIONS:
+        ask = tools[question.tool].question(dict(question.arguments))
+        try:
+            texts[question.words] = replies.answer(ask(memory, Call(Deadline.never()))).text
+        except NoDataError as error:
+            texts[question.words] = replies.error(error).text
+    known = recorder.closed_ends(now, now)
+    recorder.stop()
+    return Replied(texts, Asked(timeline, now, now, known))
+
+
+@pytest.mark.parametrize("words", BY_WORDS)
+def test_every_answer_of_a_real_memory_is_right(replied: Replied, words: str) -> None:
+    exchange = judged(BY_WORDS[words], replied.texts[words], replied.asked)
+    assert exchange.right, exchange.sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "path"),
+    [(words, path) for words, paths in PATHS_THAT_COUNT.items() for path in paths],
+)
+def test_an_answer_that_differs_in_a_place_that_counts_is_wrong(
+    replied: Replied, words: str, path: str
+) -> None:
+    falsified = json.dumps(_changed(json.loads(replied.texts[words]), path.split(".")))
+    assert not judged(BY_WORDS[words], falsified, replied.asked).right
+
+
+def test_each_question_has_places_that_count() -> None:
+    assert set(PATHS_THAT_COUNT) == set(BY_WORDS)
+
+
+@pytest.mark.parametrize("words", ["How far back do you remember?"])
+@pytest.mark.parametrize("kind", ["gaps", "damaged", "incomplete", "unread"])
+def test_a_memory_with_faults_is_wrong(replied: Replied, words: str, kind: str) -> None:
+    reply = json.loads(replied.texts[words])
+    reply[kind] = [{"file": "x.mcap", "reason": "bad"}]
+    assert not judged(BY_WORDS[words], json.dumps(reply), replied.asked).right
+    reply[kind] = []
+    assert judged(BY_WORDS[words], json.dumps(reply), replied.asked).right
+
+
+def test_an_answer_of_a_memory_that_has_fallen_behind_is_wrong(replied: Replied) -> None:
+    """The newest known end moves on by a split, and the answers do not."""
+    later = Asked(
+        replied.asked.timeline,
+        replied.asked.before,
+        replied.asked.after,
+        (replied.asked.known[-1] + 5 * NS_PER_S,),
+    )
+    stale = {
+        words
+        for words, question in BY_WORDS.items()
+        if not judged(question, replied.texts[words], later).right
+    }
+    assert {"How far back do you remember?", "What do you remember?"} <= stale
+
+
+def _changed(reply: JsonValue, path: list[str]) -> JsonValue:
+    """The reply with another value at the path, off by little where it is a number."""
+    whole = copy.deepcopy(reply)
+    here = whole
+    *way, last = path
+    for step in way:
+        here = _step(here, step)
+    old = _step(here, last)
+    changed: JsonValue = f"{old}x" if isinstance(old, str) else old
+    if isinstance(old, bool):
+        changed = not old
+    elif isinstance(old, int | float):
+        changed = old + (1 if isinstance(old, int) else 0.25)
+    if isinstance(here, dict):
+        here[last] = changed
+    elif isinstance(here, list):
+        here[int(last)] = changed
+    return whole
+
+
+def _step(here: JsonValue, step: str) -> JsonValue:
+    if isinstance(here, dict):
+        return here[step]
+    assert isinstance(here, list)
+    return here[int(step)]

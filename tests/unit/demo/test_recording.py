@@ -1,0 +1,263 @@
+"""The demo's bags: the layout of `ros2 bag record`, and what the closed forms say, in each."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, FixedClock
+from ros2_memory.demo import published_topics, robot
+from ros2_memory.demo.messages import VISION_DEFINITIONS, definition, description
+from ros2_memory.demo.published_topics import STREAMS, Stream, Timeline
+from ros2_memory.demo.recording import DemoRecorder
+
+T0 = 1_800_000_000 * NS_PER_S + 123 * NS_PER_MS
+START = T0 + 22 * NS_PER_S + 7 * NS_PER_MS
+TIMELINE = Timeline(T0, START)
+BY_TOPIC = {stream.topic: stream for stream in STREAMS}
+MAGIC = b"\x89MCAP0\r\n"
+SECONDS = 13
+
+
+def record(folder: Path, *, until: int, close: bool = True) -> DemoRecorder:
+    recorder = DemoRecorder(folder / "demo", TIMELINE, clock=FixedClock(until))
+    recorder.write_until(until)
+    if close:
+        recorder.stop()
+    return recorder
+
+
+def in_order(folder: Path) -> list[Path]:
+    return sorted(folder.glob("demo/*.mcap"), key=lambda path: int(path.stem.split("_")[-1]))
+
+
+def closed(path: Path) -> bool:
+    return path.read_bytes().endswith(MAGIC)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bags")
+    record(folder, until=START + SECONDS * NS_PER_S)
+    return folder / "demo"
+
+
+def test_every_topic_holds_exactly_the_messages_that_were_due(recording: Path) -> None:
+    with Reader(recording) as reader:
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        times = Counter(connection.topic for connection, _, _ in reader.messages())
+    due = {stream.topic: TIMELINE.count(stream, START + SECONDS * NS_PER_S) for stream in STREAMS}
+    assert counts == due == times
+    assert due["/odom"] == 20 * SECONDS
+    assert due["/tf_static"] == 1
+
+
+def test_messages_hold_the_closed_form_at_their_own_stamp(recording: Path) -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in VISION_DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    with Reader(recording) as reader:
+        for connection, log_time, raw in reader.messages():
+            message: Any = store.deserialize_cdr(raw, connection.msgtype)
+            k = (log_time - T0) // BY_TOPIC[connection.topic].period
+            t = k * BY_TOPIC[connection.topic].period / NS_PER_S
+            check = CHECKS.get(connection.topic)
+            if check:
+                check(message, t)
+            if connection.topic not in {"/cmd_vel", "/path_clear", "/tf", "/tf_static"}:
+                stamp = message.header.stamp
+                assert stamp.sec * NS_PER_S + stamp.nanosec == T0 + round(t * NS_PER_S)
+
+
+def check_odom(message: Any, t: float) -> None:
+    at, (forward, turning) = robot.pose(t), robot.twist(t)
+    pose, twist = message.pose.pose, message.twist.twist
+    assert (pose.position.x, pose.position.y) == pytest.approx((at.x, at.y), abs=1e-9)
+    assert 2 * math.atan2(pose.orientation.z, pose.orientation.w) == pytest.approx(at.yaw)
+    assert (twist.linear.x, twist.angular.z) == pytest.approx((forward, turning), abs=1e-9)
+    assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
+
+
+def check_tf(message: Any, t: float) -> None:
+    (moving,) = message.transforms
+    at = robot.pose(t)
+    there = moving.transform.translation
+    assert (there.x, there.y) == pytest.approx((at.x, at.y), abs=1e-9)
+    assert (moving.header.frame_id, moving.child_frame_id) == ("odom", "base_link")
+
+
+def check_tf_static(message: Any, _: float) -> None:
+    pairs = {(fixed.header.frame_id, fixed.child_frame_id) for fixed in message.transforms}
+    assert pairs == {("map", "odom"), ("base_link", "camera"), ("base_link", "laser")}
+
+
+def check_objects(message: Any, t: float) -> None:
+    assert [found.label for found in message.detections] == [thing.label for thing in robot.seen(t)]
+    for found, thing in zip(message.detections, robot.seen(t), strict=True):
+        assert (found.point.x, found.point.y, found.point.z) == pytest.approx(thing.point)
+
+
+def check_found(message: Any, t: float) -> None:
+    seen = {thing.label for thing in robot.seen(t)}
+    assert [found.label for found in message.detections] == sorted(seen & {"scissors"})
+
+
+def check_scan(message: Any, t: float) -> None:
+    assert message.ranges == pytest.approx(robot.scan(t), abs=1e-5)
+    assert message.angle_min == pytest.approx(-math.pi)
+
+
+CHECKS: dict[str, Callable[[Any, float], None]] = {
+    published_topics.ODOM: check_odom,
+    published_topics.TF: check_tf,
+    published_topics.TF_STATIC: check_tf_static,
+    published_topics.SCENE_OBJECTS: check_objects,
+    published_topics.FOUND: check_found,
+    published_topics.SCAN: check_scan,
+    published_topics.PATH_CLEAR: lambda message, t: _equal(message.data, robot.path_clear(t)),
+    published_topics.SCENE_DESCRIPTION: lambda message, t: _equal(message.data, description(t)),
+    published_topics.BATTERY: lambda message, t: _equal(
+        message.percentage, pytest.approx(robot.battery(t), abs=1e-6)
+    ),
+}
+
+
+def _equal(one: object, other: object) -> None:
+    assert one == other
+
+
+def test_every_split_carries_every_channel_with_its_definition_and_its_qos(
+    recording: Path,
+) -> None:
+    for path in recording.glob("*.mcap"):
+        with path.open("rb") as stream:
+            reader = make_reader(stream)
+            assert reader.get_header().profile == "ros2"
+            summary = reader.get_summary()
+            assert summary is not None
+        channels = {channel.topic: channel for channel in summary.channels.values()}
+        assert set(channels) == set(BY_TOPIC)
+        for topic, channel in channels.items():
+            schema = summary.schemas[channel.schema_id]
+            assert (schema.name, schema.encoding) == (BY_TOPIC[topic].type, "ros2msg")
+            assert schema.data.decode() == definition(schema.name)
+            latched = "durability: transient_local" in channel.metadata["offered_qos_profiles"]
+            assert latched == (topic == "/tf_static")
+        assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+
+
+def test_a_definition_carries_the_definitions_it_is_made_of() -> None:
+    text = definition("ros2_vision_interfaces/msg/VisionDetectionArray")
+    for nested in ("ros2_vision_interfaces/VisionDetection", "geometry_msgs/Point"):
+        assert f"MSG: {nested}\n" in text
+
+
+def test_a_split_ends_only_when_a_message_arrives_more_than_the_duration_after_its_first(
+    recording: Path,
+) -> None:
+    assert [path.name for path in in_order(recording.parent)] == [
+        f"demo_{i}.mcap" for i in range(3)
+    ]
+    spans = []
+    for path in in_order(recording.parent):
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        statistics = summary.statistics
+        spans.append((statistics.message_start_time, statistics.message_end_time))
+    for (start, end), (following, _) in pairwise(spans):
+        assert end - start <= 5 * NS_PER_S < following - start
+
+
+def test_while_recording_the_last_split_has_no_footer_and_the_others_have(tmp_path: Path) -> None:
+    recorder = record(tmp_path, until=START + 12 * NS_PER_S, close=False)
+    files = in_order(tmp_path)
+    assert [closed(path) for path in files] == [True, True, False]
+    assert not (tmp_path / "demo" / "metadata.yaml").exists()
+    recorder.stop()
+    assert all(map(closed, files))
+    assert (tmp_path / "demo" / "metadata.yaml").exists()
+
+
+def test_the_open_split_grows_as_messages_are_written(tmp_path: Path) -> None:
+    recorder = record(tmp_path, until=START + 1 * NS_PER_S, close=False)
+    before = in_order(tmp_path)[-1].stat().st_size
+    recorder.write_until(START + 4 * NS_PER_S)
+    assert in_order(tmp_path)[-1].stat().st_size > before
+    recorder.stop()
+
+
+def test_the_recorder_knows_up_to_when_the_closed_splits_reach(tmp_path: Path) -> None:
+    now = START + 12 * NS_PER_S
+    recorder = record(tmp_path, until=now, close=False)
+    assert recorder.splits == 3
+    with in_order(tmp_path)[1].open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    second = summary.statistics.message_end_time
+    assert recorder.closed_ends(now - 1, now)[1:] == (second,)
+    assert recorder.closed_ends(now, now) == (second,)
+    assert recorder.closed_ends(now - 2, now - 1) == ()
+    recorder.stop()
+
+
+def test_live_recording_writes_what_is_due_and_stops_cleanly(tmp_path: Path) -> None:
+    now = START + 6 * NS_PER_S
+    recorder = DemoRecorder(tmp_path / "demo", TIMELINE, clock=FixedClock(now))
+    with recorder:
+        recorder.write_until(START + NS_PER_S)
+        recorder.start()
+    with Reader(tmp_path / "demo") as reader:
+        assert reader.message_count in {
+            sum(TIMELINE.count(stream, until) for stream in STREAMS)
+            for until in (START + NS_PER_S, now)
+        }
+    assert recorder.failure is None
+
+
+def test_an_existing_directory_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "demo").mkdir()
+    with pytest.raises(FileExistsError):
+        DemoRecorder(tmp_path / "demo", TIMELINE)
+
+
+@given(st.sampled_from(STREAMS), st.integers(0, 100 * NS_PER_S))
+def test_the_newest_message_at_a_moment_is_the_last_one_heard_by_then(
+    stream: Stream, after: int
+) -> None:
+    at = START + after
+    heard = []
+    for message in TIMELINE.messages(stream):
+        if message.log_time > at:
+            break
+        heard.append(message)
+    assert TIMELINE.newest(stream, at) == (heard[-1] if heard else None)
+    assert TIMELINE.count(stream, at) == len(heard)
+    assert list(TIMELINE.newest_first(stream, at)) == heard[::-1]
+
+
+@given(st.sampled_from(STREAMS), st.integers(0, 10_000))
+def test_a_message_is_heard_within_a_millisecond_of_its_publication(stream: Stream, k: int) -> None:
+    message = Timeline(T0, T0).message(stream, k)
+    assert message.publish_time == T0 + k * stream.period
+    assert 0 < message.log_time - message.publish_time < NS_PER_MS
+
+
+def test_a_latched_message_is_older_than_the_recording_that_receives_it() -> None:
+    message = TIMELINE.newest(BY_TOPIC["/tf_static"], START + NS_PER_S)
+    assert message is not None
+    assert message.publish_time == T0
+    assert 0 < message.log_time - START < NS_PER_MS

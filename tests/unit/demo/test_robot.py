@@ -1,0 +1,159 @@
+"""The simulated robot's closed forms agree with each other and with the flat it drives through."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.demo import robot
+from ros2_memory.demo.floor_plan import THINGS, room_at, wall_distances
+from ros2_memory.demo.robot import LAP, LAP_M, LAP_S, Planar
+
+MOMENTS = st.floats(min_value=-200.0, max_value=10_000.0)
+PLANAR = st.builds(
+    Planar,
+    st.floats(-10.0, 10.0),
+    st.floats(-10.0, 10.0),
+    st.floats(-3.0, 3.0),
+)
+
+
+def assert_same(one: Planar, other: Planar, *, within: float) -> None:
+    assert math.hypot(one.x - other.x, one.y - other.y) < within
+    assert abs(robot.wrapped(one.yaw - other.yaw)) < within
+
+
+@given(MOMENTS)
+def test_the_velocity_is_the_derivative_of_the_pose(t: float) -> None:
+    step = 1e-4
+    before, after = robot.pose(t - step), robot.pose(t + step)
+    here = robot.pose(t)
+    forward, turning = robot.twist(t)
+    rate_x, rate_y = (after.x - before.x) / (2 * step), (after.y - before.y) / (2 * step)
+    assert rate_x == pytest.approx(forward * math.cos(here.yaw), abs=1e-3)
+    assert rate_y == pytest.approx(forward * math.sin(here.yaw), abs=1e-3)
+    assert robot.wrapped(after.yaw - before.yaw) / (2 * step) == pytest.approx(turning, abs=1e-3)
+
+
+@given(MOMENTS)
+def test_after_a_lap_the_robot_is_where_it_was(t: float) -> None:
+    assert_same(robot.pose(t), robot.pose(t + LAP_S), within=1e-6)
+    assert robot.driven(t + LAP_S) - robot.driven(t) == pytest.approx(LAP_M, abs=1e-6)
+
+
+@given(st.floats(0.0, 2 * LAP_S), st.floats(0.0, 60.0))
+def test_the_way_driven_is_the_integral_of_the_speed(start: float, duration: float) -> None:
+    times = np.linspace(start, start + duration, 4001)
+    speeds = [abs(robot.twist(float(t))[0]) for t in times]
+    length = float(np.trapezoid(speeds, times))
+    assert robot.driven(start + duration) - robot.driven(start) == pytest.approx(length, abs=1e-3)
+
+
+def test_the_way_driven_is_the_length_of_the_polyline_of_poses() -> None:
+    poses = [robot.pose(k / 200) for k in range(int(LAP_S * 200) + 1)]
+    length = sum(math.hypot(b.x - a.x, b.y - a.y) for a, b in pairwise(poses))
+    assert length == pytest.approx(LAP_M, rel=1e-5)
+
+
+def test_the_robot_rests_between_its_legs() -> None:
+    starts = np.cumsum([leg.duration for leg in LAP])
+    for start in starts:
+        assert robot.twist(float(start)) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_it_starts_on_its_dock_which_is_the_origin_of_odom() -> None:
+    assert_same(robot.pose(0.0), Planar(0.0, 0.0, 0.0), within=1e-12)
+    assert_same(robot.pose_in_map(0.0), robot.MAP_TO_ODOM, within=1e-12)
+
+
+def test_it_comes_by_the_living_room_the_hall_and_the_kitchen() -> None:
+    rooms = [robot.place(float(t)) for t in range(int(LAP_S))]
+    visits = [room for k, room in enumerate(rooms) if k == 0 or rooms[k - 1] != room]
+    assert visits == ["living room", "hall", "kitchen", "hall", "living room"]
+
+
+@pytest.mark.parametrize("stop", [robot.FRONT_DOOR, robot.KITCHEN_COUNTER])
+def test_it_rests_at_the_places_that_have_a_name(stop: Planar) -> None:
+    resting = [
+        t
+        for t in np.arange(0.0, LAP_S, 0.5)
+        if robot.twist(float(t)) == pytest.approx((0.0, 0.0), abs=1e-9)
+        and math.dist(robot.pose_in_map(float(t))[:2], stop[:2]) < 1e-9
+    ]
+    assert len(resting) >= 8
+
+
+@given(MOMENTS)
+def test_it_stays_clear_of_the_walls(t: float) -> None:
+    here = robot.pose_in_map(t)
+    around = wall_distances(here.x, here.y, np.linspace(-math.pi, math.pi, 360))
+    assert around.min() > 0.4
+
+
+@given(PLANAR, PLANAR)
+def test_a_pose_undone_is_the_origin(one: Planar, other: Planar) -> None:
+    assert_same(one.inverse().then(one), Planar(0.0, 0.0, 0.0), within=1e-9)
+    assert_same(one.then(other).then(other.inverse()), one, within=1e-9)
+
+
+@given(st.floats(-100.0, 100.0))
+def test_a_wrapped_angle_is_the_same_direction(angle: float) -> None:
+    wrapped = robot.wrapped(angle)
+    assert -math.pi < wrapped <= math.pi + 1e-12
+    assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
+    assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+
+
+def test_at_the_front_door_it_sees_the_door_and_at_the_counter_the_scissors() -> None:
+    assert [thing.label for thing in robot.seen(20.0)] == ["front door", "shoes", "umbrella"]
+    assert {thing.label for thing in robot.seen(40.0)} == {"cup", "scissors"}
+
+
+@given(MOMENTS)
+def test_what_it_sees_is_where_it_stands_in_the_flat(t: float) -> None:
+    here = robot.pose_in_map(t)
+    for thing in robot.seen(t):
+        x, y, z = THINGS[thing.label]
+        there = here.then(Planar(thing.point[0], thing.point[1], 0.0))
+        assert (there.x, there.y, thing.point[2]) == pytest.approx((x, y, z), abs=1e-9)
+        assert 0.6 < thing.score < 1.0
+
+
+def test_nothing_is_seen_through_a_wall() -> None:
+    rooms = {label: room_at(x) for label, (x, _, _) in THINGS.items()}
+    at_the_counter = {rooms[thing.label] for thing in robot.seen(40.0)}
+    on_the_dock = {rooms[thing.label] for thing in robot.seen(76.0)}
+    assert (at_the_counter, on_the_dock) == ({"kitchen"}, {"living room"})
+
+
+def test_a_beam_ends_at_the_wall_and_goes_on_through_a_doorway() -> None:
+    east, north, west = 0.0, math.pi / 2, math.pi
+    bearings = np.array([east, north, west])
+    assert wall_distances(6.0, 2.0, bearings) == pytest.approx([5.0, 2.0, 6.0])
+    assert wall_distances(6.0, 3.0, bearings) == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_a_scan_starts_behind_the_robot_and_turns_left() -> None:
+    ranges = robot.scan(20.0)  # in the hall, 0.8 m from its north wall, facing it
+    behind, right, ahead, left = ranges[0], ranges[90], ranges[180], ranges[270]
+    assert (behind, right, ahead, left) == pytest.approx((3.3, 1.0, 0.7, 1.0))
+
+
+def test_the_path_is_clear_on_the_way_and_not_in_front_of_the_door() -> None:
+    assert robot.path_clear(8.0)
+    assert not robot.path_clear(20.0)
+
+
+@given(MOMENTS)
+def test_the_battery_falls_on_the_way_and_is_full_again_after_a_lap(t: float) -> None:
+    assert 0.82 - 1e-9 <= robot.battery(t) <= 0.90 + 1e-9
+    assert robot.battery(t + LAP_S) == pytest.approx(robot.battery(t), abs=1e-6)
+
+
+def test_the_battery_is_lowest_when_the_robot_reaches_its_dock() -> None:
+    assert robot.battery(LAP_S - LAP[-1].duration) == pytest.approx(0.82)

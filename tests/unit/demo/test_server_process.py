@@ -1,0 +1,64 @@
+"""How the demo's server is started: on a free port, and by nobody's settings but the demo's."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from ros2_memory.core.errors import ConfigError
+from ros2_memory.demo.run import DemoOptions, run_demo
+from ros2_memory.demo.server_process import free_port, server_environment
+
+
+def test_any_free_port_is_found() -> None:
+    port = free_port(0)
+    assert free_port(port) == port
+
+
+def test_a_port_in_use_is_refused_with_its_number_and_the_way_out() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=rf"port {port} .* in use .* --port"):
+            free_port(port)
+
+
+@pytest.mark.parametrize("port", [-1, 65536])
+def test_a_number_that_is_no_port_is_refused(port: int) -> None:
+    with pytest.raises(ConfigError, match=f"port {port} "):
+        free_port(port)
+
+
+def test_the_callers_settings_do_not_reach_the_server(tmp_path: Path) -> None:
+    caller = {
+        "PATH": "/bin",
+        "MEMORY_DEPLOYMENT": "robot",
+        "MEMORY_CONFIG_DIR": "elsewhere",
+        "MCP_TRANSPORT": "stdio",
+        "ROS_VISION_INTERFACES_PATH": "elsewhere",
+        "XDG_CACHE_HOME": "/home/someone/.cache",
+    }
+    environment = server_environment(caller, tmp_path, 9203, 5.0, "/elsewhere")
+    overrides = environment.pop("MEMORY_CONFIG_OVERRIDES").split()
+    assert environment == {
+        "PATH": "/bin",
+        "MCP_TRANSPORT": "sse",
+        "MCP_HOST": "127.0.0.1",
+        "MCP_PORT": "9203",
+        "MEMORY_BAG_DIR": str(tmp_path),
+        "XDG_CACHE_HOME": "/elsewhere",
+    }
+    assert {"recorder=none", "recording.split_duration_s=5"} <= set(overrides)
+
+
+@pytest.mark.parametrize("duration_s", [89.9, 86_401.0, float("nan")])
+def test_a_history_too_short_for_a_lap_or_endless_is_refused(duration_s: float) -> None:
+    with pytest.raises(ConfigError, match="--duration"):
+        run_demo(DemoOptions(duration_s=duration_s), print)
+
+
+def test_a_folder_that_holds_something_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "theirs.mcap").write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"--bag-dir .* not an empty folder"):
+        run_demo(DemoOptions(bag_dir=tmp_path), print)

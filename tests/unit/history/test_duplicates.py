@@ -1,0 +1,89 @@
+"""Of copies the same ones are kept, whichever way a stream runs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from ros2_memory.core.model import BagFile, BagState, BagSummary
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.history.duplicates import (
+    COPY_HORIZON_NS,
+    Found,
+    once_backward,
+    once_forward,
+)
+from ros2_memory.storage.base import Channel, Record, Schema
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+CHANNEL = Channel("/bumper", "cdr", Schema("std_msgs/msg/Bool"))
+EVERYWHERE = [(MIN_NS, MAX_NS)]
+MS = 10**6
+S = 10**9
+
+
+def found(recording: str, time: int, said: bytes = b"x") -> Found:
+    bag = BagFile(f"/{recording}/0.mcap", 1, 1, BagState.CLOSED, BagSummary(()), 0, 0)
+    return Found(bag, Record(CHANNEL, time, 0, said))
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> list[Found]:
+    """Rows of a few messages that are alike, in two recordings or three, some rows close by."""
+    messages = []
+    start = 0
+    for _ in range(draw(st.integers(1, 4))):
+        start += draw(st.sampled_from([MS, S, 3 * S, 20 * S]))
+        for _ in range(draw(st.integers(1, 6))):
+            at = start + draw(st.integers(0, 3)) * draw(st.sampled_from([1, 300 * MS]))
+            said = draw(st.sampled_from([b"x", b"y"]))
+            messages.append(found(draw(st.sampled_from("aabbc")), at, said))
+        start = max(each.time for each in messages)
+    return sorted(messages, key=lambda each: each.time)
+
+
+@given(histories())
+@example([found("a", 0), found("b", 1), found("b", 2)])
+@example([found("a", 0), found("b", 1), found("a", 2)])
+def test_the_same_copies_are_kept_newest_first(messages: list[Found]) -> None:
+    forwards = list(once_forward(messages, EVERYWHERE))
+    backwards = list(once_backward(reversed(messages), EVERYWHERE))
+    assert backwards[::-1] == forwards
+
+
+@given(histories(), st.integers(0, 30 * S), st.integers(0, 30 * S))
+def test_what_lies_outside_of_the_contested_time_is_kept_both_ways(
+    messages: list[Found], one: int, other: int
+) -> None:
+    spans = [(min(one, other), max(one, other))]
+    forwards = list(once_forward(messages, spans))
+    assert list(once_backward(reversed(messages), spans))[::-1] == forwards
+    outside = [each for each in messages if not spans[0][0] <= each.time < spans[0][1]]
+    assert not Counter(map(id, outside)) - Counter(map(id, forwards))
+
+
+def test_as_many_remain_as_the_recording_holds_that_holds_the_most() -> None:
+    messages = [found("a", 0), found("b", 1), found("b", 2), found("b", 3), found("a", 4)]
+    kept = [each.time for each in once_forward(messages, EVERYWHERE)]
+    assert kept == [0, 2, 3]
+    assert [each.time for each in once_backward(reversed(messages), EVERYWHERE)] == kept[::-1]
+
+
+def test_no_more_is_held_of_messages_that_are_all_alike_than_of_some_seconds() -> None:
+    taken = 0
+
+    def endless() -> Iterator[Found]:
+        nonlocal taken
+        for number in range(10_000):
+            taken += 1
+            yield found("ab"[number % 2], (10_000 - number) * 100 * MS)
+
+    kept = once_backward(endless(), EVERYWHERE)
+    next(kept)
+    assert taken * 100 * MS < 4 * COPY_HORIZON_NS
+    assert 4_900 < 1 + sum(1 for _ in kept) < 5_400

@@ -1,0 +1,278 @@
+"""What could not be read is part of every answer, and a wrong clock spoils none."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory import queries
+from ros2_memory.core.timebase import FixedClock
+from ros2_memory.history.context import Call, Limits
+from tests.asking import asked
+from tests.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
+from tests.mcap_surgery import spoil_chunk
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+S = 10**9
+T0_S = 1_784_023_200
+T0 = T0_S * S
+HOUR = 3600 * S
+LOST = "1 bag file could not be read and may hold more: rec/rec_1.mcap"
+
+
+def messages(start_s: int, seconds: int = 10) -> list[Msg]:
+    made: list[Msg] = []
+    for second in range(start_s, start_s + seconds):
+        at = T0 + second * S
+        made += [
+            odom(at, second * 0.1, 0.0),
+            tf(at, transform(at, "odom", "base_link", (second * 0.1, 0.0, 0.0))),
+            boolean(at, second % 7 == 0),
+        ]
+    return [*made, detections(T0 + start_s * S, ["cup"])]
+
+
+def write_splits(bag_dir: Path, count: int, folder: str = "rec") -> list[Path]:
+    paths = []
+    for number in range(count):
+        path = bag_dir / folder / f"{folder}_{number}.mcap"
+        paths.append(write_mcap(path, messages(number * 10), McapLayout(chunk_size=2000)))
+        os.utime(path, ns=(T0 + number * 10 * S + 10 * S,) * 2)
+    return paths
+
+
+def tear(path: Path) -> None:
+    was = path.stat().st_mtime_ns
+    path.write_bytes(b"this was a bag once, and is none any more")
+    os.utime(path, ns=(was, was))
+
+
+def notes_of(reply: Any) -> list[str]:
+    return list(reply.get("notes", ())) if isinstance(reply, dict) else []
+
+
+def at(second: float) -> float:
+    return T0_S + second
+
+
+TOUCHING: list[tuple[str, dict[str, Any]]] = [
+    ("get_topic_at_time", {"topic": "/odom", "timestamp": at(15), "tolerance_s": 30}),
+    ("get_topic_in_range", {"topic": "/odom", "start": at(5), "end": at(25)}),
+    ("get_position_at", {"timestamp": at(15)}),
+    ("get_velocity_at", {"timestamp": at(15)}),
+    ("get_transform_at", {"parent": "odom", "child": "base_link", "timestamp": at(12)}),
+    ("get_transform_at", {"parent": "odom", "child": "nobody", "timestamp": at(15)}),
+    ("trajectory_summary", {"start": at(0), "end": at(29)}),
+    ("get_topic_in_range", {"topic": "/odom", "start": at(12), "end": at(15)}),
+    ("list_frames", {}),
+    (
+        "find_last_match",
+        {"topic": "/odom", "condition_type": "near_position", "value": {"x": 0.3, "y": 0}},
+    ),
+    (
+        "find_last_match",
+        {"topic": "/odom", "condition_type": "near_position", "value": {"x": 500, "y": 0}},
+    ),
+    (
+        "find_last_match",
+        {
+            "topic": "/vision/*",
+            "condition_type": "contains",
+            "value": "scissors",
+            "before": at(19),
+        },
+    ),
+    (
+        "get_value_when",
+        {
+            "value_topic": "/odom",
+            "condition_topic": "/vision/scene/scene_objects",
+            "condition_type": "contains",
+            "value": "scissors",
+        },
+    ),
+    ("get_topic_at_time", {"topic": "/nowhere", "timestamp": at(5)}),
+]
+APART: list[tuple[str, dict[str, Any]]] = [
+    ("get_topic_at_time", {"topic": "/odom", "timestamp": at(5)}),
+    ("get_topic_in_range", {"topic": "/odom", "start": at(0), "end": at(9)}),
+    ("get_position_at", {"timestamp": at(25)}),
+    ("get_transform_at", {"parent": "odom", "child": "base_link", "timestamp": at(5)}),
+    ("trajectory_summary", {"start": at(21), "end": at(29)}),
+    (
+        "find_last_match",
+        {"topic": "/odom", "condition_type": "near_position", "value": {"x": 2.5, "y": 0}},
+    ),
+    (
+        "find_last_match",
+        {
+            "topic": "/odom",
+            "condition_type": "near_position",
+            "value": {"x": 500, "y": 0},
+            "before": at(8),
+        },
+    ),
+]
+
+
+@pytest.mark.parametrize("recall", [False, True], ids=["plain", "catalogue"])
+@pytest.mark.parametrize(("tool", "given"), TOUCHING)
+def test_every_tool_says_that_a_split_of_its_window_could_not_be_read(
+    tool: str, given: dict[str, Any], recall: bool, tmp_path: Path
+) -> None:
+    tear(write_splits(tmp_path, 3)[1])
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    if recall:
+        memory = recalling(memory, tmp_path)
+    told = notes_of(asked(memory, tmp_path, tool, **given))
+    assert any(note.startswith(LOST) for note in told), told
+
+
+@pytest.mark.parametrize(("tool", "given"), APART)
+def test_no_tool_speaks_of_a_split_that_its_window_does_not_touch(
+    tool: str, given: dict[str, Any], tmp_path: Path
+) -> None:
+    tear(write_splits(tmp_path, 3)[1])
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    reply = asked(memory, tmp_path, tool, **given)
+    assert reply is None or "error" not in reply
+    assert not any("could not be read" in note for note in notes_of(reply))
+
+
+def test_never_seen_is_null_only_where_everything_was_searched(tmp_path: Path) -> None:
+    splits = write_splits(tmp_path, 3)
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    never = {"topic": "/vision/*", "condition_type": "contains", "value": "scissors"}
+    assert asked(memory, tmp_path, "find_last_match", **never) is None
+    tear(splits[0])
+    reply = asked(memory, tmp_path, "find_last_match", **never)
+    assert (reply.pop("timestamp"), reply.pop("value")) == (None, None)
+    assert [*reply] == ["notes"]
+
+
+def test_the_split_being_written_is_told_where_it_may_hold_newer(tmp_path: Path) -> None:
+    write_splits(tmp_path, 2)
+    active = write_mcap(tmp_path / "rec" / "rec_2.mcap", messages(20), McapLayout(finish=False))
+    os.utime(active, ns=(T0 + 29 * S,) * 2)
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + 30 * S))
+    written = f"the split being written is not included: nothing after {at(19):.6f}"
+    newest = asked(memory, tmp_path, "find_last_match", **SEEN)
+    assert (newest["timestamp"], newest["notes"]) == (at(10), [written])
+    older = asked(memory, tmp_path, "find_last_match", **SEEN, before=at(15))
+    assert "notes" not in older
+    lately = asked(memory, tmp_path, "get_topic_in_last", topic="/odom", seconds=25)
+    assert lately["notes"] == [written]
+    now = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=1)
+    assert (now["reason"], now["notes"]) == ("not_closed_yet", [written])
+
+
+SEEN = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
+
+
+def test_a_bag_that_a_crash_left_open_is_told_with_what_is_lost_of_it(tmp_path: Path) -> None:
+    paths = write_splits(tmp_path, 3)
+    paths[2].write_bytes(paths[2].read_bytes()[:6000])
+    os.utime(paths[2], ns=(T0 + 32 * S,) * 2)
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    [told] = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", start=at(1), end=at(31))[
+        "notes"
+    ][:1]
+    assert told.startswith("1 bag left open by a crash; what is readable is used: rec/rec_2.mcap (")
+    [named] = asked(memory, tmp_path, "data_time_range")["incomplete"]
+    assert named["file"] == "rec/rec_2.mcap"
+    rows = queries.list_recorded_topics(memory, Call())
+    assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
+
+
+def test_a_chunk_that_is_lost_of_a_closed_bag_is_told_in_windows_that_touch_the_bag(
+    tmp_path: Path,
+) -> None:
+    paths = write_splits(tmp_path, 3)
+    spoil_chunk(paths[1], 3)
+    os.utime(paths[1], ns=(T0 + 20 * S,) * 2)
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    window = {"topic": "/odom", "start": at(2), "end": at(25)}
+    told = notes_of(asked(memory, tmp_path, "get_topic_in_range", **window))
+    assert any(note.startswith("rec/rec_1.mcap could not be read whole: ") for note in told)
+    recalled = recalling(memory, tmp_path)
+    assert told == notes_of(asked(recalled, tmp_path, "get_topic_in_range", **window))
+
+
+def test_what_does_not_answer_is_listed_with_reasons(tmp_path: Path) -> None:
+    tear(write_splits(tmp_path, 3)[1])
+    write_mcap(tmp_path / "boot" / "boot_0.mcap", [odom(0, 0, 0), odom(5 * S, 1, 0)])
+    foreign = Msg("/foreign", "nobody_msgs/msg/Unknown", T0 + 5 * S, b"\x00\x01\x00\x00abc")
+    write_mcap(tmp_path / "odd" / "odd_0.mcap", [foreign], McapLayout(definitions=False))
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    told = asked(memory, tmp_path, "data_time_range")
+    assert (told["earliest"], told["latest"]) == (at(0), at(29))
+    assert [each["file"] for each in told["damaged"]] == ["rec/rec_1.mcap"]
+    assert [each["file"] for each in told["clock_faults"]] == ["boot/boot_0.mcap"]
+    [undecodable] = told["undecodable"]
+    assert (undecodable["topic"], undecodable["type"]) == ("/foreign", "nobody_msgs/msg/Unknown")
+    assert undecodable["reason"]
+    assert all(gap["start"] >= at(0) for gap in told["gaps"])
+    rows = queries.list_recorded_topics(memory, Call())
+    [odometry] = [row for row in rows if row.topic == "/odom"]
+    assert odometry.first == 0
+    assert odometry.notes[0].startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
+
+
+def test_what_a_wrong_clock_dated_is_found_by_its_times_and_told_so(tmp_path: Path) -> None:
+    write_splits(tmp_path, 2)
+    write_mcap(tmp_path / "boot" / "boot_0.mcap", [odom(0, 0, 0), odom(5 * S, 1, 0)])
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    found = asked(memory, tmp_path, "get_position_at", timestamp=5.0)
+    assert found["x"] == 1.0
+    [told] = found["notes"]
+    assert told.startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
+    window = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", start=0, end=at(30))
+    assert not any("the memory begins" in note for note in window["notes"])
+
+
+def test_a_match_from_the_future_has_no_age(tmp_path: Path) -> None:
+    write_splits(tmp_path, 2)
+    write_mcap(tmp_path / "ahead" / "ahead_0.mcap", [boolean(T0 + 9 * HOUR, True, "/late")])
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    found = asked(
+        memory, tmp_path, "find_last_match", topic="/late", condition_type="equals", value=True
+    )
+    assert "age_s" not in found
+    assert "dated 28800 s after now: when it was is unknown" in found["notes"]
+
+
+def test_now_of_replayed_bags_is_not_the_year_2262(tmp_path: Path) -> None:
+    write_splits(tmp_path, 2)
+    write_mcap(tmp_path / "max" / "max_0.mcap", [odom(T0, 0, 0), odom(T0, 1, 0, log_time=2**62)])
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR), limits=Limits(now="latest"))
+    found = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=1)
+    assert found["timestamp"] == at(18)
+
+
+def test_simulated_times_are_no_fault(tmp_path: Path) -> None:
+    for number in range(2):
+        moments = [number * 10 * S + second * S for second in range(10)]
+        write_mcap(tmp_path / "sim" / f"sim_{number}.mcap", [odom(at, 0, 0) for at in moments])
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR), limits=Limits(now="latest"))
+    told = asked(memory, tmp_path, "data_time_range")
+    assert (told["earliest"], told["latest"], told["clock_faults"]) == (0.0, 19.0, [])
+    found = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=4)
+    assert (found["timestamp"], found.get("notes")) == (15.0, None)
+
+
+def test_a_clock_set_back_in_a_recording_is_listed(tmp_path: Path) -> None:
+    for number, start_s in enumerate([100, 110, 40, 50]):
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages(start_s))
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
+    [fault] = asked(memory, tmp_path, "data_time_range")["clock_faults"]
+    assert fault == {
+        "file": "rec/rec_2.mcap",
+        "reason": "the clock was set back by 79 s after rec_1.mcap was begun",
+    }

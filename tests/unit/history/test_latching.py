@@ -1,0 +1,259 @@
+"""Latched is what holds until the next message, and not all that is transient local."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory import cli
+from ros2_memory.cli.info import usual_rate
+from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.time_arguments import Moment
+from ros2_memory.index.pace import Pace, is_rare
+from ros2_memory.index.segment import Stated
+from ros2_memory.insights.status import memory_status
+from ros2_memory.queries import position, topic_value, value_when
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.replies import Replies
+from tests.bags import McapLayout, Msg, boolean, make, odom, stamp, text, tf, transform, write_mcap
+from tests.keeping import keeper_of
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+MS = 10**6
+T0 = 1_790_000_000 * S
+MAP, TELEMETRY, ROSOUT = "/map_name", "/fmu/out/vehicle_status", "/rosout"
+TRANSIENT = McapLayout(latched=frozenset({MAP, TELEMETRY, ROSOUT, "/tf_static"}))
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def log_line(at: int) -> Msg:
+    body = make(
+        "rcl_interfaces/msg/Log",
+        stamp=stamp(at),
+        level=20,
+        name="nav",
+        msg="hello",
+        file="",
+        function="",
+        line=1,
+    )
+    return Msg(ROSOUT, "rcl_interfaces/msg/Log", at, body)
+
+
+def drive(start: int, stop: int) -> list[Msg]:
+    return [odom(at, 0.0, 0.0) for at in range(start, stop, S)]
+
+
+def every(period_s: float, seconds: float, topic: str, begin: int = T0) -> list[Msg]:
+    count = int(seconds / period_s)
+    return [text(begin + round(n * period_s * S), str(n), topic) for n in range(count)]
+
+
+def record(folder: Path, messages: list[Msg], layout: McapLayout = TRANSIENT) -> None:
+    """In splits of ten seconds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    by_split: dict[int, list[Msg]] = {}
+    for each in sorted(messages, key=lambda message: message.log_time):
+        by_split.setdefault((each.log_time - T0) // (10 * S), []).append(each)
+    for nth, some in by_split.items():
+        write_mcap(folder / f"{folder.name}_{nth}.mcap", some, layout)
+
+
+def remembered(root: Path, *, recalls: bool = False, **limits: Any) -> Memory:
+    memory = memory_of(root, limits=Limits(**limits))
+    return recalling(replace(memory), root) if recalls else memory
+
+
+def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:
+    """The reply to a question for a moment, or the reason why there is none."""
+    try:
+        answer = topic_value(memory, Call(), topic, Moment(unix_from_ns(at)))
+    except NoDataError as error:
+        return {"error": error.reason}
+    shown: dict[str, Any] = json.loads(Replies(memory.index.bag_dir, 24_000).answer(answer).text)
+    return shown
+
+
+@pytest.mark.parametrize(
+    ("messages", "span_s", "length_s", "rare"),
+    [
+        (1, 0.0, 3.0, True),  # a map, published once, in a recording however short
+        (12, 11 * 4.9, 60.0, False),
+        (12, 11 * 5.0, 60.0, True),
+        (12, 11 * 5.1, 60.0, True),
+        (3, 2 * 4.9, 14.6, False),
+        (3, 2 * 5.1, 15.2, True),
+        (2, 0.4, 600.0, True),  # twice when its node started
+        (2, 0.4, 3.0, False),
+        (2300, 23.0, 30.0, False),
+        (2300, 23.0, 1e7, False),  # telemetry that fell silent is no map
+    ],
+)
+def test_a_topic_is_rare_by_its_pace_over_its_recording(
+    messages: int, span_s: float, length_s: float, rare: bool
+) -> None:
+    said = Stated(T0, T0 + round(span_s * S), messages)
+    assert is_rare(Pace(said, T0, T0 + round(length_s * S))) is rare
+
+
+@each_way
+def test_telemetry_that_is_transient_local_does_not_hold(tmp_path: Path, recalls: bool) -> None:
+    telemetry = every(0.01, 7, TELEMETRY)
+    record(tmp_path / "rec", [*telemetry, *drive(T0, T0 + 60 * S)])
+    memory = remembered(tmp_path, recalls=recalls)
+    assert reply(memory, TELEMETRY, T0 + 3 * S)["timestamp"] == unix_from_ns(T0 + 3 * S)
+    assert "latched" not in reply(memory, TELEMETRY, T0 + 3 * S)
+    assert set(reply(memory, TELEMETRY, T0 + 30 * S)) == {"error"}
+    assert set(reply(memory, TELEMETRY, T0 + 365 * 86_400 * S)) == {"error"}
+
+
+@each_way
+@pytest.mark.parametrize(("period_s", "holds"), [(4.9, False), (5.1, True), (60.0, True)])
+def test_what_is_said_every_five_seconds_or_less_often_holds(
+    tmp_path: Path, period_s: float, holds: bool, recalls: bool
+) -> None:
+    said = every(period_s, 120, MAP)
+    record(tmp_path / "rec", [*said, *drive(T0, T0 + 130 * S)])
+    memory = remembered(tmp_path, recalls=recalls)
+    at = said[-1].log_time + 3 * S
+    found = reply(memory, MAP, at)
+    assert ("error" not in found) is holds
+    if holds:
+        assert (found["latched"], found["age_s"]) == (True, 3.0)
+
+
+@each_way
+def test_a_map_that_was_published_once_holds_and_says_how_old_it_is(
+    tmp_path: Path, recalls: bool
+) -> None:
+    record(tmp_path / "rec", [text(T0 + S, "office", MAP), *drive(T0, T0 + 30 * S)])
+    memory = remembered(tmp_path, recalls=recalls)
+    found = reply(memory, MAP, T0 + 29 * S)
+    assert (found["value"], found["latched"], found["age_s"]) == ({"value": "office"}, True, 28.0)
+    assert "error" in reply(memory, MAP, T0)
+
+
+def test_a_log_never_holds_and_is_no_reason_to_say_that_a_topic_fell_silent(
+    tmp_path: Path,
+) -> None:
+    lines = [log_line(T0 + n * 10 * MS) for n in range(6)]
+    record(tmp_path / "rec", [*lines, *drive(T0, T0 + 600 * S)])
+    memory = remembered(tmp_path)
+    assert set(reply(memory, ROSOUT, T0 + 300 * S)) == {"error"}
+    assert memory_status(memory, Call()).fell_silent == ()
+
+
+def test_static_transforms_hold_in_bags_without_qos(tmp_path: Path) -> None:
+    """As rosbags writes them; however often they are said."""
+    mounts = [
+        tf(T0 + n * S, transform(T0, "base_link", child, (0.1, 0.0, 0.0)), topic="/tf_static")
+        for n, child in enumerate(("laser", "camera", "sonar"))
+    ]
+    record(tmp_path / "rec", [*mounts, *drive(T0, T0 + 60 * S)], McapLayout(latched=frozenset()))
+    memory = remembered(tmp_path)
+    assert reply(memory, "/tf_static", T0 + 59 * S)["latched"] is True
+    memory = remembered(tmp_path, tf_static_topics=())
+    assert set(reply(memory, "/tf_static", T0 + 59 * S)) == {"error"}
+
+
+def test_the_configuration_says_what_is_latched_and_what_is_not(tmp_path: Path) -> None:
+    telemetry = every(0.1, 7, TELEMETRY)
+    record(tmp_path / "rec", [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
+    said: dict[str, Any] = {"latched_topics": ("/fmu/*",), "never_latched_topics": (MAP,)}
+    memory = remembered(tmp_path, **said)
+    assert reply(memory, TELEMETRY, T0 + 59 * S)["latched"] is True
+    assert set(reply(memory, MAP, T0 + 59 * S)) == {"error"}
+    both = remembered(tmp_path, latched_topics=("/odom",), never_latched_topics=("/odom",))
+    assert set(reply(both, "/odom", T0 + 99 * S)) == {"error"}
+
+
+def test_the_status_sees_telemetry_fall_silent_and_topics_tell_its_rate(tmp_path: Path) -> None:
+    telemetry = every(0.01, 7, TELEMETRY)
+    record(tmp_path / "rec", [text(T0, "x", MAP), *telemetry, *drive(T0, T0 + 60 * S)])
+    memory = remembered(tmp_path)
+    assert [each.topic for each in memory_status(memory, Call()).fell_silent] == [TELEMETRY]
+    snapshot, latching = memory.index.snapshot(), memory.limits.latching
+    assert usual_rate(snapshot, TELEMETRY, latching) == pytest.approx(100.0)
+    assert usual_rate(snapshot, MAP, latching) is None
+
+
+def test_an_export_takes_along_what_is_latched_and_no_telemetry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag_dir, out = tmp_path / "bags", tmp_path / "out.mcap"
+    telemetry = every(0.1, 7, TELEMETRY)
+    messages = [text(T0, "x", MAP), log_line(T0), *telemetry, *drive(T0, T0 + 60 * S)]
+    record(bag_dir / "rec", messages)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
+    start, end = str(T0 / S + 30), str(T0 / S + 40)
+    words = ["export", "--mcap", str(out), "--start", start, "--end", end, "--latched"]
+    assert cli.main([*words, "deployment=replay"]) == 0
+    assert {each.topic for each in McapReader().channels(out)} == {MAP, "/odom"}
+
+
+def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None:
+    bump = boolean(T0 + 20 * S, True)
+    record(tmp_path / "rec", [text(T0, "office", MAP), bump, *drive(T0, T0 + 60 * S)])
+    memory = remembered(tmp_path)
+    found = value_when(memory, Call(), MAP, "/bumper", condition_type="equals", value=True)
+    shown = json.loads(Replies(tmp_path, 24_000).answer(found).text)
+    assert (shown["value_latched"], shown["value_age_s"]) == (True, 20.0)
+
+
+def test_a_pose_that_is_latched_says_so(tmp_path: Path) -> None:
+    record(tmp_path / "rec", [odom(T0, 1.0, 2.0), text(T0 + 60 * S, "later", "/words")])
+    memory = remembered(tmp_path, latched_topics=("/odom",))
+    found = position(memory, Call(), Moment(unix_from_ns(T0 + 30 * S)))
+    assert [note for note in found.notes if "/odom is latched" in note and "30" in note]
+
+
+def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
+    tmp_path: Path,
+) -> None:
+    """However often it is said; and then it is no more latched than before."""
+    telemetry = every(0.01, 7, TELEMETRY)
+    messages = [text(T0, "office", MAP), log_line(T0 + S), *telemetry, *drive(T0, T0 + 30 * S)]
+    record(tmp_path / "rec", messages)
+    keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+    carried = tmp_path / "latched/carried.mcap"
+    topics = [TELEMETRY, MAP, ROSOUT]
+    found = {
+        each.channel.topic: each.log_time
+        for each in McapReader().records(carried, topics, TimeWindow.everything())
+    }
+    assert found == {TELEMETRY: telemetry[-1].log_time, MAP: T0}
+    memory = remembered(tmp_path)
+    assert set(reply(memory, TELEMETRY, T0 + 29 * S)) == {"error"}
+    assert reply(memory, TELEMETRY, telemetry[-1].log_time)["value"] == {"value": "699"}
+    assert reply(memory, MAP, T0 + 29 * S)["age_s"] == 29.0
+
+
+def test_static_transforms_in_every_split_stay_few(tmp_path: Path) -> None:
+    """As `--repeat-transient-local` and other recorders write them."""
+    body = transform(T0, "base_link", "laser", (0.1, 0.0, 0.0))
+    mounts = [
+        replace(tf(T0, body, topic="/tf_static"), log_time=T0 + n * 10 * S, publish_time=T0)
+        for n in range(20)
+    ]
+    record(tmp_path / "rec", [*mounts, *drive(T0, T0 + 200 * S)])
+    keeper_of(tmp_path, max_bytes=60_000).apply(tmp_path)
+    left = [path for path in tmp_path.rglob("*.mcap") if path.parent.name == "rec"]
+    assert 1 < len(left) < 20
+    carried = tmp_path / "latched/carried.mcap"
+    assert len([*McapReader().records(carried, ["/tf_static"], TimeWindow.everything())]) == 1
+    memory = remembered(tmp_path)
+    assert reply(memory, "/tf_static", T0 + 199 * S)["latched"] is True

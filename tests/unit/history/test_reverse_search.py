@@ -1,0 +1,243 @@
+"""A search skips what is ruled out, stops at the newest match, and can be gone on with."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import queries
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.timebase import NS_PER_S, Deadline
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.replies import Replies
+from tests.bags import Msg, boolean, detections, odom, write_mcap
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
+    from pathlib import Path
+
+    from ros2_memory.core.model import BagSummary, JsonValue, TimeWindow
+    from ros2_memory.history.context import Memory
+    from ros2_memory.results import Match
+    from ros2_memory.storage.base import Record
+
+T0_S = 1_700_000_000
+T0 = T0_S * NS_PER_S
+SCENE = "/vision/scene/scene_objects"
+
+
+class Counting(McapReader):
+    """Notes which bags' messages were read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.read: list[str] = []
+
+    def summarize(self, path: Path) -> BagSummary:
+        self.read.append(path.name)
+        return super().summarize(path)
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        self.read.append(path.name)
+        return super().records(path, topics, window, newest_first=newest_first)
+
+
+def seen(number: int, *labels: str, x: float = 0.0) -> list[Msg]:
+    at = T0 + number * 10 * NS_PER_S
+    return [
+        odom(at, x, 0.0),
+        detections(at + NS_PER_S, labels, at=(x, 0.0, 0.0)),
+        boolean(at + 2 * NS_PER_S, data=False),
+    ]
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    for number, label in enumerate(["scissors", "cup", "cup", "chair", "cup"]):
+        path = tmp_path / "rec" / f"rec_{number}.mcap"
+        write_mcap(path, seen(number, label, x=float(number * 10)))
+    return tmp_path
+
+
+def filled(bag_dir: Path) -> tuple[Memory, Counting]:
+    reader = Counting()
+    memory = recalling(memory_of(bag_dir, reader=reader), bag_dir)
+    reader.read.clear()
+    return memory, reader
+
+
+def last(
+    memory: Memory,
+    condition_type: str,
+    value: JsonValue,
+    *,
+    topic: str = SCENE,
+    call: Call | None = None,
+    before_s: float | None = None,
+) -> Match:
+    return queries.find_last_match(
+        memory, call or Call(), topic, condition_type, value, before_s=before_s
+    )
+
+
+def at(match: Match) -> int:
+    assert match.found is not None
+    return (match.found.sample.time - T0) // NS_PER_S
+
+
+def test_only_the_bag_of_the_match_is_read(bag_dir: Path) -> None:
+    memory, reader = filled(bag_dir)
+    assert at(last(memory, "contains", "scissors")) == 1
+    assert reader.read == ["rec_0.mcap"]
+
+
+def test_the_newest_of_many_matches_is_found_first(bag_dir: Path) -> None:
+    memory, reader = filled(bag_dir)
+    assert at(last(memory, "contains", "cup")) == 41
+    assert reader.read == ["rec_4.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("topic", "condition_type", "value"),
+    [
+        (SCENE, "contains", "elephant"),
+        ("/*", "contains", "elephant"),
+        ("/bumper", "equals", True),
+    ],
+)
+def test_what_never_was_is_answered_without_reading_a_bag(
+    bag_dir: Path, topic: str, condition_type: str, value: JsonValue
+) -> None:
+    memory, reader = filled(bag_dir)
+    assert last(memory, condition_type, value, topic=topic).found is None
+    assert reader.read == []
+
+
+def test_a_place_never_visited_is_looked_up_in_no_bag_but_the_newest(bag_dir: Path) -> None:
+    memory, reader = filled(bag_dir)
+    assert last(memory, "near_position", {"x": 500.0, "y": 0.0}, topic="/odom").found is None
+    assert set(reader.read) == {"rec_4.mcap"}
+
+
+def test_a_place_is_looked_for_only_where_it_may_be(bag_dir: Path) -> None:
+    memory, reader = filled(bag_dir)
+    assert at(last(memory, "near_position", {"x": 20.0, "y": 0.0}, topic="/odom")) == 20
+    assert reader.read == ["rec_2.mcap"]
+
+
+def test_what_is_known_of_all_bags_is_told_without_reading_one(bag_dir: Path) -> None:
+    memory, reader = filled(bag_dir)
+    queries.list_recorded_topics(memory, Call())
+    queries.data_time_range(memory, Call())
+    queries.trajectory_summary(
+        memory, Call(), Span(start_s=T0_S - 1, end_s=T0_S + 100), topic="/odom"
+    )
+    assert reader.read == []
+
+
+# Before, and the deadline
+
+
+def test_before_looks_only_at_what_came_up_to_then(bag_dir: Path) -> None:
+    for memory in (memory_of(bag_dir), filled(bag_dir)[0]):
+        assert at(last(memory, "contains", "cup", before_s=T0_S + 41)) == 41
+        assert at(last(memory, "contains", "cup", before_s=T0_S + 40.9)) == 21
+        assert last(memory, "contains", "cup", before_s=T0_S + 5).found is None
+
+
+def test_before_must_be_a_moment(bag_dir: Path) -> None:
+    with pytest.raises(InvalidArgumentsError, match="before"):
+        last(memory_of(bag_dir), "contains", "cup", before_s=float("nan"))
+
+
+def test_a_search_that_runs_out_of_time_says_how_far_it_got_and_can_go_on(bag_dir: Path) -> None:
+    memory = memory_of(bag_dir)
+    found: Match | None = None
+    before_s: float | None = None
+    told: list[tuple[str, bool]] = []
+    while found is None:
+        assert len(told) < 20
+        call = Call(Deadline.after(6.0, partial(next, map(float, itertools.count()))))
+        try:
+            found = last(memory, "contains", "scissors", call=call, before_s=before_s)
+        except QueryTimeoutError as error:
+            reply = json.loads(Replies(bag_dir, 4000).error(error).text)
+            before_s = reply["searched_back_to"]
+            told.append((reply["error"], f"before={before_s:.6f}" in reply["detail"]))
+    assert at(found) == 1
+    assert told
+    assert set(told) == {("timeout", True)}
+
+
+def test_a_search_that_got_nowhere_in_its_time_does_not_say_how_far(bag_dir: Path) -> None:
+    call = Call(Deadline.after(0.0))
+    with pytest.raises(QueryTimeoutError) as caught:
+        last(memory_of(bag_dir), "contains", "scissors", call=call)
+    assert caught.value.searched_back_to is None
+    assert "searched_back_to" not in Replies(bag_dir, 4000).error(caught.value).text
+
+
+def test_a_catalogue_that_is_gone_in_the_middle_changes_no_answer(bag_dir: Path) -> None:
+    memory, _ = filled(bag_dir)
+    expected = last(memory_of(bag_dir, clock=memory.clock), "contains", "scissors")
+    assert memory.recall is not None
+    assert last(memory, "contains", "scissors") == expected
+    memory.recall.catalogue.close()
+    for wanted in ("scissors", "cup", "elephant"):
+        assert last(memory, "contains", wanted) == last(
+            replace(memory, recall=None), "contains", wanted
+        )
+
+
+class Topical(McapReader):
+    """Counts of how many topics messages were asked for, over all reads."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = 0
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        self.asked += len(topics)
+        return super().records(path, topics, window, newest_first=newest_first)
+
+
+@pytest.mark.parametrize("tool", ["find_last_match", "find_matches"])
+def test_a_search_of_many_short_topics_reads_each_where_it_has_messages(
+    tmp_path: Path, tool: str
+) -> None:
+    count = 60
+    write_mcap(
+        tmp_path / "bag.mcap",
+        [boolean(T0 + nth * NS_PER_S, True, topic=f"/door_{nth:02}") for nth in range(count)],
+    )
+    reader = Topical()
+    memory = memory_of(tmp_path, reader=reader)
+    if tool == "find_last_match":
+        assert queries.find_last_match(memory, Call(), "/*", "equals", False).found is None
+    else:
+        assert not find_matches(memory, Call(), "/*", "equals", False).sightings
+    assert reader.asked <= 2 * count

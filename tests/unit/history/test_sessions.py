@@ -1,0 +1,364 @@
+"""Whose transforms hold: those of the time, of both topics, and of the recording that is asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.insights.recap import recap
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.insights.visits import visits
+from ros2_memory.queries import (
+    find_last_match,
+    frames,
+    position,
+    trajectory_summary,
+    transform,
+    value_when,
+)
+from tests.bags import Msg, detections, make, odom, tf, write_mcap
+from tests.bags import transform as stamped
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+DAY = 86_400 * S
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def static(at: int, parent: str, child: str, x: float) -> Msg:
+    return tf(at, stamped(at, parent, child, (x, 0.0, 0.0)), topic="/tf_static")
+
+
+def moving(begin: int, seconds: int, parent: str, child: str, x: float, mps: float) -> list[Msg]:
+    ticks = [begin + nth * S // 5 for nth in range(seconds * 5 + 1)]
+    return [
+        tf(at, stamped(at, parent, child, (x + mps * (at - begin) / S, 0.0, 0.0))) for at in ticks
+    ]
+
+
+def drive(begin: int, seconds: int, mps: float = 0.5) -> list[Msg]:
+    """Odometry along x from 0."""
+    ticks = [begin + nth * S // 5 for nth in range(seconds * 5 + 1)]
+    return [odom(at, mps * (at - begin) / S, 0.0, 0.0) for at in ticks]
+
+
+def record(folder: Path, messages: list[Msg], split_s: int = 10) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    by_split: dict[int, list[Msg]] = {}
+    begin = min(each.log_time for each in messages)
+    for each in sorted(messages, key=lambda message: message.log_time):
+        by_split.setdefault((each.log_time - begin) // (split_s * S), []).append(each)
+    for nth, some in by_split.items():
+        write_mcap(folder / f"{folder.name}_{nth}.mcap", some)
+
+
+def remembered(root: Path, *, recalls: bool) -> Memory:
+    memory = memory_of(root)
+    return recalling(replace(memory), root) if recalls else memory
+
+
+def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:
+    """Arrivals in whole seconds after BEGIN, newest first."""
+    found = visits(memory, Call(), x, 0.0, radius_m=radius)
+    assert found.frame_id == "map"
+    return [round(((each.arrived or 0) - BEGIN) / S, 1) for each in found.visits]
+
+
+def two_robots(root: Path, static_at: int, moving_at: int) -> None:
+    """One whose map is 100 m off its odometry for ever; and one that slips in its odometry."""
+    record(root / "nav2", [static(static_at, "map", "odom", 100.0), *drive(static_at, 20, 0.4)])
+    record(root / "boat", [*moving(moving_at, 20, "map", "odom", 5.0, -0.5), *drive(moving_at, 20)])
+
+
+@each_way
+@pytest.mark.parametrize("nav2_days", [-3, 3, 0])
+def test_a_place_in_the_map_is_one_by_the_transforms_of_the_own_recording(
+    tmp_path: Path, nav2_days: int, recalls: bool
+) -> None:
+    """The boat stands at 5 m of its map throughout; the other robot drives from 100 m to 110."""
+    apart = nav2_days * DAY
+    two_robots(tmp_path, BEGIN + apart, BEGIN)
+    memory = remembered(tmp_path, recalls=recalls)
+    assert arrivals(memory, 5.0) == [0.0]
+    assert arrivals(memory, 103.0) == [round(apart / S + 6.8, 1)]
+    assert visits(memory, Call(), 3.0, 0.0, radius_m=0.3).visits == ()
+    assert visits(memory, Call(), 105.0, 0.0, radius_m=0.3).total == 1
+
+
+@each_way
+def test_another_robots_static_transform_places_nothing(tmp_path: Path, recalls: bool) -> None:
+    """A boat that knows no map was nowhere in it, whoever else has one."""
+    record(tmp_path / "nav2", [static(BEGIN - DAY, "map", "odom", 100.0), *drive(BEGIN - DAY, 20)])
+    record(
+        tmp_path / "boat", [*moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5), *drive(BEGIN, 20)]
+    )
+    memory = remembered(tmp_path, recalls=recalls)
+    assert arrivals(memory, 103.0) == [round(-DAY / S + 5.4, 1)]
+    with pytest.raises(NoDataError):
+        transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 5 * S)))
+
+
+def asked(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> float:
+    found = transform(memory, Call(), parent, child, Moment(unix_from_ns(at)))
+    return round(found.transform.translation[0], 3)
+
+
+@each_way
+def test_a_transform_is_that_of_the_time_that_is_asked(tmp_path: Path, recalls: bool) -> None:
+    two_robots(tmp_path, BEGIN + DAY, BEGIN)
+    memory = remembered(tmp_path, recalls=recalls)
+    assert asked(memory, BEGIN + 4 * S) == 3.0
+    assert asked(memory, BEGIN + DAY + 4 * S) == 100.0
+
+
+@each_way
+def test_two_robots_of_one_time_are_not_mixed_and_a_note_says_whose_it_is(
+    tmp_path: Path, recalls: bool
+) -> None:
+    two_robots(tmp_path, BEGIN, BEGIN)
+    memory = remembered(tmp_path, recalls=recalls)
+    found = transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 4 * S)))
+    assert found.transform.translation[0] == pytest.approx(3.0)
+    assert [note for note in found.notes if "2 sessions" in note and "boat" in note]
+
+
+@each_way
+def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(
+    tmp_path: Path, recalls: bool
+) -> None:
+    first, second = "rec_20260714T000000Z", "rec_20260714T000001Z"
+    for name, x in ((first, 100.0), (second, 500.0)):
+        record(tmp_path / name, [static(BEGIN, "map", "odom", x), *drive(BEGIN, 20)])
+    memory = remembered(tmp_path, recalls=recalls)
+    found = transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 4 * S)))
+    named = {100.0: first, 500.0: second}[found.transform.translation[0]]
+    [note] = [note for note in found.notes if "2 sessions" in note]
+    assert note.endswith(f"this is that of {named}")
+
+
+@each_way
+def test_a_static_transform_that_changes_holds_from_then_on(tmp_path: Path, recalls: bool) -> None:
+    """Also inside one bag: the robot is placed anew while it stands."""
+    poses = [odom(BEGIN + nth * S // 5, 0.0, 0.0, 0.0) for nth in range(100)]
+    changed = [static(BEGIN, "map", "odom", 0.0), static(BEGIN + 8 * S, "map", "odom", 50.0)]
+    record(tmp_path / "one", [*changed, *poses], split_s=60)
+    memory = remembered(tmp_path, recalls=recalls)
+    there, later = (visits(memory, Call(), x, 0.0, radius_m=1.0).visits for x in (0.0, 50.0))
+    assert [((each.arrived or 0) - BEGIN, (each.departed or 0) - BEGIN) for each in there] == [
+        (0, 39 * S // 5)
+    ]
+    assert [((each.arrived or 0) - BEGIN, (each.departed or 0) - BEGIN) for each in later] == [
+        (8 * S, 99 * S // 5)
+    ]
+
+
+@each_way
+def test_recordings_joined_by_a_handover_share_their_transforms(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """A publisher that has gone is not heard by the recording that took over."""
+    first, second = tmp_path / "rec_20260714T000000Z", tmp_path / "rec_20260714T010000Z"
+    record(first, [static(BEGIN, "map", "odom", 7.0), *drive(BEGIN, 20)])
+    record(second, [static(BEGIN + 21 * S, "base_link", "laser", 1.0), *drive(BEGIN + 21 * S, 20)])
+    memory = remembered(tmp_path, recalls=recalls)
+    with pytest.raises(NoDataError):
+        asked(memory, BEGIN + 33 * S)
+    write_handover(first, Handover(next=second.name))
+    write_handover(second, Handover(previous=first.name))
+    memory = remembered(tmp_path, recalls=recalls)
+    assert asked(memory, BEGIN + 33 * S) == 7.0
+    assert arrivals(memory, 12.0) == [pytest.approx(30.6, abs=0.3), pytest.approx(9.6, abs=0.3)]
+
+
+@each_way
+def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls: bool) -> None:
+    """One records what moves, one what is static, one neither."""
+    record(tmp_path / "fixed", [static(BEGIN, "map", "odom", 7.0)])
+    record(tmp_path / "moving", moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5))
+    record(tmp_path / "sensors", drive(BEGIN, 20))
+    memory = remembered(tmp_path, recalls=recalls)
+    at = Moment(unix_from_ns(BEGIN + 4 * S))
+    joined = transform(memory, Call(), "map", "base_link", at)
+    assert joined.transform.translation[0] == pytest.approx(9.0)
+    assert [note for note in joined.notes if "fixed and moving are joined" in note]
+    alone = transform(memory, Call(), "odom", "base_link", at)
+    assert alone.notes == ()
+    assert arrivals(memory, 9.0) == [pytest.approx(3.4, abs=0.21)]
+    [note] = visits(memory, Call(), 9.0, 0.0, radius_m=0.3).notes[:1]
+    assert note.startswith("sensors is placed by transforms of another recording")
+    assert note.endswith("those of fixed and moving")
+
+
+@each_way
+@pytest.mark.parametrize("later_s", [0, 30])
+def test_a_loan_is_never_silent(tmp_path: Path, later_s: int, recalls: bool) -> None:
+    """Whether `nav2` is the same robot cannot be known; a day apart it is another."""
+    base = moving(BEGIN, 60, "odom", "base_link", 0.0, 0.5)
+    record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *base])
+    record(tmp_path / "boat", drive(BEGIN + later_s * S, 60))
+    answer = visits(remembered(tmp_path, recalls=recalls), Call(), 105.0, 0.0)
+    assert answer.total == 1
+    assert [note for note in answer.notes if "boat" in note and "those of nav2" in note]
+
+
+@each_way
+@pytest.mark.parametrize("apart", [-DAY, 3600 * S, DAY])
+def test_a_recording_of_another_time_lends_nothing(
+    tmp_path: Path, apart: int, recalls: bool
+) -> None:
+    base = moving(BEGIN, 60, "odom", "base_link", 0.0, 0.5)
+    record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *base])
+    record(tmp_path / "boat", drive(BEGIN + apart, 60))
+    memory = remembered(tmp_path, recalls=recalls)
+    assert visits(memory, Call(), 105.0, 0.0).total == 0
+    assert visits(memory, Call(), 5.0, 0.0).frame_id == "odom"
+
+
+@each_way
+@pytest.mark.parametrize("has_tf", [False, True])
+def test_a_robot_beside_it_that_has_poses_of_its_own_lends_nothing(
+    tmp_path: Path, has_tf: bool, recalls: bool
+) -> None:
+    """A boat without a map was nowhere in that of the other robot, and a note says so."""
+    record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *drive(BEGIN, 20, 0.0)])
+    base = moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5) if has_tf else []
+    record(tmp_path / "boat", [*base, *drive(BEGIN, 20)])
+    memory = remembered(tmp_path, recalls=recalls)
+    answer = visits(memory, Call(), 105.0, 0.0)
+    assert (answer.frame_id, answer.total) == ("map", 0)
+    assert visits(memory, Call(), 100.0, 0.0).total == 1
+    if has_tf:
+        with pytest.raises(NoDataError):
+            asked(memory, BEGIN + 4 * S, "map", "base_link")
+    else:
+        assert [note for note in answer.notes if "boat has no transforms" in note]
+
+
+@each_way
+def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Two robots of one time: the sighting is of the one that stands, though the other is newer."""
+    record(
+        tmp_path / "nav2",
+        [
+            static(BEGIN, "map", "odom", 100.0),
+            *moving(BEGIN, 20, "odom", "base_link", 2.0, 0.0),
+            *[odom(BEGIN + nth * S, 2.0, 0.0, 0.0) for nth in range(20)],
+            detections(BEGIN + 4 * S + S // 2, ["scissors"]),
+        ],
+    )
+    boat = moving(BEGIN, 20, "map", "odom", 5.0, -0.5)
+    boat += moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5)
+    record(tmp_path / "boat", [*boat, *drive(BEGIN, 20)])
+    memory = remembered(tmp_path, recalls=recalls)
+    topic = detections(BEGIN, []).topic
+    [found] = find_matches(memory, Call(), topic, "contains", "scissors").sightings
+    assert found.thing is not None
+    assert found.thing.frame_id == "map"
+    assert found.thing.position[0] == pytest.approx(103.0)
+    assert found.robot is not None
+    assert found.robot.position[0] == pytest.approx(2.0)
+
+
+def boolean(at: int, *, on: bool) -> Msg:
+    return Msg("/bumper", "std_msgs/msg/Bool", at, make("std_msgs/msg/Bool", data=on))
+
+
+def two_at_once(root: Path) -> None:
+    """Two robots of one time on the same topics: r1 drives 20 m, r2 stands at 50 m and bumps."""
+    ticks = [BEGIN + nth * S // 5 for nth in range(101)]
+    bumps = [boolean(at + 1, on=False) for at in ticks]
+    record(root / "r1", [*drive(BEGIN, 20, 1.0), *bumps])
+    bumps = [boolean(at + 2, on=at == ticks[50]) for at in ticks]
+    record(root / "r2", [*[odom(at + S // 10, 50.0, 0.0, 0.0) for at in ticks], *bumps])
+
+
+@each_way
+def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path, recalls: bool) -> None:
+    two_at_once(tmp_path)
+    memory = remembered(tmp_path, recalls=recalls)
+    told = value_when(
+        memory, Call(), "/odom", "/bumper", condition_type="equals", value=True, fields=[]
+    )
+    assert told.value is not None
+    assert told.value.sample.time == BEGIN + 49 * S // 5 + S // 10
+    assert [note for note in told.notes if "/bumper" in note and note.endswith(": r1, r2")]
+    assert not [note for note in told.notes if "the match is of" in note]
+
+
+@each_way
+def test_a_value_of_another_recording_than_the_match_is_noted(
+    tmp_path: Path, recalls: bool
+) -> None:
+    record(tmp_path / "r1", [boolean(BEGIN + 4 * S + 1, on=True)])
+    record(tmp_path / "r2", drive(BEGIN, 20))
+    memory = remembered(tmp_path, recalls=recalls)
+    told = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
+    assert told.value is not None
+    assert [note for note in told.notes if "of recording r1" in note and "of r2" in note]
+
+
+@each_way
+def test_two_robots_on_one_topic_are_named(tmp_path: Path, recalls: bool) -> None:
+    two_at_once(tmp_path)
+    memory = remembered(tmp_path, recalls=recalls)
+    begin, end = unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S)
+    at = Moment(unix_from_ns(BEGIN + 5 * S))
+    for answer in (
+        trajectory_summary(memory, Call(), Span(begin, end)),
+        recap(memory, Call(), Span(begin, end)),
+        position(memory, Call(), at),
+        find_last_match(memory, Call(), "/odom", "near_position", {"x": 50, "y": 0}),
+    ):
+        [note] = [note for note in answer.notes if "as of several robots" in note]
+        assert note.startswith("2 recordings hold messages of their own on /odom")
+        assert note.endswith(": r1, r2")
+
+
+@each_way
+@pytest.mark.parametrize("joined", [False, True])
+def test_copies_and_what_a_handover_joins_are_of_one_robot(
+    tmp_path: Path, joined: bool, recalls: bool
+) -> None:
+    first, second = tmp_path / "rec_20260714T000000Z", tmp_path / "rec_20260714T000010Z"
+    record(first, drive(BEGIN, 20))
+    if joined:
+        record(second, drive(BEGIN + 10 * S, 20))
+        write_handover(first, Handover(next=second.name))
+        write_handover(second, Handover(previous=first.name))
+    else:
+        record(second, [each for each in drive(BEGIN, 20) if each.log_time >= BEGIN + 10 * S])
+    memory = remembered(tmp_path, recalls=recalls)
+    span = Span(unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S))
+    answer = trajectory_summary(memory, Call(), span)
+    assert not [note for note in answer.notes if "robots" in note]
+
+
+@each_way
+def test_a_frame_without_a_name_is_none(tmp_path: Path, recalls: bool) -> None:
+    """Neither listed, nor a reason to advise another time."""
+    nameless = moving(BEGIN, 20, "", "base_link", 0.0, 0.0)
+    record(tmp_path / "one", [*nameless, *moving(BEGIN, 20, "odom", "wheel", 0.0, 0.0)])
+    memory = remembered(tmp_path, recalls=recalls)
+    found = frames(memory, Call())
+    assert [(edge.parent, edge.child) for edge in found.edges] == [("odom", "wheel")]
+    assert [note for note in found.notes if "no name" in note and note.endswith("1")]
+    with pytest.raises(NoDataError) as refused:
+        asked(memory, BEGIN + 300 * S, "", "base_link")
+    assert "ask about then" not in refused.value.detail

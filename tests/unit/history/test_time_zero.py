@@ -1,0 +1,186 @@
+"""Time 0 is a moment like any other, and what stands for no bound reaches no reply."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+
+from ros2_memory.history.context import Limits
+from tests.asking import asked, replied
+from tests.bags import boolean, detections, odom, write_mcap
+from tests.memories import SettableClock, memory_of
+from tests.recalled import recalling
+from tests.shared_bags import REAL, needs_real
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+Now = Literal["wall", "latest"]
+SEARCH = {"condition_type": "equals", "value": True}
+NEVER = {"condition_type": "contains", "value": "never recorded"}
+PLACE = {"condition_type": "near_position", "value": {"x": 0.0, "y": 0.0}}
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+each_now = pytest.mark.parametrize("now", ["wall", "latest"])
+
+
+def questions(topic: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    yield "list_recorded_topics", {}
+    yield "data_time_range", {}
+    yield "list_frames", {}
+    yield "memory_status", {}
+    for timestamp in (-5.0, 0.0, 1e-6, 1.0):
+        for more in ({}, {"tolerance_s": 0.5}, {"tolerance_s": 1e12}):
+            yield "get_topic_at_time", {"topic": topic, "timestamp": timestamp, **more}
+            yield "get_position_at", {"topic": topic, "timestamp": timestamp, **more}
+    for ago in (0.0, 1.0, 1e12):
+        yield "get_topic_seconds_ago", {"topic": topic, "seconds_ago": ago}
+    for start, end in ((-1e300, 1e-6), (-5.0, -1.0), (-10.0, 1e9), (0.0, 0.0), (0.0, 5.0)):
+        window = {"start": start, "end": end}
+        yield "get_topic_in_range", {"topic": topic, **window}
+        yield "trajectory_summary", {"topic": topic, **window}
+        yield "recap", window
+        for condition in (SEARCH, NEVER, PLACE):
+            yield "find_matches", {"topic": "/*", **condition, **window}
+    for seconds in (1e-6, 5.0, 1e12, 1e300):
+        yield "get_topic_in_last", {"topic": topic, "seconds": seconds}
+        yield "recap_last", {"seconds": seconds}
+        yield "find_matches", {"topic": "/*", **SEARCH, "seconds": seconds}
+    for condition in (SEARCH, NEVER, PLACE):
+        yield "find_matches", {"topic": "/*", **condition}
+        yield "find_last_match", {"topic": "/*", **condition}
+        yield "find_last_match", {"topic": "/*", **condition, "before": -1.0}
+        yield "get_value_when", {"value_topic": topic, "condition_topic": "/*", **condition}
+    yield "visits", {"x": 0.0, "y": 0.0, "radius_m": 0.5}
+
+
+def times(value: Any) -> Iterator[float]:
+    """All numbers of a reply."""
+    if isinstance(value, dict):
+        value = [*value.values()]
+    if isinstance(value, list):
+        for each in value:
+            yield from times(each)
+    elif isinstance(value, int | float):
+        yield value
+
+
+def hold(memory: Memory, bag_dir: Path, topic: str) -> None:
+    """Asks everything, and finds neither a refusal nor the least or greatest 64-bit time."""
+    for name, given in questions(topic):
+        reply = replied(memory, bag_dir, name, given)
+        told = f"{name}({given}): {reply.text[:2000]}"
+        assert "92233720" not in reply.text, told
+        value = json.loads(reply.text)
+        if reply.is_error:
+            assert "carries no" in reply.text or "no position" in reply.text, told
+        assert all(abs(each) < 9e9 or each == 1e300 for each in times(value)), told
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    for split in range(2):
+        messages = [odom((split * 5 + n) * S, n * 0.1, 0.0) for n in range(5)]
+        messages.append(boolean(split * 5 * S, True))
+        messages.append(detections(split * 5 * S, ["cup"]))
+        write_mcap(tmp_path / "rec" / f"rec_{split}.mcap", messages)
+    return tmp_path
+
+
+def memory_at(bag_dir: Path, recalls: bool, now: Now = "wall") -> Memory:
+    memory = memory_of(bag_dir, clock=SettableClock(9 * S), limits=Limits(now=now))
+    return recalling(memory, bag_dir) if recalls else memory
+
+
+@each_way
+@each_now
+def test_no_reply_about_a_memory_from_time_zero_holds_a_bound_of_the_clock(
+    bag_dir: Path, recalls: bool, now: Now
+) -> None:
+    hold(memory_at(bag_dir, recalls, now), bag_dir, "/odom")
+
+
+@needs_real
+@each_now
+@pytest.mark.parametrize(
+    ("folder", "storage", "topic"),
+    [
+        ("rosbag2_time0_mcap", "mcap", "/test_topic"),
+        ("ait_time0_images_db3", "rosbag2", "/image"),
+        ("rosbag2_wbag_5split_mcap", "mcap", "AAA"),
+    ],
+)
+def test_no_reply_about_public_bags_from_time_zero_does(
+    folder: str, storage: str, topic: str, now: Now
+) -> None:
+    [bag_dir] = REAL.glob(f"**/{folder}")
+    memory = memory_of(bag_dir, storage=storage, limits=Limits(now=now))
+    topics = [row["topic"] for row in asked(memory, bag_dir, "list_recorded_topics")]
+    hold(memory, bag_dir, topic if topic in topics else topics[0])
+
+
+@each_way
+def test_a_search_of_everything_says_that_it_began_at_zero(bag_dir: Path, recalls: bool) -> None:
+    memory = memory_at(bag_dir, recalls)
+    reply = asked(memory, bag_dir, "find_matches", topic="/bumper", **SEARCH)
+    assert reply["searched_from"] == 0.0
+    assert reply["searched_to"] == 9.0
+    assert [each["first_seen"] for each in reply["sightings"]] == [0.0]
+
+
+@each_way
+def test_a_window_that_begins_below_zero_is_clamped(bag_dir: Path, recalls: bool) -> None:
+    memory = memory_at(bag_dir, recalls)
+    whole = asked(memory, bag_dir, "get_topic_in_range", topic="/odom", start=0.0, end=9.0)
+    assert asked(memory, bag_dir, "get_topic_in_range", topic="/odom", start=-5, end=9.0) == whole
+    assert whole["total"] == 10
+    lately = asked(memory, bag_dir, "get_topic_in_last", topic="/odom", seconds=1e12)
+    assert lately["total"] == 10
+    told = asked(memory, bag_dir, "recap", start=-100.0, end=9.0)
+    assert (told["start"], told["duration_s"]) == (0.0, 9.0)
+    nothing = asked(memory, bag_dir, "get_position_at", timestamp=-5.0)
+    assert (nothing["error"], nothing["reason"]) == ("no_data", "outside_range")
+    assert "-5.000000" in nothing["detail"]
+
+
+@each_way
+@each_now
+@pytest.mark.parametrize("begin_s", [0, 1_784_000_000])
+@pytest.mark.parametrize(("start", "end"), [(-50, -10), (-1e300, -1e-6), (-5, -5), (-1, 0)])
+def test_a_window_below_zero_is_clamped_at_both_ends(
+    tmp_path: Path, recalls: bool, now: Now, begin_s: int, start: float, end: float
+) -> None:
+    messages = [odom((begin_s + 1 + n) * S, n * 0.1, 0.0) for n in range(5)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
+    clock = SettableClock((begin_s + 9) * S)
+    memory = memory_of(tmp_path, clock=clock, limits=Limits(now=now))
+    memory = recalling(memory, tmp_path) if recalls else memory
+    window = {"start": start, "end": end}
+    told = asked(memory, tmp_path, "recap", **window)
+    assert (told["start"], told["end"], told["events"]) == (0.0, 0.0, [])
+    told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
+    assert (told["searched_from"], told["searched_to"], told["sightings"]) == (0.0, 0.0, [])
+    for tool in ("get_topic_in_range", "trajectory_summary"):
+        told = asked(memory, tmp_path, tool, topic="/odom", **window)
+        assert "no message of /odom between 0.000000 and 0.000000" in told["detail"]
+
+
+@each_way
+@pytest.mark.parametrize(("start", "end"), [(1.0, 2.0), (1e9, 1e9), (1.9e9, 2e9), (0.0, 2e9)])
+def test_no_span_that_was_searched_ends_before_it_begins(
+    tmp_path: Path, recalls: bool, start: float, end: float
+) -> None:
+    begin = 1_784_000_000 * S
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(begin + n * S, True) for n in range(5)])
+    memory = memory_of(tmp_path)
+    memory = recalling(memory, tmp_path) if recalls else memory
+    window = {"start": start, "end": end}
+    told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
+    assert start <= told["searched_from"] <= told["searched_to"] <= end
+    assert (told["total"] > 0) == (end > begin / S > start)

@@ -1,0 +1,166 @@
+"""What a window touched and could not be read, in sentences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.model import (
+    BagFile,
+    BagState,
+    BagSummary,
+    SetAside,
+    TimeWindow,
+    TopicSummary,
+)
+from ros2_memory.core.wording import counted, listed
+from ros2_memory.history.unseen import unseen
+from ros2_memory.index.snapshot import Snapshot
+
+S = 10**9
+T0 = 1_784_023_200 * S
+DAY = 24 * 3600 * S
+
+
+def split(
+    number: int, *, state: BagState = BagState.CLOSED, notes: tuple[str, ...] = ()
+) -> BagFile:
+    start, end = T0 + number * 10 * S, T0 + number * 10 * S + 9 * S
+    topics = (TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),)
+    summary = BagSummary(topics, notes=notes)
+    return BagFile(f"/b/rec/rec_{number}.mcap", 1, end, state, summary, start, end)
+
+
+def torn(number: int, written: int | None = T0 + DAY, folder: str = "rec") -> SetAside:
+    return SetAside(Path(f"/b/{folder}/{folder}_{number}.mcap"), "torn", written)
+
+
+def told(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False) -> list[str]:
+    window = TimeWindow(T0 + round(start * S), T0 + round(stop * S))
+    return list(unseen(snapshot, window, nothing=nothing))
+
+
+LOST_SPLIT = Snapshot(bags=(split(0), split(2), split(3)), damaged=(torn(1),), scanned_at=T0 + DAY)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "touched"),
+    [(0, 9, False), (5, 12, True), (12, 15, True), (19.5, 31, True), (21, 31, False)],
+)
+def test_a_split_that_could_not_be_read_is_told_in_windows_that_may_touch_it(
+    start: float, stop: float, touched: bool
+) -> None:
+    sentence = "1 bag file could not be read and may hold more: rec/rec_1.mcap (torn)"
+    assert told(LOST_SPLIT, start, stop) == [sentence] * touched
+
+
+def test_a_file_of_which_the_time_is_unknown_is_told_where_nothing_was_found() -> None:
+    snapshot = Snapshot(bags=(split(0),), damaged=(torn(7, None, "alone"),), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 9) == []
+    assert told(snapshot, 0, 9, nothing=True) == [
+        "1 bag file could not be read and may hold more: alone/alone_7.mcap (torn)"
+    ]
+
+
+def test_an_old_file_that_nobody_removes_is_not_part_of_every_answer() -> None:
+    old = torn(0, T0 - 30 * DAY, "old")
+    snapshot = Snapshot(bags=(split(0), split(1)), damaged=(old,), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 20) == []
+    assert told(snapshot, 0, 20, nothing=True) == []
+    assert len(told(snapshot, -30 * 86400 - 5, 20)) == 1
+
+
+def test_files_that_are_not_read_here_count_too() -> None:
+    other = SetAside(Path("/b/rec/rec_1.db3"), "choose storage=rosbag2", T0 + DAY)
+    snapshot = Snapshot(bags=(split(0), split(2)), unread=(other,), scanned_at=T0 + DAY)
+    assert told(snapshot, 11, 12) == [
+        "1 bag file could not be read and may hold more: rec/rec_1.db3 (choose storage=rosbag2)"
+    ]
+
+
+def test_many_files_are_counted_and_the_last_ones_named() -> None:
+    lost = tuple(torn(number) for number in range(1, 9))
+    snapshot = Snapshot(bags=(split(0), split(9)), damaged=lost, scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 100) == [
+        (
+            "8 bag files could not be read and may hold more: rec/rec_6.mcap (torn), "
+            "rec/rec_7.mcap (torn), rec/rec_8.mcap (torn) and 5 more"
+        )
+    ]
+
+
+def test_the_split_being_written_is_told_from_the_end_of_the_one_before_it_on() -> None:
+    active = SetAside(Path("/b/rec/rec_1.mcap"), "still being written")
+    snapshot = Snapshot(bags=(split(0),), active=(active,), scanned_at=T0 + 15 * S)
+    assert told(snapshot, 0, 9) == []
+    assert told(snapshot, 5, 12) == [
+        "the split being written is not included: nothing after 1784023209.000000"
+    ]
+
+
+def test_a_file_that_is_written_beside_closed_ones_is_named() -> None:
+    active = SetAside(Path("/b/other/other_0.mcap"), "still being written")
+    snapshot = Snapshot(bags=(split(0), split(1)), active=(active,), scanned_at=T0 + 25 * S)
+    assert told(snapshot, 0, 9) == ["still being written and not included: other/other_0.mcap"]
+
+
+def test_a_bag_that_a_crash_left_open_is_told_with_what_is_lost_of_it() -> None:
+    cut = split(1, state=BagState.INCOMPLETE, notes=("the last 41 bytes could not be read",))
+    snapshot = Snapshot(bags=(split(0), cut), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 9) == []
+    assert told(snapshot, 5, 15) == [
+        (
+            "1 bag left open by a crash; what is readable is used: rec/rec_1.mcap (the last 41 "
+            "bytes could not be read)"
+        )
+    ]
+
+
+def test_a_closed_bag_that_contradicts_itself_is_told() -> None:
+    odd = [split(number, notes=("its own statistics are wrong",)) for number in range(5)]
+    snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 5) == ["rec/rec_0.mcap: its own statistics are wrong"]
+    named = "rec/rec_4.mcap, rec/rec_3.mcap, rec/rec_2.mcap and 2 more"
+    assert told(snapshot, 0, 60) == [f"5 bags ({named}): its own statistics are wrong"]
+
+
+def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_told() -> None:
+    odd = [split(number, notes=(f"way {number}",)) for number in range(5)]
+    snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 60) == [
+        "rec/rec_2.mcap: way 2",
+        "rec/rec_3.mcap: way 3",
+        "rec/rec_4.mcap: way 4",
+        "2 older bags are odd too",
+    ]
+
+
+@given(
+    lost=st.sets(st.integers(0, 40), max_size=30),
+    reason=st.text(min_size=1, max_size=3000),
+    window=st.tuples(st.integers(-100, 500), st.integers(-100, 500)),
+    nothing=st.booleans(),
+)
+def test_what_is_told_stays_short_however_much_was_lost(
+    lost: set[int], reason: str, window: tuple[int, int], nothing: bool
+) -> None:
+    asides = tuple(SetAside(Path(f"/b/rec/rec_{n}.mcap"), reason, T0) for n in sorted(lost))
+    bags = tuple(split(n, notes=(reason,)) for n in range(41) if n not in lost)
+    snapshot = Snapshot(bags=bags, damaged=asides, scanned_at=T0 + DAY)
+    sentences = told(snapshot, *sorted(window), nothing=nothing)
+    assert len(sentences) <= 5
+    assert sum(map(len, sentences)) < 2000
+
+
+def test_a_count_of_one_is_not_a_plural() -> None:
+    assert [counted(n, "jump") for n in (0, 1, 2)] == ["0 jumps", "1 jump", "2 jumps"]
+    assert counted(2, "entry", "entries") == "2 entries"
+
+
+def test_a_list_names_a_few_and_counts_the_rest() -> None:
+    assert listed(["a", "b"]) == "a, b"
+    assert listed(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"
+    assert listed(["a", "b", "c"], 9) == "a, b, c and 6 more"

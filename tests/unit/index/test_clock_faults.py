@@ -1,0 +1,188 @@
+"""Bags that a wrong clock dated, and the span that is told without them."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.model import BagFile, BagState, BagSummary, TopicSummary
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.index.clock_faults import (
+    FIRST_BAGS_NS,
+    FUTURE_NS,
+    Dating,
+    FaultyClock,
+    Part,
+    dating_of,
+    last_believed,
+)
+from ros2_memory.index.split_order import StepBack
+
+S = 10**9
+HOUR = 3600 * S
+DAY = 24 * HOUR
+NOW = 1_790_000_000 * S
+
+
+def bag(name: str, start: int, end: int | None = None, *, written: int = NOW) -> BagFile:
+    end = start + 10 * S if end is None else end
+    summary = BagSummary((TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),))
+    return BagFile(f"/bags/rec/{name}", 1, written, BagState.CLOSED, summary, start, end)
+
+
+def dating(
+    *bags: BagFile, now: int = NOW, steps: tuple[StepBack, ...] = (), size: int = 256
+) -> Dating:
+    ordered = sorted(bags, key=lambda each: (each.start, each.end, each.file))
+    groups = [ordered[at : at + size] for at in range(0, len(ordered), size)]
+    parts = [Part(group, max(each.end for each in group)) for group in groups]
+    return dating_of(
+        parts,
+        steps,
+        now,
+        lambda first, last: [each for each in bags if each.start <= last and each.end >= first],
+    )
+
+
+def kinds(found: Dating) -> dict[str, FaultyClock]:
+    return {fault.bag.path.name: fault.kind for fault in found.faults}
+
+
+GOOD = [bag(f"good{n}", NOW - HOUR + n * 10 * S) for n in range(4)]
+SPAN = (GOOD[0].start, GOOD[-1].end)
+
+
+def span(found: Dating) -> tuple[int | None, int | None]:
+    return found.earliest, found.latest
+
+
+def test_good_clocks_leave_no_trace() -> None:
+    assert dating(*GOOD) == Dating(*SPAN)
+    assert dating() == Dating()
+
+
+def test_time_0_and_1970_are_clocks_that_were_not_set() -> None:
+    found = dating(*GOOD, bag("zero", 0), bag("boot", 40 * S))
+    assert span(found) == SPAN
+    assert kinds(found) == {"zero": FaultyClock.UNSET, "boot": FaultyClock.UNSET}
+
+
+def test_a_clock_that_was_set_within_a_bag_does_not_stretch_the_span() -> None:
+    found = dating(*GOOD, bag("across", 20 * S, NOW - HOUR))
+    assert span(found) == SPAN
+    assert kinds(found) == {"across": FaultyClock.UNSET}
+
+
+def test_what_is_dated_after_now_was_recorded_by_a_clock_that_was_ahead() -> None:
+    found = dating(*GOOD, bag("ahead", NOW + DAY), bag("max", NOW - HOUR, MAX_NS))
+    assert span(found) == SPAN
+    assert kinds(found) == {"ahead": FaultyClock.AHEAD, "max": FaultyClock.AHEAD}
+
+
+def test_a_clock_that_is_being_corrected_is_no_fault() -> None:
+    found = dating(*GOOD, bag("soon", NOW, NOW + FUTURE_NS))
+    assert (found.latest, found.faults) == (NOW + FUTURE_NS, ())
+
+
+def test_where_all_bags_are_near_zero_their_clock_is_simulated() -> None:
+    found = dating(bag("a", 0), bag("b", 12 * S))
+    assert (span(found), found.faults, found.note) == ((0, 22 * S), (), None)
+
+
+def test_a_bag_from_the_future_among_simulated_ones_is_at_fault_alone() -> None:
+    found = dating(bag("a", 0), bag("b", 12 * S), bag("ahead", NOW + DAY))
+    assert span(found) == (0, 22 * S)
+    assert kinds(found) == {"ahead": FaultyClock.AHEAD}
+
+
+def test_where_all_bags_are_in_the_future_this_machines_clock_may_be_behind() -> None:
+    found = dating(*GOOD, now=GOOD[0].start - DAY)
+    assert span(found) == SPAN
+    assert set(kinds(found).values()) == {FaultyClock.AHEAD}
+    assert found.misdated == frozenset()
+    assert found.note is not None
+
+
+def test_a_clock_that_is_not_set_now_tells_nothing_of_the_future() -> None:
+    assert last_believed(5 * S) == MAX_NS
+    found = dating(*GOOD, bag("boot", 2 * S), now=15 * S)
+    assert (span(found), kinds(found)) == (SPAN, {"boot": FaultyClock.UNSET})
+
+
+def test_a_small_step_back_is_listed_and_changes_no_span() -> None:
+    before, after = bag("b", NOW - HOUR), bag("a", NOW - HOUR - 60 * S)
+    found = dating(before, after, steps=(StepBack(before, after, 70 * S),))
+    assert span(found) == (after.start, before.end)
+    [fault] = found.faults
+    assert (fault.bag.path.name, fault.kind) == ("a", FaultyClock.SET_BACK)
+    assert fault.reason == "the clock was set back by 70 s after b was begun"
+
+
+def test_a_clock_that_falls_back_by_years_in_a_recording_leaves_its_last_splits_out() -> None:
+    strays = [bag(f"stray{n}", NOW - 900 * DAY + n * 10 * S) for n in range(2)]
+    step = StepBack(GOOD[-1], strays[0], 900 * DAY)
+    found = dating(*GOOD, *strays, steps=(step,))
+    assert span(found) == SPAN
+    assert found.misdated == {each.file for each in strays}
+
+
+def test_a_clock_that_was_ahead_for_a_while_leaves_its_first_splits_out() -> None:
+    later = [bag(f"n{n}", NOW - 9 * DAY + n * 10 * S) for n in range(4)]
+    ahead = bag("ahead", NOW - 2 * DAY)
+    found = dating(ahead, *later, steps=(StepBack(ahead, later[0], 7 * DAY),))
+    assert span(found) == (later[0].start, later[-1].end)
+    assert found.misdated == {ahead.file}
+
+
+def test_of_two_sides_with_equally_many_bags_the_earlier_one_strayed() -> None:
+    late, early = bag("late", NOW - HOUR), bag("early", NOW - 900 * DAY)
+    found = dating(late, early, steps=(StepBack(late, early, 900 * DAY),))
+    assert span(found) == (late.start, late.end)
+
+
+def test_the_files_own_date_tells_whether_a_clock_may_have_been_simulated() -> None:
+    found = dating(*GOOD, bag("sim", 5 * S), bag("boot", 6 * S, written=20 * S))
+    assert [fault.reason for fault in found.faults] == [
+        (
+            "its messages are dated from 5 on, its file 1790000000: the clock was not set, or was"
+            " simulated; left out of earliest and latest"
+        ),
+        "dated from 6 on: the clock was not set; left out of earliest and latest",
+    ]
+
+
+MOMENTS = st.sampled_from(
+    [0, 5 * S, FIRST_BAGS_NS - 1, FIRST_BAGS_NS, NOW - DAY, NOW, NOW + FUTURE_NS, NOW + DAY, MAX_NS]
+) | st.integers(0, MAX_NS)
+SPANS = st.lists(st.tuples(MOMENTS, MOMENTS), min_size=1, max_size=12)
+
+
+@given(SPANS, st.integers(1, 5), st.sampled_from([0, NOW]))
+def test_the_span_is_that_of_the_bags_that_are_not_left_out(
+    spans: list[tuple[int, int]], size: int, now: int
+) -> None:
+    bags = [bag(f"{n}", *sorted(each)) for n, each in enumerate(spans)]
+    found = dating(*bags, now=now, size=size)
+    kept = [each for each in bags if each.file not in found.misdated]
+    assert span(found) == (min(each.start for each in kept), max(each.end for each in kept))
+
+
+@given(SPANS, st.integers(1, 5), st.data())
+def test_one_sound_bag_keeps_all_others_from_spoiling_the_span(
+    spans: list[tuple[int, int]], size: int, data: st.DataObject
+) -> None:
+    start = data.draw(st.integers(FIRST_BAGS_NS, NOW))
+    sound = bag("sound", start, data.draw(st.integers(start, NOW)))
+    found = dating(sound, *(bag(f"{n}", *sorted(each)) for n, each in enumerate(spans)), size=size)
+    assert found.earliest is not None
+    assert found.latest is not None
+    assert FIRST_BAGS_NS <= found.earliest <= sound.start
+    assert sound.end <= found.latest <= last_believed(NOW)
+
+
+@given(SPANS)
+def test_every_bag_that_is_left_out_is_named_with_a_reason(spans: list[tuple[int, int]]) -> None:
+    found = dating(*(bag(f"{n}", *sorted(each)) for n, each in enumerate(spans)))
+    for fault in found.faults:
+        assert fault.reason
+        assert "left out" in fault.reason or not fault.misleads

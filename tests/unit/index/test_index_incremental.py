@@ -1,0 +1,213 @@
+"""An index that followed every change knows what a fresh one finds."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.heartbeat import (
+    HEARTBEAT_FILE,
+    Heartbeat,
+    RecorderState,
+    write_heartbeat,
+)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import Clock
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from tests.plain_bags import PlainReader, close, grow, plain
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+S = 10**9
+NOW = 1_800_000_000 * S
+
+FOLDERS = (".", "rec_1", "rec_2", "day/rec_3", ".trash")
+NAMES = ("a.mcap", "b.mcap", "a.mcap.zstd", "c.db3", "d.db3.zstd", "notes.txt")
+WAITS_S = (0.0, 0.0, 0.001, 1.0, 2.0, 5.0, 14.0, 31.0, 700.0)
+
+places = st.tuples(st.sampled_from(FOLDERS), st.sampled_from(NAMES)).map("/".join)
+steps = st.one_of(
+    st.tuples(st.sampled_from(["add", "open", "replace", "overwrite"]), places, st.integers(0, 99)),
+    st.tuples(st.sampled_from(["empty", "zero", "junk", "grow", "close"]), places, st.just(0)),
+    st.tuples(st.sampled_from(["delete", "rename", "link", "drop folder"]), places, st.just(0)),
+    st.tuples(st.sampled_from(["metadata", "beat", "silence"]), places, st.integers(0, 3)),
+    st.tuples(st.just("wait"), st.just(""), st.integers(0, len(WAITS_S) - 1)),
+    st.tuples(st.just("scan"), st.just(""), st.just(0)),
+)
+
+
+class HandClock(Clock):
+    """A clock that stands still until a test moves it."""
+
+    def __init__(self) -> None:
+        self.at = NOW
+
+    def now(self) -> int:
+        return self.at
+
+
+class World:
+    """A bag directory in which things happen; every mtime is that of the hand-moved clock.
+
+    `held` keeps what was written open: the inode of a file that has gone would be the next one's,
+    which then looks like the same file, grown. And who sees a file grow cannot tell that it grew
+    long before, as a fresh index does by the mtime: no time passes before that is seen.
+    """
+
+    def __init__(self, root: Path, held: ExitStack) -> None:
+        self.root = root
+        self._held = held
+        self._grown = False
+        self.clock = HandClock()
+        self.index = self.fresh_index()
+        self.index.refresh()
+
+    def fresh_index(self) -> IndexManager:
+        reader = PlainReader(".mcap", ".mcap.zstd", ".db3")
+        return IndexManager(self.root, reader, self.clock, refresh_s=5.0, split_duration_s=10.0)
+
+    def do(self, deed: str, place: str, number: int) -> None:
+        path = self.root / place
+        assert path.is_relative_to(self.root)
+        if deed == "wait":
+            if self._grown:
+                self._scan()
+            self.clock.at += round(WAITS_S[number] * S)
+        elif deed == "scan":
+            self._scan()
+        else:
+            self._grown |= deed in {"grow", "close", "overwrite"}
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._deeds()[deed](path, number)
+            self._stamp(path)
+
+    def _scan(self) -> None:
+        self.index.refresh()
+        self._grown = False
+
+    def _deeds(self) -> dict[str, Callable[[Path, int], None]]:
+        return {
+            "add": self._add,
+            "open": self._open,
+            "replace": self._replace,
+            "overwrite": self._overwrite,
+            "empty": self._empty,
+            "zero": lambda path, _: self._write(path, ""),
+            "junk": lambda path, _: self._write(path, "junk"),
+            "grow": self._grow,
+            "close": self._close,
+            "delete": lambda path, _: path.unlink(missing_ok=True),
+            "rename": self._rename,
+            "link": self._link,
+            "drop folder": self._drop_folder,
+            "metadata": self._metadata,
+            "beat": self._beat,
+            "silence": lambda _, __: (self.root / HEARTBEAT_FILE).unlink(missing_ok=True),
+        }
+
+    def _add(self, path: Path, number: int, *, closed: bool = True) -> None:
+        path.unlink(missing_ok=True)
+        topic = "/odom" if number % 2 else "/tf_static"
+        plain(path, [number, number + 5], topic=topic, silent=["/scan"], closed=closed)
+
+    def _open(self, path: Path, number: int) -> None:
+        self._add(path, number, closed=False)
+
+    def _empty(self, path: Path, _: int) -> None:
+        path.unlink(missing_ok=True)
+        plain(path, silent=["/idle"])
+
+    def _write(self, path: Path, text: str) -> None:
+        path.unlink(missing_ok=True)
+        path.write_text(text)
+
+    def _link(self, path: Path, _: int) -> None:
+        path.unlink(missing_ok=True)
+        path.symlink_to("elsewhere")
+
+    def _overwrite(self, path: Path, number: int) -> None:
+        if path.is_file():
+            plain(path, [number])
+
+    def _grow(self, path: Path, _: int) -> None:
+        if self._is_open(path):
+            grow(path, 100, 101)
+
+    def _close(self, path: Path, _: int) -> None:
+        if self._is_open(path):
+            close(path)
+
+    def _is_open(self, path: Path) -> bool:
+        return path.is_file() and path.read_text().startswith("BAG") and not self._is_closed(path)
+
+    def _is_closed(self, path: Path) -> bool:
+        return path.read_text().endswith("END")
+
+    def _replace(self, path: Path, number: int) -> None:
+        other = plain(path.with_name("incoming"), [number], closed=number % 3 != 0)
+        os.utime(other, ns=(self.clock.at,) * 2)
+        other.rename(path)
+
+    def _rename(self, path: Path, _: int) -> None:
+        if path.is_file():
+            path.rename(path.with_name(f"z_{path.name}"))
+
+    def _drop_folder(self, path: Path, _: int) -> None:
+        if path.parent != self.root:
+            shutil.rmtree(path.parent)
+
+    def _metadata(self, path: Path, number: int) -> None:
+        text = f"files:\n  - path: {path.name}\n" if number else ""
+        path.with_name("metadata.yaml").write_text(text)
+
+    def _beat(self, path: Path, number: int) -> None:
+        recordings = FOLDERS[1 : number + 1]
+        beat = Heartbeat(
+            1, self.clock.at, RecorderState.RECORDING, recordings, NOW, 0, (), (), None, 2.0
+        )
+        write_heartbeat(self.root, beat)
+
+    def _stamp(self, path: Path) -> None:
+        """The file system's clock is the test's: it stamps what was touched."""
+        if path.is_file():
+            self._held.enter_context(path.open("rb"))
+            os.utime(path, ns=(self.clock.at,) * 2)
+        for folder in path.parents:
+            if folder.is_relative_to(self.root) and folder.is_dir():
+                os.utime(folder, ns=(self.clock.at,) * 2)
+
+
+@settings(max_examples=300)
+@given(script=st.lists(steps, max_size=40))
+def test_an_index_that_followed_every_change_knows_what_a_fresh_one_finds(
+    script: list[tuple[str, str, int]],
+) -> None:
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as held:
+        world = World(Path(folder), held)
+        for deed in script:
+            world.do(*deed)
+        followed, fresh = world.index.refresh(), world.fresh_index().refresh()
+        assert followed == fresh
+        assert _views(followed) == _views(fresh)
+        assert replace(world.index.refresh(), scanned_at=0) == replace(fresh, scanned_at=0)
+
+
+def _views(snapshot: Snapshot) -> tuple[object, ...]:
+    return (
+        snapshot.earliest,
+        snapshot.latest,
+        snapshot.topics(),
+        [snapshot.holding(topic) for topic in snapshot.topics()],
+        [snapshot.types_of(topic) for topic in snapshot.topics()],
+        [snapshot.is_transient_local(topic) for topic in snapshot.topics()],
+        snapshot.overlapping(TimeWindow(20, 60)),
+    )

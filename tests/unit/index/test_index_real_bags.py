@@ -1,0 +1,157 @@
+"""The index over bags that real recorders wrote, killed ones among them."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.core.model import BagState
+from ros2_memory.core.timebase import FixedClock, Ns
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.bags import McapLayout, text, write_db3, write_mcap
+from tests.shared_bags import REAL, RECORDED, needs_real, needs_recorded
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from ros2_memory.core.model import BagFile, SetAside
+    from ros2_memory.storage.base import BagReader
+
+S = 10**9
+LONG_AFTER = 1_900_000_000 * S
+
+
+def _scan(bag_dir: Path, reader: BagReader, now: Ns = LONG_AFTER) -> Snapshot:
+    clock = FixedClock(now)
+    return IndexManager(bag_dir, reader, clock, refresh_s=5.0, split_duration_s=10.0).snapshot()
+
+
+def _names(files: Iterable[BagFile | SetAside]) -> list[str]:
+    return [each.path.name for each in files]
+
+
+def _states(snapshot: Snapshot) -> list[tuple[str, BagState]]:
+    return [(bag.path.name, bag.state) for bag in snapshot.bags]
+
+
+@needs_recorded
+def test_the_splits_of_a_real_recording_are_found_in_order() -> None:
+    snapshot = _scan(RECORDED / "session_mcap", McapReader())
+    assert _states(snapshot) == [(f"session_mcap_{n}.mcap", BagState.CLOSED) for n in range(7)]
+    assert sum(held.count for _, held in snapshot.holding("/odom")) == 1300
+    assert [bag.path.name for bag, _ in snapshot.holding("/tf_static")] == ["session_mcap_0.mcap"]
+    assert snapshot.is_transient_local("/tf_static")
+    assert not snapshot.is_transient_local("/tf")
+
+
+@needs_recorded
+def test_a_recorder_killed_with_nothing_on_disk_leaves_a_damaged_split() -> None:
+    snapshot = _scan(RECORDED / "session_killed", McapReader())
+    assert _states(snapshot) == [(f"session_killed_{n}.mcap", BagState.CLOSED) for n in range(2)]
+    assert _names(snapshot.damaged) == ["session_killed_2.mcap"]
+    assert "empty" in snapshot.damaged[0].reason
+
+
+@needs_recorded
+def test_a_recorder_killed_with_small_chunks_leaves_a_split_that_is_served() -> None:
+    snapshot = _scan(RECORDED / "session_killed_chunk64k", McapReader())
+    assert [bag.state for bag in snapshot.bags] == [
+        BagState.CLOSED,
+        BagState.CLOSED,
+        BagState.INCOMPLETE,
+    ]
+    assert snapshot.bags[2].summary.count >= 251
+
+
+@needs_recorded
+def test_recordings_without_messages_with_deleted_splits_and_cut_by_a_full_disk_stand_right() -> (
+    None
+):
+    snapshot = _scan(RECORDED / "extra", McapReader())
+    by_recording: dict[str, int] = {}
+    for bag in snapshot.bags:
+        by_recording[bag.recording.name] = by_recording.get(bag.recording.name, 0) + 1
+    assert by_recording["gc"] == 4
+    assert by_recording["ev"] == 6
+    assert "never" not in by_recording
+    assert snapshot.empty >= 2
+    assert [bag.path.name for bag in snapshot.bags if bag.state is BagState.INCOMPLETE] == [
+        "fullsmall_4.mcap"
+    ]
+
+
+@needs_recorded
+def test_what_one_storage_does_not_read_the_other_does() -> None:
+    by_mcap, by_rosbag2 = _scan(RECORDED, McapReader()), _scan(RECORDED, Rosbag2Reader())
+    assert {each.path.suffix for each in by_mcap.unread} == {".db3", ".zstd"}
+    assert all("storage=rosbag2" in each.reason for each in by_mcap.unread)
+    assert by_rosbag2.unread == ()
+    unread = {each.path for each in by_mcap.unread}
+    assert {bag.path for bag in by_rosbag2.bags} == {bag.path for bag in by_mcap.bags} | unread
+
+
+@needs_real
+def test_both_forms_of_a_public_pair_are_indexed_and_a_text_file_is_damaged() -> None:
+    snapshot = _scan(REAL / "tiryoh_small_and_truncated", Rosbag2Reader())
+    assert sorted(_states(snapshot)) == [
+        ("test_sample.mcap", BagState.CLOSED),
+        ("test_sample.mcap.zstd", BagState.CLOSED),
+        ("test_sample_no_rosout.mcap", BagState.CLOSED),
+        ("test_sample_truncated.mcap", BagState.INCOMPLETE),
+    ]
+    assert _names(snapshot.damaged) == ["Dockerfile.mcap"]
+
+
+@pytest.mark.parametrize("reader", [McapReader(), Rosbag2Reader()])
+@pytest.mark.parametrize("content", ["nothing", "a header", "messages"])
+def test_an_mcap_under_way_is_active_and_then_left_behind(
+    tmp_path: Path, reader: BagReader, content: str
+) -> None:
+    path = tmp_path / "rec" / "rec_0.mcap"
+    messages = [text(n * S, "hello" * 50) for n in range(100 if content == "messages" else 0)]
+    write_mcap(path, messages, McapLayout(chunk_size=1024, finish=False))
+    if content == "nothing":
+        path.write_bytes(b"")
+    written = path.stat().st_mtime_ns
+    under_way = _scan(tmp_path, reader, written + 30 * S)
+    assert (_names(under_way.active), under_way.bags) == (["rec_0.mcap"], ())
+    left = _scan(tmp_path, reader, written + 31 * S)
+    assert left.active == ()
+    if content == "messages":
+        assert _states(left) == [("rec_0.mcap", BagState.INCOMPLETE)]
+    else:
+        assert _names(left.damaged) == ["rec_0.mcap"]
+
+
+def test_a_db3_with_its_wal_beside_it_is_active_and_then_left_behind(tmp_path: Path) -> None:
+    source = write_db3(tmp_path / "source.db3", [text(n * S, "hello") for n in range(5)])
+    bags = tmp_path / "bags"
+    bags.mkdir()
+    with closing(sqlite3.connect(source)) as base:
+        base.execute("PRAGMA journal_mode=WAL")
+        base.execute("UPDATE messages SET timestamp = timestamp + 1")
+        base.commit()
+        for end in ("", "-wal"):
+            shutil.copy(f"{source}{end}", bags / f"rec_0.db3{end}")
+    written = (bags / "rec_0.db3").stat().st_mtime_ns
+    assert _names(_scan(bags, Rosbag2Reader(), written + 30 * S).active) == ["rec_0.db3"]
+    left = _scan(bags, Rosbag2Reader(), written + 31 * S)
+    assert _states(left) == [("rec_0.db3", BagState.INCOMPLETE)]
+    assert left.bags[0].summary.count == 5
+
+
+def test_a_young_db3_is_active_unless_its_recording_was_closed(tmp_path: Path) -> None:
+    path = write_db3(tmp_path / "rec" / "rec_0.db3", [text(n * S, "hello") for n in range(5)])
+    written = path.stat().st_mtime_ns
+    assert _names(_scan(tmp_path, Rosbag2Reader(), written + S).active) == ["rec_0.db3"]
+    path.with_name("metadata.yaml").write_text("relative_file_paths:\n  - rec_0.db3\n")
+    assert _states(_scan(tmp_path, Rosbag2Reader(), written + S)) == [
+        ("rec_0.db3", BagState.CLOSED)
+    ]

@@ -1,0 +1,428 @@
+"""What answers of a file that is still being written: all that is whole, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+from typing import TYPE_CHECKING, Any
+
+import anyio
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.handover_file import (
+    Counting,
+    Handover,
+    Overlap,
+    write_handover,
+)
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.view import View
+from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.instructions import instructions
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.spec_tools import build_tools
+from tests.bags import McapLayout, Msg, odom, write_db3, write_mcap
+from tests.mcap_surgery import spoil_chunk
+from tests.memories import SettableClock, memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from ros2_memory.history.context import Memory
+    from ros2_memory.tools.declaration import Tool
+
+S = 10**9
+T0 = 1_784_023_200 * S
+TENTH = S // 10
+LIVE = Limits(include_active=True)
+LAYOUTS = (
+    McapLayout(chunk_size=4096, compression=CompressionType.ZSTD),
+    McapLayout(chunk_size=4096),
+    McapLayout(chunk_size=None),
+)
+EVERYTHING = TimeWindow.everything()
+SCRATCH = TemporaryDirectory()
+
+
+def driven(first: int, count: int, late: int = 0) -> list[Msg]:
+    """Messages of a robot that drives 0.1 m in each tenth of a second, `late` in being logged."""
+    return [
+        odom(T0 + n * TENTH, n * 0.1, 0.0, log_time=T0 + n * TENTH + late)
+        for n in range(first, first + count)
+    ]
+
+
+def written(path: Path, messages: list[Msg], layout: McapLayout = LAYOUTS[0]) -> bytes:
+    """What the file comes to once it is closed; nothing is left there."""
+    content = write_mcap(path, messages, layout).read_bytes()
+    path.unlink()
+    return content
+
+
+@cache
+def split(layout: McapLayout) -> tuple[bytes, tuple[tuple[int, int], ...]]:
+    """A closed split of 10 s, and of each of its chunks the end and the messages up to there."""
+    with TemporaryDirectory() as folder:
+        path = write_mcap(Path(folder) / "rec_0.mcap", driven(0, 100), layout)
+        content = path.read_bytes()
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+    assert summary is not None
+    ends, count = [], 0
+    for chunk in summary.chunk_indexes:
+        count += round((chunk.message_end_time - chunk.message_start_time) / TENTH) + 1
+        ends.append((chunk.chunk_start_offset + chunk.chunk_length, count))
+    return content, tuple(ends)
+
+
+@cache
+def closed(layout: McapLayout) -> Memory:
+    """The memory over that split alone."""
+    folder = Path(mkdtemp(dir=SCRATCH.name))
+    (folder / "rec").mkdir()
+    (folder / "rec" / "rec_0.mcap").write_bytes(split(layout)[0])
+    return memory_of(folder)
+
+
+class Tail:
+    """A memory that answers from what is being written; the clock is that of the newest file."""
+
+    def __init__(self, bag_dir: Path, **more: Any) -> None:
+        self.bag_dir = bag_dir
+        self.clock = SettableClock(T0)
+        self.memory = memory_of(
+            bag_dir, clock=self.clock, limits=LIVE, **{"include_active": True} | more
+        )
+
+    def write(self, name: str, content: bytes, at: int = 0) -> Path:
+        """Has a file hold this, its inode unchanged, `at` nanoseconds after T0."""
+        path = self.bag_dir / name
+        path.parent.mkdir(exist_ok=True)
+        with path.open("r+b" if path.exists() else "wb") as stream:
+            stream.write(content)
+            stream.truncate()
+        self.clock.at = T0 + at
+        os.utime(path, ns=(T0 + at,) * 2)
+        return path
+
+    def beat(self, *recordings: str) -> None:
+        """A live recorder says that it writes these recordings alone."""
+        at = self.clock.at
+        state = RecorderState.RECORDING
+        beat = Heartbeat(1, at, state, recordings, at, 0, (), (), None, interval_s=2.0)
+        write_heartbeat(self.bag_dir, beat)
+
+    def ticks(self, view: View | None = None) -> list[int]:
+        """Which messages a question about all of time finds, by their publish times."""
+        found = (view or View(self.memory, Call())).stream(["/odom"], EVERYTHING)
+        return [round((each.record.publish_time - T0) / TENTH) for each in found]
+
+    def states(self) -> list[BagState]:
+        return [bag.state for bag in self.memory.index.refresh().bags]
+
+    def asked(self, name: str, **arguments: object) -> Any:
+        return told(self.memory, name, **arguments)
+
+
+@cache
+def tools() -> Mapping[str, Tool]:
+    """Those of this deployment, by name."""
+    return {tool.name: tool for tool in build_tools(LIVE, 25.0)}
+
+
+def told(memory: Memory, name: str, **arguments: object) -> Any:
+    """A reply as a client gets it."""
+    replies, call = Replies(Path("bags"), 24_000), Call()
+    try:
+        answer = tools()[name].question(arguments)(memory, call)
+    except EpisodicError as error:
+        return json.loads(replies.error(error).text)
+    return json.loads(replies.answer(answer, from_active=call.sources.active).text)
+
+
+@pytest.fixture
+def tail(tmp_path: Path) -> Tail:
+    return Tail(tmp_path)
+
+
+@given(st.sampled_from(LAYOUTS), st.data())
+def test_wherever_the_file_ends_all_whole_chunks_answer_and_nothing_that_is_not_whole(
+    layout: McapLayout, data: st.DataObject
+) -> None:
+    content, ends = split(layout)
+    cut = data.draw(st.integers(0, len(content) - 1))
+    with TemporaryDirectory() as folder:
+        tail = Tail(Path(folder))
+        tail.write("rec/rec_0.mcap", content[:cut], at=10 * S)
+        ticks = tail.ticks()
+        snapshot = tail.memory.index.snapshot()
+        [aside] = snapshot.active
+        assert ticks == list(range(len(ticks)))
+        assert len(ticks) >= max((count for end, count in ends if end <= cut), default=0)
+        assert [bag.state for bag in snapshot.bags] == [BagState.ACTIVE] * bool(ticks)
+        assert aside.until == (T0 + (len(ticks) - 1) * TENTH if ticks else None)
+        for tick in {*ticks[:1], *ticks[-1:]}:
+            live = tail.asked("get_position_at", timestamp=T0 / S + tick / 10)
+            whole = told(closed(layout), "get_position_at", timestamp=T0 / S + tick / 10)
+            assert live.pop("from_active") is True
+            assert {**live, "notes": None} == {**whole, "notes": None}
+
+
+def test_by_default_the_split_being_written_does_not_answer(tmp_path: Path) -> None:
+    tail = Tail(tmp_path, include_active=False)
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
+    assert tail.states() == []
+    [aside] = tail.memory.index.snapshot().active
+    assert (aside.reason, aside.answers) == ("still being written", False)
+
+
+def test_an_active_file_answers_and_is_named_as_active_all_the_same(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
+    assert tail.states() == [BagState.ACTIVE]
+    told = tail.asked("data_time_range")
+    assert (told["bags"], told["from_active"]) == (1, True)
+    assert tail.asked("memory_status")["from_active"] is True
+    assert told["active"] == [
+        {"file": "rec_0.mcap", "reason": "still being written: its complete chunks answer"}
+    ]
+    assert (told["incomplete"], told["damaged"]) == ([], [])
+    assert not any("ends early" in note for note in told.get("notes", ()))
+
+
+@pytest.mark.parametrize("recall", [False, True], ids=["plain", "catalogue"])
+def test_what_is_amiss_inside_is_told_before_the_split_closes(tail: Tail, recall: bool) -> None:
+    content, ends = split(LAYOUTS[0])
+    path = tail.write("rec/rec_0.mcap", content, at=10 * S)
+    spoil_chunk(path, 1)
+    tail.write("rec/rec_0.mcap", path.read_bytes()[: ends[3][0]], at=10 * S)
+    if recall:
+        tail.memory = recalling(tail.memory, tail.bag_dir)
+    notes = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 9)["notes"]
+    assert any(note.startswith("rec/rec_0.mcap: 1 damaged") for note in notes), notes
+    assert not any("crash" in note for note in notes)
+
+
+def test_with_the_catalogue_the_same_is_answered(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0], at=10 * S)
+    tail.clock.at = T0 + 60 * S
+    catalogued = recalling(tail.memory, tail.bag_dir)
+    later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
+    near = {"condition_type": "near_position", "value": {"x": 14.2, "y": 0}}
+    for cut in range(4096, len(later), 4096):
+        tail.write("rec/rec_1.mcap", later[:cut], at=60 * S + cut)
+        for name, arguments in (
+            ("find_last_match", {"topic": "/odom", **near}),
+            ("trajectory_summary", {"start": T0 / S, "end": T0 / S + 30}),
+            ("get_topic_in_range", {"topic": "/odom", "start": T0 / S, "end": T0 / S + 30}),
+        ):
+            assert told(catalogued, name, **arguments) == tail.asked(name, **arguments)
+
+
+def test_a_file_that_is_no_bag_yet_stays_aside(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:5], at=5 * S)
+    assert tail.states() == []
+    [aside] = tail.memory.index.snapshot().active
+    assert not aside.answers
+
+
+def test_a_db3_that_is_being_written_does_not_answer(tmp_path: Path) -> None:
+    tail = Tail(tmp_path, storage="rosbag2")
+    path = write_db3(tmp_path / "rec" / "rec_0.db3", driven(0, 5))
+    os.utime(path, ns=(T0, T0))
+    assert tail.states() == []
+    [aside] = tail.memory.index.snapshot().active
+    assert (aside.reason, aside.answers) == ("still being written", False)
+
+
+def test_what_a_killed_recorder_left_is_incomplete_and_answers_the_same(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
+    tail.beat("rec")
+    before = tail.ticks()
+    assert tail.states() == [BagState.ACTIVE]
+    tail.beat("another")
+    assert tail.states() == [BagState.INCOMPLETE]
+    assert tail.ticks() == before
+
+
+def growth(bag_dir: Path) -> Iterator[tuple[str, bytes]]:
+    """What two splits of a recording look like one after another: file by file, as it grows.
+
+    The second one is there before the footer of the first.
+    """
+    first = written(bag_dir / "x" / "x_0.mcap", driven(0, 100))
+    second = written(bag_dir / "x" / "x_1.mcap", driven(100, 100))
+    for cut in range(0, len(first), 4096):
+        yield "rec/rec_0.mcap", first[:cut]
+    yield "rec/rec_1.mcap", b""
+    yield "rec/rec_0.mcap", first
+    for cut in range(4096, len(second), 4096):
+        yield "rec/rec_1.mcap", second[:cut]
+    yield "rec/rec_1.mcap", second
+
+
+def test_as_splits_grow_and_close_nothing_is_missing_and_nothing_doubled(tail: Tail) -> None:
+    reach, closed = 0, 0
+    for step, (name, content) in enumerate(growth(tail.bag_dir)):
+        held = View(tail.memory, Call())
+        before = tail.ticks(held)
+        tail.write(name, content, at=step * TENTH)
+        # Whoever asked before sees what there was, even where the file has changed since.
+        assert tail.ticks(held) == before == list(range(reach))
+        now = tail.ticks()
+        assert now == list(range(len(now)))
+        assert len(now) >= reach
+        reach = len(now)
+        closed += tail.states().count(BagState.CLOSED)
+    assert reach == 200
+    assert tail.states() == [BagState.CLOSED] * 2
+    assert closed > 2
+
+
+def test_splits_that_overlap_while_one_recording_takes_over_count_once(tmp_path: Path) -> None:
+    tail = Tail(tmp_path, reader=CountingReader(McapReader()))
+    old = written(tmp_path / "x" / "x_0.mcap", driven(0, 80))
+    new = written(tmp_path / "x" / "x_1.mcap", driven(50, 80, late=100_000))
+    tail.write("a/a_0.mcap", old[:-300], at=8 * S)
+    tail.write("b/b_0.mcap", new[:-300], at=8 * S)
+    assert tail.states() == [BagState.ACTIVE] * 2
+    assert tail.ticks() == list(range(tail.ticks()[-1] + 1))
+    write_handover(tmp_path / "b", Handover(state=Counting.PENDING, previous="a"))
+    assert tail.ticks() == list(range(80))
+    cut = T0 + 60 * TENTH
+    write_handover(tmp_path / "a", Handover(next="b", counts_until=cut))
+    write_handover(tmp_path / "b", Handover(previous="a", counts_from=cut))
+    assert tail.ticks() == list(range(tail.ticks()[-1] + 1))
+
+
+def test_what_the_older_of_two_recordings_has_yet_to_write_is_no_gap(tmp_path: Path) -> None:
+    tail = Tail(tmp_path, reader=CountingReader(McapReader()))
+    old, chunks = split(LAYOUTS[0])
+    new = written(tmp_path / "x" / "x_1.mcap", driven(80, 80, late=100_000))
+    behind, reach = max(chunk for chunk in chunks if chunk[1] < 80)
+    tail.write("a/a_0.mcap", old[:behind], at=12 * S)
+    tail.write("b/b_0.mcap", new[: len(new) * 9 // 10], at=12 * S)
+    cut = T0 + 90 * TENTH
+    write_handover(tmp_path / "a", Handover(next="b", counts_until=cut))
+    begin = Overlap(None, None, ("b_0.mcap",))
+    write_handover(tmp_path / "b", Handover(previous="a", counts_from=cut, begin=begin))
+    missing = {"timestamp": T0 / S + 8.5, "tolerance_s": 0.2}
+    within = {"topic": "/odom", "start": T0 / S + 8, "end": T0 / S + 8.8}
+    assert tail.ticks() == [*range(reach), *range(90, tail.ticks()[-1] + 1)]
+    for told in (
+        tail.asked("get_position_at", **missing),
+        tail.asked("get_topic_in_range", **within),
+    ):
+        assert told["reason"] == "not_closed_yet"
+        assert told["notes"] == ["still being written and not all on disk yet: a/a_0.mcap"]
+        assert "again in 3 s" in told["detail"]
+    tail.write("a/a_0.mcap", old, at=12 * S)
+    assert tail.asked("get_position_at", **missing)["x"] == pytest.approx(8.5)
+
+
+def test_between_messages_that_are_on_disk_a_gap_is_one_while_more_is_written(tail: Tail) -> None:
+    content = written(tail.bag_dir / "x" / "x_0.mcap", [*driven(0, 30), *driven(50, 60)])
+    tail.write("rec/rec_0.mcap", content[: len(content) * 9 // 10], at=11 * S)
+    told = tail.asked("get_position_at", timestamp=T0 / S + 4.5, tolerance_s=0.5)
+    assert told["reason"] == "gap"
+
+
+def test_where_the_robot_was_2_s_ago_is_answered_and_says_from_what(tail: Tail) -> None:
+    content, _ = split(LAYOUTS[0])
+    tail.write("rec/rec_0.mcap", content, at=10 * S)
+    later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
+    tail.write("rec/rec_1.mcap", later[: len(later) * 6 // 10], at=12 * S)
+    at = tail.memory.index.snapshot().latest
+    assert at is not None
+    tail.clock.at = at + 2 * S
+    told = tail.asked("get_position_seconds_ago", seconds_ago=2)
+    assert told["x"] == pytest.approx((at - T0) / S)
+    assert told["from_active"] is True
+    assert "from_active" not in tail.asked("get_position_at", timestamp=T0 / S + 5)
+    ranged = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 5)
+    assert "from_active" not in ranged
+
+
+def test_past_what_is_on_disk_the_answer_says_where_that_ends(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
+    end = tail.memory.index.snapshot().latest
+    assert end is not None
+    sentence = f"nothing after {end / S:.6f} is on disk yet"
+    tail.clock.at = end + 4 * S
+    told = tail.asked("get_position_seconds_ago", seconds_ago=1)
+    assert (told["reason"], told["notes"]) == ("not_closed_yet", [sentence])
+    assert "again in 3 s" in told["detail"]
+    assert "closes" not in told["detail"]
+    assert sentence in tail.asked("get_topic_in_last", topic="/odom", seconds=60)["notes"]
+    before = (end - TENTH) / S
+    inside = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=before)
+    assert "notes" not in inside or sentence not in inside["notes"]
+
+
+def test_a_first_split_of_which_nothing_is_on_disk_yet_is_no_empty_memory(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", b"", at=S)
+    told = tail.asked("get_position_seconds_ago", seconds_ago=1)
+    assert told["reason"] == "not_closed_yet"
+    assert told["detail"] == "nothing of the first split is on disk yet; ask again in 3 s"
+
+
+def test_of_two_files_being_written_the_one_that_is_behind_is_named(tail: Tail) -> None:
+    content = written(tail.bag_dir / "x" / "x_0.mcap", driven(0, 100))
+    tail.write("a/a_0.mcap", content[:5000], at=5 * S)
+    tail.write("b/b_0.mcap", content[:9000], at=5 * S)
+    behind, ahead = sorted(aside.until or 0 for aside in tail.memory.index.snapshot().active)
+    told = tail.asked(
+        "get_topic_in_range", topic="/odom", start=(behind + TENTH) / S, end=(ahead - TENTH) / S
+    )
+    assert told["notes"][0] == "still being written and not all on disk yet: a/a_0.mcap"
+
+
+def test_each_call_says_for_itself_whether_it_drew_on_what_is_being_written(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0], at=10 * S)
+    later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
+    tail.write("rec/rec_1.mcap", later[: len(later) * 6 // 10], at=12 * S)
+    dispatcher = Dispatcher(
+        tail.memory, [*tools().values()], Replies(tail.bag_dir, 24_000), call_timeout_s=25.0
+    )
+    old, new = {"timestamp": T0 / S + 5}, {"timestamp": T0 / S + 11}
+    said: list[bool] = []
+
+    async def ask(arguments: dict[str, float]) -> None:
+        reply = json.loads((await dispatcher.answer("get_position_at", arguments)).text)
+        said.append(reply.get("from_active", False))
+        assert reply.get("from_active", False) is (arguments is new), reply
+
+    async def go() -> None:
+        async with anyio.create_task_group() as group:
+            for arguments in (old, new) * 20:
+                group.start_soon(ask, arguments)
+
+    anyio.run(go)
+    assert said.count(True) == said.count(False) == 20
+
+
+def test_lists_have_no_place_for_it_and_stay_lists(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
+    [row] = tail.asked("list_recorded_topics")
+    assert row["count"] == len(tail.ticks())
+    assert "notes" not in row
+
+
+def test_the_instructions_tell_what_this_deployment_can_answer() -> None:
+    assert "not_closed_yet" in instructions(LIVE)
+    assert "3 s" in instructions(LIVE)
+    assert "newest 10 s" in instructions(Limits())
+    assert "newest 10 s" not in instructions(LIVE)
+    assert len(instructions(LIVE)) < 2_000

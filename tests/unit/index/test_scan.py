@@ -1,0 +1,246 @@
+"""Walking the bag directory."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.index.scan import Tree, Walked
+
+S = 10**9
+NOW = 1_800_000_000 * S
+LONG_AGO = NOW - 3600 * S
+
+
+def _file(path: Path, text: str = "x", *, at: int = LONG_AGO) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    os.utime(path, ns=(at, at))
+    return path
+
+
+def _aged(root: Path, at: int = LONG_AGO) -> Path:
+    """Gives every directory an mtime that proves that nothing came or went since."""
+    for folder in (root, *(path for path in root.rglob("*") if path.is_dir())):
+        os.utime(folder, ns=(at, at))
+    return root
+
+
+def _names(walked: Walked) -> list[str]:
+    return sorted(Path(path).name for path in walked.looked_at)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("rec_0.mcap", ".mcap"),
+        ("rec_0.db3", ".db3"),
+        ("rec_0.mcap.zstd", ".mcap.zstd"),
+        ("rec_0.db3.zstd", ".db3.zstd"),
+        ("REC_0.MCAP", ".mcap"),
+        (".rec_0.mcap", None),
+        ("metadata.yaml", None),
+        ("rec_0.db3-wal", None),
+        ("rec_0.mcap.tmp", None),
+        (".rec_0.mcap.repair", None),
+        (".carried.mcap.tmp", None),
+        ("recorder.qos.yaml", None),
+        ("rec_0.zstd", None),
+        ("mcap", None),
+        (".mcap", None),
+        (".db3.zstd", None),
+    ],
+)
+def test_a_bag_is_known_by_the_end_of_its_name(name: str, kind: str | None) -> None:
+    assert bag_kind(name) == kind
+
+
+def test_bags_are_found_at_any_depth_and_foreign_files_are_not(tmp_path: Path) -> None:
+    for name in ("a.mcap", "rec/b.db3", "2026/rec/c.mcap.zstd", "2026/rec.mcap/d.db3.zstd"):
+        _file(tmp_path / name)
+    for name in ("recorder.json", "rec/metadata.yaml", "rec/b.db3-shm", "notes.txt"):
+        _file(tmp_path / name)
+    assert _names(Tree(tmp_path).walk(NOW, ())) == ["a.mcap", "b.db3", "c.mcap.zstd", "d.db3.zstd"]
+
+
+def test_what_a_file_system_check_put_aside_is_left_out(tmp_path: Path) -> None:
+    _file(tmp_path / "lost+found" / "a.mcap")
+    _file(tmp_path / "b.mcap")
+    walked = Tree(tmp_path).walk(NOW, ())
+    assert (_names(walked), walked.damaged) == (["b.mcap"], [])
+
+
+def test_folders_and_files_that_begin_with_a_dot_are_left_out(tmp_path: Path) -> None:
+    _file(tmp_path / ".trash" / "rec" / "a.mcap")
+    _file(tmp_path / "rec" / ".cache" / "b.mcap")
+    _file(tmp_path / "rec" / ".c.mcap")
+    assert _names(Tree(tmp_path).walk(NOW, ())) == []
+
+
+def test_a_second_walk_looks_at_nothing_that_lies_in_unchanged_folders(tmp_path: Path) -> None:
+    _file(tmp_path / "rec_1" / "a.mcap")
+    _file(tmp_path / "rec_2" / "b.mcap")
+    tree = Tree(_aged(tmp_path))
+    assert _names(tree.walk(NOW, ())) == ["a.mcap", "b.mcap"]
+    assert tree.walk(NOW, ()) == Walked({}, set(), [], [])
+
+
+def test_only_the_folder_into_which_a_file_came_is_listed_again(tmp_path: Path) -> None:
+    _file(tmp_path / "rec_1" / "a.mcap")
+    _file(tmp_path / "rec_2" / "b.mcap")
+    tree = Tree(_aged(tmp_path))
+    tree.walk(NOW, ())
+    _file(tmp_path / "rec_2" / "c.mcap")
+    assert _names(tree.walk(NOW, ())) == ["b.mcap", "c.mcap"]
+
+
+@pytest.mark.parametrize("age_s", [0.0, 1.9, -1.9])
+def test_a_folder_whose_mtime_is_younger_than_2_s_is_listed_again(
+    tmp_path: Path, age_s: float
+) -> None:
+    first = NOW - round(age_s * S)
+    _file(tmp_path / "a.mcap")
+    tree = Tree(_aged(tmp_path, first))
+    tree.walk(NOW, ())
+    _file(tmp_path / "b.mcap")
+    _aged(tmp_path, first)  # the same tick of the file system
+    assert _names(tree.walk(NOW + 10 * S, ())) == ["a.mcap", "b.mcap"]
+
+
+@pytest.mark.parametrize("age_s", [2.0, 3600.0, -2.0, -3600.0])
+def test_an_mtime_further_from_the_clock_is_trusted(tmp_path: Path, age_s: float) -> None:
+    _file(tmp_path / "a.mcap")
+    tree = Tree(_aged(tmp_path, NOW - round(age_s * S)))
+    tree.walk(NOW, ())
+    assert _names(tree.walk(NOW, ())) == []
+
+
+def test_a_watched_file_is_looked_at_though_its_folder_did_not_change(tmp_path: Path) -> None:
+    path = _file(tmp_path / "a.mcap", "x")
+    _file(tmp_path / "b.mcap", "x")
+    tree = Tree(_aged(tmp_path))
+    tree.walk(NOW, ())
+    _file(path, "longer")
+    walked = tree.walk(NOW, [str(path)])
+    assert {key: stamp.size for key, stamp in walked.looked_at.items()} == {str(path): 6}
+
+
+def test_what_vanished_is_named_once(tmp_path: Path) -> None:
+    path = _file(tmp_path / "rec" / "a.mcap")
+    _file(tmp_path / "rec" / "b.mcap")
+    tree = Tree(_aged(tmp_path))
+    tree.walk(NOW, ())
+    path.unlink()
+    assert tree.walk(NOW, ()).gone == {str(path)}
+    assert tree.walk(NOW, ()).gone == set()
+
+
+def test_a_whole_tree_that_vanished_is_gone_to_the_last_file(tmp_path: Path) -> None:
+    paths = {str(_file(tmp_path / "day" / name / "a.mcap")) for name in ("rec_1", "rec_2")}
+    tree = Tree(_aged(tmp_path))
+    tree.walk(NOW, ())
+    (tmp_path / "day").rename(tmp_path / ".trash")
+    assert tree.walk(NOW, ()).gone == paths
+
+
+def test_a_watched_file_that_left_and_came_back_within_one_tick_is_found(tmp_path: Path) -> None:
+    path = _file(tmp_path / "a.mcap")
+    tree = Tree(_aged(tmp_path))
+    tree.walk(NOW, ())
+    path.unlink()
+    _aged(tmp_path)
+    assert tree.walk(NOW, [str(path)]).gone == {str(path)}
+    _file(path)
+    _aged(tmp_path)
+    assert _names(tree.walk(NOW, ())) == ["a.mcap"]
+
+
+def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
+    _file(tmp_path / "elsewhere" / "a.mcap")
+    bags = tmp_path / "bags"
+    _file(bags / "rec" / "b.mcap")
+    (bags / "latest").symlink_to(bags / "rec", target_is_directory=True)
+    (bags / "up").symlink_to(tmp_path, target_is_directory=True)
+    (bags / "c.mcap").symlink_to(tmp_path / "elsewhere" / "a.mcap")
+    (bags / "broken.mcap").symlink_to(tmp_path / "nowhere")
+    (bags / "README").symlink_to(_file(tmp_path / "readme.txt"))
+    (bags / ".hidden").symlink_to(tmp_path, target_is_directory=True)
+    tree = Tree(_aged(bags))
+    first, second = tree.walk(NOW, ()), tree.walk(NOW, ())
+    assert _names(first) == ["b.mcap"]
+    for walked in (first, second):
+        assert sorted(each.path.name for each in walked.links) == [
+            "broken.mcap",
+            "c.mcap",
+            "latest",
+            "up",
+        ]
+        assert all("not followed" in each.reason for each in walked.links)
+
+
+def test_the_bag_directory_itself_may_be_a_link(tmp_path: Path) -> None:
+    _file(tmp_path / "disk" / "rec" / "a.mcap")
+    (tmp_path / "bags").symlink_to(tmp_path / "disk", target_is_directory=True)
+    assert list(Tree(tmp_path / "bags").walk(NOW, ()).looked_at) == [
+        str(tmp_path / "bags" / "rec" / "a.mcap")
+    ]
+
+
+def test_a_pipe_with_the_name_of_a_bag_is_damaged_and_never_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.mcap")
+    tree = Tree(_aged(tmp_path))
+    for walked in (tree.walk(NOW, ()), tree.walk(NOW, ())):
+        assert walked.looked_at == {}
+        assert [(each.path.name, each.reason) for each in walked.damaged] == [
+            ("a.mcap", "not a regular file")
+        ]
+
+
+def test_a_folder_that_cannot_be_listed_is_damaged_and_hides_no_other(tmp_path: Path) -> None:
+    _file(tmp_path / "rec" / "a.mcap")
+    deep = _beyond_the_longest_path(tmp_path)
+    tree = Tree(tmp_path)
+    first, second = tree.walk(NOW, ()), tree.walk(NOW, ())
+    assert _names(first) == ["a.mcap"]
+    assert second.gone == set()
+    for walked in (first, second):
+        assert [each.path.parts[len(tmp_path.parts)] for each in walked.damaged] == [deep]
+        assert walked.damaged[0].reason == "the directory cannot be listed: File name too long"
+
+
+@pytest.mark.parametrize("kind", ["missing", "file"])
+def test_a_root_that_is_no_directory_is_a_problem_and_empties_the_tree(
+    tmp_path: Path, kind: str
+) -> None:
+    bags = tmp_path / "bags"
+    path = _file(bags / "rec" / "a.mcap")
+    tree = Tree(_aged(bags))
+    tree.walk(NOW, ())
+    bags.rename(tmp_path / "aside")
+    if kind == "file":
+        bags.write_text("", encoding="utf-8")
+    walked = tree.walk(NOW, [str(path)])
+    assert walked.gone == {str(path)}
+    assert walked.looked_at == {}
+    assert ("does not exist" if kind == "missing" else "recording.bag_dir") in (
+        walked.problem or ""
+    )
+    bags.unlink(missing_ok=True)
+    (tmp_path / "aside").rename(bags)
+    assert _names(tree.walk(NOW, ())) == ["a.mcap"]
+
+
+def _beyond_the_longest_path(root: Path) -> str:
+    """Makes a chain of folders longer than any path may be; gives the name of its first."""
+    name = "d" * 250
+    here = os.open(root, os.O_RDONLY)
+    for _ in range(18):
+        os.mkdir(name, dir_fd=here)
+        below = os.open(name, os.O_RDONLY, dir_fd=here)
+        os.close(here)
+        here = below
+    os.close(here)
+    return name

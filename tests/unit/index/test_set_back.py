@@ -1,0 +1,102 @@
+"""A clock that is set back while one bag is being written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import IndexType
+
+from ros2_memory.catalogue.codec import shape_of_text, shape_text
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.overview import data_time_range
+from ros2_memory.queries import topic_range
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.memories import memory_of
+
+S: Final = 10**9
+T0: Final = 1_784_000_000 * S
+STEP: Final = 30
+LAYOUTS: Final = {
+    "indexed": McapLayout(chunk_size=200),
+    "without indexes": McapLayout(chunk_size=200, index_types=IndexType.NONE),
+    "cut off": McapLayout(chunk_size=200, finish=False),
+    "without chunks": McapLayout(chunk_size=None),
+}
+
+
+def said(seconds: float) -> Msg:
+    return text(T0 + round(seconds * S), "x" * 100)
+
+
+def set_back(path: Path, messages: list[Msg], layout: McapLayout) -> int:
+    write_mcap(path, messages, layout)
+    return McapReader().summarize(path).shape.set_back
+
+
+@pytest.fixture(params=list(LAYOUTS))
+def layout(request: pytest.FixtureRequest) -> McapLayout:
+    return LAYOUTS[request.param]
+
+
+def test_how_far_it_was_set_back_is_told_whatever_the_layout(
+    tmp_path: Path, layout: McapLayout
+) -> None:
+    way = [said(n) for n in range(20)] + [said(n - STEP) for n in range(20, 40)]
+    found = set_back(tmp_path / "a.mcap", way, layout)
+    # Chunks hold two messages: what lies within one of them is not told apart.
+    assert (STEP - 3) * S <= found <= (STEP - 1) * S
+
+
+def test_messages_a_little_out_of_order_are_no_sign_of_it(
+    tmp_path: Path, layout: McapLayout
+) -> None:
+    way = [said(n - 0.9 * (n % 2)) for n in range(20)]
+    assert set_back(tmp_path / "a.mcap", way, layout) == 0
+
+
+def test_topics_that_were_written_one_after_another_are_no_sign_of_it(
+    tmp_path: Path, layout: McapLayout
+) -> None:
+    way = [said(n) for n in range(20)] + [boolean(T0 + n * S, data=True) for n in range(20)]
+    assert set_back(tmp_path / "a.mcap", way, layout) == 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    times=st.lists(st.integers(0, 100), min_size=1, max_size=30),
+    name=st.sampled_from(list(LAYOUTS)),
+)
+def test_it_is_never_more_than_the_times_of_a_topic_go_back(times: list[int], name: str) -> None:
+    most = max(max(times[: at + 1]) - time for at, time in enumerate(times))
+    with TemporaryDirectory() as folder:
+        found = set_back(Path(folder) / "a.mcap", [said(each) for each in times], LAYOUTS[name])
+    assert found <= most * S
+    assert found == 0 or found > S
+    if name == "without chunks":
+        assert found == (most * S if most > 1 else 0)
+
+
+def test_it_is_listed_and_told_where_it_matters_and_changes_no_span(tmp_path: Path) -> None:
+    way = [said(n) for n in range(20)] + [said(n - STEP) for n in range(20, 50)]
+    write_mcap(tmp_path / "a.mcap", way, LAYOUTS["indexed"])
+    memory = memory_of(tmp_path)
+    [fault] = data_time_range(memory, Call()).clock_faults
+    assert "set back by 28 s or more while it was being written" in fault.reason
+    assert data_time_range(memory, Call()).earliest == T0 - 10 * S
+    told = topic_range(memory, Call(), way[0].topic, Span(start_s=T0 / S, end_s=T0 / S + 10))
+    assert any("set back" in note for note in told.notes)
+
+
+def test_the_catalogue_keeps_it(tmp_path: Path) -> None:
+    way = [said(n) for n in range(20)] + [said(n - STEP) for n in range(20, 40)]
+    write_mcap(tmp_path / "a.mcap", way, LAYOUTS["indexed"])
+    shape = McapReader().summarize(tmp_path / "a.mcap").shape
+    assert shape.set_back
+    assert shape_of_text(shape_text(shape)) == shape

@@ -1,0 +1,221 @@
+"""Bags in time order, and what follows from them."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER
+from ros2_memory.core.model import (
+    BagFile,
+    BagState,
+    BagSummary,
+    TimeWindow,
+    TopicSummary,
+)
+from ros2_memory.index.snapshot import RUN_LIMIT, Snapshot, Timeline
+
+ODOM = "nav_msgs/msg/Odometry"
+
+
+def _bag(
+    name: str, *topics: tuple[str, int, int], silent: tuple[str, ...] = (), type_name: str = ODOM
+) -> BagFile:
+    """A bag whose topics are given as (name, first, last)."""
+    summary = BagSummary(
+        tuple(
+            TopicSummary(topic, type_name, "cdr", 2, first, last, latched=topic == "/tf_static")
+            for topic, first, last in topics
+        ),
+        silent=silent,
+    )
+    return BagFile(name, 1, 1, BagState.CLOSED, summary, summary.start, summary.end)
+
+
+def test_bags_are_ordered_by_time_and_never_by_name() -> None:
+    bags = [_bag(f"rec/rec_{n}.mcap", ("/odom", n * 10, n * 10 + 9)) for n in range(12)]
+    ordered = Timeline.of(reversed(bags)).bags
+    assert [bag.path.name for bag in ordered] == [f"rec_{n}.mcap" for n in range(12)]
+
+
+def test_ties_are_broken_by_end_and_then_by_path() -> None:
+    bags = [_bag("b", ("/a", 1, 5)), _bag("c", ("/a", 1, 4)), _bag("a", ("/a", 1, 5))]
+    assert [bag.path.name for bag in Timeline.of(bags).bags] == ["c", "a", "b"]
+
+
+def test_an_empty_timeline_has_neither_beginning_nor_end() -> None:
+    empty = Snapshot()
+    assert (empty.earliest, empty.latest, empty.topics()) == (None, None, ())
+    assert empty.holding("/odom") == ()
+    assert empty.overlapping(TimeWindow.everything()) == ()
+
+
+def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> None:
+    bags = [
+        _bag(f"rec/rec_{nth}.mcap", ("/odom", nth, nth))._replace(
+            size=nth, state=BagState.INCOMPLETE if nth % 3 == 0 else BagState.CLOSED
+        )
+        for nth in range(RUN_LIMIT + 10)
+    ]
+    carried = _bag(f"{CARRY_FOLDER}/{CARRY_FILE}", ("/tf_static", -5, -5))._replace(size=7)
+    whole = Timeline.of([carried, *bags])
+    snapshot = Snapshot(bags=whole.recorded, timeline=whole)
+    left_open = sum(bag.state is BagState.INCOMPLETE for bag in snapshot.bags)
+    assert snapshot.taken == (sum(bag.size for bag in snapshot.bags), left_open)
+    assert len(snapshot.bags) == len(bags)
+    assert Timeline.of([carried]).taken == (7, 0)
+    assert Snapshot().taken == (0, 0)
+
+
+def test_the_latest_message_may_stand_in_a_bag_that_began_earlier() -> None:
+    snapshot = Snapshot(bags=(_bag("a", ("/odom", 0, 100)), _bag("b", ("/odom", 10, 20))))
+    assert (snapshot.earliest, snapshot.latest) == (0, 100)
+
+
+def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> None:
+    both = _bag("b", ("/x", 10, 19), ("/odom", 10, 19))
+    second = replace(both.summary.topics[0], type="std_msgs/msg/String")
+    both = both._replace(summary=BagSummary((*both.summary.topics, second)))
+    first = _bag("a", ("/x", 0, 9))
+    snapshot = Snapshot(bags=(first, both))
+    assert snapshot.holding("/x") == (
+        (first, first.summary.topics[0]),
+        (both, both.summary.topics[0]),
+        (both, second),
+    )
+    assert snapshot.types_of("/x") == (ODOM, "std_msgs/msg/String")
+    assert snapshot.types_of("/nothing") == ()
+
+
+def test_a_topic_is_transient_local_where_any_bag_says_so() -> None:
+    snapshot = Snapshot(bags=(_bag("a", ("/tf_static", 0, 0), ("/tf", 0, 9)),))
+    assert snapshot.is_transient_local("/tf_static")
+    assert not snapshot.is_transient_local("/tf")
+    assert not snapshot.is_transient_local("/nothing")
+
+
+def test_heard_topics_come_sorted_without_the_silent_ones() -> None:
+    snapshot = Snapshot(bags=(_bag("a", ("/tf", 0, 9), ("/odom", 0, 9), silent=("/scan",)),))
+    assert snapshot.topics() == ("/odom", "/tf")
+
+
+@pytest.mark.parametrize(
+    ("window", "names"),
+    [
+        ((0, 10), ["a"]),
+        ((0, 11), ["a", "b"]),
+        ((9, 10), ["a"]),
+        ((19, 20), ["b"]),
+        ((20, 30), []),
+        ((-5, 0), []),
+        ((5, 5), []),
+        ((-(2**63), 2**63 - 1), ["a", "b"]),
+    ],
+)
+def test_a_window_overlaps_the_bags_that_have_a_moment_in_it(
+    window: tuple[int, int], names: list[str]
+) -> None:
+    snapshot = Snapshot(bags=(_bag("a", ("/odom", 0, 9)), _bag("b", ("/odom", 10, 19))))
+    assert [bag.path.name for bag in snapshot.overlapping(TimeWindow(*window))] == names
+    held = snapshot.holding("/odom", TimeWindow(*window))
+    assert [bag.path.name for bag, _ in held] == names
+
+
+def test_a_window_counts_for_a_topic_by_the_times_of_that_topic_alone() -> None:
+    snapshot = Snapshot(bags=(_bag("a", ("/odom", 0, 99), ("/tf_static", 3, 3)),))
+    assert len(snapshot.holding("/tf_static", TimeWindow(3, 4))) == 1
+    assert snapshot.holding("/tf_static", TimeWindow(4, 99)) == ()
+
+
+def test_removing_a_bag_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ValueError, match="not in list"):
+        Timeline.of([_bag("a", ("/odom", 0, 9))]).changed([_bag("b", ("/odom", 0, 9))], [])
+
+
+bag_times = st.tuples(st.integers(0, 3000), st.integers(0, 200))
+
+
+@given(seed=st.integers(0, 2**32), rounds=st.integers(1, 4), windows=st.lists(bag_times))
+def test_a_timeline_that_changed_is_the_timeline_of_what_it_holds(
+    seed: int, rounds: int, windows: list[tuple[int, int]]
+) -> None:
+    chance = random.Random(seed)
+    pool = [_random_bag(chance, number) for number in range(3 * RUN_LIMIT)]
+    present = set(chance.sample(range(len(pool)), chance.choice([0, 1, 40, 2 * RUN_LIMIT])))
+    timeline = Timeline.of(pool[number] for number in present)
+    for _ in range(rounds):
+        timeline.holding("/odom")
+        chosen = set(chance.sample(range(len(pool)), chance.choice([0, 1, 5, 2 * RUN_LIMIT])))
+        removed, added = present & chosen, chosen - present
+        present = (present - removed) | added
+        timeline = timeline.changed(
+            [pool[number] for number in removed], [pool[number] for number in added]
+        )
+    _assert_holds(timeline, [pool[number] for number in present], windows)
+
+
+def _random_bag(chance: random.Random, number: int) -> BagFile:
+    start = chance.randrange(3000)
+    long = chance.random() < 0.01
+    topics = chance.sample(["/odom", "/tf", "/tf_static", "/scan"], chance.randint(1, 3))
+    spans = [(topic, start, start + chance.randrange(2000 if long else 20)) for topic in topics]
+    type_name = chance.choice([ODOM, "std_msgs/msg/String"])
+    return _bag(f"rec/{number}.mcap", *spans, silent=("/idle",), type_name=type_name)
+
+
+def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[int, int]]) -> None:
+    ordered = sorted(bags, key=lambda bag: (bag.start, bag.end, bag.path))
+    held = [(bag, topic) for bag in ordered for topic in bag.summary.topics]
+    names = sorted({topic.topic for _, topic in held})
+    assert timeline.bags == tuple(ordered)
+    snapshot = Snapshot(timeline=timeline)
+    assert snapshot.earliest == min((bag.start for bag in bags), default=None)
+    assert snapshot.latest == max((bag.end for bag in bags), default=None)
+    assert timeline.silent == {name for bag in bags for name in bag.summary.silent}
+    assert timeline.latched == {topic.topic for _, topic in held if topic.latched}
+    assert timeline.types == {
+        name: tuple(sorted({topic.type for _, topic in held if topic.topic == name}))
+        for name in names
+    }
+    for name in (*names, "/nothing"):
+        assert timeline.holding(name) == tuple(each for each in held if each[1].topic == name)
+    for start, length in windows:
+        window = TimeWindow(start, start + length)
+        overlaps = ordered if length else []
+        assert timeline.overlapping(window) == tuple(
+            bag for bag in overlaps if bag.start < window.stop and bag.end >= start
+        )
+        assert timeline.holding("/odom", window) == tuple(
+            (bag, topic)
+            for bag, topic in held
+            if topic.topic == "/odom"
+            and length
+            and topic.first < window.stop
+            and topic.last >= start
+        )
+
+
+def test_a_timeline_to_which_nothing_happens_stays_itself() -> None:
+    timeline = Timeline.of([_bag("a", ("/odom", 0, 9))])
+    assert timeline.changed([], iter(())) is timeline
+
+
+def test_which_recordings_hold_a_topic_is_known_anew_whatever_changes() -> None:
+    def split(number: int, until: int = 9) -> BagFile:
+        folder = f"rec_{number // 100}"
+        return _bag(f"{folder}/{number}.mcap", ("/odom", number * 10, number * 10 + until))
+
+    first = 2 * RUN_LIMIT - 3
+    timeline = Timeline.of(split(number) for number in range(first))
+    for number in range(first, first + 6):  # past the end of a run
+        timeline = timeline.changed([], [split(number, 0)])
+        for before, until in ((0, 4), (4, 9)):
+            timeline = timeline.changed([split(number, before)], [split(number, until)])
+            assert timeline.recordings("/odom") == Timeline.of(timeline.bags).recordings("/odom")
+    for number in (0, RUN_LIMIT, first + 5):
+        timeline = timeline.changed([split(number)], [])
+        assert timeline.recordings("/odom") == Timeline.of(timeline.bags).recordings("/odom")

@@ -1,0 +1,128 @@
+"""The order in which splits were written, and what it tells of clocks and of what lies between."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.model import BagFile, BagState, BagSummary, TopicSummary
+from ros2_memory.index.split_order import (
+    Neighbours,
+    courses_of,
+    is_recording,
+    neighbours,
+    place_of,
+    steps_of,
+)
+
+S = 10**9
+
+
+def bag(name: str, start_s: int, end_s: int, *, folder: str = "rec") -> BagFile:
+    start, end = start_s * S, end_s * S
+    summary = BagSummary((TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),))
+    return BagFile(f"/bags/{folder}/{name}", 1, 1, BagState.CLOSED, summary, start, end)
+
+
+def split(number: int, start_s: int, end_s: int) -> BagFile:
+    return bag(f"rec_{number}.mcap", start_s, end_s)
+
+
+def in_parts(bags: list[BagFile], size: int) -> list[list[BagFile]]:
+    ordered = sorted(bags, key=lambda each: (each.start, each.end))
+    return [ordered[at : at + size] for at in range(0, len(ordered), size)]
+
+
+def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
+    parts = in_parts(bags, size)
+    found = steps_of(
+        [courses_of(part) for part in parts], lambda at: [bag for n in at for bag in parts[n]]
+    )
+    return [(step.before.path.name, step.after.path.name, step.by) for step in found]
+
+
+def near(name: str, bags: list[BagFile], size: int = 256) -> Neighbours:
+    parts = in_parts(bags, size)
+    return neighbours(
+        f"/bags/rec/{name}",
+        [courses_of(part) for part in parts],
+        lambda at: [bag for n in at for bag in parts[n]],
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("rec_12.mcap", 12),
+        ("rec_0.db3", 0),
+        ("rec_3.mcap.zstd", 3),
+        ("rec_0007.mcap", 7),
+        ("5.mcap", 5),
+        ("rec_" + "9" * 200 + ".mcap", int("9" * 200)),
+        ("rec.mcap", None),
+        ("rec_1b.mcap", None),
+    ],
+)
+def test_a_split_is_known_by_the_count_in_its_name(name: str, number: int | None) -> None:
+    place = place_of(f"/bags/rec/{name}")
+    assert (None if place is None else place[1]) == number
+
+
+def test_only_files_named_after_their_folder_are_splits_of_one_recording() -> None:
+    places = [place_of(f"/bags/{name}") for name in ("run/run_1.mcap", "drives/drive_1.mcap")]
+    assert [place is not None and is_recording(place[0]) for place in places] == [True, False]
+
+
+def test_a_clock_that_was_set_back_shows_between_two_splits() -> None:
+    bags = [split(0, 100, 110), split(1, 110, 120), split(2, 60, 70), split(3, 70, 80)]
+    assert steps(bags) == [("rec_1.mcap", "rec_2.mcap", 60 * S)]
+
+
+def test_splits_that_overlap_by_little_are_messages_out_of_order() -> None:
+    assert steps([split(0, 100, 110), split(1, 109, 120), split(2, 120, 130)]) == []
+
+
+def test_files_that_people_named_tell_nothing_of_a_clock() -> None:
+    assert steps([bag("drive_1.mcap", 100, 110), bag("drive_2.mcap", 10, 20)]) == []
+
+
+@given(
+    st.lists(st.integers(0, 40), min_size=2, max_size=20),
+    st.integers(1, 6),
+)
+def test_steps_are_those_between_neighbours_however_the_history_is_parted(
+    starts: list[int], size: int
+) -> None:
+    bags = [split(n, start, start + 3) for n, start in enumerate(starts)]
+    expected = [
+        (a.path.name, b.path.name, a.end - b.start)
+        for a, b in pairwise(bags)
+        if a.end - b.start > S
+    ]
+    assert sorted(steps(bags, size)) == sorted(expected)
+
+
+@given(
+    st.sets(st.integers(0, 30), min_size=1, max_size=15),
+    st.integers(0, 30),
+    st.integers(1, 5),
+    st.booleans(),
+)
+def test_neighbours_are_the_nearest_by_count_however_the_history_is_parted(
+    numbers: set[int], missing: int, size: int, backwards: bool
+) -> None:
+    sign = -1 if backwards else 1
+    bags = {n: split(n, 1000 + sign * n * 10, 1005 + sign * n * 10) for n in numbers - {missing}}
+    before = bags.get(max((n for n in bags if n < missing), default=-1))
+    after = bags.get(min((n for n in bags if n > missing), default=-1))
+    assert near(f"rec_{missing}.mcap", list(bags.values()), size) == Neighbours(
+        before and before.end, after and after.start
+    )
+
+
+def test_a_file_of_another_series_has_no_neighbours_here() -> None:
+    assert near("other_1.mcap", [split(0, 0, 5), split(2, 9, 12)]) == Neighbours()
+    assert near("rec.mcap", [split(0, 0, 5)]) == Neighbours()

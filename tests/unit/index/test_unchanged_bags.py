@@ -1,0 +1,165 @@
+"""Bags that the catalogue knows are taken over unread, and woken by whatever happens to them."""
+
+from __future__ import annotations
+
+import os
+import random
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.bag_dir.layout import HANDOVER_FILE
+from ros2_memory.core.timebase import FixedClock
+from ros2_memory.index.file_state import FormerFile
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from tests.plain_bags import PlainReader, plain
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+NOW = 1_800_000_000 * S
+LONG_AGO = NOW - 3600 * S
+KINDS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+
+
+class Start:
+    """A bag directory that was indexed before, and an index that begins anew over it."""
+
+    def __init__(self, bag_dir: Path) -> None:
+        self.bag_dir = bag_dir
+        self.known: dict[str, FormerFile] = {}
+        for split in range(6):
+            plain(bag_dir / "rec" / f"rec_{split}.mcap", [split * 10, split * 10 + 9])
+        self.age()
+
+    def age(self, at: int = LONG_AGO) -> None:
+        """Gives every file and directory the same mtime."""
+        for path in (self.bag_dir, *self.bag_dir.rglob("*")):
+            os.utime(path, ns=(at, at))
+
+    def remember(self) -> None:
+        """Knows from then on all bags as they are."""
+        index, _ = self.index(knowing=False)
+        self.known = {
+            bag.file: FormerFile(
+                bag.size, bag.mtime_ns, bag.sidecar_ns, bag.summary, bag.start, bag.end
+            )
+            for bag in index.refresh().bags
+        }
+
+    def index(self, *, knowing: bool = True) -> tuple[IndexManager, PlainReader]:
+        """An index that has scanned nothing yet, and its reader."""
+        reader = PlainReader(*KINDS)
+        index = IndexManager(
+            self.bag_dir,
+            reader,
+            FixedClock(NOW),
+            refresh_s=5.0,
+            split_duration_s=10.0,
+            known=(lambda: self.known) if knowing else None,
+        )
+        return index, reader
+
+    def read(self) -> Snapshot:
+        """The snapshot of an index that reads everything."""
+        return self.index(knowing=False)[0].refresh()
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Start:
+    begun = Start(tmp_path)
+    begun.remember()
+    return begun
+
+
+def test_a_start_over_known_bags_reads_none_and_finds_the_same(start: Start) -> None:
+    index, reader = start.index()
+    assert index.refresh() == start.read()
+    assert index.refresh() == start.read()
+    assert (reader.closings.total(), reader.summaries.total()) == (0, 0)
+
+
+def test_a_bag_that_looks_otherwise_than_it_is_known_is_read(start: Start) -> None:
+    plain(start.bag_dir / "rec" / "rec_3.mcap", [30, 31, 32])
+    start.age()
+    index, reader = start.index()
+    assert index.refresh() == start.read()
+    assert [*reader.summaries] == ["rec_3.mcap"]
+
+
+def test_a_bag_of_which_nothing_is_known_is_read_beside_the_others(start: Start) -> None:
+    del start.known[str(start.bag_dir / "rec" / "rec_0.mcap")]
+    index, reader = start.index()
+    assert index.refresh() == start.read()
+    assert [*reader.summaries] == ["rec_0.mcap"]
+
+
+def test_what_is_known_of_a_young_bag_is_believed_and_the_bag_watched(start: Start) -> None:
+    start.age(NOW - 5 * S)
+    start.remember()
+    index, reader = start.index()
+    assert index.refresh() == start.read()
+    assert reader.summaries.total() == 0
+
+
+def test_a_known_bag_of_a_kind_that_the_reader_does_not_read_is_set_aside(start: Start) -> None:
+    index, reader = start.index()
+    reader.kinds = (".db3",)
+    snapshot = index.refresh()
+    assert (len(snapshot.bags), len(snapshot.unread)) == (0, 6)
+
+
+def test_a_bag_that_is_written_over_in_place_is_noticed_on_patrol(start: Start) -> None:
+    index, reader = start.index()
+    index.refresh()
+    plain(start.bag_dir / "rec" / "rec_2.mcap", [20, 21, 22])
+    start.age()
+    assert index.refresh() == start.read()
+    assert [*reader.summaries] == ["rec_2.mcap"]
+
+
+def test_a_bag_that_goes_is_known_no_more(start: Start) -> None:
+    index, reader = start.index()
+    index.refresh()
+    (start.bag_dir / "rec" / "rec_2.mcap").unlink()
+    assert index.refresh() == start.read()
+    assert reader.summaries.total() == 0
+
+
+def test_a_compressed_copy_beside_a_known_bag_is_weighed_against_it(start: Start) -> None:
+    index, _ = start.index()
+    index.refresh()
+    plain(start.bag_dir / "rec" / "rec_2.mcap.zstd", [20, 29])
+    start.age()
+    os.utime(start.bag_dir / "rec", ns=(LONG_AGO + S, LONG_AGO + S))
+    assert index.refresh() == start.read()
+
+
+def test_a_sidecar_that_comes_has_the_bags_beside_it_read_again(start: Start) -> None:
+    index, reader = start.index()
+    index.refresh()
+    (start.bag_dir / "rec" / HANDOVER_FILE).write_text("{}", encoding="utf-8")
+    start.age()
+    os.utime(start.bag_dir / "rec", ns=(LONG_AGO + S, LONG_AGO + S))
+    assert index.refresh() == start.read()
+    assert len(reader.summaries) == 6
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_whatever_happens_to_known_bags_the_index_is_that_of_one_that_read_them(
+    start: Start, seed: int
+) -> None:
+    chance = random.Random(seed)
+    (index, _), (other, _) = start.index(), start.index(knowing=False)
+    assert index.refresh() == other.refresh()
+    for step in range(6):
+        number = chance.randrange(8)
+        path = start.bag_dir / "rec" / f"rec_{number}.mcap{chance.choice(['', '', '.zstd'])}"
+        if path.exists() and chance.random() < 0.5:
+            path.unlink()
+        else:
+            times = sorted(chance.sample(range(100), chance.randint(0, 3)))
+            plain(path, times, closed=chance.random() < 0.8)
+        start.age(LONG_AGO + step * S + S)
+        assert index.refresh() == other.refresh()

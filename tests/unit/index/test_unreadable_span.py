@@ -1,0 +1,146 @@
+"""When the messages of a file that cannot be read may have been recorded."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.index.split_order import Neighbours
+from ros2_memory.index.unreadable_span import (
+    LONGEST_NS,
+    begun,
+    bounds,
+    whereabouts,
+)
+
+S = 10**9
+NOW = 1_790_000_000 * S
+HOUR = 3600 * S
+OWN = "rec_20260921T130000Z"
+"""Begun 4400 s before NOW."""
+
+
+def test_between_two_splits_it_holds_what_lies_between_them() -> None:
+    found = whereabouts("rec", Neighbours(100 * S, 200 * S), NOW, NOW)
+    assert found == TimeWindow(100 * S, 200 * S + 1)
+
+
+def test_behind_the_last_split_it_ends_when_its_file_was_last_written() -> None:
+    found = whereabouts("rec", Neighbours(NOW - 600 * S), NOW - 500 * S, NOW)
+    assert found == TimeWindow(NOW - 600 * S, NOW - 440 * S)
+
+
+def test_a_file_that_was_copied_here_later_is_taken_to_hold_a_day() -> None:
+    found = whereabouts("rec", Neighbours(NOW - 1000 * HOUR), NOW, NOW)
+    assert found == TimeWindow(NOW - 1000 * HOUR, NOW - 976 * HOUR)
+
+
+def test_before_the_first_split_it_begins_with_its_recording() -> None:
+    begin = begun(OWN)
+    assert begin is not None
+    found = whereabouts(OWN, Neighbours(after=begin + 20 * S), NOW, NOW)
+    assert found == TimeWindow(begin, begin + 20 * S + 1)
+
+
+def test_alone_in_a_folder_it_ends_when_it_was_written_and_holds_a_day() -> None:
+    found = whereabouts("someones", Neighbours(), NOW - HOUR, NOW)
+    assert found == TimeWindow(NOW - 25 * HOUR + 60 * S, NOW - HOUR + 60 * S)
+
+
+def test_where_nothing_is_known_around_it_its_time_is_unknown() -> None:
+    assert whereabouts("someones", Neighbours(), None, NOW) is None
+    assert whereabouts("someones", Neighbours(), 5 * S, NOW) is None
+    assert whereabouts("someones", Neighbours(), NOW + HOUR, NOW) is None
+
+
+def test_a_file_that_is_still_being_written_has_no_end() -> None:
+    found = whereabouts("rec", Neighbours(NOW - 10 * S), NOW, NOW, growing=True)
+    assert found == TimeWindow(NOW - 10 * S, MAX_NS)
+    found = whereabouts("someones", Neighbours(), NOW, NOW, growing=True)
+    assert found == TimeWindow(NOW - 24 * HOUR, MAX_NS)
+
+
+def test_simulated_times_and_a_file_of_today_hold_a_day_from_the_split_before() -> None:
+    found = whereabouts("sim", Neighbours(before=30 * S), 20 * S, NOW)
+    assert found == TimeWindow(30 * S, 30 * S + LONGEST_NS)
+
+
+def test_a_recording_tells_when_it_began_only_in_the_names_that_the_recorder_gives() -> None:
+    assert begun(OWN) == 1_789_995_600 * S
+    assert begun(f"{OWN}_2") == 1_789_995_600 * S
+    assert begun("rec_20269921T130000Z") is None
+    assert begun("rosbag2_2025_09_10-13_03_56") is None
+
+
+MOMENTS = st.integers(MIN_NS, MAX_NS)
+
+
+@given(
+    st.sampled_from([OWN, "someones"]),
+    st.none() | MOMENTS,
+    st.none() | MOMENTS,
+    st.none() | MOMENTS,
+    MOMENTS,
+    st.booleans(),
+)
+def test_a_window_that_is_found_holds_the_neighbouring_ends_and_fits_64_bits(
+    recording: str,
+    before: int | None,
+    after: int | None,
+    written: int | None,
+    now: int,
+    growing: bool,
+) -> None:
+    found = whereabouts(recording, Neighbours(before, after), written, now, growing=growing)
+    if found is None:
+        assert before is after is None
+        return
+    assert MIN_NS <= found.start <= found.stop <= MAX_NS
+    if before is not None and after is not None:
+        assert found.start == min(before, after)
+        assert found.stop == min(max(before, after) + 1, MAX_NS)
+    elif not growing:
+        assert found.stop - found.start <= LONGEST_NS + 1 or recording == OWN
+
+
+def test_a_copy_of_yesterday_may_hold_anything_from_before_it_was_made() -> None:
+    assert bounds("someones", Neighbours(), NOW - HOUR, NOW) == TimeWindow(
+        MIN_NS, NOW - HOUR + 60 * S
+    )
+    assert bounds("someones", Neighbours(), None, NOW) is None
+    assert bounds("someones", Neighbours(), 5 * S, NOW) is None
+
+
+def test_splits_around_a_file_bound_it_and_so_does_the_name_of_its_recording() -> None:
+    begin = begun(OWN)
+    assert begin is not None
+    assert bounds("rec", Neighbours(100 * S, 200 * S), NOW, NOW) == TimeWindow(100 * S, 200 * S + 1)
+    assert bounds("rec", Neighbours(100 * S), None, NOW) == TimeWindow(100 * S, MAX_NS)
+    assert bounds("rec", Neighbours(after=9 * S), NOW, NOW) == TimeWindow(MIN_NS, 9 * S + 1)
+    assert bounds(OWN, Neighbours(), NOW, NOW) == TimeWindow(begin, NOW + 60 * S)
+
+
+def test_times_that_contradict_each_other_bound_nothing() -> None:
+    assert bounds("rec", Neighbours(200 * S, 100 * S), NOW, NOW) is None
+    assert bounds("rec", Neighbours(NOW), NOW - HOUR, NOW) is None
+
+
+@given(
+    st.sampled_from([OWN, "someones"]),
+    st.none() | MOMENTS,
+    st.none() | MOMENTS,
+    st.none() | MOMENTS,
+    MOMENTS,
+)
+def test_what_may_be_there_includes_all_that_is_likely_up_to_the_last_write(
+    recording: str, before: int | None, after: int | None, written: int | None, now: int
+) -> None:
+    near = Neighbours(before, after)
+    likely = whereabouts(recording, near, written, now)
+    possible = bounds(recording, near, written, now)
+    if possible is not None:
+        assert likely is not None
+        assert MIN_NS <= possible.start <= likely.start
+        assert likely.stop <= possible.stop <= MAX_NS

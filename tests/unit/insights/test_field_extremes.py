@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory import queries
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.insights import field_extremes
+from ros2_memory.results import Extremes
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.reply_json import shown
+from tests.bags import Msg, boolean, detections, odom, text, write_mcap
+from tests.memories import memory_of
+
+if TYPE_CHECKING:
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.results import TopicRange
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+WHOLE = Span(start_s=BEGIN / S, end_s=BEGIN / S + 100)
+
+
+def asked(folder: Path, messages: list[Msg], *fields: str, most: int = 2) -> TopicRange:
+    write_mcap(folder / "bag.mcap", messages)
+    topic = messages[0].topic
+    return queries.topic_range(
+        memory_of(folder), Call(), topic, WHOLE, max_samples=most, fields=fields
+    )
+
+
+def test_extremes_are_of_all_messages_and_not_of_the_samples(tmp_path: Path) -> None:
+    heights = [0.0, 3.0, -2.0, 3.0, -2.0, 1.0]
+    driven = [odom(BEGIN + n * S, x, 1.0, 0.0) for n, x in enumerate(heights)]
+    answer = asked(tmp_path, driven, "position.x", "position.y")
+    [x, y] = answer.extremes
+    assert (x.field, x.least, x.most) == ("position.x", -2.0, 3.0)
+    assert (x.least_at, x.most_at) == (BEGIN + 2 * S, BEGIN + S)
+    assert (y.least, y.most, y.least_at) == (1.0, 1.0, BEGIN)
+    reply: JsonValue = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    assert isinstance(reply, dict)
+    assert reply["extremes"] == {
+        "position.x": {
+            "min": -2.0,
+            "min_at": BEGIN / S + 2,
+            "max": 3.0,
+            "max_at": BEGIN / S + 1,
+        },
+        "position.y": {"min": 1.0, "min_at": BEGIN / S, "max": 1.0, "max_at": BEGIN / S},
+    }
+
+
+def test_without_fields_and_of_what_is_no_number_there_are_none(tmp_path: Path) -> None:
+    said = [text(BEGIN + n * S, f"word {n}") for n in range(3)]
+    assert asked(tmp_path, said).extremes == ()
+    answer = asked(tmp_path, said, "value")
+    assert answer.extremes == ()
+    assert "extremes" not in str(shown(answer, tmp_path))
+    assert asked(tmp_path, [boolean(BEGIN, data=True)], "value").extremes == ()
+
+
+def test_a_full_path_in_the_message_has_extremes_as_the_values_own_field_has(
+    tmp_path: Path,
+) -> None:
+    driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(3)]
+    [own, full] = asked(tmp_path, driven, "position.x", "pose.pose.position.x").extremes
+    assert full.field == "pose.pose.position.x"
+    assert (full.least, full.most) == (own.least, own.most) == (0.0, 2.0)
+
+
+def test_a_field_that_leads_into_a_list_means_all_of_it(tmp_path: Path) -> None:
+    seen = [detections(BEGIN, ["cup", "fork"]), detections(BEGIN + S, [])]
+    [score] = asked(tmp_path, seen, "detections.point.x").extremes
+    assert score.least <= score.most
+    assert score.least_at == score.most_at == BEGIN
+
+
+@pytest.mark.parametrize("bound", ["MOST_MESSAGES", "MOST_NUMBERS"])
+def test_a_window_that_holds_too_much_says_so(
+    tmp_path: Path, bound: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(field_extremes, bound, 3)
+    monkeypatch.setattr(queries, "MOST_MESSAGES", field_extremes.MOST_MESSAGES)
+    answer = asked(tmp_path, [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)], "position.x")
+    assert answer.extremes == ()
+    assert field_extremes.TOO_MANY in answer.notes
+
+
+@pytest.mark.parametrize("summary", [{"bytes": 921_600}, {"numbers": 2_000_000}])
+def test_a_summary_of_many_numbers_has_no_extremes(summary: JsonValue) -> None:
+    assert [*field_extremes._numbers(summary)] == []
+    assert [*field_extremes._numbers({"bytes": 1, "rate": 2})] == [2.0, 1.0]
+
+
+@given(st.lists(st.lists(st.one_of(st.floats(), st.integers(-(10**400), 10**400)), max_size=4)))
+def test_extremes_are_the_least_and_the_greatest_finite_numbers(rows: list[list[float]]) -> None:
+    found: dict[str, Extremes] = {}
+    finite = [[*field_extremes._numbers([*row, True, None, "9"])] for row in rows]
+    for time, numbers in enumerate(finite):
+        if numbers:
+            field_extremes._take(found, "a", time, numbers)
+    flat = [number for numbers in finite for number in numbers]
+    assert sorted(map(abs, flat), reverse=True)[:1] <= [field_extremes._LARGEST]
+    if not flat:
+        assert not found
+        return
+    assert (found["a"].least, found["a"].most) == (min(flat), max(flat))
+    assert found["a"].least in finite[found["a"].least_at]
+    assert found["a"].most in finite[found["a"].most_at]

@@ -1,0 +1,589 @@
+from __future__ import annotations
+
+import json
+import math
+import random
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.accounts import Event, Recap
+from ros2_memory.analysis.topic_events import MOST_FLAGS, MOST_LABELS
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.timebase import FixedClock, unix_from_ns
+from ros2_memory.demo import robot as demo_robot
+from ros2_memory.demo.published_topics import Timeline
+from ros2_memory.demo.recording import DemoRecorder
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.insights.recap import MOST_EVENTS, recap
+from ros2_memory.queries import trajectory_summary
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.replies import Replies
+from tests.bags import STATUS_FLAGS, Msg, boolean, detections, make, odom, stamp, write_mcap
+from tests.closed_form import SESSIONS, SPEED
+from tests.histories import write_history
+from tests.memories import SettableClock, memory_of
+from tests.recalled import recalling
+from tests.shared_bags import needs_recorded
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def over(memory: Memory, begin: float, end: float) -> Recap:
+    """Of so many seconds after BEGIN."""
+    return recap(memory, Call(), Span(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
+
+
+def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
+    return [(each.text, (each.start - BEGIN) / S) for each in events if each.kind == kind]
+
+
+@needs_recorded
+@each_way
+def test_a_recorded_session_is_told_as_it_happened(tmp_path: Path, recalls: bool) -> None:
+    session = SESSIONS["session_mcap"]
+    for bag in session.folder.glob("*.mcap"):
+        (tmp_path / bag.name).write_bytes(bag.read_bytes())
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = recap(memory, Call(), Span(start_s=session.at(2.0), end_s=session.at(60.0)))
+    assert told.distance_m == pytest.approx(58 * SPEED, rel=0.002)
+    assert told.stood == 0
+    assert told.throughout == ("table",)
+    expected = [
+        ("cup in view", 5, 24),
+        ("scissors in view", 12, 5),
+        ("/bumper became true", 25, 1),
+        ("/bumper became false", 26, None),
+        ("scissors in view", 40, 5),
+    ]
+    assert [each.text for each in told.events] == [text for text, _, _ in expected]
+    for event, (_, start, length) in zip(told.events, expected, strict=True):
+        assert abs(session.since(unix_from_ns(event.start)) - start) < 0.05
+        if length is None:
+            assert event.end is None
+        else:
+            assert event.end is not None
+            assert abs(unix_from_ns(event.end - event.start) - length) < 0.05
+
+
+@each_way
+def test_the_demos_robot_stood_where_and_as_long_as_its_lap_says(
+    tmp_path: Path, recalls: bool
+) -> None:
+    now = BEGIN + 110 * S
+    recorder = DemoRecorder(tmp_path / "flat", Timeline(BEGIN, BEGIN), clock=FixedClock(now))
+    recorder.write_until(now)
+    recorder.stop()
+    memory = memory_of(tmp_path, clock=SettableClock(now))
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 5.0, 95.0)
+    standing = [
+        (max(start, 5.0), min(end, 95.0)) for start, end in _standing(0.0, 110.0) if 5 < end < 95
+    ]
+    found = [each for each in told.events if each.kind == "stop"]
+    assert len(found) == len(standing)
+    for stop, (began, ended) in zip(found, standing, strict=True):
+        assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.2)
+        assert ((stop.end or 0) - BEGIN) / S == pytest.approx(ended, abs=0.2)
+        here = demo_robot.pose((began + ended) / 2)
+        x, y = (float(part.split()[-1]) for part in stop.text.split(","))
+        assert math.dist((x, y), (here.x, here.y)) < 0.02
+
+
+def _standing(begin: float, end: float) -> list[tuple[float, float]]:
+    """When the demo's robot moves slower than 5 mm/s for at least 3 s, from its closed form."""
+    step = 0.02
+    spans: list[tuple[float, float]] = []
+    t = begin
+    while t < end:
+        start = t
+        while t < end and abs(demo_robot.twist(t)[0]) < 0.005:
+            t += step
+        if t - start >= 3.0:
+            spans.append((start, t))
+        t += step
+    return spans
+
+
+def _drive(
+    bag_dir: Path, legs: list[tuple[float, float]], *, begin: float = 0.0, hz: int = 50
+) -> list[tuple[float, float]]:
+    """Legs of (seconds, metres per second) from `begin` on, in bags of 7.3 s; when it stood."""
+    edges, places = [begin], [0.0]
+    for length, speed in legs:
+        edges.append(edges[-1] + length)
+        places.append(places[-1] + length * speed)
+    messages: list[Msg] = []
+    leg = 0
+    for nth in range(int((edges[-1] - begin) * hz) + 1):
+        time = begin + nth / hz
+        while leg + 1 < len(legs) and time >= edges[leg + 1]:
+            leg += 1
+        x = places[leg] + (time - edges[leg]) * legs[leg][1]
+        messages.append(odom(BEGIN + round(time * S), x, 0.0, 0.0))
+    for nth, at in enumerate(range(0, len(messages), 365)):
+        write_mcap(bag_dir / "rec" / f"rec_{nth}.mcap", messages[at : at + 365])
+    return [span for span, leg in zip(pairwise(edges), legs, strict=True) if leg[1] == 0]
+
+
+@each_way
+def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path, recalls: bool) -> None:
+    [(began, ended)] = _drive(tmp_path, [(8.745, 0.5), (8.0, 0.0), (9.0, 0.5)], begin=260)
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 260, 286)
+    [stop] = [each for each in told.events if each.kind == "stop"]
+    assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.0201)
+    assert ((stop.end or 0) - BEGIN) / S == pytest.approx(ended, abs=0.0201)
+    reply = json.loads(Replies(tmp_path, 24_000).answer(told).text)
+    assert reply["shortest_stop_s"] == 3.0
+    assert reply["stood_s"] == pytest.approx(8.0, abs=0.0401)
+    assert reply["events"][0]["duration_s"] == reply["stood_s"]
+
+
+@each_way
+def test_a_window_that_ends_in_a_stop_counts_what_it_holds_of_it(
+    tmp_path: Path, recalls: bool
+) -> None:
+    _drive(tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5)], begin=0.37)
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    for begin, end, stood in [(13.27, 20, 3.1), (14.37, 22, 2.0), (0.4, 8.37, 2.0), (9, 9.5, 0.5)]:
+        assert (over(memory, begin, end).stood or 0) / S == pytest.approx(stood, abs=0.0201)
+
+
+def test_a_stop_goes_on_where_it_does_after_the_window_or_up_to_the_newest_pose(
+    tmp_path: Path,
+) -> None:
+    [(began, ended), _] = _drive(tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5), (5.0, 0.0)])
+    memory = memory_of(tmp_path)
+
+    def goes_on(end: float) -> list[bool]:
+        told = over(memory, began - 2, end)
+        return [each.goes_on for each in told.events if each.kind == "stop"]
+
+    assert goes_on(ended - 1) == [True]
+    assert goes_on(ended) == [False]
+    assert goes_on(ended + 3) == [False]
+    assert goes_on(ended + 20) == [False, True]
+
+
+@each_way
+@pytest.mark.parametrize(("hz", "noise", "toggle"), [(10, 0.02, 0.0), (50, 0.0, 0.05)])
+def test_stops_under_noise_do_not_last_longer_than_the_window(
+    tmp_path: Path, recalls: bool, hz: int, noise: float, toggle: float
+) -> None:
+    draw = random.Random(11)
+    messages = [
+        odom(
+            BEGIN + nth * S // hz,
+            draw.gauss(0, noise) + draw.choice([0.0, toggle]),
+            draw.gauss(0, noise),
+            0.0,
+        )
+        for nth in range(180 * hz)
+    ]
+    for nth, at in enumerate(range(0, len(messages), 9 * hz)):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 9 * hz])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    whole = over(memory, 0, 180)
+    parts = [over(memory, at, at + 30) for at in range(0, 180, 30)]
+    for told in (whole, *parts):
+        assert told.stood is not None
+        assert told.stood <= told.end - told.start
+        stops = [each for each in told.events if each.kind == "stop"]
+        assert all((one.end or 0) <= other.start for one, other in pairwise(stops))
+    assert sum(told.stood or 0 for told in parts) == pytest.approx(whole.stood or 0, abs=0.2 * S)
+
+
+def test_a_window_between_two_poses_of_a_stop_is_a_stop(tmp_path: Path) -> None:
+    write_mcap(
+        tmp_path / "bag.mcap", [odom(BEGIN + at * S, 1.0, 2.0, 0.0) for at in range(0, 20, 2)]
+    )
+    memory = memory_of(tmp_path)
+    told = over(memory, 6.5, 7.5)
+    assert told.stood == S
+    assert told.distance_m is None
+    assert any("no poses in this time" in note for note in told.notes)
+    parts = [over(memory, at, at + 0.5).stood or 0 for at in (n / 2 for n in range(36))]
+    assert sum(parts) == over(memory, 0, 18).stood == 18 * S
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    legs=st.lists(
+        st.tuples(st.floats(2.9, 4.1) | st.floats(4.1, 12.0), st.floats(1.0, 4.0)),
+        min_size=1,
+        max_size=4,
+    ),
+    parts=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=6),
+    recalls=st.booleans(),
+)
+def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
+    legs: list[tuple[float, float]], parts: list[float], recalls: bool
+) -> None:
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        driven = [(2.0, 0.5)]
+        for stands, drives in legs:
+            driven += [(stands, 0.0), (drives, 0.5)]
+        _drive(bag_dir, driven)
+        memory = memory_of(bag_dir)
+        if recalls:
+            memory = recalling(replace(memory), bag_dir)
+        end = sum(length for length, _ in driven)
+        # No part is so short that no pose is in it.
+        inner = {round(0.1 + part * (end - 0.2), 1) for part in parts}
+        edges = [0.0, *sorted(inner), end]
+        whole = over(memory, 0.0, end)
+        stood = [over(memory, *span).stood or 0 for span in pairwise(edges)]
+        assert sum(stood) == pytest.approx(whole.stood or 0, abs=0.02 * S)
+
+
+@each_way
+@pytest.mark.parametrize("speed", [0.005, 0.01, 0.03, 0.05])
+def test_a_robot_that_creeps_is_not_said_to_stand(
+    tmp_path: Path, recalls: bool, speed: float
+) -> None:
+    _drive(tmp_path, [(60.0, speed)], hz=20)
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    for span in ((0, 60), (10, 20), (45, 60)):
+        told = over(memory, *span)
+        assert told.stood == 0
+        assert told.events == ()
+
+
+@each_way
+@pytest.mark.parametrize(("hz", "noise"), [(10, 0.2), (1, 0.02), (1, 1.0), (1, 0.005)])
+def test_noise_that_hides_where_the_robot_stood_is_named(
+    tmp_path: Path, recalls: bool, hz: int, noise: float
+) -> None:
+    draw = random.Random(3)
+    messages = [
+        odom(BEGIN + nth * S // hz, draw.gauss(0, noise), draw.gauss(0, noise), 0.0)
+        for nth in range(300 * hz)
+    ]
+    for nth, at in enumerate(range(0, len(messages), 60 * hz)):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 60 * hz])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 0, 300)
+    reply = json.loads(Replies(tmp_path, 24_000).answer(told).text)
+    assert reply["stood_s"] is None
+    assert any("too noisy, or too few" in note for note in reply["notes"])
+
+
+def test_a_robot_that_drove_all_the_time_did_not_stand_whatever_the_noise(tmp_path: Path) -> None:
+    draw = random.Random(3)
+    write_mcap(
+        tmp_path / "bag.mcap",
+        [odom(BEGIN + nth * S // 10, nth * 0.05, draw.gauss(0, 0.02), 0.0) for nth in range(300)],
+    )
+    told = over(memory_of(tmp_path), 0, 30)
+    assert told.stood == 0
+    assert not any("stood_s" in note for note in told.notes)
+
+
+@each_way
+def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
+    tmp_path: Path, recalls: bool
+) -> None:
+    write_mcap(
+        tmp_path / "rec" / "rec_0.mcap",
+        [odom(BEGIN + nth * S // 10, math.nan, 0.0, 0.0) for nth in range(100)],
+    )
+    write_mcap(
+        tmp_path / "rec" / "rec_1.mcap",
+        [
+            odom(BEGIN + nth * S // 10, math.nan if 150 <= nth < 180 else nth * 0.05, 0.0, 0.0)
+            for nth in range(100, 300)
+        ],
+    )
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    none = over(memory, 0, 9.95)
+    assert (none.distance_m, none.max_speed, none.stood) == (None, None, None)
+    assert none.notes == ("100 poses left out: the coordinates are no place (NaN or beyond)",)
+    some = over(memory, 10, 30)
+    assert some.distance_m == pytest.approx(0.05 * 168, abs=0.06)
+    assert some.stood == 0
+    assert "30 poses left out: the coordinates are no place (NaN or beyond)" in some.notes
+    assert any("1 gap without a valid pose" in note for note in some.notes)
+    assert not any("nothing was recorded" in note for note in some.notes)
+    summary = trajectory_summary(memory, Call(), Span(start_s=BEGIN / S + 10, end_s=BEGIN / S + 30))
+    shown = json.loads(Replies(tmp_path, 24_000).answer(summary).text)["notes"]
+    assert {note for note in some.notes if "pose" in note} <= set(shown)
+
+
+def test_a_gap_in_the_memory_is_told(tmp_path: Path) -> None:
+    for nth, at in enumerate((0, 100)):
+        write_mcap(
+            tmp_path / f"bag_{nth}.mcap",
+            [odom(BEGIN + (at + t) * S, 0.1 * t, 0.0, 0.0) for t in range(10)],
+        )
+    told = over(memory_of(tmp_path), 0, 120)
+    [gap] = [each for each in told.events if each.kind == "gap"]
+    assert ((gap.start - BEGIN) / S, ((gap.end or 0) - BEGIN) / S) == (9.0, 100.0)
+
+
+def test_errors_in_logs_are_told_once_with_their_count(tmp_path: Path) -> None:
+    def log(at: int, level: int, msg: str) -> object:
+        return make(
+            "rcl_interfaces/msg/Log",
+            stamp=stamp(at),
+            level=level,
+            name="planner",
+            msg=msg,
+            file="",
+            function="",
+            line=0,
+        )
+
+    said = [(1, 20, "all well"), (2, 40, "no path"), (3, 40, "no path"), (4, 50, "giving up")]
+    messages = [
+        Msg("/rosout", "rcl_interfaces/msg/Log", BEGIN + at * S, log(BEGIN, level, msg))
+        for at, level, msg in said
+    ]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    told = over(memory_of(tmp_path), 0, 10)
+    assert times(told.events, "error") == [
+        ("error: planner: no path (2 times)", 2.0),
+        ("error: planner: giving up", 4.0),
+    ]
+    assert told.distance_m is None
+    assert any("nothing is known of the way" in note for note in told.notes)
+
+
+def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") -> Msg:
+    """The status of a vehicle after so many seconds, with these of its 40 booleans true."""
+    body = make(
+        "px4_msgs/msg/VehicleStatus",
+        timestamp=round(at * 1e6),
+        arming_state=1,
+        gcs_connection_lost_counter=0,
+        **{name: name in set_flags for name in STATUS_FLAGS},
+    )
+    return Msg(topic, "px4_msgs/msg/VehicleStatus", BEGIN + round(at * S), body)
+
+
+@each_way
+@pytest.mark.parametrize("flag", [STATUS_FLAGS[0], STATUS_FLAGS[15], STATUS_FLAGS[16], "flag_39"])
+def test_every_boolean_of_a_status_message_is_followed(
+    tmp_path: Path, recalls: bool, flag: str
+) -> None:
+    for bag in range(4):
+        write_mcap(
+            tmp_path / f"bag_{bag}.mcap",
+            [
+                _status(at, *([flag] if 13 <= at < 26 else []))
+                for at in (bag * 10 + nth * 0.5 for nth in range(20))
+            ],
+        )
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 0, 40)
+    assert times(told.events, "flip") == [
+        (f"/fmu/out/vehicle_status {flag} became true", 13.0),
+        (f"/fmu/out/vehicle_status {flag} became false", 26.0),
+    ]
+    assert not any("vehicle_status" in note for note in told.notes)
+
+
+@each_way
+def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls: bool) -> None:
+    type_name = "px4_msgs/msg/ManyFlags"
+    body = make(type_name, **{f"flag_{nth:03}": False for nth in range(600)})
+    write_mcap(
+        tmp_path / "bag.mcap", [Msg("/many", type_name, BEGIN + n * S, body) for n in (1, 2)]
+    )
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    [note] = [note for note in over(memory, 0, 10).notes if "/many" in note]
+    more = 600 - MOST_FLAGS
+    assert note == (
+        f"/many has too many booleans or things in one message: {more} more are not followed"
+    )
+
+
+@each_way
+def test_things_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls: bool) -> None:
+    labels = [f"thing {nth}" for nth in range(MOST_LABELS + 3)]
+    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN + n * S, labels) for n in (1, 2)])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    assert any("one message: 3 more" in note for note in over(memory, 0, 10).notes)
+
+
+@each_way
+def test_toggles_that_are_too_many_to_keep_are_counted(tmp_path: Path, recalls: bool) -> None:
+    """All 40 booleans flip four times in one bag; 64 flips of a bag are kept."""
+    messages = [_status(at, *(STATUS_FLAGS if at in {1, 3} else ())) for at in range(5)]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 0, 10)
+    more = 4 * 40 - 64
+    assert dict(told.counts) == {"flips": 64}
+    assert f"/fmu/out/vehicle_status changes too often to tell each: {more} more" in told.notes
+    assert any("left out, since they are too many: 39 flips" in note for note in told.notes)
+
+
+def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
+    log = make(
+        "rcl_interfaces/msg/Log",
+        stamp=stamp(BEGIN),
+        level=40,
+        name="planner",
+        msg="no path " * 40,
+        file="",
+        function="",
+        line=0,
+    )
+    write_mcap(tmp_path / "bag.mcap", [Msg("/rosout", "rcl_interfaces/msg/Log", BEGIN + S, log)])
+    [event] = over(memory_of(tmp_path), 0, 10).events
+    assert event.text.startswith("error: planner: no path no path")
+    assert event.text.endswith("…")
+
+
+def test_a_thing_that_was_missed_for_a_moment_did_not_leave(tmp_path: Path) -> None:
+    seen = [(1, "cup"), (2, ""), (3, "cup"), (4, ""), (5, ""), (8, "cup"), (9, "")]
+    messages = [detections(BEGIN + at * S, names.split()) for at, names in seen]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    told = over(memory_of(tmp_path), 0, 10)
+    assert times(told.events, "thing") == [("cup in view", 1.0), ("cup in view", 8.0)]
+
+
+@each_way
+def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """It saw scissors for 5 s of 65, and the table all the time."""
+    rows = [(at / 5, "scissors") for at in range(60, 85)]
+    rows += [(at / 5 + 0.1, "table") for at in range(325)]
+    messages = [
+        detections(BEGIN + round(at * S), [label], topic=f"/vision/{label}") for at, label in rows
+    ]
+    messages += [odom(BEGIN + n * S, 0.1 * n, 0.0, 0.0) for n in range(66)]
+    messages.sort(key=lambda each: each.log_time)
+    for nth in range(0, len(messages), 100):
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[nth : nth + 100])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    told = over(memory, 0, 65)
+    assert told.throughout == ("table",)
+    assert times(told.events, "thing") == [("scissors in view", 12.0)]
+    assert over(memory, 12.5, 16).throughout == ("scissors", "table")
+    # What the memory does not hold was not looked at.
+    assert over(memory, 0, 80).throughout == ()
+    assert over(memory, -10, 60).throughout == ()
+
+
+def test_a_thing_that_several_detectors_see_is_told_once(tmp_path: Path) -> None:
+    one = [detections(BEGIN + at * S, ["cup"] if at in {2, 3} else []) for at in range(10)]
+    other = [
+        detections(BEGIN + at * S, ["cup"] if at in {3, 4} else [], topic="/vision/other")
+        for at in range(10)
+    ]
+    messages = sorted([*one, *other], key=lambda each: each.log_time)
+    write_mcap(tmp_path / "bag.mcap", messages)
+    [event] = over(memory_of(tmp_path), 0, 10).events
+    assert (event.text, event.start, event.end) == ("cup in view", BEGIN + 2 * S, BEGIN + 4 * S)
+
+
+def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
+    blinking = [boolean(BEGIN + at * S, at % 2 == 0) for at in range(20)]
+    things = [
+        detections(BEGIN + at * S, [f"thing {at // 5}"] if at % 5 == 0 else []) for at in range(100)
+    ]
+    messages = sorted([*blinking, *things], key=lambda each: each.log_time)
+    write_mcap(tmp_path / "bag.mcap", messages)
+    told = over(memory_of(tmp_path), 0, 100)
+    assert len(told.events) == MOST_EVENTS
+    assert len(times(told.events, "flip")) == 19
+    assert dict(told.counts) == {"flips": 19, "sights of things": 20}
+    assert any("left out, since they are too many: 14 sights of things" in n for n in told.notes)
+    assert [each.start for each in told.events] == sorted(each.start for each in told.events)
+    reply = Replies(tmp_path, 24_000).answer(told).text
+    assert len(reply) < 3_500
+    assert set(json.loads(reply)["events"][0]) == {"timestamp", "ago_s", "text", "duration_s"}
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
+def test_a_recap_is_the_same_whatever_the_catalogue_knows(seed: int, part: float) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        moments = write_history(bag_dir, draw).moments
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        memory = recalling(replace(plain), bag_dir, part=part)
+        for _ in range(3):
+            first, last = sorted(draw.choices(moments, k=2))
+            span = Span(start_s=first / S, end_s=last / S)
+            assert _answer(memory, span) == _answer(plain, span)
+
+
+def _answer(memory: Memory, span: Span) -> str:
+    try:
+        return repr(recap(memory, Call(), span))
+    except EpisodicError as error:
+        return repr(error)
+
+
+def test_a_stop_a_hair_below_0_is_told_without_a_sign(tmp_path: Path) -> None:
+    stood = [odom(BEGIN + at * S // 2, -0.0001, 2.0, 0.0) for at in range(40)]
+    write_mcap(tmp_path / "bag.mcap", stood)
+    told = [each.text for each in over(memory_of(tmp_path), 0, 30).events]
+    assert told == ["stood at x 0.00, y 2.00"]
+
+
+def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> None:
+    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
+    seen = [
+        detections(BEGIN + at * S, ["cup"] if at < 9 else ["fork"] if at > 11 else [])
+        for at in range(20)
+    ]
+    flips = [boolean(BEGIN + at * S, 3 <= at < 7) for at in range(20)]
+    messages = sorted([*stood, *seen, *flips], key=lambda each: each.log_time)
+    write_mcap(tmp_path / "bag.mcap", messages)
+    told = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 30).events}
+    assert told == {
+        "stood at x 1.00, y 2.00": True,
+        "cup in view": False,
+        "fork in view": True,
+        "/bumper became true": False,
+        "/bumper became false": True,
+    }
+    before = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 8).events}
+    assert before["stood at x 1.00, y 2.00"]
+    assert "cup in view" not in before  # all the time

@@ -1,0 +1,264 @@
+"""What a planner is told when it asks for a moment to be kept, and for those that are."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, REQUESTS_FOLDER
+from ros2_memory.bag_dir.moment_file import (
+    Keepsake,
+    Wish,
+    make_folder,
+    write_keepsake,
+)
+from ros2_memory.bag_dir.request_queue import Slot
+from ros2_memory.config import load_settings
+from ros2_memory.core.errors import RefusedError
+from ros2_memory.core.timebase import Deadline
+from ros2_memory.endpoint import build_server
+from ros2_memory.history.context import Call, Limits, Memory
+from ros2_memory.insights import saved_moments
+from ros2_memory.insights.saved_moments import (
+    MOST_LISTED,
+    list_moments,
+    remember_moment,
+)
+from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.spec_tools import build_tools
+from tests.bags import odom, write_mcap
+from tests.keeping import keeper_of, recorder_at_work
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+T0 = 1_790_000_000 * S
+NOW = T0 + 60 * S
+RECORDS = Limits(kept=RetentionLimits(10**12, 10**18))
+
+
+@pytest.fixture(autouse=True)
+def _much_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy machine does not fail a test."""
+    monkeypatch.setattr(saved_moments, "PATIENCE_S", 60.0)
+
+
+def remembering(bag_dir: Path, limits: Limits = RECORDS) -> Memory:
+    for n in range(6):
+        times = [T0 + (n * 10 + second) * S for second in range(10)]
+        write_mcap(bag_dir / f"rec/rec_{n}.mcap", [odom(at, 1.0, 2.0) for at in times])
+    return memory_of(bag_dir, clock=SettableClock(NOW), limits=limits)
+
+
+def beating(bag_dir: Path, state: RecorderState = RecorderState.RECORDING, at: int = NOW) -> None:
+    write_heartbeat(bag_dir, Heartbeat(1, at, state, (), at, 0, (), (), None, 2.0))
+
+
+def remember(memory: Memory, label: str = "charger found", *, before: float = 30) -> Any:
+    return remember_moment(memory, Call(), label, seconds_before=before, seconds_after=0)
+
+
+def refusal(memory: Memory, call: Call | None = None) -> str:
+    with pytest.raises(RefusedError) as caught:
+        remember_moment(memory, call or Call(), "here", seconds_before=30, seconds_after=0)
+    return str(caught.value)
+
+
+def shown(memory: Memory, folder: Path) -> Any:
+    return json.loads(Replies(folder, 24_000).answer(list_moments(memory, Call())).text)
+
+
+def requests(bag_dir: Path) -> list[Path]:
+    folder = bag_dir / REQUESTS_FOLDER
+    return list(folder.iterdir()) if folder.exists() else []
+
+
+def test_a_moment_is_kept_by_the_recorder_and_then_listed(tmp_path: Path) -> None:
+    memory = remembering(tmp_path)
+    beating(tmp_path)
+    with recorder_at_work(tmp_path, SettableClock(NOW)):
+        told = remember(memory)
+    assert (told.label, told.start, told.end) == ("charger found", T0 + 30 * S, NOW)
+    assert (told.bags, told.pending) == (3, True)  # its end is just now
+    assert requests(tmp_path) == []
+    [moment] = shown(memory, tmp_path)["moments"]
+    size = sum((tmp_path / f"rec/rec_{n}.mcap").stat().st_size for n in (3, 4, 5))
+    assert moment == {
+        "moment": told.moment,
+        "label": "charger found",
+        "start": T0 / S + 30,
+        "end": NOW / S,
+        "ago_s": 0.0,
+        "bags": 3,
+        "size_gb": round(size / 1e9, 6),
+        "complete": False,
+        "pending": True,
+    }
+    reply = json.loads(Replies(tmp_path, 24_000).answer(told).text)
+    assert reply == {
+        "moment": told.moment,
+        "label": "charger found",
+        "start": T0 / S + 30,
+        "end": NOW / S,
+        "bags": 3,
+        "pending": True,
+    }
+
+
+def test_what_the_recorder_refuses_is_told_with_its_reason(tmp_path: Path) -> None:
+    memory = remembering(tmp_path)
+    beating(tmp_path)
+    (tmp_path / MOMENTS_FOLDER).symlink_to(tmp_path)
+    with recorder_at_work(tmp_path, SettableClock(NOW)):
+        assert "symbolic link" in refusal(memory)
+    reply = Replies(tmp_path, 24_000).error(RefusedError("there is no room"))
+    assert json.loads(reply.text) == {"error": "refused", "detail": "there is no room"}
+    assert reply.is_error
+
+
+def test_where_nothing_is_recorded_nothing_can_be_kept(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, Limits())
+    beating(tmp_path)
+    assert "recorder=none" in refusal(memory)
+    assert requests(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("state", "at"),
+    [(RecorderState.RECORDING, NOW - 60 * S), (RecorderState.STOPPED, NOW)],
+)
+def test_a_recorder_that_does_not_run_is_not_asked(
+    tmp_path: Path, state: RecorderState, at: int
+) -> None:
+    memory = remembering(tmp_path)
+    assert "start ros2-memory-recorder" in refusal(memory)
+    beating(tmp_path, state, at)
+    assert "start ros2-memory-recorder" in refusal(memory)
+    assert requests(tmp_path) == []
+
+
+def test_a_recorder_that_does_not_answer_is_not_waited_for_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = remembering(tmp_path)
+    beating(tmp_path)
+    monkeypatch.setattr(saved_moments, "PATIENCE_S", 0.0)
+    assert "did not answer" in refusal(memory)
+    assert requests(tmp_path) == []
+
+
+def test_a_call_that_is_over_withdraws_its_wish(tmp_path: Path) -> None:
+    memory = remembering(tmp_path)
+    beating(tmp_path)
+    assert "did not answer" in refusal(memory, Call(Deadline.after(-1)))
+    assert requests(tmp_path) == []
+
+
+def test_a_wish_that_was_begun_just_in_time_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    memory = remembering(tmp_path)
+    beating(tmp_path)
+    house = keeper_of(tmp_path, clock=SettableClock(NOW))
+    withdraw = Slot.withdraw
+
+    def too_late(slot: Slot) -> bool:
+        house.keep_moments(tmp_path)
+        return withdraw(slot)
+
+    monkeypatch.setattr(saved_moments, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(Slot, "withdraw", too_late)
+    assert remember(memory).bags == 3
+
+
+def test_a_server_that_may_not_write_there_says_where(tmp_path: Path) -> None:
+    memory = remembering(tmp_path)
+    beating(tmp_path)
+    (tmp_path / ".episodic").write_text("in the way")
+    assert ".episodic/requests" in refusal(memory)
+
+
+def test_with_simulated_time_now_is_the_newest_recorded_moment(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, replace(RECORDS, now="latest"))
+    beating(tmp_path)
+    with recorder_at_work(tmp_path, SettableClock(NOW)):
+        told = remember(memory, before=5)
+    assert (told.start, told.end) == (T0 + 54 * S, T0 + 59 * S)
+    assert told.bags == 1
+
+
+class TestTheList:
+    def keep(self, bag_dir: Path, number: int, **more: Any) -> None:
+        end = T0 + number * S
+        wish = Wish(f"{number:032x}", f"number {number}", end - S, end, NOW)
+        write_keepsake(make_folder(bag_dir, wish), replace(Keepsake.of(wish), **more))
+
+    def test_it_has_the_newest_first_and_counts_the_others(self, tmp_path: Path) -> None:
+        for number in range(MOST_LISTED + 3):
+            self.keep(tmp_path, number, pending=False)
+        told = shown(memory_of(tmp_path, clock=SettableClock(NOW)), tmp_path)
+        assert [each["label"] for each in told["moments"]][:2] == ["number 22", "number 21"]
+        assert len(told["moments"]) == MOST_LISTED
+        assert told["more"] == 3
+
+    def test_a_moment_says_what_of_it_is_not_kept(self, tmp_path: Path) -> None:
+        self.keep(tmp_path, 1, pending=False, missing=("the share was used up",))
+        [told] = shown(memory_of(tmp_path, clock=SettableClock(NOW)), tmp_path)["moments"]
+        assert (told["complete"], told["notes"]) == (False, ["the share was used up"])
+
+    def test_it_is_empty_where_nothing_is_kept(self, tmp_path: Path) -> None:
+        assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
+
+    def test_a_file_in_the_place_of_the_folder_holds_none(self, tmp_path: Path) -> None:
+        (tmp_path / MOMENTS_FOLDER).write_text("no folder")
+        assert shown(memory_of(tmp_path), tmp_path) == {"moments": []}
+
+
+class TestTheTool:
+    async def test_clients_are_told_that_it_writes_and_destroys_nothing(
+        self, tmp_path: Path
+    ) -> None:
+        chosen = load_settings([f"recording.bag_dir={tmp_path}", "server.write_tools=true"], {})
+        server = build_server(chosen, memory_of(tmp_path))
+        hints = {each.name: each.annotations for each in await server.list_tools()}
+        writing = hints.pop("remember_moment")
+        assert writing is not None
+        assert (writing.read_only_hint, writing.destructive_hint) == (False, False)
+        assert not writing.idempotent_hint
+        assert all(each is not None and each.read_only_hint for each in hints.values())
+
+    @pytest.mark.parametrize(("preset", "offered"), [("robot", True), ("query_only", False)])
+    def test_it_is_on_where_the_robot_records(self, preset: str, offered: bool) -> None:
+        assert load_settings((), {"MEMORY_DEPLOYMENT": preset}).server.write_tools is offered
+
+    def test_it_is_offered_only_where_writing_is_allowed(self) -> None:
+        reading = {tool.name for tool in build_tools(Limits(), 25.0)}
+        writing = {tool.name: tool for tool in build_tools(Limits(), 25.0, writing=True)}
+        assert writing.keys() - reading == {"remember_moment"}
+        assert [name for name, tool in writing.items() if tool.writes] == ["remember_moment"]
+        spec = build_tools(Limits(), 25.0, additions=False, writing=True)
+        assert not [tool for tool in spec if tool.writes]
+
+    @pytest.mark.parametrize(
+        ("given", "said"),
+        [
+            ({"label": ""}, "is empty"),
+            ({"label": "x" * 121}, "longer than 120"),
+            ({"label": "a\nb"}, "cannot be seen"),
+            ({"label": "\ud800"}, "cannot be seen"),
+            ({"label": "a", "seconds_before": 3601}, "is more than 3600"),
+            ({"label": "a", "seconds_after": 601}, "is more than 600"),
+            ({"label": "a", "seconds_after": -1}, "at least 0"),
+        ],
+    )
+    def test_its_arguments_are_bounded(self, given: dict[str, Any], said: str) -> None:
+        [tool] = [tool for tool in build_tools(Limits(), 25.0, writing=True) if tool.writes]
+        with pytest.raises(Exception, match=said):
+            tool.question(given)

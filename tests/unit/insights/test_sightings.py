@@ -1,0 +1,312 @@
+from __future__ import annotations
+
+import json
+import math
+import random
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    NoDataError,
+    QueryTimeoutError,
+)
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.timebase import Deadline, FixedClock, unix_from_ns
+from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.reverse_search import Search
+from ros2_memory.history.view import View
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.replies import Replies
+from tests.bags import boolean, detections, odom, tf, transform, write_mcap
+from tests.closed_form import SESSIONS, position
+from tests.histories import write_history
+from tests.memories import memory_of
+from tests.recalled import recalling
+from tests.shared_bags import needs_recorded
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+OBJECTS = "/vision/scene/scene_objects"
+PLACES = {"table": (1.5, 3.5, 0.4), "cup": (1.4, 3.6, 0.8), "scissors": (-2.5, 1.0, 0.75)}
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+@needs_recorded
+@each_way
+@pytest.mark.parametrize(
+    ("label", "seen"),
+    [("scissors", [(40, 45), (12, 17)]), ("cup", [(5, 29)]), ("table", [(0, 64)])],
+)
+def test_sightings_of_a_recorded_session_are_the_closed_form(
+    tmp_path: Path, label: str, seen: list[tuple[int, int]], recalls: bool
+) -> None:
+    session = SESSIONS["session_mcap"]
+    memory = memory_of(session.folder)
+    if recalls:
+        memory = recalling_elsewhere(memory, tmp_path)
+    answer = find_matches(memory, Call(), "/vision/*/scene_objects", "contains", label)
+    assert not answer.more
+    assert len(answer.sightings) == len(seen)
+    for sighting, (first, last) in zip(answer.sightings, seen, strict=True):
+        assert abs(session.since(unix_from_ns(sighting.first)) - first) < 0.05
+        assert abs(session.since(unix_from_ns(sighting.last)) - last) < 0.05
+        assert sighting.messages == last - first + 1
+        assert sighting.robot is not None
+        assert sighting.thing is not None
+        assert math.dist(sighting.robot.position[:2], position(last)) < 0.05
+        assert sighting.thing.frame_id == "odom"
+        assert math.dist(sighting.thing.position, PLACES[label]) < 0.05
+
+
+@needs_recorded
+@each_way
+def test_a_boolean_of_a_recorded_session_was_true_once(tmp_path: Path, recalls: bool) -> None:
+    session = SESSIONS["session_mcap"]
+    memory = memory_of(session.folder)
+    if recalls:
+        memory = recalling_elsewhere(memory, tmp_path)
+    [sighting] = find_matches(memory, Call(), "/bumper", "equals", value=True).sightings
+    assert abs(session.since(unix_from_ns(sighting.first)) - 25.0) < 0.05
+    assert abs(session.since(unix_from_ns(sighting.last)) - 25.5) < 0.05
+    assert sighting.thing is None
+
+
+def recalling_elsewhere(memory: Memory, folder: Path) -> Memory:
+    """The same with a catalogue beside none of the bags, which lie where nothing is written."""
+    session = SESSIONS["session_mcap"].folder
+    for bag in session.glob("*"):
+        (folder / bag.name).write_bytes(bag.read_bytes())
+    copied = memory_of(folder)
+    return recalling(replace(copied), folder)
+
+
+def spoken(tmp_path: Path, *said: tuple[float, str]) -> Memory:
+    """Detections at so many seconds after BEGIN: names separated by blanks."""
+    messages = [detections(BEGIN + round(at * S), names.split()) for at, names in said]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    return memory_of(tmp_path)
+
+
+def seconds(memory: Memory, value: str, topic: str, **given: object) -> list[tuple[float, float]]:
+    answer = find_matches(memory, Call(), topic, "contains", value, **given)  # type: ignore[arg-type]
+    return [((each.first - BEGIN) / S, (each.last - BEGIN) / S) for each in answer.sightings]
+
+
+def test_a_message_without_the_thing_ends_a_sighting(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    memory = spoken(tmp_path, (1, "cup"), (2, "cup fork"), (3, "fork"), (4, "cup"))
+    assert seconds(memory, "cup", topic) == [(4, 4), (1, 2)]
+
+
+def test_a_silence_ends_a_sighting(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    memory = spoken(tmp_path, (1, "cup"), (11, "cup"), (21.5, "cup"))
+    assert seconds(memory, "cup", topic) == [(21.5, 21.5), (1, 11)]
+
+
+def test_the_window_and_the_limit_bound_what_is_told(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    said = [(float(t), "cup" if t % 2 else "") for t in range(20)]
+    memory = spoken(tmp_path, *said)
+    at = BEGIN / S
+    assert seconds(memory, "cup", topic, start_s=at + 5, end_s=at + 9) == [(9, 9), (7, 7), (5, 5)]
+    answer = find_matches(memory, Call(), topic, "contains", "cup", limit=3)
+    assert [(each.last - BEGIN) // S for each in answer.sightings] == [19, 17, 15]
+    assert answer.more
+    assert answer.total is None
+    whole = find_matches(memory, Call(), topic, "contains", "cup", limit=10)
+    assert (whole.more, whole.total) == (False, 10)
+
+
+def test_the_oldest_sightings_come_with_the_number_of_all(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    said = [(float(t), "cup" if t % 2 else "") for t in range(20)]
+    memory = spoken(tmp_path, *said)
+    answer = find_matches(memory, Call(), topic, "contains", "cup", limit=3, oldest_first=True)
+    assert [(each.last - BEGIN) // S for each in answer.sightings] == [1, 3, 5]
+    assert (answer.more, answer.total) == (True, 10)
+    since = BEGIN / S + 14.5
+    later = find_matches(
+        memory, Call(), topic, "contains", "cup", start_s=since, limit=1, oldest_first=True
+    )
+    assert [(each.last - BEGIN) // S for each in later.sightings] == [15]
+    assert later.total == 3
+
+
+def test_the_last_seconds_count_from_now(tmp_path: Path) -> None:
+    topic = detections(BEGIN, []).topic
+    spoken(tmp_path, *((float(t), "cup" if t % 2 else "") for t in range(20)))
+    memory = memory_of(tmp_path, clock=FixedClock(BEGIN + 25 * S))
+    assert seconds(memory, "cup", topic, last_s=10.0) == [(19, 19), (17, 17), (15, 15)]
+    newest = memory_of(tmp_path, limits=Limits(now="latest"))
+    assert seconds(newest, "cup", topic, last_s=3.0) == [(19, 19), (17, 17)]
+    with pytest.raises(InvalidArgumentsError, match="seconds counts from now"):
+        find_matches(memory, Call(), topic, "contains", "cup", last_s=5.0, end_s=4.0)
+
+
+def test_a_number_beyond_a_limit_is_a_sighting_too(tmp_path: Path) -> None:
+    driven = [odom(BEGIN + t * S, 0.0, 0.0, 0.0, vx=0.1 * t) for t in range(10)]
+    write_mcap(tmp_path / "bag.mcap", driven)
+    [fast] = find_matches(
+        memory_of(tmp_path), Call(), "/odom", "above", 0.45, field="linear_velocity.x"
+    ).sightings
+    assert ((fast.first - BEGIN) // S, (fast.last - BEGIN) // S) == (5, 9)
+
+
+def test_a_thing_is_told_in_the_map_where_transforms_lead_there(tmp_path: Path) -> None:
+    seen = detections(BEGIN + S, ["cup"], at=(1.0, 0.0, 0.5))
+    messages = [
+        odom(BEGIN + S - 1, 3.0, 0.0, 0.0),
+        tf(BEGIN, transform(BEGIN, "map", "odom", (10.0, 0.0, 0.0)), topic="/tf_static"),
+        tf(BEGIN, transform(BEGIN, "odom", "base_link", (3.0, 0.0, 0.0))),
+        tf(BEGIN + 2 * S, transform(BEGIN + 2 * S, "odom", "base_link", (3.0, 0.0, 0.0))),
+        seen,
+    ]
+    write_mcap(tmp_path / "bag.mcap", sorted(messages, key=lambda each: each.log_time))
+    memory = memory_of(tmp_path)
+    [sighting] = find_matches(memory, Call(), seen.topic, "contains", "cup").sightings
+    assert sighting.thing is not None
+    assert sighting.thing.frame_id == "map"
+    assert sighting.thing.position == pytest.approx((14.0, 0.0, 0.5))
+    plain = replace(memory, limits=replace(memory.limits, map_frame=None))
+    [again] = find_matches(plain, Call(), seen.topic, "contains", "cup").sightings
+    assert again.thing is not None
+    assert again.thing.frame_id == "odom"
+    assert again.thing.position == pytest.approx((4.0, 0.0, 0.5))
+
+
+def test_what_was_never_seen_is_an_empty_list_with_what_was_searched(tmp_path: Path) -> None:
+    memory = spoken(tmp_path, (1, "cup"), (2, "fork"))
+    answer = find_matches(memory, Call(), detections(BEGIN, []).topic, "contains", "spoon")
+    shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    assert shown["sightings"] == []
+    assert shown["searched_from"] == (BEGIN + S) / S
+    assert shown["searched_to"] == (BEGIN + 2 * S) / S
+
+
+def test_a_reply_tells_how_long_ago_so_that_nobody_has_to_subtract(tmp_path: Path) -> None:
+    memory = spoken(tmp_path, (1, "cup"), (3, "cup"), (4, ""))
+    latest = replace(memory, limits=replace(memory.limits, now="latest"))
+    answer = find_matches(latest, Call(), detections(BEGIN, []).topic, "contains", "cup")
+    [shown] = json.loads(Replies(tmp_path, 24_000).answer(answer).text)["sightings"]
+    assert shown["duration_s"] == 2.0
+    assert shown["ago_s"] == 1.0
+    assert shown["count"] == 2
+    assert shown["robot"] is None
+    assert "began_earlier" not in shown
+
+
+def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
+    tmp_path: Path,
+) -> None:
+    bags = 6
+    for nth in range(bags):
+        times = [BEGIN + (nth * 10 + t) * S for t in range(10)]
+        write_mcap(tmp_path / f"bag_{nth}.mcap", [boolean(at, True) for at in times])
+    memory = memory_of(tmp_path)
+    counts = []
+    for looks in range(1, 30):  # how often the clock may be looked at before the time is over
+        call = Call(Deadline.after(looks, iter(range(10_000)).__next__))
+        try:
+            answer = find_matches(memory, call, "/bumper", "equals", value=True)
+        except QueryTimeoutError:
+            continue
+        [sighting] = answer.sightings
+        counts.append(sighting.messages)
+        assert answer.more != sighting.begun
+        assert sighting.begun == (sighting.messages == bags * 10)
+        assert sighting.begun != any("ran out of time" in note for note in answer.notes)
+    assert counts == sorted(counts)
+    assert counts[0] < bags * 10 == counts[-1]
+
+
+def test_a_search_that_ends_before_it_began_is_refused(tmp_path: Path) -> None:
+    memory = spoken(tmp_path, (1, "cup"))
+    with pytest.raises(InvalidArgumentsError, match="lies before start"):
+        find_matches(memory, Call(), "/x", "contains", "cup", start_s=5.0, end_s=4.0)
+
+
+def test_a_topic_that_was_never_recorded_is_no_empty_list(tmp_path: Path) -> None:
+    memory = spoken(tmp_path, (1, "cup"))
+    with pytest.raises(NoDataError):
+        find_matches(memory, Call(), "/nothing/like/it", "contains", "cup")
+
+
+def test_a_call_without_any_time_is_an_error(tmp_path: Path) -> None:
+    memory = spoken(tmp_path, (1, "cup"))
+    call = Call(Deadline.after(0.0, iter(range(1000)).__next__))
+    with pytest.raises(QueryTimeoutError):
+        find_matches(memory, call, detections(BEGIN, []).topic, "contains", "cup")
+
+
+def grouped(
+    memory: Memory, topic: str, kind: str, value: JsonValue
+) -> list[tuple[str, int, int, int]]:
+    """What sightings are, read off all messages in order."""
+    condition = parse_condition(kind, value, memory.limits.position_tolerance_m)
+    view = View(memory, Call(), memory.clock.now())
+    search = Search(view, topic, condition)
+    rows: list[list[tuple[str, int]]] = []
+    under_way: dict[str, list[tuple[str, int]]] = {}
+    backwards = view.stream(search.topics, TimeWindow.everything(), newest_first=True)
+    for each in reversed(list(backwards)):
+        name = each.record.channel.topic
+        row = under_way.get(name)
+        if not search.matches(each):
+            under_way.pop(name, None)
+        elif row is None or each.time - row[-1][1] > SILENCE_NS:
+            under_way[name] = [(name, each.time)]
+            rows.append(under_way[name])
+        else:
+            row.append((name, each.time))
+    told = [(row[0][0], row[0][1], row[-1][1], len(row)) for row in rows]
+    return sorted(told, key=lambda each: (-each[2], each[0]))
+
+
+ASKED: tuple[tuple[str, str, JsonValue], ...] = (
+    ("/vision/*", "contains", "cup"),
+    ("/vision/a", "contains", "e"),
+    ("/bumper", "equals", True),
+    ("/odom", "near_position", {"x": 0.0, "y": 0.0}),
+    ("/dock", "contains", "docked"),
+)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.0, 0.5, 1.0]))
+def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
+    seed: int, part: float
+) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        write_history(bag_dir, draw)
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()), limits=Limits())
+        memory = recalling(replace(plain), bag_dir, part=part)
+        for topic, kind, value in ASKED:
+            try:
+                expected = grouped(plain, topic, kind, value)
+            except NoDataError:
+                continue
+            answer = find_matches(memory, Call(), topic, kind, value, limit=100)
+            told = [(each.topic, each.first, each.last, each.messages) for each in answer.sightings]
+            assert sorted(told, key=lambda each: (-each[2], each[0])) == expected, (topic, value)
+            assert [each[2] for each in told] == sorted((each[2] for each in told), reverse=True)
+            oldest = find_matches(memory, Call(), topic, kind, value, limit=2, oldest_first=True)
+            assert oldest.sightings == tuple(reversed(answer.sightings))[:2]
+            assert oldest.total == len(answer.sightings)

@@ -1,0 +1,317 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+from mcap.writer import Writer
+
+from ros2_memory.accounts import Stillness
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.history.context import Call
+from ros2_memory.index.listed_splits import absent_splits
+from ros2_memory.insights.status import memory_status
+from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.tools.replies import Replies
+from tests.bags import Msg, boolean, odom, text, tf, transform, write_mcap
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+DAY = 86_400 * S
+BEGIN = 1_784_000_000 * S
+
+
+def remembering(folder: Path, messages: list[Msg], *, seconds: float = 60) -> Memory:
+    write_mcap(folder / "bag.mcap", sorted(messages, key=lambda each: each.log_time))
+    return memory_of(folder, clock=SettableClock(BEGIN + round(seconds * S)))
+
+
+def beating(folder: Path, state: RecorderState, at: float, **more: Any) -> None:
+    beat = Heartbeat(
+        pid=1,
+        updated=BEGIN + round(at * S),
+        state=state,
+        recordings=(),
+        since=BEGIN,
+        bytes_written=0,
+        subscribed=("/a", "/b"),
+        silent=("/b",),
+        last_error=None,
+        interval_s=2.0,
+    )
+    write_heartbeat(folder, replace(beat, **more))
+
+
+def shown(memory: Memory, folder: Path) -> dict[str, Any]:
+    reply: dict[str, Any] = json.loads(
+        Replies(folder, 24_000).answer(memory_status(memory, Call())).text
+    )
+    return reply
+
+
+def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
+    beating(tmp_path, RecorderState.RECORDING, 59)
+    told = shown(memory, tmp_path)
+    assert told["trust"] == "nothing is known to be missing"
+    assert (told["recorder"], told["recorder_alive"]) == ("recording", True)
+    assert told["newest_age_s"] == 11.0
+    assert told["never_heard"] == ["/b"]
+    assert (told["restarts"], told["missing"]) == (0, [])
+    assert told["fell_silent"] == []
+
+
+def test_age_that_is_held_is_told_while_the_recorder_lives(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    beating(tmp_path, RecorderState.RECORDING, 59, age_held="72 bags stay")
+    told = shown(memory, tmp_path)
+    assert told["notes"] == ["72 bags stay"]
+    assert told["trust"] == "nothing is known to be missing"
+    beating(tmp_path, RecorderState.STOPPED, -100, age_held="72 bags stay")
+    assert "notes" not in shown(memory, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("now", "told"), [("wall", ("recording", False)), ("latest", (None, False))]
+)
+def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
+    now: Literal["wall", "latest"], told: tuple[str | None, bool], tmp_path: Path
+) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=1e6)
+    memory = replace(memory, limits=replace(memory.limits, now=now))
+    beating(tmp_path, RecorderState.RECORDING, 1)
+    reply = shown(memory, tmp_path)
+    assert (reply["recorder"], reply["recorder_alive"]) == told
+    assert ("stopped without saying so" in reply["trust"]) == (now == "wall")
+
+
+def test_restarts_and_topics_that_nobody_offers_are_told(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    missing = tuple(f"/gone_{n:02}" for n in range(30))
+    beating(tmp_path, RecorderState.RECORDING, 59, restarts=3, missing=missing)
+    told = shown(memory, tmp_path)
+    assert told["restarts"] == 3
+    assert told["missing"] == [*missing[: len(told["missing"])]]
+    assert told["missing_count"] == 30
+
+
+@pytest.mark.parametrize(
+    ("state", "at", "trust"),
+    [
+        (RecorderState.RECORDING, -100, "the recorder has stopped without saying so"),
+        (RecorderState.PAUSED, 59, "the recorder is paused: it does not say why"),
+        (RecorderState.STOPPED, 59, "nothing is known to be missing"),
+    ],
+)
+def test_a_recorder_that_does_not_record_is_told(
+    tmp_path: Path, state: RecorderState, at: float, trust: str
+) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    beating(tmp_path, state, at)
+    assert shown(memory, tmp_path)["trust"] == trust
+
+
+def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Path) -> None:
+    messages = [
+        *(odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(100)),
+        *(boolean(BEGIN + t * S, True) for t in range(80)),  # a second apart, silent for 20
+        *(text(BEGIN + t * S, "hi") for t in range(0, 90, 15)),  # 15 apart, silent for 24
+        tf(BEGIN, transform(BEGIN, "a", "b", (0, 0, 0)), topic="/tf_static"),
+    ]
+    answer = memory_status(remembering(tmp_path, messages), Call())
+    assert answer.fell_silent == (Stillness("/bumper", BEGIN + 79 * S, S),)
+
+
+def test_damaged_files_are_counted_and_told(tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"no bag at all, whatever its name says")
+    told = shown(remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=9e6), tmp_path)
+    assert told["damaged"] == 1
+    assert "1 damaged bag file" in told["trust"]
+
+
+def test_an_empty_memory_has_a_status_too(tmp_path: Path) -> None:
+    told = shown(memory_of(tmp_path), tmp_path)
+    assert (told["earliest"], told["latest"], told["newest_age_s"]) == (None, None, None)
+    assert told["recorder"] is None
+    assert told["budget"] == {
+        "used_gb": 0.0,
+        "max_gb": None,
+        "foreign_gb": None,
+        "growth_gb_per_day": None,
+    }
+
+
+def test_where_nothing_is_recorded_there_is_no_budget_and_nothing_grows(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
+    budget = shown(memory, tmp_path)["budget"]
+    assert (budget["max_gb"], budget["growth_gb_per_day"]) == (None, None)
+    assert budget["used_gb"] >= 0
+
+
+def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
+    size = (tmp_path / "bag.mcap").stat().st_size
+    budget = RetentionLimits(max_total_bytes=size * 49, max_age_ns=7 * DAY)
+    memory = replace(memory, limits=replace(memory.limits, kept=budget))
+    beating(tmp_path, RecorderState.RECORDING, 59)
+    answer = memory_status(memory, Call())
+    assert (answer.budget.used, answer.budget.per_day) == (size, size * 24)  # all within an hour
+    told = shown(memory, tmp_path)["budget"]
+    assert told["full_in_days"] == 2.0
+    assert told["keeps_days"] == 2.04
+    older = replace(memory.limits, kept=replace(budget, max_age_ns=DAY))
+    assert shown(replace(memory, limits=older), tmp_path)["budget"]["keeps_days"] == 1.0
+
+
+SOUND = "nothing is known to be missing"
+
+
+@pytest.mark.parametrize(
+    ("state", "at"),
+    [
+        (None, 0),
+        (RecorderState.RECORDING, 0),
+        (RecorderState.STOPPED, 59),
+        (RecorderState.PAUSED, 59),
+    ],
+)
+def test_no_growth_is_predicted_of_bags_that_nobody_writes(
+    tmp_path: Path, state: RecorderState | None, at: float
+) -> None:
+    memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
+    budget = RetentionLimits(max_total_bytes=10**9, max_age_ns=7 * DAY)
+    memory = replace(memory, limits=replace(memory.limits, kept=budget))
+    if state is not None:
+        beating(tmp_path, state, at)
+    told = shown(memory, tmp_path)["budget"]
+    assert (told["max_gb"], told["growth_gb_per_day"]) == (1.0, None)
+    assert "full_in_days" not in told
+    assert "keeps_days" not in told
+
+
+class TestWhatIsMissingIsNamedAndCounted:
+    def trust(self, folder: Path, storage: str = "mcap") -> str:
+        trust = shown(memory_of(folder, storage=storage), folder)["trust"]
+        assert isinstance(trust, str)
+        return trust
+
+    def recording(self, folder: Path, *listed: tuple[str, int]) -> None:
+        """Two splits of five messages each, and a metadata.yaml that lists those given."""
+        for split in range(2):
+            messages = [odom(BEGIN + (10 * split + t) * S, 0.0, 0.0) for t in range(5)]
+            write_mcap(folder / f"rec_{split}.mcap", messages)
+        names = "".join(f"  - {name}\n" for name, _ in listed)
+        files = "".join(f"  - path: {name}\n    message_count: {n}\n" for name, n in listed)
+        (folder / "metadata.yaml").write_text(
+            "rosbag2_bagfile_information:\n  version: 9\n"
+            f"  message_count: {sum(n for _, n in listed)}\n"
+            f"  relative_file_paths:\n{names}  files:\n{files}"
+        )
+
+    def test_an_empty_folder(self, tmp_path: Path) -> None:
+        assert self.trust(tmp_path).startswith("no bag is here")
+
+    def test_a_bag_that_a_crash_left_open(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)])
+        path.write_bytes(path.read_bytes()[:-100])
+        assert self.trust(tmp_path).startswith("1 bag was left open by a crash")
+
+    def test_files_that_are_not_read(self, tmp_path: Path) -> None:
+        write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 0.0, 0.0)])
+        for n in range(3):
+            (tmp_path / f"old_{n}.db3").write_bytes(b"SQLite format 3\0")
+        assert self.trust(tmp_path) == "3 files are not read; data_time_range says why"
+
+    def test_a_topic_that_cannot_be_decoded(self, tmp_path: Path) -> None:
+        with (tmp_path / "bag.mcap").open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            schema = writer.register_schema("odd.Odd", "protobuf", b"")
+            channel = writer.register_channel("/odd", "protobuf", schema)
+            writer.add_message(channel, BEGIN, b"", BEGIN)
+            writer.finish()
+        assert self.trust(tmp_path) == "1 topic cannot be decoded: /odd"
+
+    def test_splits_and_messages_that_metadata_lists(self, tmp_path: Path) -> None:
+        there = [("rec_0.mcap", 5), ("rec_1.mcap", 5)]
+        gone = [(f"rec_{n}.mcap", 20) for n in range(2, 14)]
+        self.recording(tmp_path / "rec", *there, *gone)
+        assert self.trust(tmp_path) == (
+            "metadata.yaml of rec lists 12 files that are not there and 240 messages that no file "
+            "here holds"
+        )
+
+    def test_messages_alone(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 255))
+        assert self.trust(tmp_path).endswith("lists 250 messages that no file here holds")
+
+    def test_a_recording_of_which_metadata_alone_is_left(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
+        for each in (tmp_path / "rec").glob("*.mcap"):
+            each.unlink()
+        trust = self.trust(tmp_path)
+        assert "lists 2 files that are not there and 10 messages" in trust
+
+    def test_metadata_that_lists_what_is_there(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
+        assert self.trust(tmp_path) == SOUND
+
+    def test_metadata_that_cannot_be_read_is_not_compared_and_told(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5))
+        (tmp_path / "rec" / "metadata.yaml").write_text("")
+        assert self.trust(tmp_path).startswith("metadata.yaml of rec cannot be read")
+
+    def test_the_oldest_splits_that_retention_deleted_are_not_missing(self, tmp_path: Path) -> None:
+        listed = [(f"rec_{n}.mcap", 5) for n in range(-3, 3)]
+        self.recording(tmp_path / "rec", *listed)
+        assert "lists 4 files" in self.trust(tmp_path)
+        beating(tmp_path, RecorderState.STOPPED, 59)
+        assert "lists 1 file that is not there and 5 messages" in self.trust(tmp_path)
+
+    def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(
+        self, tmp_path: Path
+    ) -> None:
+        self.recording(tmp_path / "rec", *((f"rec_{n}.mcap", 5) for n in range(-3, 3)))
+        beating(tmp_path, RecorderState.STOPPED, 59)
+        own = tmp_path / ".episodic" / "recordings.jsonl"
+        own.parent.mkdir()
+        inode = (tmp_path / "rec").stat().st_ino
+        own.write_text('{"bag_dir_id": "5f0c"}\n')
+        assert "lists 4 files" in self.trust(tmp_path)
+        with own.open("a") as stream:
+            stream.write(json.dumps({"recording": "rec", "inode": inode}) + "\n")
+        assert "lists 1 file that is not there" in self.trust(tmp_path)
+
+    def test_nothing_behind_a_link_is_looked_at(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "bags" / "rec", ("rec_0.mcap", 5), ("gone.mcap", 5))
+        memory = memory_of(tmp_path / "bags")
+        snapshot = memory.index.snapshot()
+        (tmp_path / "bags" / "rec").rename(tmp_path / "outside")
+        (tmp_path / "bags" / "rec").symlink_to(tmp_path / "outside")
+        (absent,) = absent_splits(snapshot, tmp_path / "bags")
+        assert (absent.files, absent.unreadable) == ((), True)
+
+    def test_splits_cut_by_a_handover_hold_fewer_than_listed(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 9), ("rec_1.mcap", 9))
+        (tmp_path / "rec" / "handover.json").write_text("{}")
+        assert self.trust(tmp_path) == SOUND
+
+    def test_a_recording_compressed_by_file(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5))
+        assert self.trust(tmp_path) == SOUND
+
+    def test_it_is_no_longer_told_when_the_file_is_back(self, tmp_path: Path) -> None:
+        self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
+        second = tmp_path / "rec" / "rec_1.mcap"
+        content = second.read_bytes()
+        second.unlink()
+        memory = memory_of(tmp_path)
+        assert "lists 1 file" in str(shown(memory, tmp_path)["trust"])
+        second.write_bytes(content)
+        assert shown(memory, tmp_path)["trust"] == SOUND

@@ -1,0 +1,414 @@
+from __future__ import annotations
+
+import json
+import math
+import random
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.core.errors import (
+    EpisodicError,
+    InvalidArgumentsError,
+    QueryTimeoutError,
+    UndecodableError,
+)
+from ros2_memory.core.timebase import Deadline, FixedClock
+from ros2_memory.demo import robot as demo_robot
+from ros2_memory.demo.published_topics import Timeline
+from ros2_memory.demo.recording import DemoRecorder
+from ros2_memory.history.context import Call
+from ros2_memory.insights.visits import visits
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.replies import Replies
+from tests.bags import Msg, odom, tf, transform, write_mcap
+from tests.closed_form import SESSIONS
+from tests.histories import write_history
+from tests.memories import SettableClock, memory_of
+from tests.recalled import recalling
+from tests.shared_bags import needs_recorded
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+
+
+def line(*legs: tuple[float, float], begin: float = 0.0, x: float = 0.0) -> list[Msg]:
+    """Odometry at 5 Hz along x: legs of (seconds, metres per second)."""
+    messages = []
+    for length, speed in legs:
+        for _ in range(round(length * 5)):
+            messages.append(odom(BEGIN + round(begin * S), x, 0.0, 0.0))
+            begin += 0.2
+            x += speed * 0.2
+    return messages
+
+
+def remembering(folder: Path, messages: list[Msg], *, split_s: float = 10.0) -> Memory:
+    by_split: dict[int, list[Msg]] = {}
+    for each in sorted(messages, key=lambda message: message.log_time):
+        by_split.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
+    for nth, some in by_split.items():
+        write_mcap(folder / f"bag_{nth}.mcap", some)
+    return memory_of(folder)
+
+
+def spans(memory: Memory, x: float, y: float = 0.0, **given: Any) -> list[tuple[float, float]]:
+    """Arrivals and departures in seconds after BEGIN; NaN where still there or not known."""
+    return [
+        (
+            math.nan if each.arrived is None else (each.arrived - BEGIN) / S,
+            math.nan if each.departed is None else (each.departed - BEGIN) / S,
+        )
+        for each in visits(memory, Call(), x, y, **given).visits
+    ]
+
+
+@needs_recorded
+@each_way
+def test_visits_of_a_recorded_session_are_the_closed_form(tmp_path: Path, recalls: bool) -> None:
+    session = SESSIONS["session_mcap"]
+    for bag in session.folder.glob("*.mcap"):
+        (tmp_path / bag.name).write_bytes(bag.read_bytes())
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    answer = visits(memory, Call(), 0.0, 4.0, radius_m=0.5)
+    lap, half = 2 * math.pi / 0.25, 2 * math.asin(0.5 / 4) / 0.25
+    middles = [lap / 2 + lap * nth for nth in range(3)]
+    assert answer.frame_id == "odom"
+    assert not answer.more
+    assert len(answer.visits) == len(middles)
+    for visit, middle in zip(answer.visits, reversed(middles), strict=True):
+        assert visit.arrived is not None
+        assert visit.departed is not None
+        assert abs(session.since(visit.arrived / S) - (middle - half)) < 0.06
+        assert abs(session.since(visit.departed / S) - (middle + half)) < 0.06
+        assert abs(session.since(visit.closest_at / S) - middle) < 0.06
+        assert visit.closest_m < 0.05
+        assert visit.restarts == 0
+
+
+@each_way
+def test_the_demos_robot_was_at_the_kitchen_counter_when_its_lap_says(
+    tmp_path: Path, recalls: bool
+) -> None:
+    now = BEGIN + 200 * S
+    recorder = DemoRecorder(tmp_path / "flat", Timeline(BEGIN, BEGIN), clock=FixedClock(now))
+    recorder.write_until(now)
+    recorder.stop()
+    memory = memory_of(tmp_path, clock=SettableClock(now))
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    counter = demo_robot.KITCHEN_COUNTER
+    answer = visits(memory, Call(), counter.x, counter.y)
+    assert answer.frame_id == "map"
+    times = [nth * 0.05 for nth in range(200 * 20)]
+    near = [
+        t
+        for t in times
+        if math.dist(demo_robot.pose_in_map(t)[:2], (counter.x, counter.y)) <= answer.radius_m
+    ]
+    starts = [t for before, t in pairwise([-1.0, *near]) if t - before > 0.06]
+    assert [(each.arrived or 0) / S - BEGIN / S for each in reversed(answer.visits)] == (
+        pytest.approx(starts, abs=0.1)
+    )
+    assert all(each.closest_m < 0.01 for each in answer.visits)
+
+
+def at(memory: Memory, now: int) -> Memory:
+    """The memory, asked at another time."""
+    return replace(memory, clock=SettableClock(now))
+
+
+@pytest.mark.parametrize("now", ["wall", "latest"])
+def test_a_robot_that_is_there_still_has_not_departed(
+    tmp_path: Path, now: Literal["wall", "latest"]
+) -> None:
+    memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
+    memory = replace(memory, limits=replace(memory.limits, now=now))
+    if now == "wall":
+        memory = at(memory, BEGIN + 75 * S)
+    answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0)
+    shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    assert shown["there_now"] is True
+    [visit] = shown["visits"]
+    assert visit["departed"] is None
+    assert visit["ago_s"] == 0.0
+    assert visit["arrived"] == pytest.approx(BEGIN / S + 18.0, abs=0.21)
+    assert "notes" not in shown
+
+
+def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
+    """A year ago, or minutes: its newest pose is its last one there, and a note says so."""
+    memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
+    newest = BEGIN + round(49.8 * S)
+    for later in (31 * S, 365 * 86_400 * S):
+        answer = visits(at(memory, newest + later), Call(), 10.0, 0.0, radius_m=1.0)
+        shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+        assert shown["there_now"] is False
+        [visit] = shown["visits"]
+        assert visit["departed"] == pytest.approx(newest / S)
+        assert visit["ago_s"] == pytest.approx(later / S)
+        assert "too old to know whether the robot is there now" in shown["notes"][0]
+    elsewhere = visits(at(memory, newest + 365 * 86_400 * S), Call(), 5.0, 0.0, radius_m=1.0)
+    assert elsewhere.visits
+    assert elsewhere.notes == ()
+
+
+def test_a_robot_that_was_outside_for_a_moment_did_not_leave(tmp_path: Path) -> None:
+    there = line((10, 0.0), (2, 1.0), (2, -1.0), (10, 0.0), (30, 1.0))
+    memory = remembering(tmp_path, there)
+    [(arrived, departed)] = spans(memory, 0.0, radius_m=1.0)
+    assert arrived == 0.0
+    assert departed == pytest.approx(25.0, abs=0.21)
+    longer = tmp_path / "longer"
+    longer.mkdir()
+    memory = remembering(longer, line((10, 0.0), (5, 1.0), (5, -1.0), (10, 0.0), (30, 1.0)))
+    assert len(spans(memory, 0.0, radius_m=1.0)) == 2
+
+
+def test_a_place_where_it_never_was_has_no_visits(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((20, 0.5)))
+    answer = visits(memory, Call(), 500.0, 0.0)
+    assert (answer.visits, answer.more) == ((), False)
+
+
+def test_the_newest_visits_come_first_and_more_are_told_of(tmp_path: Path) -> None:
+    there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
+    memory = remembering(tmp_path, line(*there_and_back))
+    answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0, limit=2)
+    assert answer.more
+    assert [round(((each.arrived or 0) - BEGIN) / S) for each in answer.visits] == [69, 49]
+
+
+def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_path: Path) -> None:
+    first = line((10, 0.0), (20, 0.5))
+    second = line((10, 0.0), (20, 0.5), begin=1000.0)
+    memory = remembering(tmp_path, first + second)
+    answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
+    assert [each.restarts for each in answer.visits] == [0, 1]
+    assert any("odometry began anew" in note for note in answer.notes)
+    recalled = recalling(replace(memory), tmp_path)
+    assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
+
+
+def test_a_restart_of_odometry_inside_one_bag_is_seen_with_a_catalogue_too(tmp_path: Path) -> None:
+    first = line((10, 0.0), (20, 0.5))
+    second = line((10, 0.0), (20, 0.5), begin=1000.0)
+    memory = remembering(tmp_path, [*first, *second], split_s=5000.0)
+    answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
+    assert [each.restarts for each in answer.visits] == [0, 1]
+    recalled = recalling(replace(memory), tmp_path)
+    assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
+
+
+def test_a_robot_that_drives_on_through_a_long_bag_did_not_restart(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((8, 0.5), (7, -0.2)), split_s=20.0)
+    recalled = recalling(replace(memory), tmp_path)
+    for each in (memory, recalled):
+        answer = visits(each, Call(), 0.0, 0.0, radius_m=1.0)
+        assert [visit.restarts for visit in answer.visits] == [0]
+
+
+def test_in_a_map_a_restart_of_odometry_changes_nothing(tmp_path: Path) -> None:
+    first = line((10, 0.0), (20, 0.5))
+    second = line((10, 0.0), (20, 0.5), begin=1000.0)
+    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 1.0, 0.0)), topic="/tf_static")
+    memory = remembering(tmp_path, [fixed, *first, *second])
+    answer = visits(memory, Call(), 5.0, 1.0, radius_m=1.0)
+    assert answer.frame_id == "map"
+    assert [each.restarts for each in answer.visits] == [0, 0]
+    assert answer.total == 2
+
+
+def test_a_place_may_be_named_in_the_frame_of_the_poses(tmp_path: Path) -> None:
+    fixed = tf(BEGIN, transform(BEGIN, "map", "odom", (5.0, 1.0, 0.0)), topic="/tf_static")
+    memory = remembering(tmp_path, [fixed, *line((10, 0.0), (20, 0.5))])
+    in_map = visits(memory, Call(), 5.0, 1.0, frame_id="map", radius_m=1.0)
+    in_odom = visits(memory, Call(), 0.0, 0.0, frame_id="odom", radius_m=1.0)
+    assert (in_map.frame_id, in_odom.frame_id) == ("map", "odom")
+    assert in_map.visits == in_odom.visits
+    assert visits(memory, Call(), 5.0, 1.0, radius_m=1.0) == in_map
+    with pytest.raises(InvalidArgumentsError, match=r'frame_id was "laser"; .* in map or odom'):
+        visits(memory, Call(), 0.0, 0.0, frame_id="laser")
+
+
+@each_way
+def test_a_map_that_moves_under_odometry_is_followed(tmp_path: Path, recalls: bool) -> None:
+    """The robot drives on in odometry, which slips back as fast: it stands in the map."""
+    poses = line((40, 0.5))
+    moves = [
+        tf(at, transform(at, "map", "odom", (-(at - BEGIN) / S * 0.5, 0.0, 0.0)))
+        for at in (BEGIN + t * S // 2 for t in range(81))
+    ]
+    memory = remembering(tmp_path, [*poses, *moves])
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    answer = visits(memory, Call(), 0.0, 0.0, radius_m=0.3)
+    [visit] = answer.visits
+    assert answer.frame_id == "map"
+    assert (visit.arrived, visit.departed) == (BEGIN, BEGIN + round(39.8 * S))
+
+
+@pytest.mark.parametrize("radius", [0.0, -1.0, math.inf, math.nan])
+def test_a_radius_must_be_a_length(tmp_path: Path, radius: float) -> None:
+    memory = remembering(tmp_path, line((5, 0.5)))
+    with pytest.raises(InvalidArgumentsError, match="radius_m"):
+        visits(memory, Call(), 0.0, 0.0, radius_m=radius)
+
+
+def test_a_visit_whose_search_runs_out_of_time_has_no_arrival(tmp_path: Path) -> None:
+    memory = remembering(tmp_path, line((100, 0.003)))
+    outcomes = set()
+    for looks in range(1, 120):
+        call = Call(Deadline.after(looks, iter(range(100_000)).__next__))
+        try:
+            answer = visits(memory, call, 0.0, 0.0, radius_m=0.28)
+        except QueryTimeoutError:
+            continue
+        for visit in answer.visits:
+            outcomes.add(visit.arrived is None)
+            assert (visit.arrived is None) == any("out of time" in note for note in answer.notes)
+    assert False in outcomes
+
+
+@each_way
+@pytest.mark.parametrize("split_s", [10.0, 40.0])
+def test_a_robot_that_passes_over_a_place_was_no_farther_than_its_nearest_pose(
+    tmp_path: Path, split_s: float, recalls: bool
+) -> None:
+    memory = remembering(tmp_path, line((20, 0.25), x=-2.5), split_s=split_s)
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    [visit] = visits(memory, Call(), 0.0, 0.0, radius_m=5.0).visits
+    assert visit.closest_m == pytest.approx(0.0, abs=1e-9)
+    assert visit.closest_at == BEGIN + 10 * S
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    seed=st.integers(0, 2**32),
+    step=st.sampled_from([0.0, 0.002, 0.05, 0.3]),
+    radius=st.sampled_from([0.1, 0.6, 2.0, 8.0]),
+    split_s=st.sampled_from([5.0, 12.0, 60.0]),
+)
+def test_the_closest_approach_is_that_of_the_recorded_poses(
+    seed: int, step: float, radius: float, split_s: float
+) -> None:
+    """Held to every pose there is, whether the catalogue knows the bags or not."""
+    draw = random.Random(seed)
+    poses, x, y, at = [], 0.0, 0.0, BEGIN
+    for _ in range(200):
+        x, y = x + draw.uniform(-step, step), y + draw.uniform(-step, step)
+        poses.append((at, x, y))
+        at += draw.choice([S // 5] * 20 + [2 * S] * 8 + [12 * S])
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        plain = remembering(bag_dir, [odom(t, x, y, 0.0) for t, x, y in poses], split_s=split_s)
+        place = (draw.uniform(-1, 1), draw.uniform(-1, 1))
+        told = visits(plain, Call(), *place, radius_m=radius, limit=100)
+        for visit in told.visits:
+            first = visit.arrived or BEGIN
+            last = visit.departed if visit.departed is not None else poses[-1][0]
+            inside = [(math.dist((px, py), place), t) for t, px, py in poses if first <= t <= last]
+            distance, when = min(inside)
+            assert visit.closest_m == pytest.approx(distance, abs=1e-12)
+            assert visit.closest_at == when
+        assert told.total == len(told.visits)
+        assert visits(recalling(plain, bag_dir), Call(), *place, radius_m=radius, limit=100) == told
+
+
+@each_way
+def test_total_counts_the_visits_that_are_not_shown_too(tmp_path: Path, recalls: bool) -> None:
+    there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
+    memory = remembering(tmp_path, line(*there_and_back))
+    if recalls:
+        memory = recalling(replace(memory), tmp_path)
+    answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0, limit=1)
+    assert len(answer.visits) == 1
+    assert answer.more
+    assert answer.total == 4
+    assert not answer.notes
+
+
+def test_total_is_what_was_counted_where_the_time_is_over(tmp_path: Path) -> None:
+    there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
+    memory = remembering(tmp_path, line(*there_and_back))
+    totals = set()
+    for looks in range(1, 60):
+        call = Call(Deadline.after(looks, iter(range(100_000)).__next__))
+        try:
+            answer = visits(memory, call, 10.0, 0.0, radius_m=1.0, limit=1)
+        except QueryTimeoutError:
+            continue
+        assert answer.total >= len(answer.visits)
+        assert (answer.total < 4) <= any("total counts" in note for note in answer.notes)
+        totals.add(answer.total)
+    assert 4 in totals
+    assert len(totals) > 1
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
+def test_visits_are_the_same_whatever_the_catalogue_knows(seed: int, part: float) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        write_history(bag_dir, draw)
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        memory = recalling(replace(plain), bag_dir, part=part)
+        for radius in (0.5, 3.0):
+            place = (draw.uniform(-2, 2), draw.uniform(-1, 1))
+            assert _answer(memory, place, radius) == _answer(plain, place, radius)
+
+
+def _answer(memory: Memory, place: tuple[float, float], radius: float) -> str:
+    try:
+        return repr(visits(memory, Call(), *place, radius_m=radius))
+    except EpisodicError as error:
+        return repr(error)
+
+
+@each_way
+def test_a_newest_pose_that_cannot_be_decoded_hides_no_visit(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    way = line((20.0, 0.1))
+    way[-1] = replace(way[-1], body=way[-1].payload[:40])
+    memory = remembering(tmp_path, way)
+    if recalls:
+        memory = recalling(memory, tmp_path)
+    found = visits(memory, Call(), 0.0, 0.0)
+    assert len(found.visits) == 1
+    assert found.frame_id == "odom"
+    assert [note for note in found.notes if "cannot be decoded" in note]
+
+
+@each_way
+def test_a_pose_on_the_way_that_cannot_be_decoded_is_told(tmp_path: Path, *, recalls: bool) -> None:
+    way = line((20.0, 0.1))
+    way[3] = replace(way[3], body=way[3].payload[:40])
+    memory = remembering(tmp_path, way)
+    if recalls:
+        memory = recalling(memory, tmp_path)
+    found = visits(memory, Call(), 0.0, 0.0)
+    assert len(found.visits) == 1
+    assert [note for note in found.notes if "cannot be decoded" in note]
+
+
+def test_of_poses_of_which_none_can_be_decoded_it_is_told_that(tmp_path: Path) -> None:
+    way = [replace(each, body=each.payload[:40]) for each in line((3.0, 0.1))]
+    with pytest.raises(UndecodableError, match="does not fit"):
+        visits(remembering(tmp_path, way), Call(), 0.0, 0.0)

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from ros2_memory.messages.conversions import (
+    euler,
+    nanoseconds,
+    rotation,
+    view,
+    xyz,
+    xyzw,
+)
+from ros2_memory.messages.fields import ABSENT
+from tests import bags
+
+NAN = math.nan
+
+
+def quaternion(x: float, y: float, z: float, w: float) -> object:
+    return bags.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def image(encoding: str, height: int = 2, width: int = 4, size: int = 24) -> object:
+    return bags.make(
+        "sensor_msgs/msg/Image",
+        header=bags.header(0, "camera"),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=size // height,
+        data=np.zeros(size, dtype=np.uint8),
+    )
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shape"),
+    [
+        ("rgb8", [2, 4, 3]),
+        ("bgr16", [2, 4, 3]),
+        ("rgba8", [2, 4, 4]),
+        ("bgra8", [2, 4, 4]),
+        ("mono8", [2, 4, 1]),
+        ("16UC1", [2, 4, 1]),
+        ("32FC3", [2, 4, 3]),
+        ("bayer_rggb8", [2, 4, 1]),
+        ("yuv422", [2, 4]),
+        ("", [2, 4]),
+    ],
+)
+def test_an_image_is_its_size_encoding_and_shape(encoding: str, shape: list[int]) -> None:
+    assert view(image(encoding), "data") == {"bytes": 24, "encoding": encoding, "shape": shape}
+
+
+def test_a_compressed_image_is_its_size_and_format() -> None:
+    jpeg = bags.make(
+        "sensor_msgs/msg/CompressedImage",
+        header=bags.header(0, ""),
+        format="jpeg",
+        data=np.zeros(9, dtype=np.uint8),
+    )
+    assert view(jpeg, "data") == {"bytes": 9, "encoding": "jpeg"}
+
+
+def test_a_point_cloud_is_its_size_and_points() -> None:
+    cloud = bags.make(
+        "sensor_msgs/msg/PointCloud2",
+        header=bags.header(0, ""),
+        height=2,
+        width=100,
+        fields=[],
+        is_bigendian=False,
+        point_step=16,
+        row_step=1600,
+        data=np.zeros(3200, dtype=np.uint8),
+        is_dense=True,
+    )
+    assert view(cloud, "data") == {"bytes": 3200, "points": 200, "shape": [2, 100]}
+
+
+def test_a_map_is_its_size_and_shape() -> None:
+    origin = bags.make(
+        "geometry_msgs/msg/Pose", position=bags.point(0, 0), orientation=bags.quaternion(0)
+    )
+    info = bags.make(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=bags.stamp(0),
+        resolution=0.05,
+        width=3,
+        height=2,
+        origin=origin,
+    )
+    grid = bags.make(
+        "nav_msgs/msg/OccupancyGrid",
+        header=bags.header(0, "map"),
+        info=info,
+        data=np.zeros(6, dtype=np.int8),
+    )
+    assert view(grid, "data") == {"bytes": 6, "shape": [2, 3]}
+
+
+def test_a_definition_of_another_shape_under_a_standard_name_is_not_taken_for_it() -> None:
+    store = get_typestore(Stores.EMPTY)
+    texts = {
+        "geometry_msgs/msg/Quaternion": "string x\nfloat64 y\n",
+        "sensor_msgs/msg/Image": "string data\n",
+    }
+    for name, text in texts.items():
+        store.register(get_types_from_msg(text, name))
+    own = store.types["geometry_msgs/msg/Quaternion"](x="a", y=1.0)
+    assert view(own, "x") == "a"
+    assert view(own, "yaw_deg") is ABSENT
+    picture = view(store.types["sensor_msgs/msg/Image"](data="abc"), "data")
+    assert picture == {"bytes": 3, "encoding": None, "shape": []}
+
+
+def test_a_quaternion_has_angles_and_no_components_in_this_view() -> None:
+    node = bags.quaternion(math.radians(30))
+    assert view(node, "yaw_deg") == pytest.approx(30)
+    assert view(node, "roll_deg") == pytest.approx(0)
+    assert view(node, "w") is ABSENT
+
+
+def test_a_time_is_one_number_in_this_view() -> None:
+    assert view(bags.stamp(5), "sec") is ABSENT
+
+
+@pytest.mark.parametrize("parts", [(0.0, 0.0, 0.0, 0.0), (NAN, 0.0, 0.0, 1.0), (0, 0, math.inf, 1)])
+def test_a_zero_or_unfinite_quaternion_is_no_rotation(
+    parts: tuple[float, float, float, float],
+) -> None:
+    node = quaternion(*parts)
+    assert rotation(node) is None
+    assert euler(node) is None
+    assert view(node, "yaw_deg") is None
+
+
+def test_a_quaternion_that_is_not_of_unit_length_is_normalised() -> None:
+    unit = rotation(quaternion(5.0, 6.0, 7.0, 8.0))
+    assert unit is not None
+    assert math.hypot(*unit) == pytest.approx(1, abs=1e-15)
+    assert unit[3] / unit[0] == pytest.approx(8 / 5)
+    assert rotation(quaternion(0.0, 0.0, 0.0, 2.0)) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_points_are_read_from_messages_and_from_json_alike() -> None:
+    assert xyz(bags.point(1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
+    assert xyz({"x": 1, "y": 2.5, "z": 0}) == (1.0, 2.5, 0.0)
+    assert xyzw({"x": 0, "y": 0, "z": 0, "w": 1}) == (0.0, 0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    "node",
+    [
+        None,
+        ABSENT,
+        3.0,
+        [1.0, 2.0, 3.0],
+        {"x": 1.0, "y": 2.0},
+        {"x": "1", "y": 2.0, "z": 3.0},
+        {"x": True, "y": 2.0, "z": 3.0},
+        {"x": 10**400, "y": 2.0, "z": 3.0},
+    ],
+)
+def test_what_is_not_shaped_like_a_point_is_none(node: object) -> None:
+    assert xyz(node) is None
+
+
+@pytest.mark.parametrize(
+    ("node", "time"),
+    [
+        (bags.stamp(1_752_500_000_123_456_789), 1_752_500_000_123_456_789),
+        (bags.make("builtin_interfaces/msg/Duration", sec=-1, nanosec=500_000_000), -500_000_000),
+        ({"sec": 2, "nanosec": 5}, 2_000_000_005),
+        ({"sec": 2, "nsec": 5}, 2_000_000_005),
+        ({"secs": 2, "nsecs": 5}, 2_000_000_005),
+        ({"sec": 2}, None),
+        ({"sec": 2.5, "nsec": 0}, None),
+        ({"sec": 10**20, "nsec": 0}, None),
+        (12.5, None),
+        (ABSENT, None),
+    ],
+)
+def test_a_time_is_read_from_messages_and_from_json_alike(node: object, time: int | None) -> None:
+    assert nanoseconds(node) == time

@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.messages.downsample import array_note, evenly, samples_note
+
+counts = st.integers(0, 5000)
+limits = st.integers(1, 600)
+
+
+@given(counts, limits)
+def test_no_more_are_kept_than_asked_and_no_fewer_than_there_are(count: int, at_most: int) -> None:
+    assert len(evenly(count, at_most)) == min(count, at_most)
+
+
+@given(counts, st.integers(2, 600))
+def test_the_first_and_the_last_are_kept(count: int, at_most: int) -> None:
+    kept = evenly(count, at_most)
+    if count:
+        assert (kept[0], kept[-1]) == (0, count - 1)
+
+
+@given(counts, limits)
+def test_indices_rise_by_steps_that_differ_by_at_most_one(count: int, at_most: int) -> None:
+    kept = evenly(count, at_most)
+    steps = [later - earlier for earlier, later in pairwise(kept)]
+    assert all(step >= 1 for step in steps)
+    assert not steps or max(steps) - min(steps) <= 1
+
+
+@given(st.integers(1, 5000))
+def test_a_single_place_goes_to_the_newest(count: int) -> None:
+    assert evenly(count, 1) == [count - 1]
+
+
+@pytest.mark.parametrize("at_most", [0, -1])
+def test_keeping_nothing_is_refused(at_most: int) -> None:
+    with pytest.raises(ValueError, match=f"at most {at_most} values"):
+        evenly(10, at_most)
+
+
+def test_the_notes_name_what_was_thinned() -> None:
+    assert array_note("ranges", 50, 360) == "ranges: 50 of 360 values, evenly spaced"
+    assert samples_note(100, 1300) == "100 of 1300 samples, evenly spaced over the window"

@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+import json
+import math
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.messages.to_json import (
+    MAX_DEPTH,
+    MAX_NOTES,
+    MAX_TEXT,
+    Exact,
+    Shown,
+)
+from tests import bags
+
+if TYPE_CHECKING:
+    from ros2_memory.core.model import JsonValue
+
+
+def shown(node: object, limit: int = 50, path: str = "") -> tuple[JsonValue, tuple[str, ...]]:
+    rendering = Shown(limit)
+    return rendering.value(node, path), rendering.notes
+
+
+def exact(node: object, limit: int = 50) -> JsonValue:
+    return Exact(limit).value(node, "")
+
+
+def test_a_long_array_is_thinned_evenly_and_the_note_says_so() -> None:
+    scan = SimpleNamespace(ranges=np.arange(360, dtype=np.float64))
+    value, notes = shown(scan)
+    assert isinstance(value, dict)
+    ranges = value["ranges"]
+    assert isinstance(ranges, list)
+    assert (len(ranges), ranges[0], ranges[-1]) == (50, 0, 359)
+    assert notes == ("ranges: 50 of 360 values, evenly spaced",)
+
+
+def test_an_array_at_the_limit_is_whole() -> None:
+    assert shown(list(range(50))) == (list(range(50)), ())
+
+
+def test_arrays_inside_elements_are_noted_once_with_the_longest() -> None:
+    node = {"markers": [{"points": list(range(size))} for size in (3, 70, 90, 60)]}
+    value, notes = shown(node)
+    assert notes == ("markers.points: 50 of 90 values, evenly spaced",)
+    assert isinstance(value, dict)
+    markers = value["markers"]
+    assert isinstance(markers, list)
+    lengths = [len(m["points"]) for m in markers if isinstance(m, dict) and "points" in m]  # type: ignore[arg-type]
+    assert lengths == [3, 50, 50, 50]
+
+
+def test_exactly_nothing_is_thinned_cut_or_rounded() -> None:
+    text = "x" * (MAX_TEXT + 1)
+    node = {"ranges": np.arange(360.0), "text": text, "third": 1 / 3, "list": list(range(99))}
+    assert exact(node) == {
+        "ranges": [float(n) for n in range(360)],
+        "text": text,
+        "third": 1 / 3,
+        "list": list(range(99)),
+    }
+
+
+def test_exactly_nan_stays_and_shown_it_is_null() -> None:
+    node = {"a": math.nan, "b": np.array([1.0, math.inf], dtype=np.float32)}
+    kept = exact(node)
+    assert isinstance(kept, dict)
+    assert isinstance(kept["a"], float)
+    assert math.isnan(kept["a"])
+    assert kept["b"] == [1.0, math.inf]
+    assert shown(node) == ({"a": None, "b": [1, None]}, ())
+
+
+def test_the_vectors_of_geometry_are_rounded_to_a_tenth_of_a_millimetre() -> None:
+    assert shown(bags.vector3(1 / 3, -0.00001, math.nan))[0] == {"x": 0.3333, "y": 0, "z": None}
+    assert exact(bags.vector3(1 / 3)) == {"x": 1 / 3, "y": 0.0, "z": 0.0}
+
+
+def test_a_magnetic_field_keeps_its_microtesla() -> None:
+    earth = bags.make(
+        "sensor_msgs/msg/MagneticField",
+        header=bags.header(0, "imu"),
+        magnetic_field=bags.vector3(2.15e-5, -1.2e-6, 4.31e-5),
+        magnetic_field_covariance=np.zeros(9),
+    )
+    value, _ = shown(earth)
+    assert isinstance(value, dict)
+    assert value["magnetic_field"] == {"x": 2.15e-5, "y": -1.2e-6, "z": 4.31e-5}
+
+
+def test_float32_arrays_leave_as_the_shortest_decimals() -> None:
+    assert shown(np.array([0.1, 2.5, 3.0], dtype=np.float32))[0] == [0.1, 2.5, 3]
+
+
+def test_numpy_scalars_become_values_of_python() -> None:
+    node = [np.float32(0.1), np.float64(0.5), np.int32(-3), np.uint64(2**64 - 1), np.bool_(True)]
+    value, _ = shown(node)
+    assert value == [0.1, 0.5, -3, 2**64 - 1, True]
+    assert isinstance(value, list)
+    assert [type(one) for one in value] == [float, float, int, int, bool]
+
+
+def test_a_bool_stays_a_bool_also_in_an_array() -> None:
+    assert json.dumps(shown([True, np.array([False, True])])[0]) == "[true, [false, true]]"
+
+
+def test_bytes_leave_as_numbers_while_few_and_as_their_count_when_many() -> None:
+    few, many = np.arange(50, dtype=np.uint8), np.arange(51, dtype=np.uint8)
+    for rendered in (shown(many)[0], exact(many), shown(bytes(51))[0], exact(bytes(51))):
+        assert rendered == {"bytes": 51}
+    assert shown(few)[0] == exact(few) == list(range(50))
+    assert shown(b"\x01\x02")[0] == [1, 2]
+
+
+def test_arrays_of_several_dimensions_leave_as_lists_of_lists() -> None:
+    assert shown(np.array([[1, 2], [3, 4]]))[0] == [[1, 2], [3, 4]]
+    assert exact(np.array([[1.5, 2], [3, 4]])) == [[1.5, 2.0], [3.0, 4.0]]
+
+
+def test_a_long_text_is_cut_with_a_note() -> None:
+    value, notes = shown({"data": "a" * 2500})
+    assert value == {"data": "a" * MAX_TEXT}
+    assert notes == (f"data: the first {MAX_TEXT} of 2500 characters",)
+
+
+def test_a_text_that_no_encoding_carries_is_mended() -> None:
+    value, _ = shown({"bad \ud800 key": "lone \udfff half, Grüße"})
+    assert value == {"bad ? key": "lone ? half, Grüße"}
+
+
+def test_a_time_leaves_as_seconds_rounded_up_to_a_microsecond() -> None:
+    stamp = bags.stamp(1_752_500_000_123_456_001)
+    assert shown(stamp)[0] == 1752500000.123457
+    assert exact(stamp) == 1_752_500_000_123_456_001 / 1e9
+    span = bags.make("builtin_interfaces/msg/Duration", sec=2, nanosec=500_000_000)
+    assert shown(span)[0] == 2.5
+
+
+def test_a_header_leaves_as_stamp_and_frame() -> None:
+    header = bags.header(1_500_000_000, "map")
+    assert shown(header)[0] == exact(header) == {"stamp": 1.5, "frame_id": "map"}
+
+
+def test_a_quaternion_that_is_no_rotation_is_null_with_a_note() -> None:
+    zero = bags.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0)
+    node = SimpleNamespace(orientation=zero)
+    assert exact(node) == {"orientation": None}
+    assert shown(node) == (
+        {"orientation": None},
+        ("orientation: no rotation (a zero or NaN quaternion)",),
+    )
+
+
+def test_nesting_beyond_reason_is_cut_with_a_note() -> None:
+    node: object = "deep"
+    for _ in range(1000):
+        node = [node]
+    value, notes = shown(node, path="a")
+    assert json.dumps(value).count("[") == MAX_DEPTH
+    assert notes == (f"a: what lies deeper than {MAX_DEPTH} levels is left out",)
+    assert json.dumps(exact(node)).count("[") == MAX_DEPTH
+
+
+def test_an_object_that_is_no_message_leaves_as_its_kind() -> None:
+    assert shown(object())[0] == "<object>"
+    assert shown(3 + 4j)[0] == "<complex>"
+
+
+def test_many_notes_are_counted_rather_than_told() -> None:
+    _, notes = shown({f"k{n}": list(range(60)) for n in range(MAX_NOTES + 5)})
+    assert len(notes) == MAX_NOTES + 1
+    assert notes[-1] == "and 5 more notes of this kind"
+
+
+def test_squeezed_long_objects_lose_their_last_entries_with_a_note() -> None:
+    rendering = Shown(2, squeeze=2)
+    assert rendering.value({"a": {"b": 1, "c": 2, "d": 3}}, "") == {"a": {"b": 1, "c": 2}}
+    assert rendering.notes == ("a: the first 2 of 3 entries",)
+
+
+numbers = st.one_of(
+    st.floats(),
+    st.integers(),
+    st.floats(width=32).map(np.float32),
+    st.integers(0, 255).map(np.uint8),
+    st.just(10**4000),
+)
+arrays = st.one_of(
+    st.lists(st.floats(width=32), max_size=40).map(lambda v: np.array(v, dtype=np.float32)),
+    st.lists(st.floats(), max_size=40).map(lambda v: np.array(v, dtype=np.float64)),
+    st.lists(st.integers(0, 255), max_size=40).map(lambda v: np.array(v, dtype=np.uint8)),
+    st.lists(st.integers(-128, 127), max_size=40).map(lambda v: np.array(v, dtype=np.int8)),
+    st.lists(st.booleans(), max_size=40).map(lambda v: np.array(v, dtype=np.bool_)),
+    st.integers(0, 12).map(lambda n: np.full((n, 2, 3), math.nan)),
+)
+parts = st.one_of(st.floats(), st.just(0.0))
+geometry = st.one_of(
+    st.builds(bags.vector3, parts, parts, parts),
+    st.builds(
+        lambda x, y, z, w: bags.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        parts, parts, parts, parts,
+    ),
+    st.integers(0, 2**62).map(bags.stamp),
+)  # fmt: skip
+texts = st.text(st.characters(codec=None, exclude_categories=()))
+leaves = st.one_of(
+    st.none(), st.booleans(), numbers, texts, st.binary(max_size=40), arrays, geometry
+)
+values = st.recursive(
+    leaves,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=12),
+        st.tuples(inner, inner),
+        st.dictionaries(texts, inner, max_size=5),
+        st.builds(lambda a, b: SimpleNamespace(a=a, b=b), inner, inner),
+    ),
+)
+
+
+def longest_list(value: JsonValue) -> int:
+    if isinstance(value, list):
+        return max([len(value), *(longest_list(one) for one in value)])
+    if isinstance(value, dict):
+        return max([0, *(longest_list(one) for one in value.values())])
+    return 0
+
+
+@given(values, st.integers(1, 8))
+def test_whatever_a_message_holds_what_leaves_is_strict_json_within_the_limit(
+    node: object, limit: int
+) -> None:
+    value, notes = shown(node, limit)
+    text = json.dumps(value, allow_nan=False, ensure_ascii=False)
+    assert json.loads(text.encode("utf-8")) == value
+    assert longest_list(value) <= limit
+    assert len(set(notes)) == len(notes)
+
+
+@given(values, st.integers(1, 8))
+def test_whatever_a_message_holds_the_exact_value_is_made_of_json_values(
+    node: object, limit: int
+) -> None:
+    pending = [exact(node, limit)]
+    while pending:
+        value = pending.pop()
+        if isinstance(value, list):
+            pending.extend(value)
+        elif isinstance(value, dict):
+            assert all(type(name) is str for name in value)
+            pending.extend(value.values())
+        else:
+            assert type(value) in {bool, int, float, str, type(None)}
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.longdouble])
+def test_the_unusual_widths_of_floats_leave_as_numbers(kind: type[np.floating]) -> None:
+    assert shown(kind(0.5))[0] == exact(kind(0.5)) == 0.5
+    assert shown(np.array([0.5], dtype=kind))[0] == exact(np.array([0.5], dtype=kind)) == [0.5]

@@ -1,0 +1,330 @@
+"""The adapters of the telemetry port: figures for Prometheus, spans for OpenTelemetry."""
+
+from __future__ import annotations
+
+import threading
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import pytest
+from mcp import Client, MCPError
+
+from ros2_memory import results
+from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
+from ros2_memory.core.model import Sample
+from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Telemetry
+from ros2_memory.history.context import Memory
+from ros2_memory.observability.gauges import (
+    IndexMeasures,
+    Measures,
+    RecorderMeasures,
+)
+from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.serving.mcp_server import EpisodicServer
+from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.replies import Replies
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from opentelemetry.sdk.trace import ReadableSpan
+
+pytest.importorskip("prometheus_client", reason="needs the extra observability")
+pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")
+
+from opentelemetry import trace
+from opentelemetry.sdk.trace.export import SimpleSpanProcessor
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from prometheus_client.parser import text_string_to_metric_families
+
+from ros2_memory.observability.opentelemetry import (
+    LONGEST,
+    SERVICE,
+    Traces,
+    provider_to,
+    traces_from_environment,
+)
+from ros2_memory.observability.prometheus import BUCKETS_S, Metrics
+
+INDEX = IndexMeasures(3, 1, 2, 0, 4096, 7.5, 0.5)
+RECORDER = RecorderMeasures(RecorderState.RECORDING, True, 1.7e9, 1.0, 700, 1, 2)
+Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
+
+
+def call(tool: str = "ask", outcome: str = "ok", seconds: float = 0.03) -> Answered:
+    return Answered(tool, outcome, seconds, 12, "abc", {"index": 1.5, "read": 2.0})
+
+
+async def scraped(metrics: Metrics) -> Samples:
+    shown = await metrics.exposition()
+    assert shown.content_type == "text/plain; version=0.0.4; charset=utf-8"
+    return {
+        (sample.name, frozenset(sample.labels.items())): sample.value
+        for family in text_string_to_metric_families(shown.body.decode())
+        for sample in family.samples
+    }
+
+
+def at(found: Samples, name: str, **labels: str) -> float:
+    return found[f"ros2_memory_{name}", frozenset(labels.items())]
+
+
+class TestMetrics:
+    async def test_answers_are_counted_by_tool_and_outcome(self) -> None:
+        metrics = Metrics(lambda: Measures(None, None, None), "1.2.3")
+        for outcome in ("ok", "ok", "no_data: gap", "timeout"):
+            metrics.answered(call(outcome=outcome))
+        found = await scraped(metrics)
+        assert at(found, "answers_total", tool="ask", outcome="ok", reason="") == 2
+        assert at(found, "answers_total", tool="ask", outcome="no_data", reason="gap") == 1
+        assert at(found, "answers_total", tool="ask", outcome="timeout", reason="") == 1
+        assert at(found, "build_info", version="1.2.3") == 1
+
+    async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole(self) -> None:
+        metrics = Metrics(lambda: Measures(None, None, None), "1")
+        tools = [Tool("full", "f", "A.", {}, blocking=False, question=partial(asking, "full"))]
+        dispatcher = Dispatcher(
+            cast("Memory", None),
+            tools,
+            Replies(Path("bags"), 1000),
+            call_timeout_s=5,
+            telemetry=Telemetry((metrics,)),
+        )
+        hostile = ['a"} 1\nup 0\n#', "\\", "\x00", "\ud800", "x" * 100_000, "full\n", "", "{"]
+        await dispatcher.answer("full", {})
+        for n in range(200):
+            name = hostile[n % len(hostile)] + str(n)
+            await dispatcher.answer(name, {name: name})
+        shown = await metrics.exposition()
+        assert len(shown.body) < 20_000
+        found = await scraped(metrics)
+        tool_labels = {dict(labels).get("tool") for _, labels in found}
+        assert tool_labels == {None, "full", UNKNOWN_TOOL}
+        asked = {"tool": UNKNOWN_TOOL, "outcome": "invalid_arguments", "reason": ""}
+        assert at(found, "answers_total", **asked) == 200
+        dispatcher.stop()
+
+    async def test_durations_are_counted_in_buckets_by_tool(self) -> None:
+        metrics = Metrics(lambda: Measures(None, None, None), "1")
+        for seconds in (0.03, 0.3, 100.0):
+            metrics.answered(call(seconds=seconds))
+        found = await scraped(metrics)
+        name = "answer_duration_seconds"
+        assert at(found, f"{name}_bucket", tool="ask", le="0.05") == 1
+        assert at(found, f"{name}_bucket", tool="ask", le=str(BUCKETS_S[-1])) == 2
+        assert at(found, f"{name}_count", tool="ask") == 3
+        assert at(found, f"{name}_sum", tool="ask") == pytest.approx(100.33)
+
+    async def test_the_memory_and_its_recorder_are_shown_as_measured(self) -> None:
+        metrics = Metrics(lambda: Measures(INDEX, RECORDER, 5000), "1")
+        found = await scraped(metrics)
+        assert at(found, "bags") == 3
+        aside = [at(found, "files_set_aside", state=each) for each in ("active", "damaged")]
+        assert aside == [1, 2]
+        assert (at(found, "kept_bytes"), at(found, "budget_bytes")) == (4096, 5000)
+        assert (at(found, "newest_data_age_seconds"), at(found, "index_age_seconds")) == (7.5, 0.5)
+        states = {each: at(found, "recorder_state", state=str(each)) for each in RecorderState}
+        assert [each for each, is_it in states.items() if is_it] == [RecorderState.RECORDING]
+        assert at(found, "recorder_live") == 1
+        assert at(found, "recorder_restarts_total") == 2
+        assert at(found, "recorder_written_bytes_total") == 700
+        assert at(found, "recorder_silent_topics") == 1
+
+    async def test_what_is_not_known_is_not_shown(self) -> None:
+        found = await scraped(Metrics(lambda: Measures(None, None, None), "1"))
+        assert {name for name, _ in found} == {"ros2_memory_build_info"}
+
+    async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone(self) -> None:
+        freed = threading.Event()
+
+        def hanging() -> Measures:
+            freed.wait()
+            return Measures(INDEX, None, None)
+
+        metrics = Metrics(hanging, "1", patience_s=0.01)
+        metrics.answered(call())
+        try:
+            for _ in range(2):
+                found = await scraped(metrics)
+                assert at(found, "answers_total", tool="ask", outcome="ok", reason="") == 1
+                assert "ros2_memory_bags" not in {name for name, _ in found}
+        finally:
+            freed.set()
+            metrics.stop()
+
+
+@pytest.fixture
+def spans(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[InMemorySpanExporter]:
+    """Spans of the MCP library, and of a server that `traced` builds.
+
+    The provider of a process can be set once, so the library is given one here instead.
+    """
+    exporter = InMemorySpanExporter()
+    arguments = getattr(request, "param", True)
+    provider = provider_to(SimpleSpanProcessor(exporter), arguments=arguments)
+    monkeypatch.setattr("mcp.shared._otel._tracer", provider.get_tracer("mcp-python-sdk"))
+    monkeypatch.setattr(trace, "get_tracer_provider", lambda: provider)
+    yield exporter
+    provider.shutdown()
+
+
+def asking(name: str, _given: Any) -> Any:
+    def asked(_memory: Any, call: Any) -> Any:
+        with call.stages.timed("read"):
+            if name == "empty":
+                raise NoDataError(NoDataReason.GAP, "a hole")
+            return results.TopicValue("/a", "a/msg/A", Sample(0, 7))
+
+    return asked
+
+
+def traced() -> EpisodicServer:
+    schema: dict[str, Any] = {"type": "object", "properties": {}}
+    tools = [
+        Tool(name, name, "Asks.", schema, blocking=False, question=partial(asking, name))
+        for name in ("full", "empty")
+    ]
+    provider: Any = trace.get_tracer_provider()
+    dispatcher = Dispatcher(
+        cast("Memory", None),
+        tools,
+        Replies(Path("bags"), 1000),
+        call_timeout_s=5,
+        telemetry=Telemetry((Traces(provider),)),
+    )
+    return EpisodicServer(dispatcher, tools, name="episodic", version="1", instructions="")
+
+
+def told(exporter: InMemorySpanExporter, outcome: str) -> ReadableSpan:
+    """The one span that has this outcome."""
+    [span] = [
+        each
+        for each in exporter.get_finished_spans()
+        if (each.attributes or {}).get("ros2_memory.outcome") == outcome
+    ]
+    return span
+
+
+class TestTraces:
+    async def test_a_call_has_one_span_with_its_outcome_and_stages(
+        self, spans: InMemorySpanExporter
+    ) -> None:
+        async with Client(traced()) as client:
+            await client.call_tool("full", {})
+            await client.call_tool("empty", {"secret": "s3cret"})
+        served = [
+            each
+            for each in spans.get_finished_spans()
+            if each.kind is trace.SpanKind.SERVER and each.name.startswith("tools/call")
+        ]
+        assert [each.name for each in served] == ["tools/call full", "tools/call empty"]
+        full = told(spans, "ok").attributes or {}
+        assert full["gen_ai.tool.name"] == "full"
+        assert full["mcp.method.name"] == "tools/call"
+        assert float(cast("float", full["ros2_memory.stage.read_ms"])) >= 0
+        assert full["ros2_memory.reply_chars"]
+        assert full["ros2_memory.correlation_id"]
+        assert told(spans, "no_data: gap").name == "tools/call empty"
+        assert "s3cret" not in "".join(each.to_json() for each in spans.get_finished_spans())
+
+    async def test_what_a_client_calls_a_tool_is_shortened(
+        self, spans: InMemorySpanExporter
+    ) -> None:
+        async with Client(traced()) as client:
+            await client.call_tool("x" * 100_000, {})
+        span = told(spans, "invalid_arguments")
+        assert len(span.name) == LONGEST
+        attributes = span.attributes or {}
+        assert attributes["gen_ai.tool.name"] == UNKNOWN_TOOL
+        assert max(len(str(each)) for each in attributes.values()) <= LONGEST
+
+    async def test_whatever_a_client_sends_spans_stay_small(
+        self, spans: InMemorySpanExporter
+    ) -> None:
+        long = "x" * 100_000
+        async with Client(traced()) as client:
+            await client.call_tool(long, {long: long})
+            for ask in (client.get_prompt, client.read_resource):
+                with pytest.raises(MCPError):
+                    await ask(f"file:///{long}")
+        assert len(spans.get_finished_spans()) >= 3
+        for each in spans.get_finished_spans():
+            assert len(each.to_json()) < 4000
+
+    @pytest.mark.parametrize("spans", [False], indirect=True)
+    async def test_without_arguments_nothing_that_a_client_chose_is_in_a_span(
+        self, spans: InMemorySpanExporter
+    ) -> None:
+        async with Client(traced()) as client:
+            await client.call_tool("full", {"s3cret": "s3cret"})
+            await client.call_tool("s3cret", {"s3cret": "s3cret"})
+            for ask in (client.get_prompt, client.read_resource):
+                with pytest.raises(MCPError):
+                    await ask("file:///s3cret")
+        served = [each for each in spans.get_finished_spans() if each.kind is trace.SpanKind.SERVER]
+        assert "s3cret" not in "".join(each.to_json() for each in served)
+        names = {each.name for each in served}
+        assert {"tools/call full", "tools/call unknown", "prompts/get", "resources/read"} <= names
+
+    async def test_a_call_that_did_not_come_over_mcp_gets_a_span_of_its_length(
+        self, spans: InMemorySpanExporter
+    ) -> None:
+        server = traced()
+        await server.dispatcher.answer("full", {})
+        await server.dispatcher.answer("other", {})
+        span = told(spans, "ok")
+        assert span.name == "tools/call full"
+        assert span.start_time is not None
+        assert span.end_time is not None
+        assert span.end_time > span.start_time
+        assert span.status.status_code is trace.StatusCode.UNSET
+        refused = told(spans, "invalid_arguments")
+        assert refused.status.status_code is trace.StatusCode.ERROR
+
+    def test_a_call_that_is_not_sampled_gets_no_other_span(
+        self, spans: InMemorySpanExporter
+    ) -> None:
+        left_out = trace.NonRecordingSpan(
+            trace.SpanContext(1, 2, is_remote=False, trace_flags=trace.TraceFlags(0))
+        )
+        provider: Any = trace.get_tracer_provider()
+        with trace.use_span(left_out):
+            Traces(provider).answered(call())
+        assert spans.get_finished_spans() == ()
+
+    @pytest.mark.parametrize(
+        ("variable", "text", "name"),
+        [
+            ("OTEL_NOTHING", "", SERVICE),
+            ("OTEL_SERVICE_NAME", "r2", "r2"),
+            ("OTEL_RESOURCE_ATTRIBUTES", "service.name=r3", "r3"),
+        ],
+    )
+    def test_the_service_has_the_name_that_the_environment_gives_or_its_own(
+        self, monkeypatch: pytest.MonkeyPatch, variable: str, text: str, name: str
+    ) -> None:
+        monkeypatch.setenv(variable, text)
+        provider = provider_to(SimpleSpanProcessor(InMemorySpanExporter()))
+        assert provider.resource.attributes["service.name"] == name
+        provider.shutdown()
+
+    def test_an_environment_that_cannot_be_used_is_refused(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("OTEL_SPAN_EVENT_COUNT_LIMIT", "many")
+        with pytest.raises(ConfigError, match=r"server\.traces: .* OTEL_SPAN_EVENT_COUNT_LIMIT"):
+            traces_from_environment(arguments=True)
+
+    def test_stopping_does_not_wait_for_an_exporter_that_hangs(self) -> None:
+        freed = threading.Event()
+
+        class Hanging(InMemorySpanExporter):
+            def shutdown(self) -> None:
+                freed.wait()
+
+        Traces(provider_to(SimpleSpanProcessor(Hanging()))).stop()
+        freed.set()

@@ -1,0 +1,235 @@
+"""One recording takes over from another: the steps, the cut, and that no message is lost to it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.bag_dir.handover_file import Counting, CutClock, Handover, Overlap
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
+from ros2_memory.recorder.handover.plan import (
+    Bounds,
+    Moment,
+    Passage,
+    Sidecars,
+    Step,
+    handed_over,
+    intended,
+    pending,
+    set_back,
+    void,
+    withdrawn,
+)
+
+T0 = 1_795_150_000 * NS_PER_S
+S = NS_PER_S
+
+
+def at(seconds: float, *, stepped_s: float = 0.0) -> Moment:
+    return Moment(500.0 + seconds, T0 + round((seconds + stepped_s) * S))
+
+
+def waited(passage: Passage, *seconds: float, ready: bool, missing: tuple[str, ...] = ()) -> Step:
+    steps = [passage.advance(at(each), ready=ready, missing=missing) for each in seconds]
+    assert set(steps[:-1]) <= {Step.WAIT}
+    return steps[-1]
+
+
+class TestSteps:
+    def test_two_seconds_after_everything_is_subscribed_the_handover_is_complete(self) -> None:
+        passage = Passage(at(0))
+        assert waited(passage, 0.2, 1.0, ready=True, missing=("/odom",)) is Step.WAIT
+        assert passage.bounds(at(1)) is None
+        assert waited(passage, 3.0, 4.9, ready=True) is Step.WAIT
+        assert passage.overlapping
+        assert waited(passage, 5.0, ready=True) is Step.COMPLETE
+
+    def test_a_recorder_that_is_not_ready_is_waited_for(self) -> None:
+        passage = Passage(at(0))
+        assert waited(passage, 1.0, 10.0, 100.0, ready=False) is Step.WAIT
+        assert not passage.overlapping
+
+    def test_a_topic_that_nobody_publishes_any_more_is_waited_for_until_the_timeout(self) -> None:
+        passage = Passage(at(0), subscribe_timeout_s=20)
+        assert waited(passage, 19.9, ready=True, missing=("/gone",)) is Step.WAIT
+        assert not passage.overlapping
+        assert waited(passage, 20.0, 21.9, ready=True, missing=("/gone",)) is Step.WAIT
+        assert waited(passage, 22.0, ready=True, missing=("/gone",)) is Step.COMPLETE
+
+    def test_a_publisher_that_appears_while_both_record_is_waited_for_anew(self) -> None:
+        passage = Passage(at(0), subscribe_timeout_s=20)
+        assert waited(passage, 1.0, 2.5, ready=True) is Step.WAIT
+        assert waited(passage, 2.7, 3.9, ready=True, missing=("/late",)) is Step.WAIT
+        assert not passage.overlapping
+        assert waited(passage, 4.0, 5.9, ready=True) is Step.WAIT
+        assert waited(passage, 6.0, ready=True) is Step.COMPLETE
+
+    def test_one_that_appears_after_the_timeout_is_not(self) -> None:
+        passage = Passage(at(0), subscribe_timeout_s=20)
+        assert waited(passage, 19.0, ready=True) is Step.WAIT
+        assert waited(passage, 20.5, ready=True, missing=("/late",)) is Step.WAIT
+        assert waited(passage, 21.0, ready=True, missing=("/late",)) is Step.COMPLETE
+
+    def test_the_clock_set_back_abandons_it(self) -> None:
+        passage = Passage(at(0))
+        waited(passage, 0.2, ready=True)
+        step = passage.advance(at(0.4, stepped_s=-0.15), ready=True, missing=())
+        assert step is Step.ABANDON
+
+    def test_the_clock_set_forward_does_not(self) -> None:
+        passage = Passage(at(0))
+        waited(passage, 0.2, ready=True)
+        assert passage.advance(at(0.4, stepped_s=3600), ready=True, missing=()) is Step.WAIT
+        assert passage.advance(at(2.3, stepped_s=3600), ready=True, missing=()) is Step.COMPLETE
+
+    def test_a_clock_that_is_slewed_does_not(self) -> None:
+        passage = Passage(at(0))
+        moments = [at(t / 5, stepped_s=-t / 5 * 0.08) for t in range(1, 12)]
+        steps = [passage.advance(moment, ready=True, missing=()) for moment in moments]
+        assert steps == [*[Step.WAIT] * 10, Step.COMPLETE]
+
+    def test_the_cut_lies_in_the_middle_of_the_time_that_both_recorded(self) -> None:
+        passage = Passage(at(0))
+        assert passage.bounds(at(1)) is None
+        waited(passage, 3.0, 5.0, ready=True)
+        assert passage.bounds(at(5)) == Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
+
+
+@pytest.mark.parametrize(
+    ("wall_s", "expected"), [(1.0, False), (0.95, False), (0.85, True), (-5.0, True), (9.0, False)]
+)
+def test_only_a_clock_that_falls_behind_at_once_was_set_back(wall_s: float, expected: bool) -> None:
+    assert set_back(Moment(10.0, T0), Moment(11.0, T0 + round(wall_s * S))) is expected
+
+
+class TestSidecars:
+    def make(self, **changes: object) -> Sidecars:
+        arguments: dict[str, object] = {
+            "old_files": ["a_7.mcap", "a_6.mcap"],
+            "new_files": ["b_0.mcap"],
+            "simulated": False,
+            "clock": CutClock.PUBLISH,
+        }
+        old = Handover(previous="z", counts_from=5, begin=Overlap(1, 9, ("a_0.mcap",)))
+        bounds = Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
+        return handed_over(old, "a", "b", bounds, **(arguments | changes))  # type: ignore[arg-type]
+
+    def test_both_name_each_other_and_the_cut(self) -> None:
+        old, new = self.make()
+        assert (old.next, old.counts_until) == ("b", T0 + 4 * S)
+        assert (new.previous, new.counts_from) == ("a", T0 + 4 * S)
+        assert new.state is Counting.COUNTS
+
+    def test_what_the_old_one_knew_of_its_own_beginning_stays(self) -> None:
+        old, _ = self.make()
+        assert (old.previous, old.counts_from) == ("z", 5)
+        assert old.begin == Overlap(1, 9, ("a_0.mcap",))
+
+    def test_each_cut_holds_only_in_the_overlap_and_in_the_files_of_it(self) -> None:
+        old, new = self.make()
+        assert old.end is not None
+        assert (old.end.log_from, old.end.files) == (T0 + 3 * S, ("a_6.mcap", "a_7.mcap"))
+        assert new.begin == Overlap(T0, T0 + 5 * S, ("b_0.mcap",))
+
+    def test_log_times_of_a_simulated_clock_do_not_bind(self) -> None:
+        old, new = self.make(simulated=True)
+        assert old.end == Overlap(None, None, ("a_6.mcap", "a_7.mcap"))
+        assert new.begin == Overlap(None, None, ("b_0.mcap",))
+
+    def test_a_cut_by_log_time_is_noted_in_both(self) -> None:
+        old, new = self.make(clock=CutClock.LOG)
+        assert old.clock is new.clock is CutClock.LOG
+        assert any("by log time" in note for note in old.notes)
+        assert any("by log time" in note for note in new.notes)
+
+    def test_before_and_after_a_failed_handover(self) -> None:
+        old = Handover(previous="z")
+        assert intended(old, "b") == Handover(previous="z", next="b")
+        assert withdrawn(intended(old, "b")) == old
+        assert pending("a").hides_all
+        assert void("a").hides_all
+
+
+class Receiver(NamedTuple):
+    """When a recorder received, in seconds of the wall clock, and by how much later it did."""
+
+    start: float
+    stop: float
+    delay_s: float
+
+
+class Publisher(NamedTuple):
+    """Publishes at multiples of its period, by a clock that is off by `skew_s`."""
+
+    period_s: float
+    phase_s: float
+    skew_s: float
+
+
+@given(
+    publisher=st.builds(Publisher, st.floats(0.003, 0.3), st.floats(0, 0.3), st.floats(-0.9, 0.9)),
+    subscribed_s=st.floats(0.2, 5),
+    delays=st.tuples(st.floats(0, 0.002), st.floats(0, 0.002)),
+    ends_after_s=st.floats(0.0, 5.0),
+)
+def test_every_message_counts_exactly_once_whatever_the_publisher_and_the_delays(
+    publisher: Publisher,
+    subscribed_s: float,
+    delays: tuple[float, float],
+    ends_after_s: float,
+) -> None:
+    bounds = Bounds(
+        T0, T0 + round(subscribed_s * S), T0 + round((subscribed_s + 1) * S),
+        T0 + round((subscribed_s + 2) * S),
+    )  # fmt: skip
+    old, new = handed_over(
+        Handover(),
+        "a",
+        "b",
+        bounds,
+        old_files=["a.mcap"],
+        new_files=["b.mcap"],
+        simulated=False,
+        clock=CutClock.PUBLISH,
+    )
+    recorders = {
+        "a.mcap": (old, Receiver(-10.0, subscribed_s + 2 + ends_after_s, delays[0])),
+        # A second later at most: it said that it had subscribed after it had.
+        "b.mcap": (new, Receiver(subscribed_s - 0.1, 20.0, delays[1])),
+    }
+    moment = -5 + publisher.phase_s
+    while moment < 15:
+        counted = 0
+        for file, (handover, receiver) in recorders.items():
+            received = moment + receiver.delay_s
+            if not receiver.start <= received < receiver.stop:
+                continue
+            published = T0 + round((moment + publisher.skew_s) * S)
+            logged = T0 + round(received * S)
+            counted += not any(
+                each.excludes(published, logged) for each in handover.exclusions(file)
+            )
+        assert counted == 1, moment
+        moment += publisher.period_s
+
+
+def test_after_the_clock_is_set_back_nothing_is_lost_outside_the_files_of_the_overlap() -> None:
+    bounds = Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
+    _, new = handed_over(
+        Handover(),
+        "a",
+        "b",
+        bounds,
+        old_files=["a_9.mcap"],
+        new_files=["b_0.mcap"],
+        simulated=False,
+        clock=CutClock.PUBLISH,
+    )
+    hour_before = T0 - 3600 * S
+    assert not any(
+        each.excludes(hour_before, hour_before + NS_PER_MS) for each in new.exclusions("b_0.mcap")
+    )
+    assert new.exclusions("b_7.mcap") == ()

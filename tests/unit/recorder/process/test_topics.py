@@ -1,0 +1,161 @@
+"""`topics.yaml`: what it may list, and the regular expression that comes of it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.errors import ConfigError
+from ros2_memory.recorder.process.topics import (
+    MAX_NAME,
+    TopicSelection,
+    load_topics,
+)
+
+SHIPPED = Path(__file__).resolve().parents[4] / "config/topics.yaml"
+NAMES = st.lists(
+    st.from_regex(r"(/[A-Za-z_][A-Za-z0-9_]{0,8}){1,3}", fullmatch=True), min_size=1, max_size=6
+)
+
+
+def listed(folder: Path, text: str) -> Path:
+    path = folder / "topics.yaml"
+    path.write_text(text)
+    return path
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_topics(path)
+    return str(caught.value)
+
+
+def test_the_shipped_list_is_that_of_the_specification() -> None:
+    assert load_topics(SHIPPED).entries == (
+        "/odom",
+        "/tf",
+        "/tf_static",
+        "/cmd_vel",
+        "/vision/scene/scene_description",
+        "/vision/scene/scene_objects",
+        "/vision/find_object/detections_meta",
+    )
+
+
+def test_a_topic_that_is_commented_out_stays_out(tmp_path: Path) -> None:
+    topics = load_topics(listed(tmp_path, "topics:\n  - /odom\n  # - /camera/image_raw\n"))
+    assert topics.entries == ("/odom",)
+    assert not topics.matches("/camera/image_raw")
+
+
+def test_an_entry_that_stands_twice_counts_once(tmp_path: Path) -> None:
+    assert load_topics(listed(tmp_path, "topics: [/tf, /odom, /tf]")).entries == ("/tf", "/odom")
+
+
+def test_the_pattern_is_anchored_and_in_the_order_of_the_file() -> None:
+    assert TopicSelection(("/odom", "/tf", "/tf_static")).regex == "^(/odom|/tf|/tf_static)$"
+
+
+def test_a_topic_does_not_bring_those_whose_names_begin_or_end_alike() -> None:
+    topics = TopicSelection(("/tf",))
+    assert [
+        name for name in ("/tf", "/tf_static", "/robot/tf", "/tf/x") if topics.matches(name)
+    ] == ["/tf"]
+
+
+def test_a_glob_stands_for_one_part_of_a_name() -> None:
+    topics = TopicSelection(("/vision/*/detections_meta", "/cam*/info"))
+    assert topics.regex == "^(/vision/[^/]+/detections_meta|/cam[^/]+/info)$"
+    assert topics.matches("/vision/find_object/detections_meta")
+    assert topics.matches("/cam1/info")
+    assert not topics.matches("/vision/detections_meta")
+    assert not topics.matches("/vision/a/b/detections_meta")
+    assert not topics.matches("/cam/info")
+    assert not topics.matches("/vision/find_object/detections")
+    assert topics.exact == ()
+
+
+@given(NAMES, NAMES)
+def test_exactly_the_listed_names_match(wanted: list[str], others: list[str]) -> None:
+    topics = TopicSelection(tuple(wanted))
+    assert all(topics.matches(name) for name in wanted)
+    assert [name for name in others if topics.matches(name) != (name in wanted)] == []
+
+
+@given(NAMES)
+def test_the_pattern_needs_no_escape_that_differs_between_regex_dialects(names: list[str]) -> None:
+    assert "\\" not in TopicSelection(tuple(names)).regex
+
+
+def test_hidden_topics_are_looked_at_only_when_one_is_named() -> None:
+    assert TopicSelection(("/odom", "/robot/_status")).hidden
+    assert not TopicSelection(("/odom", "/vision/*/x_y")).hidden
+
+
+@pytest.mark.parametrize(
+    ("entry", "reason"),
+    [
+        ("odom", "fully qualified"),
+        ("/odom/", "a part of the name is empty"),
+        ("//odom", "a part of the name is empty"),
+        ("/", "a part of the name is empty"),
+        ("/1st", "'1st' begins with a digit"),
+        ("/a b", "'a b' holds more than ASCII letters"),
+        ("/a|/.*", "'a|' holds more than"),
+        ("/ä", "'ä' holds more than"),
+        ("/~/odom", "'~' holds more than"),
+        ("/vision/**", "inside one part of the name"),
+        ("/" + "x" * MAX_NAME, f"longer than {MAX_NAME}"),
+    ],
+)
+def test_an_invalid_name_is_refused_with_file_entry_and_reason(
+    tmp_path: Path, entry: str, reason: str
+) -> None:
+    path = listed(tmp_path, f"topics: [/odom, '{entry}']")
+    said = refusal(path)
+    assert said.startswith(f"{path}: {entry!r} cannot be recorded: ")
+    assert reason in said
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("topics: []", "no topic is listed"),
+        ("topics:\n  # - /odom\n", "no topic is listed"),
+        ("topics: /odom", "must be a list"),
+        ("topics: [3]", "3 cannot be recorded: an entry must be text"),
+        ("topics: [~]", "None cannot be recorded: an entry must be text"),
+        ("- /odom", "one key, topics"),
+        ("", "one key, topics"),
+        ("topics: [/odom]\ntopic: [/tf]", "one key, topics"),
+        ("topics: [/odom", "it is not YAML"),
+    ],
+)
+def test_what_is_no_list_of_topics_is_refused(tmp_path: Path, text: str, reason: str) -> None:
+    path = listed(tmp_path, text)
+    said = refusal(path)
+    assert said.startswith(f"{path}: ")
+    assert reason in said
+
+
+def test_a_missing_list_is_refused_with_its_key(tmp_path: Path) -> None:
+    assert "recording.topics_file" in refusal(tmp_path / "nowhere.yaml")
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "topics.yaml"
+    path.write_bytes(b"\xff\xfe\x00")
+    assert "it is not YAML" in refusal(path)
+
+
+def test_more_topics_than_a_pattern_can_hold_are_refused(tmp_path: Path) -> None:
+    lines = "\n".join(f"- /{'t' * 200}_{number}" for number in range(400))
+    assert "use globs" in refusal(listed(tmp_path, f"topics:\n{lines}\n"))
+
+
+def test_the_pattern_is_a_regular_expression() -> None:
+    re.compile(TopicSelection(("/a*b/c", "/*")).regex)

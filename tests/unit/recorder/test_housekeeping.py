@@ -1,0 +1,501 @@
+from __future__ import annotations
+
+import os
+import threading
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import structlog
+import zstandard
+
+from ros2_memory import queries
+from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call, Limits, Memory
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.recorder.housekeeping import InBackground
+from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.recorder.ports import Housekeeper, NoHousekeeping
+from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import McapLayout, odom, write_db3, write_mcap
+from tests.keeping import (
+    PLENTY,
+    FakeTimeSync,
+    files_in,
+    keeper_of,
+    later,
+    reader_of_both,
+    recording_now,
+    size_of,
+)
+from tests.memories import extractor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, MutableMapping
+    from pathlib import Path
+
+S = 10**9
+T0 = 1_790_000_000 * S
+HOUR = 3600 * S
+OWN = "rec_20260921T101320Z"
+
+
+def bag(path: Path, start: int, count: int = 20, layout: McapLayout | None = None) -> Path:
+    times = [T0 + start * S + n * S // 4 for n in range(count)]
+    return write_mcap(path, [odom(time, 1.0, 2.0) for time in times], layout)
+
+
+def recording(bag_dir: Path, name: str, start: int, splits: int = 3) -> list[Path]:
+    """A closed recording as `ros2 bag record` and its supervisor leave it."""
+    made = [bag(bag_dir / name / f"{name}_{n}.mcap", start + n * 10) for n in range(splits)]
+    (bag_dir / name / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    (bag_dir / name / "handover.json").write_text('{"format": 1}')
+    return made
+
+
+def left_open(path: Path, start: int = 0, count: int = 20) -> Path:
+    return bag(path, start, count, McapLayout(chunk_size=400, finish=False))
+
+
+def events(captured: list[MutableMapping[str, Any]], name: str) -> list[MutableMapping[str, Any]]:
+    return [each for each in captured if each["event"] == name]
+
+
+class TestRetention:
+    def test_the_oldest_bags_go_and_their_recording_after_them(self, tmp_path: Path) -> None:
+        old, new = recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
+        keeper_of(tmp_path, max_bytes=sum(path.stat().st_size for path in new) + 100).apply(
+            tmp_path
+        )
+        assert files_in(tmp_path) == [
+            "b",
+            "b/b_0.mcap",
+            "b/b_1.mcap",
+            "b/b_2.mcap",
+            "b/handover.json",
+            "b/metadata.yaml",
+        ]
+        assert not any(path.exists() for path in old)
+
+    def test_the_budget_counts_metadata_sidecars_open_bags_and_what_is_derived(
+        self, tmp_path: Path
+    ) -> None:
+        first, *_ = recording(tmp_path, "a", 0)
+        left_open(tmp_path / "b" / "b_0.mcap", 100)
+        for name in (".episodic/catalogue.sqlite", ".ros_log/ros2_1.log"):
+            (tmp_path / name).parent.mkdir()
+            (tmp_path / name).write_bytes(bytes(5000))
+        recording_now(tmp_path, "b")
+        total = size_of(tmp_path)
+        keeper_of(tmp_path, max_bytes=total).apply(tmp_path)
+        assert first.exists()
+        keeper_of(tmp_path, max_bytes=total - 1).apply(tmp_path)
+        assert not first.exists()
+
+    def test_two_names_of_one_file_count_once(self, tmp_path: Path) -> None:
+        first, second, third = recording(tmp_path, "a", 0)
+        (tmp_path / "kept").mkdir()
+        os.link(first, tmp_path / "kept/same.mcap")
+        keeper_of(tmp_path, max_bytes=size_of(tmp_path)).apply(tmp_path)
+        assert all(path.exists() for path in (first, second, third))
+
+    def test_what_is_too_old_goes_by_the_time_inside_and_not_by_that_of_the_file(
+        self, tmp_path: Path
+    ) -> None:
+        old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "a/a_1.mcap", 3 * 3600)
+        os.utime(young, ns=(T0, T0))
+        keeper_of(tmp_path, max_age_h=2).apply(tmp_path)
+        assert (old.exists(), young.exists()) == (False, True)
+
+    def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
+        self, tmp_path: Path
+    ) -> None:
+        old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "b/b_0.mcap", 3 * 3600)
+        clock = FakeTimeSync(synchronised=False)
+        keeper = keeper_of(tmp_path, max_age_h=2, time_sync=clock)
+        with structlog.testing.capture_logs() as captured:
+            keeper.apply(tmp_path)
+            keeper.apply(tmp_path)
+            assert (old.exists(), clock.asked) == (True, 2)
+            [held] = events(captured, "age_held")
+            assert (held["bags"], held["reason"]) == (1, keeper.age_held())
+            assert "1 bag is older than 2 h" in held["reason"]
+            clock.synchronised = True
+            keeper.apply(tmp_path)
+        assert (old.exists(), young.exists(), keeper.age_held()) == (False, True, None)
+        assert len(events(captured, "age_no_longer_held")) == 1
+        keeper.apply(tmp_path)
+        assert clock.asked == 3
+
+    def test_what_was_recorded_longer_ago_than_the_limit_goes_by_the_monotonic_clock(
+        self, tmp_path: Path
+    ) -> None:
+        old = bag(tmp_path / "a/a_0.mcap", 0)
+        keeper = keeper_of(tmp_path, max_age_h=0.1, time_sync=FakeTimeSync(synchronised=False))
+        keeper.apply(tmp_path)
+        for second in range(400):
+            keeper.note_recorded(["b"], second, float(second))
+            if second == 350:
+                bag(tmp_path / "b/b_0.mcap", 30)
+                keeper.apply(tmp_path)
+                assert old.exists()
+        keeper.apply(tmp_path)
+        assert files_in(tmp_path / "b") == ["b_0.mcap"]
+        assert not old.exists()
+
+    def test_it_is_told_once_for_each_pass_what_was_deleted(self, tmp_path: Path) -> None:
+        recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
+        keeper = keeper_of(tmp_path, max_bytes=45_000)
+        with structlog.testing.capture_logs() as captured:
+            keeper.apply(tmp_path)
+            keeper.apply(tmp_path)
+        first, second = events(captured, "retention_applied")
+        assert (first["log_level"], first["bags"], first["recordings"]) == ("info", 4, 1)
+        assert first["bytes"] > 45_000
+        assert first["duration_ms"] > 0
+        assert (second["log_level"], second["bags"]) == ("debug", 0)
+        assert second["total_bytes"] == size_of(tmp_path) <= 45_000
+
+    def test_a_bag_without_a_message_goes_too(self, tmp_path: Path) -> None:
+        empty = write_mcap(
+            tmp_path / "e/e_0.mcap", [], declared=[("/odom", "nav_msgs/msg/Odometry")]
+        )
+        os.utime(empty, ns=(T0, T0))
+        bag(tmp_path / "a/a_0.mcap", 3 * 3600)
+        bag(tmp_path / "a/a_1.mcap", 0)
+        keeper_of(tmp_path, max_age_h=2).apply(tmp_path)
+        assert files_in(tmp_path) == ["a", "a/a_0.mcap"]
+
+    def test_a_wrong_clock_neither_deletes_a_bag_before_its_time_nor_keeps_it_for_good(
+        self, tmp_path: Path
+    ) -> None:
+        bags = {name: bag(tmp_path / f"{name}/{name}_0.mcap", 0) for name in ("old", "new")}
+        ten_years = 87_600 * HOUR
+        for name, dated, written in (
+            ("old", T0, T0),
+            ("new", T0 + HOUR, T0 + HOUR),
+            ("boot", 40 * S, T0 + HOUR // 2),
+            ("ahead", T0 + ten_years, T0 + ten_years),
+        ):
+            bags[name] = bag(tmp_path / f"{name}/{name}_0.mcap", (dated - T0) // S)
+            os.utime(bags[name], ns=(written, written))
+        size = bags["old"].stat().st_size
+        left = []
+        for count in (3, 2, 1):
+            keeper = keeper_of(tmp_path, max_bytes=count * size + size // 2, max_age_h=168)
+            keeper.apply(tmp_path)
+            left.append([name for name, path in bags.items() if path.exists()])
+        assert left == [["old", "new", "boot"], ["new", "boot"], ["new"]]
+
+    def test_a_plain_bag_goes_with_its_unfinished_compressed_form(self, tmp_path: Path) -> None:
+        first, *_ = recording(tmp_path, "a", 0)
+        packed = zstandard.compress(first.read_bytes())
+        first.with_name("a_0.mcap.zstd").write_bytes(packed[: len(packed) // 2])
+        keeper_of(tmp_path, max_bytes=30_000, reader=reader_of_both()).apply(tmp_path)
+        assert not first.exists()
+        assert not first.with_name("a_0.mcap.zstd").exists()
+
+    def test_a_sqlite_bag_goes_with_its_journals(self, tmp_path: Path) -> None:
+        messages = [odom(T0 + n, 1.0, 2.0) for n in range(5)]
+        first = write_db3(tmp_path / "a/a_0.db3", messages)
+        first.with_name("a_0.db3-shm").write_bytes(b"")
+        first.with_name("a_1.db3-shm").write_bytes(b"")
+        bag(tmp_path / "b/b_0.mcap", 100)
+        keeper_of(tmp_path, max_bytes=1, reader=reader_of_both()).apply(tmp_path)
+        assert files_in(tmp_path) == ["b", "b/b_0.mcap"]
+
+
+class TestWhatIsNeverDeleted:
+    def test_an_unknown_file_and_the_directory_that_it_lies_in(self, tmp_path: Path) -> None:
+        recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
+        (tmp_path / "a/notes.txt").write_text("mine")
+        (tmp_path / "a/.hidden.tmp").write_text("mine")
+        (tmp_path / "elsewhere").mkdir()
+        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        assert files_in(tmp_path)[:4] == ["a", "a/.hidden.tmp", "a/notes.txt", "b"]
+        assert (tmp_path / "elsewhere").is_dir()
+
+    def test_the_bag_being_written_and_its_directory(self, tmp_path: Path) -> None:
+        closed = bag(tmp_path / "a/a_0.mcap", 0)
+        active = left_open(tmp_path / "a/a_1.mcap", 10)
+        (tmp_path / "a/handover.json").write_text("{}")
+        bag(tmp_path / "b/b_0.mcap", 100)
+        recording_now(tmp_path, "a")
+        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        assert not closed.exists()
+        assert active.exists()
+        assert (tmp_path / "a/handover.json").exists()
+
+    def test_the_directory_of_a_recording_that_is_being_written_though_no_bag_is_in_it(
+        self, tmp_path: Path
+    ) -> None:
+        bag(tmp_path / "a/a_0.mcap", 0)
+        bag(tmp_path / "b/b_0.mcap", 100)
+        recording_now(tmp_path, "a")
+        keeper = keeper_of(tmp_path, max_bytes=1)
+        keeper.apply(tmp_path)
+        assert files_in(tmp_path)[0] == "a"
+        recording_now(tmp_path, "b")
+        keeper.apply(tmp_path)
+        assert files_in(tmp_path)[0] == "b"
+
+    def test_an_open_bag_that_the_recorder_named_last_though_its_heartbeat_is_old(
+        self, tmp_path: Path
+    ) -> None:
+        active = left_open(tmp_path / "a/a_0.mcap", 0)
+        bag(tmp_path / "b/b_0.mcap", 100)
+        recording_now(tmp_path, "a", clock=later(0))
+        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        assert active.exists()
+
+    def test_a_bag_that_cannot_be_read(self, tmp_path: Path) -> None:
+        damaged = tmp_path / "a/a_0.mcap"
+        damaged.parent.mkdir()
+        damaged.write_bytes(b"no bag at all")
+        bag(tmp_path / "b/b_0.mcap", 100)
+        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        assert damaged.exists()
+
+    def test_damaged_files_from_elsewhere_do_not_push_the_history_out(self, tmp_path: Path) -> None:
+        (tmp_path / "a").mkdir()
+        (tmp_path / "a/huge.mcap").write_bytes(bytes(100_000))
+        first, *_ = recording(tmp_path, "b", 0)
+        keeper_of(tmp_path, max_bytes=size_of(tmp_path) - 100_000).apply(tmp_path)
+        assert first.exists()
+
+    def test_what_lies_behind_a_link(self, tmp_path: Path) -> None:
+        bags, outside = tmp_path / "bags", tmp_path / "outside"
+        kept = recording(outside, "x", 0)
+        recording(bags, "b", 100)
+        (bags / "x").symlink_to(outside / "x", target_is_directory=True)
+        (bags / "b/b_9.mcap").symlink_to(kept[0])
+        keeper_of(bags, max_bytes=1).apply(bags)
+        assert all(path.exists() for path in kept)
+        assert (bags / "b/b_9.mcap").is_symlink()
+
+    def test_anything_where_the_index_was_built_without_limits(self, tmp_path: Path) -> None:
+        recording(tmp_path, "a", 0)
+        before = files_in(tmp_path)
+        index = IndexManager(tmp_path, McapReader(), later(), refresh_s=1.0, split_duration_s=10.0)
+        assert index.apply_retention(free_bytes=lambda: 0, min_free_bytes=PLENTY).bags == 0
+        assert files_in(tmp_path) == before
+
+
+class TestDeletionsThatFail:
+    @pytest.fixture
+    def stuck(self, tmp_path: Path) -> Iterator[Path]:
+        """A bag that not even root can delete: something is mounted on it, or it is immutable."""
+        with immovable(bag(tmp_path / "a/a_0.mcap", 0)) as path:
+            yield path
+
+    def test_are_told_once_and_do_not_stop_the_rest(self, tmp_path: Path, stuck: Path) -> None:
+        recording(tmp_path, "b", 100)
+        keeper = keeper_of(tmp_path, max_bytes=45_000)
+        with structlog.testing.capture_logs() as captured:
+            keeper.apply(tmp_path)
+            keeper.apply(tmp_path)
+        (told,) = events(captured, "not_deleted")
+        assert told["path"] == str(stuck)
+        assert told["reason"]
+        assert "b/b_0.mcap" not in files_in(tmp_path)
+        assert size_of(tmp_path) <= 45_000
+
+    def test_that_the_budget_cannot_be_held_is_told_once(self, tmp_path: Path) -> None:
+        recording(tmp_path, "b", 100, splits=1)
+        keeper = keeper_of(tmp_path, max_bytes=1)
+        with structlog.testing.capture_logs() as captured:
+            keeper.apply(tmp_path)
+            keeper.apply(tmp_path)
+        (told,) = events(captured, "budget_not_held")
+        assert told["total_bytes"] == size_of(tmp_path)
+
+
+@contextmanager
+def immovable(path: Path) -> Iterator[Path]:
+    """Makes the file one that cannot be removed, by whatever this machine can do."""
+    if os.geteuid() != 0:
+        path.parent.chmod(0o555)
+        try:
+            yield path
+        finally:
+            path.parent.chmod(0o755)
+        return
+    if os.system(f"chattr +i '{path}' 2>/dev/null") != 0:  # noqa: S605
+        pytest.skip("root can delete anything here: the file system has no immutable files")
+    try:
+        yield path
+    finally:
+        os.system(f"chattr -i '{path}'")  # noqa: S605
+
+
+class TestMakingRoom:
+    def test_more_than_the_budget_asks_is_deleted_until_enough_is_free(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, "a", 0, splits=6)
+        capacity = size_of(tmp_path) + 1000
+        keeper = keeper_of(tmp_path, measure_free=lambda at: capacity - size_of(at))
+        keeper.make_room(tmp_path, 30_000)
+        assert capacity - size_of(tmp_path) >= 30_000
+        left = [name for name in files_in(tmp_path) if name.endswith(".mcap")]
+        assert left == ["a/a_2.mcap", "a/a_3.mcap", "a/a_4.mcap", "a/a_5.mcap"]
+
+    def test_where_deleting_frees_less_than_it_should_more_is_deleted(self, tmp_path: Path) -> None:
+        recording(tmp_path, "a", 0, splits=6)
+        whole = size_of(tmp_path)
+        keeper = keeper_of(tmp_path, measure_free=lambda at: (whole - size_of(at)) // 2)
+        keeper.make_room(tmp_path, 30_000)
+        assert (whole - size_of(tmp_path)) // 2 >= 30_000
+
+    def test_the_newest_stays_though_it_is_not_enough(self, tmp_path: Path) -> None:
+        recording(tmp_path, "a", 0)
+        keeper_of(tmp_path, measure_free=lambda _: 0).make_room(tmp_path, PLENTY)
+        assert [name for name in files_in(tmp_path) if name.endswith(".mcap")] == ["a/a_2.mcap"]
+
+    def test_nothing_is_deleted_where_enough_is_free(self, tmp_path: Path) -> None:
+        recording(tmp_path, "a", 0)
+        before = files_in(tmp_path)
+        keeper_of(tmp_path, measure_free=lambda _: 100).make_room(tmp_path, 100)
+        assert files_in(tmp_path) == before
+
+
+class TestInTheBackground:
+    def test_limits_are_applied_while_the_caller_goes_on(self, tmp_path: Path) -> None:
+        first, *_ = recording(tmp_path, "a", 0)
+        keeper = InBackground(keeper_of(tmp_path, max_bytes=1))
+        keeper.apply(tmp_path)
+        keeper.apply(tmp_path)
+        keeper.wait()
+        assert not first.exists()
+
+    def test_repair_is_waited_for(self, tmp_path: Path) -> None:
+        open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
+        keeper = InBackground(keeper_of(tmp_path))
+        keeper.repair(tmp_path)
+        assert McapReader().summarize(open_one).complete
+
+    def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
+        first, *_ = recording(tmp_path, "a", 0)
+        held, asked = threading.Event(), []
+
+        def measured(_directory: Path) -> int:
+            asked.append(held.wait(30))
+            return 0
+
+        keeper = InBackground(keeper_of(tmp_path, measure_free=measured))
+        keeper.make_room(tmp_path, PLENTY)
+        keeper.make_room(tmp_path, PLENTY)
+        assert keeper.making_room()
+        assert first.exists()
+        held.set()
+        keeper.wait()
+        assert not keeper.making_room()
+        assert not first.exists()
+        assert all(asked)
+
+    @pytest.mark.parametrize(
+        ("error", "told"),
+        [
+            (OSError("the disk is gone"), "the disk is gone"),
+            (KeyError("x"), "a fault in this program (KeyError); see its log"),
+        ],
+        ids=["of the disk", "of this program"],
+    )
+    def test_a_failure_is_reported(self, tmp_path: Path, error: Exception, told: str) -> None:
+        class Failing(NoHousekeeping):
+            mended = False
+
+            def apply(self, bag_dir: Path) -> None:
+                if not self.mended:
+                    raise error
+
+        failing = Failing()
+        keeper = InBackground(failing)
+        keeper.apply(tmp_path)
+        keeper.wait()
+        assert keeper.faults() == {"apply": told}
+        failing.mended = True
+        keeper.apply(tmp_path)
+        keeper.wait()
+        assert keeper.faults() == {}
+
+    def test_both_are_housekeepers(self, tmp_path: Path) -> None:
+        keepers: list[Housekeeper] = [keeper_of(tmp_path), InBackground(keeper_of(tmp_path))]
+        assert all(hasattr(each, "repair") for each in keepers)
+
+
+class TestQuestionsMeanwhile:
+    def test_a_question_under_way_over_a_bag_that_is_deleted_still_answers(
+        self, tmp_path: Path
+    ) -> None:
+        first, *_ = recording(tmp_path, "a", 0)
+        records = McapReader().records(first, ["/odom"], TimeWindow.everything())
+        begun = next(records)
+        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        assert not first.exists()
+        rest = list(records)
+        assert (begun.log_time, len(rest)) == (T0, 19)
+
+    @pytest.mark.parametrize("kept", [1, 0])
+    def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
+        self, tmp_path: Path, kept: int
+    ) -> None:
+        paths = recording(tmp_path, "a", 0)
+        memory = stale_memory(tmp_path)
+        span = Span(start_s=T0 / S, end_s=T0 / S + 24.5)
+        assert queries.topic_range(memory, Call(), "/odom", span).total == 59
+        for path in paths[: 3 - kept]:
+            path.unlink()
+        if kept:
+            told = queries.topic_range(memory, Call(), "/odom", span)
+            assert len(told.samples) == 19
+            [gone] = [note for note in told.notes if "deleted before" in note]
+            assert gone.startswith("2 bags were deleted before they could be read: ")
+            assert queries.trajectory_summary(memory, Call(), span).start == T0 + 20 * S
+        else:
+            with pytest.raises(NoDataError):
+                queries.topic_range(memory, Call(), "/odom", span)
+            with pytest.raises(NoDataError):
+                queries.trajectory_summary(memory, Call(), span)
+        queries.list_recorded_topics(memory, Call())
+
+
+def stale_memory(bag_dir: Path) -> Memory:
+    """A memory that looked at the bags once, and does not look again."""
+    clock, reader = later(), McapReader()
+    index = IndexManager(bag_dir, reader, clock, refresh_s=10**6, split_duration_s=10.0)
+    index.refresh()
+    return Memory(index, reader, extractor(), clock, Limits(now="latest"))
+
+
+class TestRemoval:
+    def test_another_file_in_the_place_of_the_one_looked_at_stays(self, tmp_path: Path) -> None:
+        path = bag(tmp_path / "a/a_0.mcap", 0)
+        status = path.stat()
+        with pytest.raises(OSError, match="not the file that was looked at"):
+            remove_bag(tmp_path, path, Inode(status.st_dev, status.st_ino + 1))
+        assert path.exists()
+
+    def test_a_directory_that_became_a_link_is_not_followed(self, tmp_path: Path) -> None:
+        path = bag(tmp_path / "bags/a/a_0.mcap", 0)
+        status = path.stat()
+        (tmp_path / "bags/a").rename(tmp_path / "moved")
+        (tmp_path / "bags/a").symlink_to(tmp_path / "moved", target_is_directory=True)
+        with pytest.raises(OSError, match="behind a symbolic link"):
+            remove_bag(tmp_path / "bags", path, Inode(status.st_dev, status.st_ino))
+        assert (tmp_path / "moved/a_0.mcap").exists()
+
+    def test_nothing_outside_the_bag_directory_is_touched(self, tmp_path: Path) -> None:
+        path = bag(tmp_path / "a/a_0.mcap", 0)
+        status = path.stat()
+        (tmp_path / "bags").mkdir()
+        with pytest.raises(ValueError, match="is not in the subpath"):
+            remove_bag(tmp_path / "bags", path, Inode(status.st_dev, status.st_ino))
+        assert path.exists()
+
+    def test_the_bag_directory_itself_stays(self, tmp_path: Path) -> None:
+        (tmp_path / "metadata.yaml").write_text("x")
+        assert remove_emptied(tmp_path, tmp_path) == 0
+        assert (tmp_path / "metadata.yaml").exists()

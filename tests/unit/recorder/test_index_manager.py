@@ -1,0 +1,429 @@
+"""What is known of the bag directory."""
+
+from __future__ import annotations
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.timebase import Clock
+from ros2_memory.index.bag_table import PATROL
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from tests.plain_bags import PlainReader, close, grow, plain
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from ros2_memory.core.model import BagFile, SetAside
+
+S = 10**9
+NOW = 1_800_000_000 * S
+LONG_AGO = NOW - 3600 * S
+
+
+class HandClock(Clock):
+    """A clock that stands still until a test moves it."""
+
+    def __init__(self, at: int = NOW) -> None:
+        self.at = at
+
+    def now(self) -> int:
+        return self.at
+
+
+class Yard:
+    """A bag directory, its index, and a hand on the clock and on every mtime."""
+
+    def __init__(self, bag_dir: Path, *kinds: str) -> None:
+        self.bag_dir = bag_dir
+        self.clock = HandClock()
+        self.reader = PlainReader(*kinds)
+        self.index = self.fresh_index()
+
+    def fresh_index(self) -> IndexManager:
+        return IndexManager(
+            self.bag_dir, self.reader, self.clock, refresh_s=5.0, split_duration_s=10.0
+        )
+
+    def age(self, at: int = LONG_AGO) -> None:
+        """Gives every file and directory the same mtime."""
+        for path in (self.bag_dir, *self.bag_dir.rglob("*")):
+            os.utime(path, ns=(at, at), follow_symlinks=False)
+
+    def scan_after(self, seconds: float = 0.0) -> Snapshot:
+        self.clock.at += round(seconds * S)
+        return self.index.refresh()
+
+
+@pytest.fixture
+def yard(tmp_path: Path) -> Yard:
+    (tmp_path / "bags").mkdir()
+    return Yard(tmp_path / "bags")
+
+
+def _names(files: Iterable[BagFile | SetAside]) -> list[str]:
+    return [each.path.name for each in files]
+
+
+def _beat(*recordings: str, updated: int = NOW) -> Heartbeat:
+    return Heartbeat(
+        1, updated, RecorderState.RECORDING, recordings, updated, 0, (), (), None, interval_s=2.0
+    )
+
+
+def test_several_recordings_are_indexed_in_the_order_of_their_times(yard: Yard) -> None:
+    for split in range(12):
+        plain(yard.bag_dir / "rec_b" / f"rec_b_{split}.mcap", [split * 10, split * 10 + 9])
+    plain(yard.bag_dir / "2026" / "rec_a" / "rec_a_0.mcap", [200, 209])
+    yard.age()
+    snapshot = yard.index.snapshot()
+    assert _names(snapshot.bags) == [*(f"rec_b_{n}.mcap" for n in range(12)), "rec_a_0.mcap"]
+    assert (snapshot.earliest, snapshot.latest) == (0, 209)
+    assert snapshot.topics() == ("/odom",)
+    assert _names(snapshot.overlapping(TimeWindow(109, 111))) == ["rec_b_10.mcap", "rec_b_11.mcap"]
+    assert len(snapshot.holding("/odom")) == 13
+    assert (snapshot.problem, snapshot.scanned_at) == (None, NOW)
+
+
+def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9], silent=["/scan", "/lost"])
+    plain(yard.bag_dir / "rec" / "rec_1.mcap", [10, 19], topic="/scan")
+    plain(yard.bag_dir / "rec" / "rec_2.mcap", silent=["/idle"])
+    plain(yard.bag_dir / "rec" / "rec_3.mcap", [30], closed=False)
+    (yard.bag_dir / "rec" / "rec_4.mcap").touch()
+    plain(yard.bag_dir / "old" / "old_0.db3", [1])
+    (yard.bag_dir / "latest").symlink_to(yard.bag_dir / "rec", target_is_directory=True)
+    yard.age()
+    plain(yard.bag_dir / "rec" / "rec_5.mcap", [40], closed=False)
+    os.utime(yard.bag_dir / "rec" / "rec_5.mcap", ns=(NOW, NOW))
+    snapshot = yard.index.refresh()
+    assert [(bag.path.name, bag.state) for bag in snapshot.bags] == [
+        ("rec_0.mcap", BagState.CLOSED),
+        ("rec_1.mcap", BagState.CLOSED),
+        ("rec_3.mcap", BagState.INCOMPLETE),
+    ]
+    assert _names(snapshot.active) == ["rec_5.mcap"]
+    assert _names(snapshot.damaged) == ["rec_4.mcap"]
+    assert _names(snapshot.unread) == ["latest", "old_0.db3"]
+    assert snapshot.empty == 1
+    assert snapshot.silent_topics == {"/lost", "/idle"}
+
+
+def test_the_active_bag_stays_out_until_it_is_closed_in_place(yard: Yard) -> None:
+    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
+    yard.age(NOW - 5 * S)
+    assert _names(yard.scan_after().active) == ["rec_0.mcap"]
+    grow(path, 2, 3)
+    close(path)
+    yard.age(NOW - 5 * S)  # no name came or went
+    snapshot = yard.scan_after(1)
+    assert snapshot.active == ()
+    assert [(bag.start, bag.end) for bag in snapshot.bags] == [(1, 3)]
+
+
+def test_at_a_rotation_there_are_two_active_bags(yard: Yard) -> None:
+    for name in ("rec_1", "rec_2", "rec_0"):
+        plain(yard.bag_dir / name / f"{name}_0.mcap", [1], closed=False)
+    yard.age()
+    write_heartbeat(yard.bag_dir, _beat("rec_1", "rec_2"))
+    snapshot = yard.scan_after()
+    assert _names(snapshot.active) == ["rec_1_0.mcap", "rec_2_0.mcap"]
+    assert _names(snapshot.bags) == ["rec_0_0.mcap"]
+
+
+def test_when_the_heartbeat_dies_a_still_bag_is_served_as_incomplete(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
+    yard.age()
+    write_heartbeat(yard.bag_dir, _beat("rec"))
+    assert yard.scan_after(15).bags == ()
+    (bag,) = yard.scan_after(1).bags
+    assert bag.state is BagState.INCOMPLETE
+
+
+def test_an_active_bag_is_served_once_it_lay_still_for_three_splits(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
+    yard.age(NOW)
+    assert yard.scan_after(30).bags == ()
+    assert _names(yard.scan_after(1).bags) == ["rec_0.mcap"]
+
+
+def test_an_incomplete_bag_that_was_repaired_is_read_again(yard: Yard) -> None:
+    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
+    yard.age()
+    assert yard.scan_after().bags[0].state is BagState.INCOMPLETE
+    plain(yard.bag_dir / "rec" / "rec_0.repaired", [1, 2]).rename(path)
+    (bag,) = yard.scan_after().bags
+    assert (bag.state, bag.end) == (BagState.CLOSED, 2)
+
+
+def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
+    for split in range(3):
+        plain(yard.bag_dir / "rec" / f"rec_{split}.mcap", [split])
+    yard.age()
+    yard.scan_after()
+    new = plain(yard.bag_dir / "rec" / "rec_3.mcap", [3])
+    os.utime(new, ns=(LONG_AGO, LONG_AGO))
+    for _ in range(3):
+        assert len(yard.scan_after(10).bags) == 4
+    assert yard.reader.summaries == {f"rec_{split}.mcap": 1 for split in range(4)}
+    assert yard.reader.closings == yard.reader.summaries
+
+
+def test_a_changed_file_is_read_again_and_a_vanished_one_leaves(yard: Yard) -> None:
+    first = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1])
+    second = plain(yard.bag_dir / "rec" / "rec_1.mcap", [2], topic="/scan")
+    yard.age()
+    before = yard.scan_after()
+    plain(yard.bag_dir / "rec" / "new", [1, 5]).rename(first)
+    second.unlink()
+    after = yard.scan_after()
+    assert [(bag.path.name, bag.end) for bag in after.bags] == [("rec_0.mcap", 5)]
+    assert after.topics() == ("/odom",)
+    assert _names(before.bags) == ["rec_0.mcap", "rec_1.mcap"]
+    assert before.topics() == ("/odom", "/scan")
+
+
+def test_a_renamed_split_is_known_under_its_name_of_today(yard: Yard) -> None:
+    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1])
+    yard.scan_after()
+    path.rename(path.with_name("kitchen.mcap"))
+    assert _names(yard.scan_after().bags) == ["kitchen.mcap"]
+
+
+def test_a_closed_bag_that_was_overwritten_in_place_is_found_on_patrol(yard: Yard) -> None:
+    count = PATROL + 10
+    for split in range(count):
+        plain(yard.bag_dir / f"rec_{split}.mcap", [split])
+    yard.age()
+    yard.scan_after()
+    overwritten = [yard.bag_dir / f"rec_{split}.mcap" for split in (0, count - 1)]
+    for path in overwritten:
+        plain(path, [10_000, 20_000])
+    yard.age()
+    for _ in range(3):
+        snapshot = yard.scan_after(5)
+    assert [bag.path for bag in snapshot.bags if bag.end == 20_000] == overwritten
+
+
+@pytest.mark.parametrize(
+    ("plain_closed", "packed_closed", "answers"),
+    [
+        (True, False, "rec_0.mcap"),
+        (False, True, "rec_0.mcap.zstd"),
+        (False, False, "rec_0.mcap"),
+    ],
+)
+def test_of_a_bag_that_lies_there_compressed_too_only_one_is_indexed(
+    tmp_path: Path, plain_closed: bool, packed_closed: bool, answers: str
+) -> None:
+    yard = Yard(tmp_path, ".mcap", ".mcap.zstd")
+    plain(tmp_path / "rec_0.mcap", [1, 2], closed=plain_closed)
+    plain(tmp_path / "rec_0.mcap.zstd", [1, 2], closed=packed_closed)
+    yard.age()
+    snapshot = yard.scan_after()
+    assert _names(snapshot.bags) == [answers]
+    assert snapshot.active == snapshot.damaged == snapshot.unread == ()
+
+
+def test_two_whole_forms_are_one_bag_while_one_is_young_and_two_when_both_are_kept(
+    tmp_path: Path,
+) -> None:
+    yard = Yard(tmp_path, ".mcap", ".mcap.zstd")
+    plain(tmp_path / "rec_0.mcap", [1, 2])
+    yard.age()
+    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1, 2]), ns=(NOW, NOW))
+    assert _names(yard.scan_after().bags) == ["rec_0.mcap"]
+    yard.age()
+    assert sorted(_names(yard.scan_after().bags)) == ["rec_0.mcap", "rec_0.mcap.zstd"]
+
+
+def test_the_compressed_form_takes_over_when_the_plain_one_goes(tmp_path: Path) -> None:
+    yard = Yard(tmp_path, ".mcap", ".mcap.zstd")
+    path = plain(tmp_path / "rec_0.mcap", [1, 2])
+    yard.age()
+    assert _names(yard.scan_after().bags) == ["rec_0.mcap"]
+    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1, 2]), ns=(NOW, NOW))
+    assert _names(yard.scan_after().bags) == ["rec_0.mcap"]
+    path.unlink()
+    assert _names(yard.scan_after().bags) == ["rec_0.mcap.zstd"]
+
+
+def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_other(
+    tmp_path: Path,
+) -> None:
+    yard = Yard(tmp_path, ".mcap")
+    plain(tmp_path / "rec_0.mcap", [1])
+    plain(tmp_path / "rec_1.mcap.zstd", [1])
+    yard.age()
+    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1]), ns=(NOW, NOW))
+    snapshot = yard.scan_after()
+    assert _names(snapshot.bags) == ["rec_0.mcap"]
+    assert _names(snapshot.unread) == ["rec_1.mcap.zstd"]
+    assert _names(yard.scan_after(31).unread) == ["rec_0.mcap.zstd", "rec_1.mcap.zstd"]
+
+
+def test_a_bag_that_vanishes_while_it_is_read_is_left_out_and_found_if_it_comes_back(
+    yard: Yard,
+) -> None:
+    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1])
+    plain(yard.bag_dir / "rec" / "rec_1.mcap", [2])
+    yard.age()
+    yard.reader.before_summary = lambda read: read.unlink() if read == path else None
+    snapshot = yard.scan_after()
+    assert _names(snapshot.bags) == ["rec_1.mcap"]
+    assert snapshot.damaged == ()
+    yard.reader.before_summary = bool
+    plain(path, [1])
+    yard.age()
+    assert _names(yard.scan_after().bags) == ["rec_0.mcap", "rec_1.mcap"]
+
+
+def test_a_bag_directory_that_is_missing_is_a_problem_until_it_appears(tmp_path: Path) -> None:
+    yard = Yard(tmp_path / "bags")
+    snapshot = yard.index.snapshot()
+    assert (snapshot.bags, snapshot.latest) == ((), None)
+    assert "does not exist" in (snapshot.problem or "")
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [1])
+    yard.age()
+    snapshot = yard.scan_after()
+    assert _names(snapshot.bags) == ["rec_0.mcap"]
+    assert snapshot.problem is None
+
+
+def test_a_bag_directory_that_is_unmounted_takes_its_bags_along(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], silent=["/scan"])
+    plain(yard.bag_dir / "rec" / "rec_1.mcap", [1], closed=False)
+    (yard.bag_dir / "rec" / "rec_2.mcap").touch()
+    yard.age()
+    before = yard.scan_after()
+    yard.bag_dir.rename(yard.bag_dir.with_name("elsewhere"))
+    gone = yard.scan_after()
+    assert replace(gone, problem=None) == Snapshot(scanned_at=NOW)
+    assert gone.problem
+    yard.bag_dir.with_name("elsewhere").rename(yard.bag_dir)
+    assert yard.scan_after() == before
+
+
+def test_a_snapshot_is_kept_until_it_is_older_than_refresh_s(yard: Yard) -> None:
+    first = yard.index.snapshot()
+    yard.clock.at += 5 * S - 1
+    assert yard.index.snapshot() is first
+    yard.clock.at += 1
+    assert yard.index.snapshot().scanned_at == NOW + 5 * S
+
+
+def test_a_clock_that_was_set_back_has_the_snapshot_renewed(yard: Yard) -> None:
+    yard.index.snapshot()
+    yard.clock.at -= 1
+    assert yard.index.snapshot().scanned_at == NOW - 1
+
+
+def test_a_question_that_reaches_past_the_newest_end_looks_for_newer_bags(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    first = yard.index.snapshot(reach=9)
+    plain(yard.bag_dir / "rec" / "rec_1.mcap", [10, 19])
+    assert yard.index.snapshot() is first
+    assert yard.index.snapshot(reach=9) is first
+    assert _names(yard.index.snapshot(reach=10).bags) == ["rec_0.mcap", "rec_1.mcap"]
+
+
+def test_a_question_to_an_empty_memory_always_looks(yard: Yard) -> None:
+    assert yard.index.snapshot(reach=0).bags == ()
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    assert _names(yard.index.snapshot(reach=0).bags) == ["rec_0.mcap"]
+
+
+def test_callers_that_come_during_a_scan_share_its_result(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    yard.age()
+    reading, go_on = threading.Event(), threading.Event()
+
+    def hold(path: Path) -> None:
+        reading.set()
+        go_on.wait(10)
+
+    yard.reader.before_summary = hold
+    with ThreadPoolExecutor(8) as pool:
+        first = pool.submit(yard.index.snapshot)
+        assert reading.wait(10)
+        others = [pool.submit(yard.index.snapshot) for _ in range(7)]
+        go_on.set()
+        snapshots = {id(future.result(10)) for future in (first, *others)}
+    assert len(snapshots) == 1
+    assert yard.reader.summaries.total() == 1
+
+
+def test_a_scan_that_fails_on_a_defect_loses_nothing(yard: Yard) -> None:
+    for split in range(3):
+        plain(yard.bag_dir / "rec" / f"rec_{split}.mcap", [split])
+    yard.age()
+
+    def fail(path: Path) -> None:
+        raise ZeroDivisionError
+
+    yard.reader.before_summary = fail
+    with pytest.raises(ZeroDivisionError):
+        yard.index.snapshot()
+    yard.reader.before_summary = bool
+    assert len(yard.index.snapshot().bags) == 3
+
+
+def test_a_scan_that_changed_something_is_one_log_event(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    (yard.bag_dir / "rec" / "rec_1.mcap").touch()
+    yard.age()
+    with capture_logs() as events:
+        yard.scan_after()
+        yard.scan_after(5)
+    damaged, scanned = events
+    assert damaged["event"] == "bag_damaged"
+    assert (damaged["reason"], Path(damaged["path"]).name) == ("the file is empty", "rec_1.mcap")
+    assert scanned["event"] == "index_scanned"
+    assert {key: scanned[key] for key in ("bags", "added", "removed", "damaged", "active")} == {
+        "bags": 1,
+        "added": 1,
+        "removed": 0,
+        "damaged": 1,
+        "active": 0,
+    }
+    assert scanned["duration_ms"] >= 0
+
+
+def test_a_growing_active_bag_is_no_log_event(yard: Yard) -> None:
+    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [0], closed=False)
+    yard.age(NOW)
+    yard.scan_after()
+    with capture_logs() as events:
+        for moment in range(3):
+            grow(path, moment)
+            os.utime(path, ns=(yard.clock.at,) * 2)
+            assert _names(yard.scan_after(1).active) == ["rec_0.mcap"]
+    assert events == []
+
+
+def test_the_heartbeat_is_handed_on_live_or_not(yard: Yard) -> None:
+    assert yard.index.heartbeat() is None
+    stale = _beat("rec", updated=LONG_AGO)
+    write_heartbeat(yard.bag_dir, stale)
+    assert yard.index.heartbeat() == stale
+
+
+def test_nothing_is_written_into_the_bag_directory(yard: Yard) -> None:
+    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
+    plain(yard.bag_dir / "rec" / "rec_1.mcap", [0, 9], closed=False)
+    yard.age()
+    before = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
+    for _ in range(3):
+        yard.scan_after(5).holding("/odom")
+    after = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
+    assert {path: (stat.st_size, stat.st_mtime_ns) for path, stat in after.items()} == {
+        path: (stat.st_size, stat.st_mtime_ns) for path, stat in before.items()
+    }

@@ -1,0 +1,93 @@
+"""When a recording begins anew: after a death, after a session, after a silence."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.recorder.policies import Backoff, SilenceWatch, session_over
+
+
+class TestBackoff:
+    def test_doubles_up_to_its_cap(self) -> None:
+        backoff = Backoff(first_s=1, cap_s=60, stable_s=60)
+        waits = [backoff.failed(0.1) for _ in range(9)]
+        assert waits == [1, 2, 4, 8, 16, 32, 60, 60, 60]
+
+    def test_begins_anew_after_a_stable_minute(self) -> None:
+        backoff = Backoff(first_s=1, cap_s=60, stable_s=60)
+        assert [backoff.failed(59.9) for _ in range(3)] == [1, 2, 4]
+        assert backoff.failed(60.0) == 1
+        assert backoff.failed(0.0) == 2
+
+    @given(st.lists(st.floats(0, 100), max_size=60))
+    def test_never_waits_for_less_than_the_first_nor_more_than_the_cap(
+        self, lives: list[float]
+    ) -> None:
+        backoff = Backoff(first_s=1, cap_s=60, stable_s=60)
+        assert all(1 <= backoff.failed(lived) <= 60 for lived in lives)
+
+    def test_a_recorder_that_died_for_days_still_has_a_wait(self) -> None:
+        backoff = Backoff()
+        assert {backoff.failed(0) for _ in range(5000)} >= {60}
+
+
+def silent_at(watch: SilenceWatch, written: dict[float, int], until_s: float) -> float | None:
+    """The first moment, in steps of half a second, at which the watch calls for a rotation."""
+    size = 0
+    for half in range(round(until_s * 2) + 1):
+        now = half / 2
+        size = max(size, *(total for moment, total in written.items() if moment <= now), 0)
+        if watch.is_silent(now, size):
+            return now
+    return None
+
+
+class TestSilence:
+    def watch(self, session_s: float = 600) -> SilenceWatch:
+        watch = SilenceWatch(split_duration_s=10, session_duration_s=session_s)
+        watch.began(0, 5)
+        return watch
+
+    def test_three_splits_without_growth_after_some_growth_call_for_a_rotation(self) -> None:
+        assert silent_at(self.watch(), {0: 0, 7: 100, 20: 200}, 100) == 50
+
+    def test_a_robot_that_never_spoke_is_left_alone(self) -> None:
+        assert silent_at(self.watch(), {0: 0}, 1000) is None
+
+    def test_headers_and_latched_messages_of_a_young_recording_are_no_speech(self) -> None:
+        assert silent_at(self.watch(), {0: 0, 1: 500, 4.5: 900}, 1000) is None
+
+    def test_growth_goes_on_and_nothing_is_called_for(self) -> None:
+        steady = {float(t): t for t in range(0, 400, 29)}
+        assert silent_at(self.watch(), steady, 400) is None
+
+    def test_each_rotation_for_silence_doubles_the_patience_up_to_a_session(self) -> None:
+        watch = self.watch(session_s=100)
+        moments = []
+        for _ in range(4):
+            watch.began(0, 5)
+            moments.append(silent_at(watch, {0: 0, 10: 100}, 300))
+            watch.rotated(for_silence=True)
+        assert moments == [40, 70, 110, 110]
+
+    def test_a_session_that_lived_sets_the_patience_back(self) -> None:
+        watch = self.watch()
+        watch.rotated(for_silence=True)
+        watch.rotated(for_silence=True)
+        watch.rotated(for_silence=False)
+        watch.began(0, 5)
+        assert silent_at(watch, {0: 0, 10: 100}, 300) == 40
+
+    def test_after_a_rotation_it_waits_for_growth_again(self) -> None:
+        watch = self.watch()
+        assert silent_at(watch, {0: 0, 10: 100}, 300) == 40
+        watch.rotated(for_silence=True)
+        watch.began(40, 5)
+        assert [now for now in range(40, 400) if watch.is_silent(now, 0)] == []
+
+
+@pytest.mark.parametrize(("age_s", "over"), [(599.9, False), (600.0, True), (9999.0, True)])
+def test_a_session_is_over_after_its_duration(age_s: float, over: bool) -> None:
+    assert session_over(age_s, 600) is over

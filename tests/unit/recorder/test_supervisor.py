@@ -1,0 +1,229 @@
+"""What the supervisor does as time passes: no process runs, no second is waited for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.core.errors import RecorderError
+from tests.recorder_world import World
+from tests.supervision import assert_each_counts_once, events
+
+pytestmark = pytest.mark.usefixtures("no_flushing")
+
+
+class TestStart:
+    def test_a_recording_is_named_in_the_heartbeat_before_its_recorder_starts(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        assert world.named_at_start == [[world.recorders[0].directory.name]]
+
+    def test_it_records_once_the_recorder_says_so(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        assert world.heartbeat()["state"] == "starting"
+        world.run(3)
+        assert world.supervisor.is_recording
+        beat = world.heartbeat()
+        assert beat["state"] == "recording"
+        assert beat["subscribed"] == ["/bumper", "/door"]
+
+    def test_one_whose_words_for_it_are_not_known_records_once_it_subscribes(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.defaults = {"ready_s": 10**9}
+        world.supervisor.start()
+        world.run(130)
+        assert world.supervisor.is_recording
+        assert len(world.recorders) == 1
+
+    def test_a_second_start_changes_nothing(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.supervisor.start()
+        assert len(world.recorders) == 1
+
+    def test_a_recorder_that_cannot_be_started_is_an_error_and_leaves_nothing(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.refuse = "there is no ros2"
+        with pytest.raises(RecorderError, match="there is no ros2"):
+            world.supervisor.start()
+        world.run(5)
+        assert world.recorders == []
+
+    def test_after_a_stop_it_goes_on_in_a_new_recording(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+        world.supervisor.stop()
+        assert world.heartbeat()["state"] == "stopped"
+        assert world.heartbeat()["recordings"] == []
+        world.supervisor.start()
+        world.run(3)
+        assert len({recorder.directory for recorder in world.recorders}) == 2
+        assert world.supervisor.is_recording
+
+    def test_ticks_of_one_that_is_stopped_do_nothing(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.run(2)
+        world.supervisor.stop()
+        assert list(tmp_path.iterdir()) == []
+
+
+class TestRotation:
+    def test_no_message_is_lost_or_counts_twice(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(75)
+        world.supervisor.stop()
+        assert len(world.recorders) == 4
+        assert sum(world.published(counting=False).values()) > len(world.published(counting=False))
+        assert_each_counts_once(world)
+
+    def test_both_recordings_are_named_while_both_are_open(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(22)
+        names = [recorder.directory.name for recorder in world.recorders]
+        assert world.heartbeat()["recordings"] == names
+        world.run(8)
+        assert world.heartbeat()["recordings"] == names[1:]
+
+    def test_the_old_one_is_ended_two_seconds_after_the_new_one_has_subscribed(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(21)
+        old, new = world.recorders
+        world.run(1.75)
+        assert old.asked_to_end == 0
+        world.run(1)
+        assert (old.status, new.status) == (0, None)
+        assert new.status is None
+
+    def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20, subscribe_timeout_s=6)
+        world.supervisor.start()
+        world.run(19)
+        world.defaults = {"topics": ("/bumper",)}
+        with capture_logs() as logs:
+            world.run(12)
+        assert world.recorders[0].status == 0
+        (said,) = events(logs, "rotated_without")
+        assert str(said["reason"]).endswith("/door")
+        world.supervisor.stop()
+        assert_each_counts_once(world)
+
+    def test_a_split_that_the_old_one_opens_while_it_ends_is_in_its_sidecar(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.recorders[0].obeys_after = 40
+        world.run(40)
+        old = read_handover(world.recorders[0].directory).handover
+        assert old.end is not None
+        last = f"{world.recorders[0].directory.name}_{world.recorders[0].splits}.mcap"
+        assert last in old.end.files
+        world.supervisor.stop()
+        assert_each_counts_once(world)
+
+    def test_times_of_a_simulated_clock_are_not_compared(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20, simulated=True)
+        world.supervisor.start()
+        world.run(30)
+        new = read_handover(world.recorders[1].directory).handover
+        assert new.begin is not None
+        assert (new.begin.log_from, new.begin.log_until) == (None, None)
+        world.supervisor.stop()
+        assert_each_counts_once(world)
+
+    def test_a_rotation_that_cannot_begin_is_tried_again(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(19)
+        world.refuse = "no more processes"
+        world.run(4)
+        assert read_handover(world.recorders[0].directory).handover.next is None
+        world.refuse = ""
+        world.run(12)
+        world.supervisor.stop()
+        assert len(world.recorders) == 2
+        assert_each_counts_once(world)
+
+
+class TestStop:
+    @pytest.mark.parametrize("after_s", [10.0, 20.5, 21.25, 21.75, 22.5, 23.0, 23.75, 24.25])
+    def test_at_any_moment_of_a_handover_nothing_is_lost_or_counts_twice(
+        self, tmp_path: Path, after_s: float
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(after_s)
+        world.supervisor.stop()
+        assert world.running == []
+        assert_each_counts_once(world)
+
+    def test_a_process_that_nothing_ends_is_named(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.defaults = {"obeys_after": 10**9, "patience_s": 0.05}
+        world.supervisor.start()
+        world.run(2)
+        with capture_logs() as logs:
+            world.supervisor.stop()
+        (said,) = events(logs, "recorder_not_ended")
+        assert "process 100" in str(said["reason"])
+
+
+class TestClock:
+    def test_set_back_in_a_handover_the_handover_is_tried_again(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(22)
+        world.set_clock(-5)
+        world.run(15)
+        world.supervisor.stop()
+        first, second, third = world.recorders
+        assert read_handover(second.directory).handover.hides_all
+        assert read_handover(first.directory).handover.next == third.directory.name
+        # Some seconds were lived twice, and their publish times stand twice in one recording.
+        lived_s = round(world.mono - 1_000) - 1
+        counts = world.published(counting=True)
+        assert set(counts) == set(world.published(counting=False))
+        assert sum(counts.values()) == pytest.approx(4 * lived_s, abs=4)
+
+    def test_set_back_by_an_hour_a_new_recording_begins(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(10)
+        world.set_clock(-3600)
+        world.run(8)
+        assert len(world.recorders) == 2
+        world.supervisor.stop()
+        stands, counts = world.published(counting=False), world.published(counting=True)
+        assert counts == dict.fromkeys(stands, 1)
+
+    def test_set_back_by_seconds_is_waited_out(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(10)
+        world.set_clock(-30)
+        world.run(20)
+        assert len(world.recorders) == 1
+
+    def test_set_forward_by_a_year_nothing_happens(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(10)
+        world.set_clock(365 * 86400)
+        world.run(20)
+        assert len(world.recorders) == 1

@@ -1,0 +1,238 @@
+"""What the supervisor does when a recorder dies, or the disk fails it."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.recorder.handover.recovery import settle_all
+from ros2_memory.storage.base import Closing
+from tests.recorder_world import World
+from tests.supervision import Housekeeping, assert_each_counts_once, events
+
+pytestmark = pytest.mark.usefixtures("no_flushing")
+
+
+class TestDeath:
+    def test_a_recorder_that_dies_is_replaced_after_a_growing_wait(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        waits = []
+        for _ in range(4):
+            world.run(2)
+            world.running[0].die()
+            count, before = len(world.recorders), world.mono
+            while len(world.recorders) == count:
+                world.run(0.25)
+            waits.append(round(world.mono - before))
+        assert waits == [1, 2, 4, 8]
+
+    def test_it_is_told_with_its_last_words(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(2)
+        world.recorders[0].lines.append("terminate called after throwing")
+        world.recorders[0].die(-6)
+        with capture_logs() as logs:
+            world.run(3)
+        (died,) = events(logs, "recorder_died")
+        assert died["log_level"] == "error"
+        assert "status -6" in str(died["reason"])
+        assert "terminate called" in str(died["reason"])
+        assert world.heartbeat()["last_error"] == died["reason"]
+
+    def test_one_that_does_not_begin_is_given_up_and_another_is_started(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.defaults = {"ready_s": 10**9, "subscribe_s": 10**9}
+        world.supervisor.start()
+        with capture_logs() as logs:
+            world.run(119)
+            assert len(world.recorders) == 1
+            world.run(4)
+        assert [recorder.status for recorder in world.recorders] == [0, None]
+        assert len(events(logs, "recorder_not_ready")) == 1
+
+    def test_a_new_one_that_does_not_begin_never_takes_over(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(19)
+        world.defaults = {"ready_s": 10**9, "subscribe_s": 10**9}
+        world.run(125)
+        old, new = world.recorders[:2]
+        assert (old.status, new.status) == (None, 0)
+        assert read_handover(old.directory).handover.next != new.directory.name
+
+    def test_what_never_held_a_byte_leaves_no_directory(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.disk_full = True
+        world.supervisor.start()
+        world.run(0.5)
+        world.recorders[0].die()
+        world.run(0.5)
+        assert not world.recorders[0].directory.exists()
+
+    def test_its_recording_is_not_named_as_open_any_more(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(2)
+        world.recorders[0].die()
+        world.run(5)
+        assert world.heartbeat()["recordings"] == [world.recorders[1].directory.name]
+
+    def test_a_new_one_that_dies_in_a_handover_counts_for_nothing(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(22.5)
+        old, new = world.recorders
+        new.die()
+        world.run(1)
+        assert old.status is None
+        assert read_handover(new.directory).handover.hides_all
+        assert read_handover(old.directory).handover.next is None
+        world.run(15)
+        world.supervisor.stop()
+        assert len(world.recorders) == 3
+        assert_each_counts_once(world)
+
+    @pytest.mark.parametrize("after_s", [21.25, 21.75, 22.0, 23.0])
+    def test_an_old_one_that_dies_in_a_handover_counts_as_far_as_it_reaches(
+        self, tmp_path: Path, after_s: float
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(after_s)
+        old, new = world.recorders
+        old.die()
+        world.run(12)
+        assert new.status is None
+        assert world.supervisor.is_recording
+        world.supervisor.stop()
+        stands, counts = world.published(counting=False), world.published(counting=True)
+        assert counts == dict.fromkeys(stands, 1)
+
+    @pytest.mark.parametrize("after_s", [20.5, 21.0, 21.75, 22.5, 23.25, 23.75, 24.0])
+    def test_after_a_crash_of_everything_the_next_start_settles_the_handover(
+        self, tmp_path: Path, after_s: float
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(after_s)
+        for recorder in world.running:
+            recorder.die()
+        settle_all(tmp_path, world.reader)
+        stands, counts = world.published(counting=False), world.published(counting=True)
+        assert counts == dict.fromkeys(stands, 1)
+
+
+class FailingDisk:
+    """Lets whatever asks for the status of some paths fail, as a disk or a server that is gone."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, fails: Callable[[Path], bool]) -> None:
+        self.failing = True
+        stat = os.stat
+
+        def failing(path: Any, **options: Any) -> os.stat_result:
+            if self.failing and isinstance(path, Path) and fails(path):
+                raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+            return stat(path, **options)
+
+        monkeypatch.setattr(os, "stat", failing)
+
+
+class TestFailingDisk:
+    def test_a_restart_whose_name_cannot_be_looked_up_is_tried_again(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+        world.recorders[0].die()
+        known = [recorder.directory for recorder in world.recorders]
+        disk = FailingDisk(
+            monkeypatch, lambda path: path.name.startswith("rec_") and path not in known
+        )
+        with capture_logs() as logs:
+            world.run(3)
+        assert "Input/output error" in events(logs, "recorder_not_started")[0]["reason"]
+        assert "Input/output error" in world.heartbeat()["last_error"]
+        disk.failing = False
+        world.run(10)
+        assert world.supervisor.is_recording
+
+    def test_a_rotation_whose_name_cannot_be_looked_up_is_tried_again(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(18)
+        known = [recorder.directory for recorder in world.recorders]
+        disk = FailingDisk(
+            monkeypatch, lambda path: path.name.startswith("rec_") and path not in known
+        )
+        with capture_logs() as logs:
+            world.run(4)
+        assert events(logs, "rotation_failed")
+        disk.failing = False
+        world.run(15)
+        world.supervisor.stop()
+        assert len(world.recorders) == 2
+        assert_each_counts_once(world)
+
+    def test_a_handover_is_given_up_where_the_new_directory_cannot_be_told(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(20.75)
+        old, new = world.recorders
+        new.die()
+        FailingDisk(monkeypatch, lambda path: path == new.directory)
+        with capture_logs() as logs:
+            world.run(1)
+        assert "Input/output error" in events(logs, "rotation_failed")[0]["reason"]
+        assert world.running == [old]
+
+    def test_a_recorder_that_dies_is_replaced_though_its_splits_cannot_be_read(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+
+        def fails(_path: Path) -> Closing:
+            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+
+        monkeypatch.setattr(world.reader, "closing", fails)
+        world.recorders[0].die()
+        with capture_logs() as logs:
+            world.run(6)
+        assert len(world.running) == 1
+        assert "Stale file handle" in events(logs, "unreadable")[0]["reason"]
+
+    def test_one_task_that_fails_keeps_no_other_from_being_done(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        keeper = Housekeeping()
+        world = World(tmp_path, housekeeper=keeper)
+        world.supervisor.start()
+        world.run(3)
+
+        def fails() -> list[str]:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+        monkeypatch.setattr(world.recorders[0], "take_lines", fails)
+        with capture_logs() as logs:
+            world.run(30)
+        (told,) = events(logs, "supervision_failed")
+        assert (told["task"], told["reason"]) == ("look", "[Errno 5] Input/output error")
+        world.run(40)
+        assert "apply" in keeper.asked

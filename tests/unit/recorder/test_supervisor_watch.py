@@ -1,0 +1,175 @@
+"""What the supervisor notices and tells: silence, lost directories, words of the recorder."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory.bag_dir.handover_file import read_handover
+from tests.recorder_world import World
+from tests.supervision import events
+
+pytestmark = pytest.mark.usefixtures("no_flushing")
+
+
+class TestWatch:
+    def test_a_robot_that_falls_silent_has_its_last_split_closed_once(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(18)
+        world.silent = True
+        with capture_logs() as logs:
+            world.run(300)
+        (told,) = events(logs, "no_growth")
+        assert world.heartbeat()["last_error"] == told["reason"]
+        assert len(world.recorders) == 2
+        assert world.recorders[0].status == 0
+        world.silent = False
+        world.run(20)
+        world.silent = True
+        world.run(100)
+        assert len(world.recorders) == 3
+        world.supervisor.stop()
+        stands, counts = world.published(counting=False), world.published(counting=True)
+        assert counts == dict.fromkeys(stands, 1)
+
+    def test_a_directory_that_vanished_is_told_and_recording_goes_on_elsewhere(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(8)
+        shutil.rmtree(world.recorders[0].directory)
+        with capture_logs() as logs:
+            world.run(4)
+        assert len(events(logs, "recording_vanished")) == 1
+        assert [recorder.status for recorder in world.recorders] == [0, None]
+        assert world.supervisor.is_recording
+
+    def test_a_bag_directory_that_vanished_is_made_again(self, tmp_path: Path) -> None:
+        bag_dir = tmp_path / "bags"
+        world = World(bag_dir)
+        world.supervisor.start()
+        world.run(8)
+        shutil.rmtree(bag_dir)
+        world.run(5)
+        assert world.supervisor.is_recording
+        assert world.running[0].directory.is_dir()
+
+    @pytest.mark.parametrize("loser", ["old", "new"])
+    def test_a_directory_that_vanished_in_a_handover_leaves_the_other(
+        self, tmp_path: Path, loser: str
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        world.run(22)
+        old, new = world.recorders
+        shutil.rmtree((old if loser == "old" else new).directory)
+        world.run(2)
+        kept = new if loser == "old" else old
+        assert kept.status is None
+        assert not read_handover(kept.directory).handover.hides_all
+        world.run(20)
+        world.supervisor.stop()
+        stands, counts = world.published(counting=False), world.published(counting=True)
+        assert counts == dict.fromkeys(stands, 1)
+
+    def test_topics_that_brought_nothing_in_a_whole_recording_are_told(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.defaults = {"heard": ("/bumper",)}
+        world.supervisor.start()
+        with capture_logs() as logs:
+            world.run(30)
+        (told,) = events(logs, "topics_silent")
+        assert str(told["reason"]).endswith("/door")
+        assert world.heartbeat()["silent"] == ["/door"]
+
+    def test_subscribed_to_all_and_hearing_nothing_points_at_the_transport(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.silent = True
+        world.supervisor.start()
+        with capture_logs() as logs:
+            world.run(30)
+        (told,) = events(logs, "topics_silent")
+        assert "UDPv4" in str(told["reason"])
+
+    def test_a_warning_that_repeats_is_told_once_for_each_topic(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(2)
+        with capture_logs() as logs:
+            for number in range(40):
+                world.recorders[0].lines += [
+                    f"[ERROR] [{number}.5] [ROSBAG2_TRANSPORT]: Topic '/cam{topic}' has more than "
+                    "one type associated. Only topics with one type are supported"
+                    for topic in (1, 2)
+                ]
+                world.run(0.5)
+        assert len(events(logs, "several_types")) == 2
+        assert "/cam2" in str(world.heartbeat()["last_error"])
+
+    def test_a_refused_publisher_is_told_with_what_it_means(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(2)
+        world.recorders[0].lines.append(
+            "[WARN] [1.5] [rosbag2_recorder]: A new publisher for subscribed topic /scan was found "
+            "offering RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT, but rosbag already subscribed"
+        )
+        with capture_logs() as logs:
+            world.run(3)
+        (told,) = events(logs, "qos_refused")
+        assert str(told["reason"]).startswith("/scan: messages of this publisher are not recorded")
+        assert world.heartbeat()["last_error"] == told["reason"]
+
+
+class TestHeartbeat:
+    def test_it_comes_every_five_seconds(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(5)
+        moments = set()
+        for _ in range(80):
+            world.run(0.25)
+            moments.add(world.heartbeat()["updated"])
+        assert len(moments) == 4
+
+    def test_a_change_is_told_at_once(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(7)
+        world.recorders[0].die()
+        world.run(0.25)
+        beat = world.heartbeat()
+        assert (beat["state"], beat["recordings"]) == ("starting", [])
+
+    def test_one_that_cannot_be_written_is_told_once_and_recording_goes_on(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(2)
+        (tmp_path / ".recorder.json.tmp").mkdir()
+        with capture_logs() as logs:
+            world.run(20)
+        assert len(events(logs, "heartbeat_not_written")) == 1
+        assert world.supervisor.is_recording
+
+    def test_bytes_count_recordings_that_ended_too(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=20)
+        world.supervisor.start()
+        sizes = []
+        for _ in range(12):
+            world.run(5)
+            sizes.append(world.heartbeat()["bytes_written"])
+        assert sizes == sorted(sizes, key=lambda size: int(str(size)))
+        on_disk = sum(path.stat().st_size for path in tmp_path.glob("*/*.mcap"))
+        assert abs(int(str(sizes[-1])) - on_disk) < 20_000
+        assert world.heartbeat()["interval_s"] == 5.0

@@ -1,0 +1,156 @@
+"""`clear_on_startup`: what is deleted, and what never is."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.retention.clear import clear_bags, remove_if_empty
+
+
+def make(root: Path, *names: str) -> None:
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"12345")
+
+
+def left(root: Path) -> list[str]:
+    return sorted(str(path.relative_to(root)) for path in root.rglob("*"))
+
+
+def test_bags_of_every_kind_go_with_what_stands_beside_them(tmp_path: Path) -> None:
+    make(
+        tmp_path,
+        "rec_1/rec_1_0.mcap",
+        "rec_1/rec_1_1.mcap.zstd",
+        "rec_1/metadata.yaml",
+        "rec_1/handover.json",
+        "old/session.db3",
+        "old/session.db3-wal",
+        "old/session.db3-shm",
+        "deep/er/bag.db3.zstd",
+        "loose.mcap",
+        "recorder.json",
+        "recorder.qos.yaml",
+    )
+    wiped = clear_bags(tmp_path)
+    assert left(tmp_path) == ["deep"]
+    assert (wiped.files, wiped.bytes, wiped.faults) == (11, 55, [])
+
+
+def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -> None:
+    make(tmp_path, "rec_1/rec_1_0.mcap", "rec_1/notes.txt", "map.pgm", "metadata.yaml")
+    make(tmp_path, "not_a_bag/metadata.yaml", "not_a_bag/handover.json", "x/recorder.json")
+    clear_bags(tmp_path)
+    assert left(tmp_path) == [
+        "map.pgm",
+        "metadata.yaml",
+        "not_a_bag",
+        "not_a_bag/handover.json",
+        "not_a_bag/metadata.yaml",
+        "rec_1",
+        "rec_1/notes.txt",
+        "x",
+        "x/recorder.json",
+    ]
+
+
+def test_the_lock_stays(tmp_path: Path) -> None:
+    make(tmp_path, "recorder.lock", "rec_1/rec_1_0.mcap")
+    clear_bags(tmp_path)
+    assert left(tmp_path) == ["recorder.lock"]
+
+
+def test_hidden_directories_stay(tmp_path: Path) -> None:
+    make(tmp_path, ".cache/a.mcap")
+    clear_bags(tmp_path)
+    assert left(tmp_path) == [".cache", ".cache/a.mcap"]
+
+
+def test_links_are_neither_followed_nor_deleted(tmp_path: Path) -> None:
+    bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
+    make(elsewhere, "a.mcap", "sub/b.mcap")
+    bags.mkdir()
+    (bags / "link.mcap").symlink_to(elsewhere / "a.mcap")
+    (bags / "folder").symlink_to(elsewhere / "sub")
+    clear_bags(bags)
+    assert left(elsewhere) == ["a.mcap", "sub", "sub/b.mcap"]
+    assert left(bags) == ["folder", "link.mcap"]
+
+
+def test_a_bag_directory_that_is_a_link_itself_is_cleared(tmp_path: Path) -> None:
+    make(tmp_path, "real/a.mcap")
+    (tmp_path / "bags").symlink_to(tmp_path / "real")
+    clear_bags(tmp_path / "bags")
+    assert left(tmp_path / "real") == []
+
+
+def test_what_is_named_like_a_bag_and_is_no_file_stays(tmp_path: Path) -> None:
+    (tmp_path / "dir.mcap").mkdir()
+    os.mkfifo(tmp_path / "pipe.mcap")
+    clear_bags(tmp_path)
+    assert left(tmp_path) == ["dir.mcap", "pipe.mcap"]
+
+
+def test_a_directory_that_is_not_there_is_clear(tmp_path: Path) -> None:
+    assert clear_bags(tmp_path / "bags").files == 0
+
+
+@pytest.mark.parametrize("path", ["/", "~", "~/.."])
+def test_the_root_homes_and_what_holds_them_are_refused(path: str) -> None:
+    with pytest.raises(RecorderError, match="clear_on_startup refuses"):
+        clear_bags(Path(path).expanduser())
+
+
+def test_a_home_that_is_reached_through_a_link_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "bags").symlink_to(Path.home())
+    with pytest.raises(RecorderError, match="clear_on_startup refuses"):
+        clear_bags(tmp_path / "bags")
+
+
+@given(
+    st.sets(
+        st.from_regex(r"([a-c]/){0,2}[a-z]{1,3}\.(mcap|db3|txt|yaml|json)", fullmatch=True),
+        max_size=12,
+    )
+)
+def test_no_file_of_another_kind_is_ever_deleted(
+    tmp_path_factory: pytest.TempPathFactory, names: set[str]
+) -> None:
+    root = tmp_path_factory.mktemp("bags")
+    make(root, *sorted(names))
+    clear_bags(root)
+    kept = {name for name in left(root) if (root / name).is_file()}
+    assert kept == {name for name in names if not name.endswith((".mcap", ".db3"))}
+
+
+def test_a_recording_without_a_byte_is_removed(tmp_path: Path) -> None:
+    recording = tmp_path / "rec_1"
+    recording.mkdir()
+    (recording / "rec_1_0.mcap").touch()
+    (recording / "metadata.yaml").touch()
+    (recording / "handover.json").write_text("{}")
+    assert remove_if_empty(recording)
+    assert not recording.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("rec_1_0.mcap", b"1"), ("notes.txt", b""), ("metadata.yaml", b"x: 1")]
+)
+def test_a_recording_with_anything_in_it_stays(tmp_path: Path, name: str, content: bytes) -> None:
+    recording = tmp_path / "rec_1"
+    recording.mkdir()
+    (recording / "rec_1_1.mcap").touch()
+    (recording / name).write_bytes(content)
+    assert not remove_if_empty(recording)
+    assert len(list(recording.iterdir())) == 2
+
+
+def test_a_recording_that_is_not_there_is_not_removed(tmp_path: Path) -> None:
+    assert not remove_if_empty(tmp_path / "rec_1")

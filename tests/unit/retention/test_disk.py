@@ -1,0 +1,81 @@
+"""The disk under the bag directory, and how it is known again."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from ros2_memory.retention.disk import HomeDisk, device_of
+
+
+class Devices:
+    """Says which device lies under a directory, or fails."""
+
+    def __init__(self) -> None:
+        self.number = 1
+        self.fails = False
+
+    def __call__(self, _directory: Path) -> int:
+        if self.fails:
+            raise OSError(errno.EIO, "Input/output error")
+        return self.number
+
+
+@pytest.fixture
+def devices() -> Devices:
+    return Devices()
+
+
+@pytest.fixture
+def home(tmp_path: Path, devices: Devices) -> HomeDisk:
+    disk = HomeDisk(tmp_path, devices)
+    disk.remember()
+    return disk
+
+
+def test_a_directory_that_is_not_there_lies_where_it_would_be_made(tmp_path: Path) -> None:
+    assert device_of(tmp_path / "a" / "b") == tmp_path.stat().st_dev
+    assert device_of(Path("/proc")) != tmp_path.stat().st_dev
+
+
+def test_it_is_away_while_another_disk_lies_there(home: HomeDisk, devices: Devices) -> None:
+    assert not home.is_away(["rec_a"])
+    devices.number = 2
+    assert home.is_away(["rec_a"])
+    assert home.is_away([])
+    devices.number = 1
+    assert not home.is_away([])
+
+
+def test_it_is_known_by_its_recordings_under_another_number(
+    tmp_path: Path, home: HomeDisk, devices: Devices
+) -> None:
+    assert not home.is_away(["rec_a"])
+    devices.number = 2
+    assert home.is_away([])
+    (tmp_path / "rec_a").mkdir()
+    devices.number = 3
+    assert not home.is_away([])
+    (tmp_path / "rec_a").rmdir()
+    assert not home.is_away([])
+
+
+def test_what_is_recorded_on_another_disk_makes_it_none_of_its_own(
+    tmp_path: Path, home: HomeDisk, devices: Devices
+) -> None:
+    devices.number = 2
+    assert home.is_away([])
+    (tmp_path / "rec_b").mkdir()
+    assert home.is_away(["rec_b"])
+
+
+@pytest.mark.parametrize("away", [False, True])
+def test_where_it_cannot_be_told_it_is_as_before(
+    home: HomeDisk, devices: Devices, away: bool
+) -> None:
+    devices.number = 2 if away else 1
+    assert home.is_away([]) is away
+    devices.fails = True
+    assert home.is_away([]) is away

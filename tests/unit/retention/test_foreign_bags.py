@@ -1,0 +1,399 @@
+"""Bags that the recorder did not make are neither deleted, repaired nor counted in a limit."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import anyio
+import pytest
+import structlog
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory import cli
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.history.context import Call
+from ros2_memory.insights.status import memory_status
+from ros2_memory.retention.clear import clear_bags
+from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.serving.health import Health
+from ros2_memory.upkeep import claim
+from tests.bags import McapLayout, boolean, odom, write_mcap
+from tests.keeping import PLENTY, files_in, keeper_of, recording_now, size_of
+from tests.kept_moments import NOW, A, B, house_of, in_moments, kept, recording
+from tests.memories import SettableClock, memory_of
+from tests.owned import embedding, lines, own_all
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+Capture = pytest.CaptureFixture[str]
+S = 10**9
+T0 = 1_790_000_000 * S
+LITTLE = 1
+
+
+def late() -> SettableClock:
+    """A clock an hour after the bags here."""
+    return SettableClock(T0 + 3600 * S)
+
+
+def foreign(bag_dir: Path, *names: str, start: int = -86_400) -> list[Path]:
+    """Bags of another program, older than any of the recorder's."""
+    return [
+        write_mcap(bag_dir / name, [odom(T0 + (start + n) * S, 1.0, 2.0) for n in range(20)])
+        for name in names
+    ]
+
+
+@pytest.fixture
+def mixed(tmp_path: Path) -> tuple[Path, list[Path], list[Path]]:
+    """The bag directory, the recorder's bags, and those of others wherever they may lie."""
+    mine = [*recording(tmp_path, A, 0), *recording(tmp_path, B, 3 * 3600)]
+    own_all(tmp_path)
+    others = foreign(
+        tmp_path,
+        "session_mcap/session_0.mcap",
+        "loose.mcap",
+        "deep/er/run/run_0.mcap",
+        f"deep/{A}/{A}_0.mcap",
+        f"{A}/inside/x_0.mcap",
+        "rec_20260101T000000Z/rec_20260101T000000Z_0.mcap",
+    )
+    (tmp_path / "session_mcap" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
+    return tmp_path, mine, others
+
+
+class TestRetention:
+    def test_no_limit_takes_a_foreign_bag(self, mixed: tuple[Path, list[Path], list[Path]]) -> None:
+        bag_dir, mine, others = mixed
+        for limits in ({"max_bytes": LITTLE}, {"max_age_h": 0.01}):
+            for _ in range(3):
+                house_of(bag_dir, keeps_foreign=True, **limits).apply(bag_dir)
+        assert all(path.exists() for path in others)
+        assert [path for path in mine if path.exists()] == mine[-1:]
+
+    def test_on_a_full_disk_the_recorders_own_go_and_then_nothing(
+        self, mixed: tuple[Path, list[Path], list[Path]]
+    ) -> None:
+        bag_dir, mine, others = mixed
+        house = house_of(bag_dir, keeps_foreign=True, measure_free=lambda _: 0)
+        for _ in range(3):
+            house.make_room(bag_dir, PLENTY)
+        assert all(path.exists() for path in others)
+        assert [path for path in mine if path.exists()] == mine[-1:]
+
+    def test_the_budget_counts_the_recorders_own_and_moments_alone(
+        self, mixed: tuple[Path, list[Path], list[Path]]
+    ) -> None:
+        bag_dir, mine, others = mixed
+        (bag_dir / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
+        kept(house_of(bag_dir, keeps_foreign=True), bag_dir, 0, 15)
+        besides = sum(path.stat().st_size for path in others)
+        list_bytes = (bag_dir / ".episodic" / "recordings.jsonl").stat().st_size
+        counted = size_of(bag_dir) - besides - len(b"no bag")
+        counted -= (bag_dir / "session_mcap" / "metadata.yaml").stat().st_size
+        with structlog.testing.capture_logs() as logs:
+            house_of(bag_dir, keeps_foreign=True, max_bytes=counted).apply(bag_dir)
+        [told] = [each for each in logs if each["event"] == "retention_applied"]
+        assert (told["bags"], told["total_bytes"]) == (0, counted)
+        assert told["foreign_bytes"] == besides + len(b"no bag")
+        assert list_bytes
+        [warned] = [each for each in logs if each["event"] == "foreign_bags_kept"]
+        assert "adopt" in warned["reason"]
+        house_of(bag_dir, keeps_foreign=True, max_bytes=counted - 1).apply(bag_dir)
+        # The first two are kept in a moment, and would free nothing.
+        assert [path.exists() for path in mine[:4]] == [True, True, False, True]
+
+    def test_a_foreign_bag_ages_no_bag_of_the_recorder(self, tmp_path: Path) -> None:
+        mine = recording(tmp_path, A, 0)
+        own_all(tmp_path)
+        foreign(tmp_path, "later/x_0.mcap", start=3 * 3600)
+        house_of(tmp_path, keeps_foreign=True, max_age_h=1).apply(tmp_path)
+        assert all(path.exists() for path in mine)
+
+    def test_with_delete_all_bags_are_weighed(
+        self, mixed: tuple[Path, list[Path], list[Path]]
+    ) -> None:
+        bag_dir, mine, others = mixed
+        house_of(bag_dir, keeps_foreign=False, max_bytes=LITTLE).apply(bag_dir)
+        assert not any(path.exists() for path in others)
+        assert [path for path in mine if path.exists()] == mine[-1:]
+
+    def test_an_adopted_recording_is_the_recorders(self, tmp_path: Path) -> None:
+        [old] = foreign(tmp_path, "session_mcap/session_0.mcap")
+        recording(tmp_path, A, 0)
+        (tmp_path / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
+        own_all(tmp_path)
+        house = house_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE)
+        with structlog.testing.capture_logs() as logs:
+            house.apply(tmp_path)
+        assert not old.exists()
+        [told] = [each for each in logs if each["event"] == "retention_applied"]
+        assert told["foreign_bytes"] == 0
+
+    def test_a_restored_recording_is_kept_until_it_is_adopted(self, tmp_path: Path) -> None:
+        bags = tmp_path / "bags"
+        recording(bags, A, 0)
+        newest = recording(bags, B, 3 * 3600)
+        own_all(bags)
+        shutil.copytree(bags / A, tmp_path / "backup")
+        # The directory that stays holds its number for good, whatever the file system.
+        (bags / A).rename(tmp_path / "moved")
+        shutil.copytree(tmp_path / "backup", bags / A)
+        house = house_of(bags, keeps_foreign=True, max_bytes=LITTLE)
+        house.apply(bags)
+        assert len([*(bags / A).glob("*.mcap")]) == 6
+        assert [path.exists() for path in newest] == [False] * 5 + [True]
+        own_all(bags)
+        house.apply(bags)
+        assert not (bags / A).exists()
+
+    @settings(max_examples=25, deadline=None)
+    @given(
+        ours=st.lists(st.booleans(), min_size=1, max_size=6),
+        budget=st.integers(1, 60_000),
+        free=st.booleans(),
+    )
+    def test_whatever_the_limits_only_listed_recordings_lose_a_bag(
+        self,
+        tmp_path_factory: pytest.TempPathFactory,
+        ours: list[bool],
+        budget: int,
+        free: bool,
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        for number, own in enumerate(ours):
+            if own:
+                recording(bag_dir, f"rec_20260921T10{number:02}00Z", number * 600, splits=2)
+        own_all(bag_dir)
+        for number, own in enumerate(ours):
+            if not own:
+                recording(bag_dir, f"rec_20260921T10{number:02}00Z", number * 600, splits=2)
+        before = files_in(bag_dir)
+        house = house_of(
+            bag_dir, keeps_foreign=True, max_bytes=budget, measure_free=lambda _: PLENTY * free
+        )
+        house.apply(bag_dir)
+        house.make_room(bag_dir, PLENTY)
+        lost = {path.split("/")[0] for path in {*before} - {*files_in(bag_dir)}}
+        listed = {each["recording"] for each in lines(bag_dir) if "recording" in each}
+        assert lost <= listed
+
+
+class TestUpgrade:
+    """The first start of a version with the list."""
+
+    def test_a_damaged_copy_of_another_directorys_recordings_outlives_every_limit(
+        self, tmp_path: Path
+    ) -> None:
+        carried = {"recorded_by": "ros2-memory", "bag_dir_id": "1" * 32}
+        for number in range(4):
+            path = tmp_path / A / f"{A}_{number}.mcap"
+            embedding(path, carried, start=T0 + number * 10 * S)
+        first = tmp_path / A / f"{A}_0.mcap"
+        first.write_bytes(first.read_bytes()[:100])
+        write_heartbeat(
+            tmp_path,
+            Heartbeat(1, S, RecorderState.STOPPED, (A,), S, 0, (), (), None, 2.0),
+        )
+        for path in (tmp_path / A).iterdir():
+            os.utime(path, (1, 1))
+        claim(OwnRecordings(tmp_path))
+        before = files_in(tmp_path)
+        keeper_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE, clock=late()).apply(tmp_path)
+        assert files_in(tmp_path) == before
+
+
+class TestRepair:
+    def test_another_programs_bag_is_neither_rewritten_nor_removed(self, tmp_path: Path) -> None:
+        own_all(tmp_path)
+        folder = tmp_path / A
+        layout = McapLayout(chunk_size=400, finish=False)
+        cut = write_mcap(folder / "x_0.mcap", [odom(T0 + n, 1.0, 2.0) for n in range(30)], layout)
+        empty = folder / "x_1.mcap"
+        empty.touch()
+        before = cut.read_bytes()
+        house = keeper_of(tmp_path, keeps_foreign=True)
+        house.repair(tmp_path)
+        house.apply(tmp_path)
+        assert cut.read_bytes() == before
+        assert empty.exists()
+        own_all(tmp_path)
+        house.repair(tmp_path)
+        assert cut.read_bytes() != before
+        assert not empty.exists()
+
+
+class TestClearing:
+    def test_a_start_that_clears_leaves_foreign_bags(
+        self, mixed: tuple[Path, list[Path], list[Path]]
+    ) -> None:
+        bag_dir, mine, others = mixed
+        kept(house_of(bag_dir, keeps_foreign=True), bag_dir, 0, 15)
+        assert in_moments(bag_dir)
+        wiped = clear_bags(bag_dir, OwnRecordings(bag_dir))
+        assert wiped.faults == []
+        assert not any(path.exists() for path in mine)
+        assert all(path.exists() for path in others)
+        assert (bag_dir / "session_mcap" / "metadata.yaml").exists()
+        assert not (bag_dir / "moments").exists()
+        assert not (bag_dir / B).exists()
+        clear_bags(bag_dir)
+        assert not any(path.exists() for path in others)
+
+
+class TestReports:
+    def memory(self, bag_dir: Path, *, keeps_foreign: bool = True) -> Memory:
+        memory = memory_of(bag_dir, clock=SettableClock(NOW))
+        limits = RetentionLimits(PLENTY, 10**6 * 3600 * S, keeps_foreign=keeps_foreign)
+        return replace(memory, limits=replace(memory.limits, kept=limits))
+
+    def test_status_and_health_say_how_much_foreign_bags_take(
+        self, mixed: tuple[Path, list[Path], list[Path]]
+    ) -> None:
+        bag_dir, mine, others = mixed
+        (bag_dir / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
+        memory = self.memory(bag_dir)
+        budget = memory_status(memory, Call()).budget
+        assert budget.used == sum(path.stat().st_size for path in mine)
+        assert budget.foreign == sum(path.stat().st_size for path in others) + len(b"no bag")
+        health = anyio.run(Health(memory, "1"))
+        assert health["foreign_bytes"] == budget.foreign
+
+    def test_they_follow_the_list_and_the_bags(
+        self, mixed: tuple[Path, list[Path], list[Path]]
+    ) -> None:
+        bag_dir, _, others = mixed
+        memory = self.memory(bag_dir)
+        before = memory_status(memory, Call()).budget.foreign
+        own_all(bag_dir)
+        after = memory_status(memory, Call()).budget.foreign
+        loose = (bag_dir / "loose.mcap").stat().st_size
+        assert (before, after) == (sum(path.stat().st_size for path in others), loose)
+        (bag_dir / "loose.mcap").unlink()
+        memory.index.refresh()
+        assert memory_status(memory, Call()).budget.foreign == 0
+
+    def test_a_recording_that_has_just_begun_is_not_foreign(self, tmp_path: Path) -> None:
+        own_all(tmp_path)
+        foreign(tmp_path, "rec_now/x_0.mcap")
+        recording_now(tmp_path, "rec_now")
+        assert memory_status(self.memory(tmp_path), Call()).budget.foreign == 0
+
+    def test_nothing_is_said_where_it_is_not_known_or_does_not_matter(self, tmp_path: Path) -> None:
+        foreign(tmp_path, "session_mcap/session_0.mcap")
+        assert memory_status(self.memory(tmp_path), Call()).budget.foreign is None
+        own_all(tmp_path)
+        every = self.memory(tmp_path, keeps_foreign=False)
+        assert memory_status(every, Call()).budget.foreign is None
+        assert memory_status(memory_of(tmp_path), Call()).budget.foreign is None
+        assert "foreign_bytes" not in anyio.run(Health(every, "1"))
+
+    def test_doctor_and_info_say_it(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+    ) -> None:
+        own_all(tmp_path)
+        foreign(tmp_path, "session_mcap/session_0.mcap")
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+        cli.main(["doctor", "--json"])
+        found = json.loads(capsys.readouterr().out)["findings"]
+        [disk] = [each["seen"] for each in found if each["about"] == "disk"]
+        assert "bags that this recorder did not make take" in disk
+        assert "ros2-memory adopt DIR" in disk
+        cli.main(["info", "--json"])
+        told = json.loads(capsys.readouterr().out)["memory_status"]["budget"]
+        assert told["used_gb"] == 0.0
+        assert told["foreign_gb"] is not None
+
+
+class TestAdopt:
+    @pytest.fixture(autouse=True)
+    def robot(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+
+    def test_it_takes_a_directory_and_all_below_it(self, tmp_path: Path, capsys: Capture) -> None:
+        foreign(tmp_path, "old/a/a_0.mcap", "old/a/a_1.mcap", "old/b/c/d_0.mcap", "other/x.mcap")
+        assert cli.main(["adopt", str(tmp_path / "old")]) == 0
+        own = OwnRecordings(tmp_path)
+        assert [*own.names()] == ["old/a", "old/b/c"]
+        assert own.owns(tmp_path / "old" / "a")
+        told = capsys.readouterr().out
+        assert "adopted: old/a (2 bag files, " in told
+        assert "retention deletes them from now on" in told
+
+    def test_by_its_name_in_the_bag_directory(self, tmp_path: Path, capsys: Capture) -> None:
+        foreign(tmp_path, "session_mcap/s_0.mcap")
+        assert cli.main(["adopt", "session_mcap"]) == 0
+        assert cli.main(["adopt", "session_mcap"]) == 0
+        assert "1 directory is the recorder's own already" in capsys.readouterr().out
+        assert len(lines(tmp_path)) == 2
+
+    def test_all_of_the_bag_directory_but_what_lies_loose(self, tmp_path: Path) -> None:
+        foreign(tmp_path, "loose.mcap", "a/a_0.mcap", "latched/carried.mcap", "moments/m/r/r.mcap")
+        assert cli.main(["adopt", str(tmp_path)]) == 0
+        assert [*OwnRecordings(tmp_path).names()] == ["a"]
+
+    def test_recordings_of_versions_before_the_list_are_not_forgotten_by_it(
+        self, tmp_path: Path
+    ) -> None:
+        embedding(tmp_path / A / f"{A}_0.mcap", {"recorded_by": "ros2-memory"})
+        foreign(tmp_path, "session_mcap/s_0.mcap")
+        assert cli.main(["adopt", "session_mcap"]) == 0
+        assert {*OwnRecordings(tmp_path).names()} == {A, "session_mcap"}
+
+    @pytest.mark.parametrize("name", ["nowhere", "/", "..", "link"])
+    def test_what_is_no_directory_of_bags_here_is_refused(
+        self, tmp_path: Path, capsys: Capture, name: str
+    ) -> None:
+        (tmp_path / "a").mkdir()
+        (tmp_path / "link").symlink_to(tmp_path / "a")
+        assert cli.main(["adopt", name]) == 2
+        assert "ros2-memory adopt: " in capsys.readouterr().err
+
+    def test_a_directory_without_a_bag_is_said(self, tmp_path: Path, capsys: Capture) -> None:
+        (tmp_path / "a").mkdir()
+        assert cli.main(["adopt", "a"]) == 1
+        assert "no bag files lie there" in capsys.readouterr().out
+
+    def test_links_are_neither_adopted_nor_counted(self, tmp_path: Path, capsys: Capture) -> None:
+        [target] = foreign(tmp_path, "old/x_0.mcap")
+        for folder in ("a", "b"):
+            (tmp_path / folder).mkdir()
+        (tmp_path / "a" / "x_0.mcap").symlink_to(target)
+        (tmp_path / "a" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
+        (tmp_path / "b" / "old").symlink_to(target.parent)
+        assert cli.main(["adopt", "a", "b"]) == 1
+        said = capsys.readouterr().out
+        assert "no bag files lie there" in said
+        for link in ("a/x_0.mcap", "a/y_0.mcap", "b/old"):
+            assert f"{link} is a symbolic link, which is not followed" in said
+        assert "adopted" not in said
+        (tmp_path / "old" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
+        assert cli.main(["adopt", "old", "a"]) == 0
+        assert "adopted: old (1 bag file, " in capsys.readouterr().out
+        assert [*OwnRecordings(tmp_path).names()] == ["old"]
+
+    def test_where_nothing_is_recorded_nothing_is_adopted(
+        self, tmp_path: Path, capsys: Capture
+    ) -> None:
+        foreign(tmp_path, "a/a_0.mcap")
+        assert cli.main(["adopt", "a", "--set", "recorder=none"]) == 2
+        assert "recorder=none" in capsys.readouterr().err
+        assert not (tmp_path / ".episodic").exists()
+
+
+def test_a_bag_of_latched_messages_that_are_carried_is_not_foreign(tmp_path: Path) -> None:
+    own_all(tmp_path)
+    write_mcap(tmp_path / "latched" / "carried.mcap", [boolean(T0, True)])
+    with structlog.testing.capture_logs() as logs:
+        house_of(tmp_path, keeps_foreign=True).apply(tmp_path)
+    [told] = [each for each in logs if each["event"] == "retention_applied"]
+    assert told["foreign_bytes"] == 0

@@ -1,0 +1,205 @@
+"""What is kept outlives retention, and counts once."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+import pytest
+import structlog
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory import queries
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Moment, Span
+from tests.bags import odom, tf, transform, write_mcap
+from tests.keeping import PLENTY, size_of
+from tests.kept_moments import NOW, T0, A, B, S, bag, house_of, in_moments, kept, recording
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from ros2_memory.core.model import Sample
+
+
+class TestRetention:
+    def test_a_moment_outlives_its_bags_and_answers_as_before(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        young = recording(tmp_path, B, 3 * 3600)
+        house = house_of(tmp_path, max_age_h=1)
+        memory = memory_of(tmp_path, clock=SettableClock(NOW))
+        questions: list[Callable[[], object]] = [
+            lambda: queries.position(memory, Call(), Moment(at_s=T0 / S + 17)),
+            lambda: queries.topic_range(
+                memory, Call(), "/odom", Span(start_s=T0 / S + 10, end_s=T0 / S + 29)
+            ),
+        ]
+        before = [ask() for ask in questions]
+        kept(house, tmp_path, 15, 25)
+        assert [ask() for ask in questions] == before
+        house.apply(tmp_path)
+        assert not any(path.exists() for path in made)
+        assert not (tmp_path / A).exists()
+        assert [ask() for ask in questions] == before
+        assert all(path.exists() for path in young)
+
+    def test_a_kept_bag_is_one_bag_wherever_it_is_counted(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        memory = memory_of(tmp_path)
+        plain = queries.list_recorded_topics(memory, Call())
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 15, 25, "one")
+        kept(house, tmp_path, 12, 38, "two")
+
+        def counted() -> tuple[int, int]:
+            snapshot = memory.index.refresh()
+            fresh = memory_of(tmp_path).index.snapshot()
+            assert [bag.file for bag in fresh.bags] == [bag.file for bag in snapshot.bags]
+            [row] = queries.list_recorded_topics(memory, Call())
+            return len(snapshot.bags), row.count
+
+        assert queries.list_recorded_topics(memory, Call()) == plain
+        assert counted() == (6, 60)
+        for path in made[1:3]:
+            path.unlink()
+        assert counted() == (6, 60)
+        shutil.rmtree(min((tmp_path / "moments").iterdir()))
+        assert counted() == (6, 60)
+        shutil.rmtree(tmp_path / "moments")
+        assert counted() == (4, 40)
+
+    def test_the_budget_counts_a_kept_bag_once_and_never_as_freed(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        kept(house_of(tmp_path), tmp_path, 0, 15)
+        total = size_of(tmp_path)
+        with structlog.testing.capture_logs() as captured:
+            house_of(tmp_path, max_bytes=total).apply(tmp_path)
+            assert all(path.exists() for path in made)
+            house_of(tmp_path, max_bytes=total - 1).apply(tmp_path)
+        # The first two would free nothing.
+        assert [path.exists() for path in made] == [True, True, False, True, True, True]
+        told = [event for event in captured if event["event"] == "retention_applied"]
+        assert [event["total_bytes"] for event in told] == [total, size_of(tmp_path)]
+
+    def test_a_bag_that_lies_in_moments_alone_counts_once_in_the_budget(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, A, 0)
+        recording(tmp_path, B, 3 * 3600)
+        house = house_of(tmp_path, max_age_h=1)
+        kept(house, tmp_path, 15, 25, "one")
+        kept(house, tmp_path, 15, 35, "two")
+        house.apply(tmp_path)
+        assert not (tmp_path / A).exists()
+        with structlog.testing.capture_logs() as captured:
+            house.apply(tmp_path)
+        [told] = [event for event in captured if event["event"] == "retention_applied"]
+        sidecars = [path.stat() for path in (tmp_path / "moments").rglob("handover.json")]
+        assert told["total_bytes"] - size_of(tmp_path) in {0, sidecars[0].st_size}
+
+    def test_moments_stay_where_the_budget_cannot_be_held(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        house = house_of(tmp_path, max_bytes=1)
+        kept(house, tmp_path, 0, 15)
+        for _ in range(2):
+            house.apply(tmp_path)
+            house.make_room(tmp_path, PLENTY * 2)
+        assert len(in_moments(tmp_path)) == 2
+
+    def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
+        self, tmp_path: Path
+    ) -> None:
+        def fixed(at: int, x: float) -> None:
+            mounted = transform(at, "base_link", "laser", (x, 0.0, 0.0))
+            path = tmp_path / A / f"{A}_{(at - T0) // S}.mcap"
+            write_mcap(path, [odom(at, 0.0, 0.0), tf(at, mounted, topic="/tf_static")])
+
+        fixed(T0 - 100 * S, 0.1)
+        recording(tmp_path, A, 0)
+        fixed(T0 + 100 * S, 0.2)
+        recording(tmp_path, B, 3 * 3600)
+        house = house_of(tmp_path, max_age_h=1)
+        kept(house, tmp_path, 15, 25)
+        memory = memory_of(tmp_path, clock=SettableClock(NOW))
+
+        def mounted() -> Sample:
+            moment = Moment(at_s=T0 / S + 17)
+            return queries.topic_value(memory, Call(), "/tf_static", moment).sample
+
+        before = mounted()
+        assert "0.1" in str(before.value)
+        for _ in range(2):
+            house.apply(tmp_path)
+            assert mounted() == before
+        assert not (tmp_path / A).exists()
+
+    def test_the_sidecar_of_a_recording_that_goes_on_is_followed(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 15, 25)
+        anew = tmp_path / A / "anew"
+        anew.write_text('{"format": 1, "state": "counts", "clock": "publish", "notes": ["x"]}')
+        anew.replace(tmp_path / A / "handover.json")
+        house.apply(tmp_path)
+        [sidecar] = (tmp_path / "moments").rglob("handover.json")
+        assert sidecar.samefile(tmp_path / A / "handover.json")
+
+    def test_what_is_kept_beside_bags_counts_in_the_budget(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        kept(house_of(tmp_path), tmp_path, 15, 25)
+        with structlog.testing.capture_logs() as captured:
+            house_of(tmp_path).apply(tmp_path)
+        [told] = [event for event in captured if event["event"] == "retention_applied"]
+        assert told["total_bytes"] == size_of(tmp_path)
+
+
+STEPS = st.lists(
+    st.one_of(
+        st.just(("split", 0, 0)),
+        st.just(("apply", 0, 0)),
+        st.tuples(st.just("keep"), st.integers(0, 80), st.integers(0, 30)),
+        st.tuples(st.just("forget"), st.integers(0, 3), st.just(0)),
+    ),
+    max_size=14,
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(steps=STEPS, budget=st.integers(3, 9), share=st.integers(0, 5))
+def test_no_moments_in_any_order_break_a_budget_or_lose_what_is_kept(
+    tmp_path_factory: pytest.TempPathFactory,
+    steps: list[tuple[str, int, int]],
+    budget: int,
+    share: int,
+) -> None:
+    """Splits are recorded, moments kept and deleted, limits applied. A size is one of a split."""
+    root = tmp_path_factory.mktemp("bags")
+    size = bag(root / A / f"{A}_0.mcap", 0).stat().st_size
+    splits, rooms = 1, size * budget + 40_000
+    house = house_of(root, max_bytes=rooms, moments_bytes=size * share + 10)
+    promised: dict[Path, int] = {}
+    for what, first, second in steps:
+        if what == "split":
+            bag(root / A / f"{A}_{splits}.mcap", splits * 10)
+            splits += 1
+        elif what == "keep":
+            kept(house, root, first, first + second)
+            links = [path for path in root.glob("moments/**/*.mcap") if path not in promised]
+            promised.update((path, path.stat().st_ino) for path in links)
+        elif what == "forget":
+            for folder in sorted((root / "moments").glob("*"))[first : first + 1]:
+                shutil.rmtree(folder)
+            promised = {path: inode for path, inode in promised.items() if path.exists()}
+        else:
+            with structlog.testing.capture_logs() as captured:
+                house.apply(root)
+            [told] = [each for each in captured if each["event"] == "retention_applied"]
+            assert told["total_bytes"] == size_of(root) <= rooms
+        assert {path: path.stat().st_ino for path in promised} == promised
+        held = {path.stat().st_ino: path.stat().st_size for path in promised}
+        assert sum(held.values()) <= size * share + 10
+        files = {path.stat().st_ino for path in root.rglob("*.mcap")}
+        assert len(memory_of(root).index.snapshot().bags) == len(files)

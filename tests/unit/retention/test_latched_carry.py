@@ -1,0 +1,410 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import queries
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.core.errors import BagError, NoDataError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.time_arguments import Moment
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.keeping import copied, files_in, keeper_of, reader_of_both
+from tests.memories import memory_of
+from tests.shared_bags import RECORDED, needs_recorded
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable, Iterator
+    from pathlib import Path
+
+    from ros2_memory.storage.base import Record
+
+S = 10**9
+T0 = 1_790_000_000 * S
+DOCK = "/docked"
+LAYOUT = McapLayout(latched=frozenset({"/tf_static", DOCK}))
+
+
+def frame(at: int, child: str, x: float, *, received: int | None = None) -> Msg:
+    return tf(
+        at,
+        transform(at, "base_link", child, (x, 0.0, 0.0)),
+        topic="/tf_static",
+        log_time=at if received is None else received,
+    )
+
+
+def docked(at: int, where: str, *, received: int | None = None) -> Msg:
+    message = text(at, where, DOCK)
+    return Msg(DOCK, message.type, at if received is None else received, message.body, at)
+
+
+def drive(start: int, stop: int) -> list[Msg]:
+    return [odom(at, (at - T0) / S, 0.0) for at in range(start, stop, S)]
+
+
+def recording(bag_dir: Path, name: str, *splits: Iterable[Msg]) -> None:
+    for number, messages in enumerate(splits):
+        write_mcap(bag_dir / name / f"{name}_{number}.mcap", messages, LAYOUT)
+
+
+def keep_only(bag_dir: Path, *kept: str) -> None:
+    """Has all bags deleted but these, which are the newest."""
+    sidecars = {(bag_dir / name).with_name("handover.json") for name in kept}
+    files = [*(bag_dir / name for name in kept), *(each for each in sidecars if each.exists())]
+    size = sum(each.stat().st_size for each in files)
+    keeper_of(bag_dir, max_bytes=size + 1).apply(bag_dir)
+    left = [path for path in bag_dir.rglob("*.mcap") if not is_carried(path)]
+    assert sorted(path.relative_to(bag_dir).as_posix() for path in left) == sorted(kept)
+
+
+def at(moment: int) -> Moment:
+    return Moment(at_s=unix_from_ns(moment))
+
+
+def held(memory: Memory, topic: str, moment: int) -> tuple[int, object] | str:
+    """What a topic held, and since when; or why that is not known."""
+    try:
+        answer = queries.topic_value(memory, Call(), topic, at(moment))
+    except NoDataError as error:
+        return error.reason
+    return answer.sample.time, answer.sample.value
+
+
+def places(memory: Memory, moment: int, children: Iterable[str]) -> list[object]:
+    found: list[object] = []
+    for child in children:
+        try:
+            answer = queries.transform(memory, Call(), "base_link", child, at(moment))
+        except NoDataError as error:
+            found.append(error.reason)
+        else:
+            found.append(answer.transform.translation)
+    return found
+
+
+class TestTheBagOfCarriedMessages:
+    def test_a_transform_outlives_the_split_that_it_stands_in(self, tmp_path: Path) -> None:
+        recording(
+            tmp_path,
+            "rec",
+            [frame(T0, "laser", 0.1), *drive(T0, T0 + 10 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+        )
+        keep_only(tmp_path, "rec/rec_1.mcap")
+        memory = memory_of(tmp_path)
+        assert places(memory, T0 + 15 * S, ["laser"]) == [(0.1, 0.0, 0.0)]
+        assert files_in(tmp_path) == ["latched", "latched/carried.mcap", "rec", "rec/rec_1.mcap"]
+
+    def test_the_newest_of_each_child_frame_is_carried_and_not_the_newest_message(
+        self, tmp_path: Path
+    ) -> None:
+        first = [frame(T0, "laser", 0.1), frame(T0 + 1, "camera", 0.2), frame(T0 + 2, "laser", 0.3)]
+        recording(
+            tmp_path, "rec", [*first, *drive(T0, T0 + 10 * S)], drive(T0 + 10 * S, T0 + 20 * S)
+        )
+        keep_only(tmp_path, "rec/rec_1.mcap")
+        carried = records(tmp_path)
+        assert [each.log_time for each in carried] == [T0 + 1, T0 + 2]
+        assert places(memory_of(tmp_path), T0 + 15 * S, ["laser", "camera"]) == [
+            (0.3, 0.0, 0.0),
+            (0.2, 0.0, 0.0),
+        ]
+
+    def test_a_carried_message_keeps_its_bytes_times_definition_and_qos(
+        self, tmp_path: Path
+    ) -> None:
+        message = docked(T0, "home", received=T0 + 77)
+        recording(
+            tmp_path, "rec", [message, *drive(T0, T0 + 5 * S)], drive(T0 + 10 * S, T0 + 20 * S)
+        )
+        (before,) = McapReader().records(
+            tmp_path / "rec/rec_0.mcap", [DOCK], TimeWindow.everything()
+        )
+        keep_only(tmp_path, "rec/rec_1.mcap")
+        (after,) = records(tmp_path)
+        assert after._replace(channel=before.channel) == before
+        assert after.channel.latched
+        known = (after.channel.topic, after.channel.schema, *after.channel.metadata[:1])
+        assert known == (before.channel.topic, before.channel.schema, *before.channel.metadata)
+
+    def test_another_message_of_the_topic_supersedes_what_was_carried(self, tmp_path: Path) -> None:
+        splits = [
+            [docked(T0 + n * 10 * S, f"dock {n}"), *drive(T0 + n * 10 * S, T0 + (n + 1) * 10 * S)]
+            for n in range(4)
+        ]
+        recording(tmp_path, "rec", *splits)
+        keep_only(tmp_path, "rec/rec_2.mcap", "rec/rec_3.mcap")
+        assert [each.log_time for each in records(tmp_path)] == [T0 + 10 * S]
+        keep_only(tmp_path, "rec/rec_3.mcap")
+        assert [each.log_time for each in records(tmp_path)] == [T0 + 20 * S]
+
+    def test_nothing_is_written_where_nothing_is_latched(self, tmp_path: Path) -> None:
+        recording(tmp_path, "rec", drive(T0, T0 + 9 * S), drive(T0 + 10 * S, T0 + 20 * S))
+        keep_only(tmp_path, "rec/rec_1.mcap")
+        assert files_in(tmp_path) == ["rec", "rec/rec_1.mcap"]
+
+    def test_it_is_not_written_again_where_nothing_changes(self, tmp_path: Path) -> None:
+        again = docked(T0, "home", received=T0 + 10 * S)
+        recording(tmp_path, "rec", [docked(T0, "home"), *drive(T0, T0 + 9 * S)])
+        recording(tmp_path, "sec", [again, *drive(T0 + 10 * S, T0 + 20 * S)])
+        recording(tmp_path, "thi", drive(T0 + 20 * S, T0 + 30 * S))
+        keep_only(tmp_path, "sec/sec_0.mcap", "thi/thi_0.mcap")
+        before = (tmp_path / "latched/carried.mcap").stat()
+        keep_only(tmp_path, "thi/thi_0.mcap")
+        after = (tmp_path / "latched/carried.mcap").stat()
+        assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+    def test_it_is_never_deleted_itself(self, tmp_path: Path) -> None:
+        recording(
+            tmp_path,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+        )
+        keep_only(tmp_path, "rec/rec_1.mcap")
+        keeper_of(tmp_path, max_bytes=0, max_age_h=0.001).apply(tmp_path)
+        assert "latched/carried.mcap" in files_in(tmp_path)
+
+    def test_messages_of_a_sqlite_bag_are_carried(self, tmp_path: Path) -> None:
+        write_db3(tmp_path / "rec/old_0.db3", [frame(T0, "laser", 0.1), *drive(T0, T0 + 9 * S)])
+        recording(tmp_path, "rec", drive(T0 + 10 * S, T0 + 20 * S))
+        keeper_of(tmp_path, max_bytes=1, reader=reader_of_both()).apply(tmp_path)
+        memory = memory_of(tmp_path, storage="rosbag2")
+        assert places(memory, T0 + 15 * S, ["laser"]) == [(0.1, 0.0, 0.0)]
+
+    def test_a_link_in_its_place_is_not_followed_and_nothing_is_lost(self, tmp_path: Path) -> None:
+        bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
+        elsewhere.mkdir()
+        recording(
+            bags,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+        )
+        (bags / "latched").symlink_to(elsewhere, target_is_directory=True)
+        keeper_of(bags, max_bytes=1).apply(bags)
+        assert not list(elsewhere.iterdir())
+        assert "rec/rec_0.mcap" in files_in(bags)
+
+    def test_where_it_cannot_be_written_bags_without_latched_messages_go_instead(
+        self, tmp_path: Path
+    ) -> None:
+        class FullDisk(McapWriter):
+            def write(
+                self, path: Path, records: Iterable[Record], *, profile: str = "ros2"
+            ) -> None:
+                raise BagError(str(path), "it cannot be written: No space left on device")
+
+        recording(
+            tmp_path,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+            drive(T0 + 20 * S, T0 + 30 * S),
+        )
+        keeper_of(tmp_path, max_bytes=1, writer=FullDisk()).apply(tmp_path)
+        assert files_in(tmp_path) == ["rec", "rec/rec_0.mcap", "rec/rec_2.mcap"]
+        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        assert held(memory_of(tmp_path), DOCK, T0 + 25 * S) == (T0, {"value": "home"})
+
+    def test_a_bag_stays_until_nobody_looks_for_latched_messages_in_it(
+        self, tmp_path: Path
+    ) -> None:
+        recording(
+            tmp_path,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+            drive(T0 + 20 * S, T0 + 30 * S),
+            drive(T0 + 30 * S, T0 + 40 * S),
+        )
+        budget = 3 * (tmp_path / "rec/rec_0.mcap").stat().st_size + 1
+        keeper_of(tmp_path, max_bytes=budget, grace_s=10**6).apply(tmp_path)
+        left = [name for name in files_in(tmp_path) if name.endswith(".mcap")]
+        assert left == [
+            "latched/carried.mcap",
+            "rec/rec_0.mcap",
+            "rec/rec_2.mcap",
+            "rec/rec_3.mcap",
+        ]
+        keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply(tmp_path)
+        assert "rec/rec_0.mcap" not in files_in(tmp_path)
+
+    def test_where_no_other_bag_can_go_in_its_place_it_goes_at_once(self, tmp_path: Path) -> None:
+        recording(
+            tmp_path,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+        )
+        keeper_of(tmp_path, max_bytes=1, grace_s=10**6).apply(tmp_path)
+        assert "rec/rec_0.mcap" not in files_in(tmp_path)
+        assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
+
+    def test_on_a_full_disk_nothing_is_waited_for(self, tmp_path: Path) -> None:
+        recording(
+            tmp_path,
+            "rec",
+            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
+            drive(T0 + 10 * S, T0 + 20 * S),
+        )
+        keeper_of(tmp_path, grace_s=10**6, measure_free=lambda _: 0).make_room(tmp_path, 1)
+        assert "rec/rec_0.mcap" not in files_in(tmp_path)
+        assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
+
+    @needs_recorded
+    def test_frames_of_several_broadcasters_survive_all_splits_but_the_last(
+        self, tmp_path: Path
+    ) -> None:
+        copied(RECORDED / "extra/tfs", tmp_path / "tfs")
+        before = static_children(tmp_path)
+        keep_only(tmp_path, "tfs/tfs_5.mcap")
+        assert static_children(tmp_path) == before == {"c1", "c2", "c3"}
+
+    @needs_recorded
+    def test_a_real_recording_looks_its_frames_up_as_before(self, tmp_path: Path) -> None:
+        copied(RECORDED / "session_mcap", tmp_path / "session_mcap")
+        memory = memory_of(tmp_path)
+        latest = memory.index.snapshot().latest
+        assert latest is not None
+        moments = [latest - S, latest - 3 * S]
+        before = [looked_up(memory, moment) for moment in moments]
+        keep_only(tmp_path, "session_mcap/session_mcap_6.mcap")
+        assert [looked_up(memory, moment) for moment in moments] == before
+        assert held(memory, "/tf_static", latest)[0] < latest - 50 * S  # type: ignore[operator]
+
+    def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(self, tmp_path: Path) -> None:
+        class Unlucky(McapReader):
+            def records(
+                self,
+                path: Path,
+                topics: Collection[str],
+                window: TimeWindow,
+                *,
+                newest_first: bool = False,
+            ) -> Iterator[Record]:
+                if is_carried(path):
+                    raise BagError(str(path), "it cannot be opened: Input/output error")
+                return super().records(path, topics, window, newest_first=newest_first)
+
+        recording(
+            tmp_path,
+            "rec",
+            [frame(T0, "laser", 0.1), *drive(T0, T0 + 10 * S)],
+            [frame(T0 + 10 * S, "camera", 0.2), *drive(T0 + 10 * S, T0 + 20 * S)],
+            drive(T0 + 20 * S, T0 + 30 * S),
+            drive(T0 + 30 * S, T0 + 40 * S),
+        )
+        keep_only(tmp_path, *(f"rec/rec_{number}.mcap" for number in (1, 2, 3)))
+        keeper_of(tmp_path, max_bytes=1, reader=Unlucky()).apply(tmp_path)
+        assert [each.log_time for each in records(tmp_path)] == [T0]
+        assert not (tmp_path / "rec/rec_2.mcap").exists()
+        assert (tmp_path / "rec/rec_1.mcap").exists()
+        keep_only(tmp_path, "rec/rec_3.mcap")
+        assert [each.log_time for each in records(tmp_path)] == [T0, T0 + 10 * S]
+
+
+def looked_up(memory: Memory, moment: int) -> object:
+    return queries.transform(memory, Call(), "odom", "laser", at(moment)).transform
+
+
+def static_children(bag_dir: Path) -> set[str]:
+    reader = McapReader()
+    children = set()
+    for path in bag_dir.rglob("*.mcap"):
+        for record in reader.records(path, ["/tf_static"], TimeWindow.everything()):
+            message: object = reader.decode(record)
+            children |= {each.child_frame_id for each in message.transforms}  # type: ignore[attr-defined]
+    return children
+
+
+def records(bag_dir: Path) -> list[Record]:
+    """What is carried."""
+    path = bag_dir / "latched/carried.mcap"
+    return list(McapReader().records(path, ["/tf_static", DOCK], TimeWindow.everything()))
+
+
+class TestAnswers:
+    """Every recording receives latched messages again; the answer tells when they came first."""
+
+    @pytest.fixture
+    def bag_dir(self, tmp_path: Path) -> Path:
+        for n, name in enumerate(["one", "two", "six"]):
+            start = T0 + n * 100 * S
+            again = [
+                docked(T0 - 50 * S, "far", received=start + 1),
+                docked(T0 + 5 * S, "home", received=start + 2 if n else T0 + 5 * S),
+                frame(T0 - 60 * S, "laser", 0.1, received=start + 3),
+                frame(T0 - 70 * S, "camera", 0.2, received=start + 4),
+            ]
+            recording(
+                tmp_path,
+                name,
+                [*again, *drive(start + 10, start + 50 * S)],
+                drive(start + 50 * S, start + 99 * S),
+            )
+        late = [docked(T0 + 260 * S, "yard"), frame(T0 + 261 * S, "arm", 0.5)]
+        recording(tmp_path, "six_more", [*late, *drive(T0 + 255 * S, T0 + 300 * S)])
+        write_handover(tmp_path / "six", Handover(next="six_more"))
+        write_handover(tmp_path / "six_more", Handover(previous="six"))
+        return tmp_path
+
+    @pytest.mark.parametrize(
+        ("kept", "since"),
+        [
+            (
+                [
+                    "one/one_1",
+                    "two/two_0",
+                    "two/two_1",
+                    "six/six_0",
+                    "six/six_1",
+                    "six_more/six_more_0",
+                ],
+                51,
+            ),
+            (["two/two_1", "six/six_0", "six/six_1", "six_more/six_more_0"], 151),
+            (["six_more/six_more_0", "six/six_1"], 256),
+        ],
+    )
+    def test_they_are_the_same_after_as_before(
+        self, bag_dir: Path, kept: list[str], since: int
+    ) -> None:
+        memory = memory_of(bag_dir)
+        moments = [T0 + second * S for second in range(since, 300, 7)]
+        frames = ["laser", "camera", "arm"]
+
+        def answers() -> list[object]:
+            return [
+                (held(memory, DOCK, moment), places(memory, moment, frames)) for moment in moments
+            ]
+
+        before = answers()
+        keep_only(bag_dir, *(f"{name}.mcap" for name in kept))
+        assert answers() == before
+
+    def test_deleting_split_by_split_ends_in_the_same(self, bag_dir: Path) -> None:
+        memory = memory_of(bag_dir)
+        before = [held(memory, DOCK, T0 + 290 * S), places(memory, T0 + 290 * S, ["laser", "arm"])]
+        for size in range(200_000, 0, -10_000):
+            keeper_of(bag_dir, max_bytes=size).apply(bag_dir)
+            after = [
+                held(memory, DOCK, T0 + 290 * S),
+                places(memory, T0 + 290 * S, ["laser", "arm"]),
+            ]
+            assert after == before
+
+    def test_carried_messages_say_nothing_of_when_there_was_a_recording(
+        self, bag_dir: Path
+    ) -> None:
+        keep_only(bag_dir, "six_more/six_more_0.mcap", "six/six_1.mcap")
+        told = queries.data_time_range(memory_of(bag_dir), Call())
+        assert told.earliest == T0 + 250 * S
+        assert (told.bags, told.gaps) == (2, ())

@@ -1,0 +1,406 @@
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.retention.policy import (
+    RetentionLimits,
+    Span,
+    Stock,
+    StoredBag,
+    StoredFile,
+    expired,
+    weighed,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+S = 10**9
+HOUR = 3600 * S
+DAY = 24 * HOUR
+NOW = 1_790_000_000 * S
+PLENTY = 10**15
+LIMITS = RetentionLimits(max_total_bytes=PLENTY, max_age_ns=168 * HOUR)
+
+
+def bag(
+    name: str,
+    end: int | None,
+    *,
+    size: int = 10,
+    written: int | None = None,
+    recording: str = "rec",
+    length: int = 10 * S,
+    inode: int | None = None,
+) -> StoredBag:
+    """A bag whose last message is at `end`; without messages where that is None."""
+    span = None if end is None else Span(end - length, end)
+    at = written if written is not None else end or NOW
+    number = zlib.crc32(name.encode()) if inode is None else inode
+    return StoredBag(
+        f"{recording}/{name}", recording, span, at, (StoredFile((1, number), size, size),)
+    )
+
+
+def stock(
+    *bags: StoredBag,
+    now: int = NOW,
+    sidecars: dict[str, int] | None = None,
+    other_bytes: int = 0,
+    free_bytes: int | None = None,
+) -> Stock:
+    return Stock(bags, now, sidecars or {}, other_bytes, free_bytes, synchronised=True)
+
+
+def names(bags: Iterable[StoredBag]) -> list[str]:
+    return [each.path.rpartition("/")[2] for each in bags]
+
+
+def hourly(hours: int, *, until: int = NOW, size: int = 10) -> list[StoredBag]:
+    """One bag every hour, h0 the newest."""
+    return [bag(f"h{ago}", until - ago * HOUR, size=size) for ago in range(hours)]
+
+
+class TestAge:
+    def test_what_is_older_than_the_limit_is_deleted_oldest_first(self) -> None:
+        doomed = expired(stock(*hourly(172)), LIMITS)
+        assert names(doomed) == ["h171", "h170", "h169"]
+
+    def test_a_bag_of_exactly_the_limit_stays(self) -> None:
+        assert expired(stock(*hourly(169)), LIMITS) == ()
+
+    def test_age_counts_from_the_newest_data_and_not_from_the_clock(self) -> None:
+        assert expired(stock(*hourly(100), now=NOW + 365 * DAY), LIMITS) == ()
+
+    def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
+        before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
+        assert expired(stock(*before, after), LIMITS) == ()
+
+    def test_within_each_side_of_a_long_pause_age_counts_as_ever(self) -> None:
+        before = [bag(f"before{ago}", NOW - 30 * DAY - ago * HOUR) for ago in range(170)]
+        doomed = expired(stock(*before, *hourly(170)), LIMITS)
+        assert names(doomed) == ["before169", "h169"]
+
+    def test_a_shorter_pause_ages_what_lies_before_it(self) -> None:
+        doomed = expired(stock(bag("old", NOW - 10 * HOUR), bag("new", NOW)), hours(1))
+        assert names(doomed) == ["old"]
+
+    def test_a_bag_dated_in_the_future_neither_ages_nor_is_aged(self) -> None:
+        ahead = bag("ahead", NOW + 3650 * DAY)
+        week_ago = bag("week_ago", NOW - 160 * HOUR)
+        assert expired(stock(week_ago, bag("new", NOW), ahead), LIMITS) == ()
+
+    def test_bags_of_1970_neither_age_nor_are_aged(self) -> None:
+        early = [bag(f"e{n}", n * 100 * HOUR) for n in range(1, 9)]
+        assert expired(stock(*early, bag("new", NOW)), LIMITS) == ()
+        assert expired(stock(*early, now=NOW), LIMITS) == ()
+
+    def test_where_the_clock_stands_in_1970_nothing_is_aged(self) -> None:
+        assert expired(stock(*hourly(400), now=5 * HOUR), LIMITS) == ()
+
+    def test_a_bag_across_a_clock_step_neither_ages_nor_is_aged(self) -> None:
+        across = bag("across", NOW - HOUR, length=300 * DAY)
+        assert expired(stock(across, bag("new", NOW)), LIMITS) == ()
+
+    def test_a_bag_that_a_bad_clock_dated_is_as_old_as_its_file(self) -> None:
+        ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
+        boot = bag("boot", 60 * S, written=NOW - 171 * HOUR)
+        fresh = bag("fresh", 60 * S, written=NOW - HOUR)
+        doomed = expired(stock(ahead, boot, fresh, *hourly(172)), LIMITS)
+        assert names(doomed) == ["boot", "h171", "ahead", "h170", "h169"]
+
+    def test_a_bag_without_messages_does_not_age_others_and_goes_with_its_time(self) -> None:
+        old = bag("empty", None, written=NOW - 170 * HOUR + 1)
+        doomed = expired(stock(old, bag("later", None, written=NOW), *hourly(172)), LIMITS)
+        assert names(doomed) == ["h171", "h170", "empty", "h169"]
+
+    def test_a_bag_without_messages_of_another_era_is_not_aged(self) -> None:
+        early = bag("empty", None, written=NOW - 300 * DAY)
+        assert expired(stock(early, *hourly(100)), LIMITS) == ()
+
+
+class TestBudget:
+    def test_the_oldest_are_deleted_and_no_more_than_needed(self) -> None:
+        doomed = expired(stock(*hourly(10)), budget(75))
+        assert names(doomed) == ["h9", "h8", "h7"]
+
+    def test_what_fits_is_kept(self) -> None:
+        assert expired(stock(*hourly(10)), budget(100)) == ()
+
+    def test_what_nothing_may_delete_counts(self) -> None:
+        doomed = expired(stock(*hourly(10), other_bytes=15), budget(100))
+        assert names(doomed) == ["h9", "h8"]
+
+    def test_the_newest_stays_however_small_the_budget(self) -> None:
+        doomed = expired(stock(*hourly(10)), budget(0))
+        assert names(doomed) == [f"h{ago}" for ago in range(9, 0, -1)]
+
+    def test_the_newest_by_its_data_stays_though_another_was_written_later(self) -> None:
+        copied = bag("copied", NOW - 5 * DAY, written=NOW + HOUR)
+        doomed = expired(stock(bag("new", NOW), copied), budget(0))
+        assert names(doomed) == ["copied"]
+
+    def test_bags_without_a_date_go_by_the_time_of_their_file(self) -> None:
+        bags = [
+            bag("b", 3 * HOUR, written=NOW - 5 * HOUR),
+            bag("c", NOW - 4 * HOUR),
+            bag("a", NOW + 9000 * DAY, written=NOW - 6 * HOUR),
+            bag("d", NOW - 300 * DAY, written=NOW - 3 * HOUR),
+            bag("e", None, written=NOW - 2 * HOUR),
+            bag("new", NOW),
+        ]
+        limits = replace(LIMITS, max_total_bytes=0)
+        assert names(expired(stock(*bags), limits)) == ["a", "b", "c", "d", "e"]
+
+    def test_a_bag_of_1970_is_not_the_oldest_before_its_file_is(self) -> None:
+        boot = bag("boot", 60 * S, written=NOW - 150 * 60 * S)
+        doomed = expired(stock(boot, *hourly(5)), budget(30))
+        assert names(doomed) == ["h4", "h3", "boot"]
+
+    def test_a_file_from_a_far_future_goes_first_and_is_not_kept_for_good(self) -> None:
+        ahead = bag("ahead", NOW + 3650 * DAY)
+        limits = RetentionLimits(max_total_bytes=30, max_age_ns=168 * HOUR)
+        assert names(expired(stock(*hourly(3), ahead), limits)) == ["ahead"]
+
+    def test_files_dated_a_little_ahead_of_a_clock_that_is_behind_keep_their_order(self) -> None:
+        last_hours = hourly(5, until=NOW + 10 * HOUR)
+        assert names(expired(stock(*last_hours), budget(30))) == ["h4", "h3"]
+
+    def test_while_the_clock_is_not_set_what_it_dates_is_newest(self) -> None:
+        boot = [bag(f"boot{n}", n * 60 * S) for n in (1, 2)]
+        doomed = expired(stock(*hourly(3), *boot, now=200 * S), budget(20))
+        assert names(doomed) == ["h2", "h1", "h0"]
+
+    def test_the_last_bag_of_a_recording_takes_its_sidecars_along(self) -> None:
+        bags = [bag("a", NOW - 2 * HOUR, recording="old"), *hourly(2)]
+        held = stock(*bags, sidecars={"old": 20, "rec": 5})
+        assert weighed(held, LIMITS).total_bytes == 55
+        assert names(expired(held, budget(25))) == ["a"]
+        assert names(expired(held, budget(54))) == ["a"]
+
+    def test_free_space_that_is_missing_is_made_and_no_more(self) -> None:
+        limits = RetentionLimits(PLENTY, 168 * HOUR, min_free_bytes=100)
+        assert expired(stock(*hourly(10), free_bytes=100), limits) == ()
+        assert names(expired(stock(*hourly(10), free_bytes=85), limits)) == ["h9", "h8"]
+        assert expired(stock(*hourly(10), free_bytes=None), limits) == ()
+
+
+class TestSharedFiles:
+    def test_two_names_of_one_file_count_once(self) -> None:
+        held = stock(bag("a", NOW - HOUR, inode=7), bag("b", NOW - HOUR, inode=7), bag("new", NOW))
+        assert weighed(held, LIMITS).total_bytes == 20
+        assert expired(held, budget(20)) == ()
+
+    def test_deleting_one_name_frees_nothing_so_both_go_or_none(self) -> None:
+        twins = [bag("a", NOW - 3 * HOUR, inode=7), bag("b", NOW - 3 * HOUR, inode=7)]
+        held = stock(*twins, bag("c", NOW - HOUR), bag("new", NOW))
+        assert names(expired(held, budget(29))) == ["a", "b"]
+
+    def test_another_name_of_the_newest_stays(self) -> None:
+        held = stock(bag("a", NOW, inode=7), bag("b", NOW, inode=7), bag("old", NOW - HOUR))
+        assert names(expired(held, budget(0))) == ["old"]
+
+
+def budget(size: int) -> RetentionLimits:
+    return RetentionLimits(max_total_bytes=size, max_age_ns=10**6 * DAY)
+
+
+def hours(count: int) -> RetentionLimits:
+    return RetentionLimits(max_total_bytes=PLENTY, max_age_ns=count * HOUR)
+
+
+moments = st.one_of(
+    st.integers(0, 400).map(lambda ago: NOW - ago * HOUR),
+    st.integers(0, 400).map(lambda ago: NOW - 300 * DAY - ago * HOUR),
+    st.integers(0, 400).map(lambda hour: hour * HOUR),
+    st.integers(1, 400).map(lambda later: NOW + later * DAY),
+)
+
+
+@st.composite
+def stocks(draw: st.DrawFn) -> Stock:
+    """Bags by good and bad clocks, in several recordings, some of them names of one file."""
+    bags: dict[str, StoredBag] = {}
+    for number in range(draw(st.integers(0, 12))):
+        made = bag(
+            f"b{number}",
+            draw(st.none() | moments),
+            size=draw(st.integers(1, 50)),
+            written=draw(moments),
+            recording=draw(st.sampled_from("ABC")),
+            length=draw(st.sampled_from([S, 10 * S, 300 * DAY])),
+        )
+        if bags and draw(st.integers(0, 9)) == 0:
+            made = made._replace(files=draw(st.sampled_from(sorted(bags.values()))).files)
+        bags[made.path] = made
+    return Stock(
+        tuple(draw(st.permutations(list(bags.values())))),
+        draw(st.sampled_from([NOW, 5 * HOUR, NOW + 900 * DAY])),
+        sidecars=draw(st.dictionaries(st.sampled_from("ABC"), st.integers(0, 20))),
+        other_bytes=draw(st.integers(0, 50)),
+        free_bytes=draw(st.none() | st.integers(0, 100)),
+        recorded_since=draw(
+            st.dictionaries(st.sampled_from("ABC"), st.integers(0, 200).map(lambda h: h * HOUR))
+        ),
+        synchronised=draw(st.booleans()),
+    )
+
+
+all_limits = st.builds(
+    RetentionLimits,
+    st.integers(0, 400),
+    st.sampled_from([HOUR, 100 * HOUR, 168 * HOUR, 10**6 * DAY]),
+    st.integers(0, 200),
+)
+
+
+def without(held: Stock, doomed: Iterable[StoredBag]) -> Stock:
+    """What lies there after these bags, and the sidecars of emptied recordings, are deleted."""
+    gone = {each.path for each in doomed}
+    bags = [each for each in held.bags if each.path not in gone]
+    left = {each.recording for each in bags}
+    emptied = {each.recording for each in held.bags} - left
+    sidecars = {key: size for key, size in held.sidecars.items() if key not in emptied}
+    inodes = {file.inode for each in bags for file in each.files}
+    freed = {
+        file.inode: file.disk
+        for each in held.bags
+        for file in each.files
+        if file.inode not in inodes
+    }
+    free = held.free_bytes
+    if free is not None:
+        free += sum(freed.values()) + sum(held.sidecars.get(key, 0) for key in emptied)
+    return replace(held, bags=bags, sidecars=sidecars, free_bytes=free)
+
+
+def fits(held: Stock, limits: RetentionLimits) -> bool:
+    enough = held.free_bytes is None or held.free_bytes >= limits.min_free_bytes
+    return enough and weighed(held, limits).total_bytes <= limits.max_total_bytes
+
+
+class TestAlways:
+    @given(stocks(), all_limits)
+    def test_the_budget_is_held_unless_the_newest_alone_is_too_large(
+        self, held: Stock, limits: RetentionLimits
+    ) -> None:
+        left = without(held, expired(held, limits))
+        files = {each.files for each in left.bags}
+        assert fits(left, limits) or len(files) <= 1
+        assert weighed(held, limits).fits == fits(left, limits)
+
+    @given(stocks(), all_limits)
+    def test_something_is_left_where_there_was_something(
+        self, held: Stock, limits: RetentionLimits
+    ) -> None:
+        left = without(held, expired(held, limits)).bags
+        assert bool(left) == bool(held.bags)
+        assert any(each.span for each in left) == any(each.span for each in held.bags)
+
+    @given(stocks(), all_limits)
+    def test_no_more_is_deleted_than_needed(self, held: Stock, limits: RetentionLimits) -> None:
+        aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
+        doomed = [each for each in expired(held, limits) if each not in aged]
+        if doomed:
+            spared = [each for each in doomed if each.files != doomed[-1].files]
+            assert not fits(without(held, [*aged, *spared]), limits)
+
+    @given(stocks(), all_limits)
+    def test_the_order_of_what_is_known_does_not_matter(
+        self, held: Stock, limits: RetentionLimits
+    ) -> None:
+        turned = replace(held, bags=tuple(reversed(held.bags)))
+        assert expired(turned, limits) == expired(held, limits)
+
+    @given(stocks(), all_limits)
+    def test_after_it_is_applied_nothing_more_is_to_delete(
+        self, held: Stock, limits: RetentionLimits
+    ) -> None:
+        assert expired(without(held, expired(held, limits)), limits) == ()
+
+    @given(stocks(), all_limits, st.integers(0, 400))
+    def test_a_larger_budget_deletes_nothing_that_a_smaller_one_keeps(
+        self, held: Stock, limits: RetentionLimits, more: int
+    ) -> None:
+        larger = replace(limits, max_total_bytes=limits.max_total_bytes + more)
+        assert set(expired(held, larger)) <= set(expired(held, limits))
+
+    @given(stocks(), st.lists(moments, min_size=1, max_size=5))
+    def test_bags_of_bad_clocks_change_nothing_in_the_age_of_others(
+        self, held: Stock, ends: list[int]
+    ) -> None:
+        odd = [
+            bag(f"odd{number}", end, written=end, recording="ODD")
+            for number, end in enumerate(ends)
+            if end < 400 * HOUR + 1 or end > NOW
+        ]
+        held = replace(held, now=NOW)
+        more = replace(held, bags=(*held.bags, *odd))
+        dated = [each for each in held.bags if each.span is not None]
+        if dated and any(NOW - 400 * HOUR <= (each.span or (0, 0))[1] <= NOW for each in dated):
+            assert set(expired(more, LIMITS)) == set(expired(held, LIMITS))
+
+
+class TestMoments:
+    """`kept` are files of moments, which other names of may be deleted."""
+
+    def test_what_a_moment_keeps_counts_once_and_is_not_freed(self) -> None:
+        bags = hourly(4)
+        kept = tuple(each.files[0] for each in bags[2:])
+        limits = replace(LIMITS, max_total_bytes=39)
+        found = weighed(replace(stock(*bags), kept=kept), limits)
+        # The two oldest would free nothing.
+        assert (names(found.doomed), found.total_bytes, found.fits) == (["h1"], 40, True)
+
+    def test_what_lies_in_moments_alone_counts_too(self) -> None:
+        kept = (StoredFile((1, 5), 15, 15),)
+        limits = replace(LIMITS, max_total_bytes=30)
+        found = weighed(replace(stock(*hourly(2)), kept=kept), limits)
+        assert (names(found.doomed), found.total_bytes, found.fits) == (["h1"], 35, True)
+
+    def test_what_is_too_old_goes_from_where_it_was_recorded(self) -> None:
+        bags = hourly(170)
+        found = weighed(replace(stock(*bags), kept=bags[-1].files), LIMITS)
+        assert names(found.doomed) == ["h169"]
+        assert found.total_bytes == 1700
+
+    def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
+        bags = hourly(3)
+        limits = replace(LIMITS, min_free_bytes=10)
+        found = weighed(replace(stock(*bags, free_bytes=0), kept=bags[-1].files), limits)
+        assert (names(found.doomed), found.fits) == (["h1"], True)
+
+    @given(
+        st.lists(st.tuples(st.integers(0, 200), st.integers(0, 6)), min_size=1, max_size=10),
+        st.sets(st.integers(0, 8)),
+        st.integers(0, 120),
+    )
+    def test_what_is_said_of_the_budget_is_what_the_disk_would_show(
+        self, drawn: list[tuple[int, int]], kept: set[int], most: int
+    ) -> None:
+        def file(inode: int) -> StoredFile:
+            return StoredFile((1, inode), 10 + inode, 10 + inode)
+
+        bags = [
+            bag(f"b{n}", NOW - hours * HOUR)._replace(files=(file(inode),))
+            for n, (hours, inode) in enumerate(drawn)
+        ]
+        limits = replace(LIMITS, max_total_bytes=most)
+        files = tuple(file(inode) for inode in kept)
+        found = weighed(replace(stock(*bags), kept=files), limits)
+
+        def shown(left: list[StoredBag]) -> int:
+            return sum({each.inode: each.size for each in (*files, *_files(left))}.values())
+
+        left = [each for each in bags if each not in found.doomed]
+        assert found.total_bytes == shown(bags)
+        assert found.fits == (shown(left) <= most)
+
+
+def _files(bags: list[StoredBag]) -> list[StoredFile]:
+    return [each for bag in bags for each in bag.files]

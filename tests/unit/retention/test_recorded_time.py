@@ -1,0 +1,135 @@
+"""How long was recorded after each recording, across restarts and full disks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import structlog
+
+from ros2_memory.retention.recorded_time import RecordedTime
+from tests.faults.small_disk import filled, needs_mounts, small_disk
+
+S = 10**9
+FILE = ".episodic/recorded.jsonl"
+
+
+def recorded(time: RecordedTime, name: str, seconds: int, *, since_s: float = 0.0) -> float:
+    """Has one recording grow every second; the monotonic time at its end."""
+    for second in range(seconds + 1):
+        time.note([name], round(since_s) + second, since_s + second)
+    return since_s + seconds
+
+
+def folders(bag_dir: Path, *names: str) -> None:
+    for name in names:
+        (bag_dir / name).mkdir()
+
+
+def test_a_recording_is_as_old_as_what_was_recorded_after_it(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    time = RecordedTime(tmp_path)
+    end = recorded(time, "a", 90)
+    recorded(time, "b", 30, since_s=end)
+    assert time.since(["a", "b"]) == {"a": 30 * S, "b": 0}
+
+
+def test_it_goes_on_after_a_boot_where_the_monotonic_clock_begins_anew(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    recorded(RecordedTime(tmp_path), "a", 120, since_s=90_000)
+    again = RecordedTime(tmp_path)
+    recorded(again, "b", 60, since_s=2)
+    assert again.since(["a", "b"]) == {"a": 60 * S, "b": 0}
+
+
+def test_a_kill_forgets_a_minute_at_most(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    recorded(RecordedTime(tmp_path), "a", 119)
+    recorded(RecordedTime(tmp_path), "b", 119)
+    assert 60 * S <= RecordedTime(tmp_path).since(["a"])["a"] <= 119 * S
+
+
+def test_what_was_never_seen_is_new(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "copied")
+    time = RecordedTime(tmp_path)
+    end = recorded(time, "a", 100)
+    assert time.since(["copied"]) == {"copied": 0}
+    recorded(time, "a", 120, since_s=end)
+    assert time.since(["copied"]) == {"copied": 120 * S}
+    assert RecordedTime(tmp_path).since(["copied"])["copied"] >= 60 * S
+
+
+def test_silence_does_not_count_for_more_than_a_minute(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    time = RecordedTime(tmp_path)
+    time.note(["a"], 0, 0.0)
+    time.note(["b"], 1, 1.0)
+    time.note(["b"], 1, 3000.0)
+    assert time.since(["a"]) == {"a": 1 * S}
+    time.note(["b"], 2, 3600.0)
+    assert time.since(["a"]) == {"a": 61 * S}
+
+
+def test_pauses_do_not_count_and_write_nothing(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    time = RecordedTime(tmp_path)
+    time.note([], 0, 0.0)
+    assert not (tmp_path / ".episodic").exists()
+    end = recorded(time, "a", 10)
+    time.note([], 1000, end + 1)
+    recorded(time, "b", 5, since_s=end + 5000)
+    assert time.since(["a"]) == {"a": 5 * S}
+
+
+def test_lines_that_mean_nothing_are_passed_by(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b", "c")
+    (tmp_path / ".episodic").mkdir()
+    odd = ['{"recording": "c", "recor', "[1]", '{"recording": 3, "recorded_s": 9}', "[" * 5000]
+    odd += ['{"recording": "b", "recorded_s": 1e999}', '{"recording": "b", "recorded_s": NaN}', "é"]
+    lines = ['{"recording": "a", "recorded_s": 100}', *odd, '{"recording": "b", "recorded_s": 150}']
+    (tmp_path / FILE).write_text("\n".join(lines))
+    time = RecordedTime(tmp_path)
+    assert time.since(["a", "b", "c"]) == {"a": 50 * S, "b": 0, "c": 0}
+
+
+def test_what_is_gone_is_left_out_and_the_total_stays(tmp_path: Path) -> None:
+    folders(tmp_path, "b", "c")
+    (tmp_path / ".episodic").mkdir()
+    given = {"gone": 10, "b": 100, "gone too": 200}
+    lines = [json.dumps({"recording": n, "recorded_s": s}) for n, s in given.items()]
+    (tmp_path / FILE).write_text("\n".join(lines))
+    time = RecordedTime(tmp_path)
+    recorded(time, "c", 1)
+    kept = [json.loads(line) for line in (tmp_path / FILE).read_text().split("\n") if line]
+    assert {each["recording"] for each in kept} == {"b", "gone too", "c"}
+    assert RecordedTime(tmp_path).since(["b"])["b"] >= 100 * S
+
+
+def test_a_link_in_place_of_its_folder_or_file_is_not_followed(tmp_path: Path) -> None:
+    elsewhere, bag_dir = tmp_path / "elsewhere", tmp_path / "bags"
+    folders(tmp_path, "elsewhere", "bags")
+    (elsewhere / "recorded.jsonl").write_text('{"recording": "a", "recorded_s": 100}\n')
+    (bag_dir / ".episodic").symlink_to(elsewhere)
+    with structlog.testing.capture_logs() as captured:
+        recorded(RecordedTime(bag_dir), "a", 200)
+    assert [each["event"] for each in captured] == ["recorded_time_not_kept"]
+    (bag_dir / ".episodic").unlink()
+    (bag_dir / ".episodic").mkdir()
+    (bag_dir / FILE).symlink_to(elsewhere / "recorded.jsonl")
+    recorded(RecordedTime(bag_dir), "b", 200)
+    assert [path.name for path in elsewhere.iterdir()] == ["recorded.jsonl"]
+    assert (elsewhere / "recorded.jsonl").read_text().count("\n") == 1
+
+
+@needs_mounts
+def test_a_full_disk_is_reported_once_and_got_over(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", "1m") as disk:
+        folders(disk, "a", "b")
+        time = RecordedTime(disk)
+        with structlog.testing.capture_logs() as captured:
+            with filled(disk):
+                end = recorded(time, "a", 200)
+            recorded(time, "b", 100, since_s=end)
+        assert [each["event"] for each in captured] == ["recorded_time_not_kept"]
+        assert RecordedTime(disk).since(["a"])["a"] == pytest.approx(100 * S, abs=60 * S)

@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+from rosbags.rosbag2 import Reader as RosbagsReader
+
+from ros2_memory.bag_dir.layout import bag_kind, recording_name
+from ros2_memory.bag_dir.own_recordings import has_own_name
+from ros2_memory.core.errors import BagError, BagVanishedError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.retention.repair import Repairer, open_files
+from ros2_memory.storage.base import Closing
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import McapLayout, odom, write_mcap
+from tests.keeping import copied, files_in
+from tests.limits import files_limited_to
+from tests.shared_bags import RECORDED, needs_recorded
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.storage.base import Record
+
+S = 10**9
+T0 = 1_790_000_000 * S
+MESSAGES = [odom(T0 + n * S // 20, n / 20, 0.0) for n in range(200)]
+
+
+def repairer() -> Repairer:
+    return Repairer(McapReader(), McapWriter())
+
+
+def left_open(path: Path) -> Path:
+    layout = McapLayout(chunk_size=4000, finish=False)
+    return write_mcap(path, MESSAGES, layout)
+
+
+def contents(path: Path) -> list[Record]:
+    reader = McapReader()
+    topics = [each.topic for each in reader.summarize(path).topics]
+    return list(reader.records(path, topics, TimeWindow.everything()))
+
+
+def test_a_bag_that_was_left_open_is_closed_under_its_own_name(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    before, size = contents(path), path.stat().st_size
+    repaired = repairer().repair(path)
+    assert repaired is not None
+    assert repaired.rewritten is not None
+    assert repaired.rewritten.messages == len(before)
+    assert (repaired.was_bytes, repaired.is_bytes) == (size, path.stat().st_size)
+    assert McapReader().closing(path) is Closing.CLOSED
+    assert contents(path) == before
+    assert files_in(tmp_path) == ["a_0.mcap"]
+
+
+def test_its_rights_and_its_time_stay_as_they_were(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    path.chmod(0o640)
+    os.utime(path, ns=(T0, T0 + 1))
+    repairer().repair(path)
+    status = path.stat()
+    assert (status.st_mode & 0o777, status.st_mtime_ns) == (0o640, T0 + 1)
+
+
+def test_a_bag_that_is_closed_is_not_touched(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a_0.mcap", MESSAGES)
+    before = path.stat()
+    assert repairer().repair(path) is None
+    assert path.stat() == before
+
+
+def test_a_file_that_is_no_bag_is_not_touched(tmp_path: Path) -> None:
+    path = tmp_path / "a_0.mcap"
+    path.write_bytes(b"a letter")
+    assert repairer().repair(path) is None
+    assert path.read_bytes() == b"a letter"
+
+
+def test_an_empty_file_is_removed(tmp_path: Path) -> None:
+    path = tmp_path / "a_0.mcap"
+    path.write_bytes(b"")
+    repaired = repairer().repair(path)
+    assert repaired is not None
+    assert repaired.rewritten is None
+    assert files_in(tmp_path) == []
+
+
+def test_one_repaired_before_is_whole(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    repairer().repair(path)
+    assert repairer().repair(path) is None
+
+
+def test_on_a_full_disk_the_original_stays_and_the_next_attempt_repairs_it(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    before = path.read_bytes()
+    with files_limited_to(1000), pytest.raises(BagError, match="cannot be written: File too large"):
+        repairer().repair(path)
+    assert path.read_bytes() == before
+    assert files_in(tmp_path) == ["a_0.mcap"]
+    assert repairer().repair(path) is not None
+
+
+def test_a_file_that_grows_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    before = path.read_bytes()
+
+    def write_on(_: int) -> None:
+        with path.open("ab") as stream:
+            stream.write(b"\0")
+
+    with pytest.raises(BagError, match="written to while it was being repaired"):
+        repairer().repair(path, write_on)
+    assert path.read_bytes().startswith(before)
+    assert files_in(tmp_path) == ["a_0.mcap"]
+
+
+def test_a_file_that_is_deleted_meanwhile_does_not_come_back(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    with pytest.raises(BagVanishedError):
+        repairer().repair(path, lambda _: path.unlink(missing_ok=True))
+    assert files_in(tmp_path) == []
+
+
+def test_what_does_not_hold_what_was_readable_does_not_take_its_place(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    before = path.read_bytes()
+
+    def spoil(_: int) -> None:
+        """Changes a byte of what was written, as a failing disk does."""
+        with (tmp_path / ".a_0.mcap.repair").open("r+b") as stream:
+            if stream.seek(0, os.SEEK_END) > 500:
+                stream.seek(400)
+                stream.write(b"\xff\xff\xff")
+
+    with pytest.raises(BagError, match="what was written is not"):
+        repairer().repair(path, spoil)
+    assert path.read_bytes() == before
+    assert files_in(tmp_path) == ["a_0.mcap"]
+
+
+def test_what_an_earlier_attempt_left_is_replaced(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    (tmp_path / ".a_0.mcap.repair").write_bytes(b"half of it")
+    repairer().repair(path)
+    assert files_in(tmp_path) == ["a_0.mcap"]
+
+
+def test_links_are_not_followed(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    before = path.read_bytes()
+    (tmp_path / "b_0.mcap").symlink_to(path)
+    with pytest.raises(BagError, match="not a regular file"):
+        repairer().repair(tmp_path / "b_0.mcap")
+    assert path.read_bytes() == before
+
+
+def test_a_file_that_is_not_there_is_said_to_be_gone(tmp_path: Path) -> None:
+    with pytest.raises(BagVanishedError):
+        repairer().repair(tmp_path / "a_0.mcap")
+
+
+def test_the_name_of_a_bag_being_repaired_is_none_of_a_bag() -> None:
+    assert bag_kind(".a_0.mcap.repair") is None
+
+
+def test_open_files_are_found(tmp_path: Path) -> None:
+    path = left_open(tmp_path / "a_0.mcap")
+    status = path.stat()
+    key = (status.st_dev, status.st_ino)
+    with path.open("rb"):
+        assert key in open_files()
+    assert key not in open_files()
+
+
+@pytest.mark.parametrize("name", ["rec", "rec_2026", "rec_20261120T043000Z_x", "a/rec_1"])
+def test_a_directory_of_another_is_told_from_one_of_this_program(name: str, tmp_path: Path) -> None:
+    own = recording_name(T0, tmp_path)
+    (tmp_path / own).mkdir()
+    assert has_own_name(own)
+    assert has_own_name(recording_name(T0, tmp_path))
+    assert not has_own_name(name)
+
+
+@needs_recorded
+@pytest.mark.parametrize(
+    "name", ["session_killed", "session_killed_chunk64k", "extra/full_truncated"]
+)
+def test_what_killed_recorders_left_is_read_by_rosbags_afterwards(
+    tmp_path: Path, name: str
+) -> None:
+    folder = copied(RECORDED / name, tmp_path / "copy")
+    paths = sorted(folder.glob("*.mcap"))
+    before = {path: contents(path) for path in paths if path.stat().st_size}
+    for path in paths:
+        repairer().repair(path)
+    assert sorted(folder.glob("*.mcap")) == sorted(before)
+    for path, records in before.items():
+        with RosbagsReader(path) as reader:
+            read = [(c.topic, time, bytes(data)) for c, time, data in reader.messages()]
+        expected = [(each.channel.topic, each.log_time, each.payload) for each in records]
+        assert sorted(read) == sorted(expected)

@@ -1,0 +1,219 @@
+"""Age against clocks that step: what the pure plan deletes, over whole lives of a robot."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
+from ros2_memory.retention.policy import (
+    SHORTEST_PAUSE_NS,
+    RetentionLimits,
+    Span,
+    Stock,
+    StoredBag,
+    StoredFile,
+    ages,
+    expired,
+    weighed,
+)
+from ros2_memory.retention.recorded_time import RecordedTime
+
+S = 10**9
+MINUTE = 60 * S
+HOUR = 3600 * S
+DAY = 24 * HOUR
+T0 = 1_790_000_000 * S
+PLENTY = 10**15
+AGE = 20 * MINUTE
+"""Histories of minutes are as good as weeks, and short enough to try many of them."""
+
+
+def hourly(count: int, *, until: int) -> list[StoredBag]:
+    ends = (until - ago * HOUR for ago in reversed(range(count)))
+    return [bag(f"rec_{n}", n, Span(at - 10 * S, at)) for n, at in enumerate(ends)]
+
+
+def bag(recording: str, inode: int, span: Span) -> StoredBag:
+    files = (StoredFile((1, inode), 10, 10),)
+    return StoredBag(f"{recording}/b", recording, span, span.end, files)
+
+
+class TestAForwardStep:
+    """80 bags of the last 160 h, and the clock is set 150 h ahead."""
+
+    WEEK = RetentionLimits(PLENTY, 168 * HOUR)
+
+    def stock(self, *, synchronised: bool, recorded_h: int = 0) -> Stock:
+        before = hourly(160, until=T0)[::2]
+        after = bag("new", 999, Span(T0 + 150 * HOUR, T0 + 150 * HOUR + S))
+        since = {each.recording: recorded_h * HOUR for each in before}
+        now = T0 + 150 * HOUR + 2 * S
+        bags = (*before, after)
+        return Stock(bags, now, recorded_since=since, synchronised=synchronised)
+
+    def test_it_deletes_nothing_while_the_clock_is_not_known_to_be_right(self) -> None:
+        held = self.stock(synchronised=False)
+        assert expired(held, self.WEEK) == ()
+        assert len(ages(held, self.WEEK).held(synchronised=False)) == 71
+
+    def test_what_is_too_old_by_a_synchronised_clock_goes(self) -> None:
+        held = self.stock(synchronised=True)
+        assert len(expired(held, self.WEEK)) == 71
+        assert ages(held, self.WEEK).held(synchronised=True) == frozenset()
+
+    def test_what_lies_more_than_the_limit_of_recorded_time_back_goes(self) -> None:
+        assert expired(self.stock(synchronised=False, recorded_h=168), self.WEEK) == ()
+        held = self.stock(synchronised=False, recorded_h=169)
+        assert len(expired(held, self.WEEK)) == 80
+        assert ages(held, self.WEEK).held(synchronised=False) == frozenset()
+
+    def test_the_budget_deletes_all_the_same(self) -> None:
+        held = self.stock(synchronised=False)
+        found = weighed(held, RetentionLimits(500, 168 * HOUR))
+        assert (len(found.doomed), found.fits) == (31, True)
+
+
+def too_old_by_dates(bags: list[StoredBag], now: int, max_age: int) -> set[str]:
+    """What is older than the limit by its dates, worked out bag by bag.
+
+    Counted from the newest data that follows without a pause longer than the limit, and than a day.
+    """
+    longest = max(max_age, SHORTEST_PAUSE_NS)
+    dated = [
+        (bag.span.start, bag.span.end, bag)
+        for bag in bags
+        if bag.span is not None
+        and bag.span.start >= FIRST_BAGS_NS
+        and bag.span.end <= now + FUTURE_NS
+        and bag.span.end - bag.span.start <= longest
+    ]
+    newest: dict[str, int] = {}
+    for _, end, bag in dated:
+        reach = end
+        while True:
+            further = max(stop for start, stop, _ in dated if start <= reach + longest)
+            if further <= reach:
+                break
+            reach = further
+        newest[bag.path] = reach
+    old = {bag.path for _, end, bag in dated if end < newest[bag.path] - max_age}
+    if dated:
+        last = max(newest.values())
+        begun = min(start for start, _, bag in dated if newest[bag.path] == last)
+        undated = [bag for bag in bags if bag.path not in newest]
+        old |= {bag.path for bag in undated if begun <= bag.written < last - max_age}
+    return old
+
+
+@dataclass
+class Life:
+    """A robot that records a minute at a time, whose clock shows what it likes.
+
+    `lived` is the true recorded time; `after` is by bag how much of it lay before its end.
+    """
+
+    root: Path
+    wall: int = T0
+    monotonic_s: float = 0.0
+    lived_s: float = 0.0
+    bytes_written: int = 0
+    bags: list[StoredBag] = field(default_factory=list)
+    ended_s: dict[str, float] = field(default_factory=dict)
+    recordings: int = 0
+
+    def __post_init__(self) -> None:
+        self.recorded = RecordedTime(self.root)
+
+    def boot(self) -> None:
+        """Without a word: what was not saved is forgotten."""
+        self.recorded = RecordedTime(self.root)
+        self.monotonic_s, self.bytes_written = 3.0, 0
+
+    def record(self, minutes: int, step: int = 0) -> None:
+        """So many recordings of a minute; the clock steps in the middle of the last."""
+        for nth in range(minutes):
+            self.recordings += 1
+            name = f"rec_{self.recordings}"
+            (self.root / name).mkdir()
+            start = self.wall
+            self.recorded.note([name], self.bytes_written, self.monotonic_s)
+            self.wall += MINUTE + (step if nth == minutes - 1 else 0)
+            self.monotonic_s += 60.0
+            self.lived_s += 60.0
+            self.bytes_written += 10
+            self.recorded.note([name], self.bytes_written, self.monotonic_s)
+            span = Span(min(start, self.wall), max(start, self.wall))
+            made = bag(name, self.recordings, span)._replace(written=self.wall)
+            self.bags.append(made)
+            self.ended_s[made.path] = self.lived_s
+
+    def stock(self, *, synchronised: bool) -> Stock:
+        since = self.recorded.since({bag.recording for bag in self.bags})
+        return Stock(tuple(self.bags), self.wall, recorded_since=since, synchronised=synchronised)
+
+    def recorded_after(self, bag: StoredBag) -> int:
+        return round((self.lived_s - self.ended_s[bag.path]) * S)
+
+    def delete(self, doomed: tuple[StoredBag, ...]) -> None:
+        for bag in doomed:
+            self.bags.remove(bag)
+            (self.root / bag.recording).rmdir()
+
+
+steps = st.sampled_from([MINUTE, 15 * MINUTE, 25 * MINUTE, HOUR, 20 * HOUR, 3 * DAY, 150 * DAY])
+events = st.one_of(
+    st.tuples(st.just("record"), st.integers(1, 12), st.just(0)),
+    st.tuples(st.just("record"), st.integers(1, 3), steps),
+    st.tuples(st.just("record"), st.integers(1, 3), steps.map(lambda step: -step)),
+    st.tuples(st.just("off"), st.integers(1, 40), st.just(0)),
+    st.tuples(st.just("no clock"), st.just(0), st.just(0)),
+    st.tuples(st.just("set"), st.just(0), st.just(0)),
+)
+
+
+@given(
+    st.lists(st.tuples(events, st.booleans()), min_size=1, max_size=14),
+    st.none() | st.integers(0, 30),
+)
+@settings(deadline=None)
+def test_over_any_life_age_deletes_by_a_right_clock_alone_and_the_budget_holds(
+    drawn: list[tuple[tuple[str, int, int], bool]], budget: int | None
+) -> None:
+    size = PLENTY if budget is None else 10 * budget
+    limits = RetentionLimits(size, AGE)
+    with tempfile.TemporaryDirectory() as folder:
+        life = Life(Path(folder))
+        true_lead = 0
+        for (event, amount, step), synchronised in drawn:
+            if event == "record":
+                life.record(amount, step)
+                true_lead += step
+            elif event == "off":
+                life.wall += amount * DAY
+                life.boot()
+            elif event == "no clock":
+                true_lead -= life.wall - 30 * S
+                life.wall = 30 * S
+                life.boot()
+            else:
+                life.wall -= true_lead
+                true_lead = 0
+            held = life.stock(synchronised=synchronised)
+            aged = set(expired(held, RetentionLimits(PLENTY, AGE)))
+            if synchronised:
+                assert {bag.path for bag in aged} == too_old_by_dates(life.bags, life.wall, AGE)
+            else:
+                assert all(life.recorded_after(bag) > AGE for bag in aged)
+                # Each boot may have forgotten a minute of it.
+                boots = sum(each[0][0] in {"off", "no clock"} for each in drawn)
+                sure = AGE + boots * MINUTE
+                old = {bag for bag in life.bags if life.recorded_after(bag) > sure}
+                assert len(old - aged) <= 1, "the newest alone stays"
+            life.delete(expired(held, limits))
+            left = life.stock(synchronised=synchronised)
+            assert weighed(left, limits).total_bytes <= size or len(life.bags) == 1

@@ -1,0 +1,345 @@
+"""What is kept, over real files: by the keeper, through crashes, and past a wipe."""
+
+from __future__ import annotations
+
+import errno
+import os
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import structlog
+
+from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
+from ros2_memory.bag_dir.moment_file import (
+    Keepsake,
+    Wish,
+    held_in,
+    make_folder,
+    write_keepsake,
+)
+from ros2_memory.cli.recovery import recover
+from ros2_memory.retention import saved_moments
+from ros2_memory.retention.clear import clear_bags
+from ros2_memory.retention.saved_moments import Keeper
+from tests.bags import McapLayout
+from tests.keeping import PLENTY, files_in, recording_now
+from tests.kept_moments import (
+    NOW,
+    T0,
+    A,
+    B,
+    S,
+    asked,
+    bag,
+    house_of,
+    in_moments,
+    kept,
+    recording,
+    told_of,
+)
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class TestKeeping:
+    def test_the_bags_of_the_moment_are_linked_under_their_names(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        outcome = kept(house_of(tmp_path), tmp_path, 15, 25, "Küche")
+        assert (outcome.bags, outcome.pending, outcome.refused) == (2, False, None)
+        folder = tmp_path / "moments" / str(outcome.moment)
+        assert sorted(path.name for path in (folder / A).iterdir()) == [
+            "handover.json",
+            f"{A}_1.mcap",
+            f"{A}_2.mcap",
+        ]
+        assert (folder / A / f"{A}_1.mcap").samefile(made[1])
+        told = told_of(tmp_path)
+        assert (told["label"], told["complete"], told["missing"]) == ("Küche", True, [])
+        assert (told["start_ns"], told["end_ns"]) == (T0 + 15 * S, T0 + 25 * S)
+        assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
+
+    def test_a_bag_that_went_since_the_index_was_made_is_named_as_missing(
+        self, tmp_path: Path
+    ) -> None:
+        # As `forget`, in another process, deletes beside the recorder.
+        made = recording(tmp_path, A, 0)
+        house = house_of(tmp_path)
+        slot = asked(tmp_path, 15, 25)
+        with house._index.undisturbed() as snapshot:
+            made[1].unlink()
+            house._keeper.keep(snapshot)
+        outcome = slot.outcome()
+        assert outcome is not None
+        assert outcome.bags == 1
+        told = told_of(tmp_path)
+        assert told["complete"] is False
+        assert told["missing"] == [f"{A}/{A}_1.mcap has gone, or another file of that name is kept"]
+
+    def test_a_sidecar_that_goes_meanwhile_refuses_no_moment(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        recording(tmp_path, A, 0)
+        sidecar = tmp_path / A / "handover.json"
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 15, 25)
+        samefile = type(sidecar).samefile
+
+        def gone(path: Path, other: Path) -> bool:
+            sidecar.unlink(missing_ok=True)
+            return samefile(path, other)
+
+        monkeypatch.setattr(type(sidecar), "samefile", gone)
+        with structlog.testing.capture_logs() as logs:
+            house._keeper.follow()
+        assert [each for each in logs if each["event"] == "moment_not_followed"] == []
+
+    def test_what_was_never_recorded_is_refused(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        outcome = kept(house_of(tmp_path), tmp_path, 500, 600)
+        assert outcome.refused is not None
+        assert "nothing was recorded then" in outcome.refused
+        assert not (tmp_path / "moments").exists()
+
+    def test_a_bag_that_two_moments_share_counts_once_in_the_share(self, tmp_path: Path) -> None:
+        made = recording(tmp_path, A, 0)
+        share = sum(path.stat().st_size for path in made[:3])
+        house = house_of(tmp_path, moments_bytes=share)
+        assert kept(house, tmp_path, 0, 15).bags == 2
+        assert kept(house, tmp_path, 5, 25).bags == 3
+        refused = kept(house, tmp_path, 25, 35).refused
+        assert refused is not None
+        assert "retention.max_moments_gb" in refused
+        assert len(list(held_in(tmp_path))) == 2
+
+    def test_where_links_cannot_be_made_it_is_refused_and_nothing_is_left(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        recording(tmp_path, A, 0)
+
+        def refuse(*_args: object, **_options: object) -> None:
+            raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+        monkeypatch.setattr(os, "link", refuse)
+        outcome = kept(house_of(tmp_path), tmp_path, 15, 25)
+        assert outcome.refused is not None
+        assert "by hard links: Operation not permitted" in outcome.refused
+        assert files_in(tmp_path / "moments") == []
+
+    def test_a_wish_is_not_granted_twice(self, tmp_path: Path) -> None:
+        """As where the recorder was killed after it kept a moment, and before it answered."""
+        recording(tmp_path, A, 0)
+        slot = asked(tmp_path, 15, 25)
+        request = tmp_path / REQUESTS_FOLDER / f"{slot.wish.number}.json"
+        text = request.read_text()
+        house_of(tmp_path).keep_moments(tmp_path)
+        first = slot.outcome()
+        slot.close()
+        request.with_suffix(".taken").write_text(text)
+        house_of(tmp_path).keep_moments(tmp_path)
+        assert slot.outcome() == first
+        assert len(list(held_in(tmp_path))) == 1
+
+    def test_a_moment_in_a_moment_is_kept_under_the_name_that_it_was_recorded_by(
+        self, tmp_path: Path
+    ) -> None:
+        made = recording(tmp_path, A, 0)
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 0, 5, "one")
+        made[0].unlink()
+        assert kept(house, tmp_path, 2, 7, "two").bags == 1
+        one, two = in_moments(tmp_path)
+        assert one.partition("/")[2] == two.partition("/")[2] == f"{A}/{A}_0.mcap"
+
+    def test_moments_behind_a_link_are_neither_made_nor_followed(self, tmp_path: Path) -> None:
+        recording(tmp_path / "bags", A, 0)
+        (tmp_path / "else").mkdir()
+        (tmp_path / "bags/moments").symlink_to(tmp_path / "else")
+        refused = kept(house_of(tmp_path / "bags"), tmp_path / "bags", 0, 5).refused
+        assert refused is not None
+        assert "symbolic link" in refused
+        assert files_in(tmp_path / "else") == []
+
+
+class TestOpenBags:
+    def test_a_moment_waits_for_the_split_that_is_being_written(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0, splits=2)
+        layout = McapLayout(chunk_size=400, finish=False)
+        open_one = bag(tmp_path / A / f"{A}_2.mcap", 20, layout)
+        now = SettableClock(open_one.stat().st_mtime_ns)
+        recording_now(tmp_path, A, clock=now)
+        house = house_of(tmp_path, clock=now)
+        outcome = kept(house, tmp_path, 15, 25, at=now.at)
+        assert (outcome.bags, outcome.pending) == (1, True)
+        assert told_of(tmp_path)["complete"] is False
+        bag(open_one, 20)
+        bag(tmp_path / A / f"{A}_3.mcap", 30, layout)
+        # Another recorder may be the one that goes on with it.
+        house_of(tmp_path, clock=now).keep_moments(tmp_path)
+        assert [name.rpartition("/")[2] for name in in_moments(tmp_path)] == [
+            f"{A}_1.mcap",
+            f"{A}_2.mcap",
+        ]
+
+    def test_a_moment_ends_when_nothing_of_it_is_open_any_more(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0, splits=2)
+        clock = SettableClock(T0 + 19 * S)
+        house = house_of(tmp_path, clock=clock)
+        outcome = kept(house, tmp_path, 0, 25, at=clock.at)
+        assert (outcome.bags, outcome.pending) == (2, True)
+        bag(tmp_path / A / f"{A}_2.mcap", 20)
+        clock.at = T0 + 26 * S
+        house.keep_moments(tmp_path)
+        assert told_of(tmp_path)["complete"] is True
+        assert len(in_moments(tmp_path)) == 3
+
+    def test_what_passes_the_share_when_it_closes_is_told_and_not_kept(
+        self, tmp_path: Path
+    ) -> None:
+        made = recording(tmp_path, A, 0, splits=2)
+        clock = SettableClock(T0 + 19 * S)
+        share = sum(path.stat().st_size for path in made)
+        house = house_of(tmp_path, clock=clock, moments_bytes=share)
+        kept(house, tmp_path, 0, 25, at=clock.at)
+        bag(tmp_path / A / f"{A}_2.mcap", 20)
+        clock.at = T0 + 26 * S
+        house.keep_moments(tmp_path)
+        told = told_of(tmp_path)
+        assert (told["pending"], told["complete"]) == (False, False)
+        assert "retention.max_moments_gb" in told["missing"][0]
+        assert len(in_moments(tmp_path)) == 2
+
+    def test_a_bag_that_a_crash_left_open_is_kept_when_it_is_repaired(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0, splits=1)
+        bag(tmp_path / A / f"{A}_1.mcap", 10, McapLayout(chunk_size=400, finish=False))
+        house = house_of(tmp_path)
+        assert kept(house, tmp_path, 0, 15).pending
+        house.apply(tmp_path)
+        house.keep_moments(tmp_path)
+        assert told_of(tmp_path)["complete"] is True
+        assert len(in_moments(tmp_path)) == 2
+
+    def test_before_anything_is_deleted_a_pending_moment_goes_on(self, tmp_path: Path) -> None:
+        """As after a night: the recorder that begins anew deletes before it records."""
+        recording(tmp_path, A, 0, splits=2)
+        clock = SettableClock(T0 + 19 * S)
+        kept(house_of(tmp_path, clock=clock), tmp_path, 0, 25, at=clock.at)
+        bag(tmp_path / A / f"{A}_2.mcap", 20)
+        recording(tmp_path, B, 100, splits=2)
+        clock.at = NOW
+        house_of(tmp_path, clock=clock, max_bytes=1).apply(tmp_path)
+        assert len(in_moments(tmp_path)) == 3
+        assert told_of(tmp_path)["complete"] is True
+
+
+class TestCrashes:
+    def test_a_moment_that_was_begun_without_a_link_is_brought_to_its_end(
+        self, tmp_path: Path
+    ) -> None:
+        recording(tmp_path, A, 0)
+        slot = asked(tmp_path, 15, 25)
+        folder = make_folder(tmp_path, slot.wish)
+        write_keepsake(folder, Keepsake.of(slot.wish))
+        house_of(tmp_path).keep_moments(tmp_path)
+        outcome = slot.outcome()
+        assert outcome is not None
+        assert (outcome.moment, outcome.bags, outcome.pending) == (folder.name, 2, False)
+        assert len(in_moments(tmp_path)) == 2
+
+    @pytest.mark.parametrize("step", ["link", "write_keepsake"])
+    def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_completes(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+    ) -> None:
+        """It dies as it makes its second link, or writes what it made for the second time."""
+        recording(tmp_path, A, 0)
+        slot = asked(tmp_path, 15, 25)
+        owner: Any = os if step == "link" else saved_moments
+        done, real = [], getattr(owner, step)
+
+        def killed(*given: Any, **options: Any) -> None:
+            done.append(step)
+            if len(done) == 2:
+                raise KeyboardInterrupt
+            real(*given, **options)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(owner, step, killed)
+            with pytest.raises(KeyboardInterrupt):
+                house_of(tmp_path).keep_moments(tmp_path)
+        house_of(tmp_path).keep_moments(tmp_path)
+        outcome = slot.outcome()
+        assert outcome is not None
+        told = told_of(tmp_path)
+        assert (told["pending"], told["missing"]) == (False, [])
+        assert outcome.bags == len(in_moments(tmp_path)) >= 2
+        assert len(list(held_in(tmp_path))) == 1
+
+    def test_a_folder_that_is_no_moment_yet_is_removed_and_nothing_else(
+        self, tmp_path: Path
+    ) -> None:
+        wish = Wish("0" * 32, "here", T0, T0, NOW)
+        begun = make_folder(tmp_path, wish)
+        (begun / f".{MOMENT_FILE}.tmp").write_text("{")
+        mine = tmp_path / "moments/mine"
+        mine.mkdir()
+        house_of(tmp_path).keep_moments(tmp_path)
+        assert (begun.exists(), mine.exists()) == (False, True)
+
+    def test_a_moment_that_cannot_be_written_holds_up_no_other(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        recording(tmp_path, A, 0)
+        clock = SettableClock(T0 + 19 * S)
+        house = house_of(tmp_path, clock=clock)
+        stuck = kept(house, tmp_path, 0, 25, "stuck", at=clock.at)
+        clock.at = NOW
+        folder = tmp_path / "moments" / str(stuck.moment)
+        (folder / f".{MOMENT_FILE}.tmp").mkdir()
+        with structlog.testing.capture_logs() as captured:
+            assert kept(house, tmp_path, 30, 35).bags == 1
+        assert "moment_not_written" in {event["event"] for event in captured}
+
+
+class TestOthers:
+    def test_a_wipe_takes_moments_too_and_leaves_what_is_not_of_them(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        house = house_of(tmp_path)
+        kept(house, tmp_path, 15, 25, "one")
+        kept(house, tmp_path, 15, 25, "two")
+        mine = min((tmp_path / "moments").iterdir()) / "notes.txt"
+        mine.write_text("why this matters")
+        assert clear_bags(tmp_path).faults == []
+        assert mine.exists()
+        assert list(tmp_path.rglob("*.mcap")) == []
+        assert [path.name for path in (tmp_path / "moments").iterdir()] == [mine.parent.name]
+
+    def test_a_folder_called_moments_elsewhere_is_none(self, tmp_path: Path) -> None:
+        (tmp_path / "mine/moments").mkdir(parents=True)
+        (tmp_path / "mine/moments/metadata.yaml").write_text("of another program")
+        clear_bags(tmp_path)
+        assert (tmp_path / "mine/moments/metadata.yaml").exists()
+
+    def test_what_is_in_a_moment_is_not_repaired(self, tmp_path: Path) -> None:
+        """It would be written anew, and be another file than the one that it was linked to."""
+        recording(tmp_path, A, 0, splits=1)
+        layout = McapLayout(chunk_size=400, finish=False)
+        left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, layout)
+        before = left.read_bytes()
+        house_of(tmp_path).apply(tmp_path)
+        assert left.read_bytes() == before
+
+    def test_recover_leaves_moments_alone(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0, splits=1)
+        kept(house_of(tmp_path), tmp_path, 0, 5)
+        said: list[str] = []
+        assert recover(tmp_path, said.append).whole == 1
+
+    def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
+        recording(tmp_path, A, 0)
+        looking = Keeper(tmp_path, PLENTY, SettableClock(NOW))
+        assert looking.has_work()
+        looking.keep(memory_of(tmp_path).index.snapshot())
+        assert not looking.has_work()
+        asked(tmp_path, 0, 5)
+        assert looking.has_work()

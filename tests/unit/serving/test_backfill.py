@@ -1,0 +1,284 @@
+"""The catalogue is filled bag by bag, and nothing that is in doubt gets into it."""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import anyio
+import anyio.lowlevel
+import pytest
+import structlog
+
+from ros2_memory import queries
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.catalogue.digest import Digester
+from ros2_memory.catalogue.lookup import Recall
+from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
+from ros2_memory.cli import main
+from ros2_memory.cli.index import Bar, fill, line
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
+from ros2_memory.serving.backfill import BACKLOG, Filler, Progress, keep_filled
+from ros2_memory.serving.health import Health
+from tests.bags import McapLayout, odom, text, write_mcap
+from tests.keeping import recorded_before
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.catalogue.digest import Digest
+    from ros2_memory.history.context import Memory
+
+T0 = 1_700_000_000 * NS_PER_S
+
+
+def bag(bag_dir: Path, number: int, *, finish: bool = True) -> Path:
+    start = T0 + number * 10 * NS_PER_S
+    messages = [odom(start + n * NS_PER_S, number + n / 10, 0.0) for n in range(10)]
+    path = bag_dir / "rec" / f"rec_{number}.mcap"
+    return write_mcap(path, messages, McapLayout(finish=finish, chunk_size=300))
+
+
+def recalling(bag_dir: Path, clock: SettableClock | None = None) -> Memory:
+    recall = Recall(Catalogue([bag_dir / FOLDER / FILE], "test"), bag_dir)
+    return replace(memory_of(bag_dir, clock=clock), recall=recall)
+
+
+def filler_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -> Filler:
+    made = digester or Digester(memory.reader, memory.extractor, 10.0)
+    return Filler(memory, made, bag_dir)
+
+
+def never() -> bool:
+    return False
+
+
+def test_the_newest_bag_comes_first(tmp_path: Path) -> None:
+    paths = [bag(tmp_path, number) for number in range(3)]
+    filler = filler_of(recalling(tmp_path), tmp_path)
+    assert [each.path for each in filler.waiting()] == paths[::-1]
+
+
+def test_when_all_is_digested_nothing_waits(tmp_path: Path) -> None:
+    for number in range(3):
+        bag(tmp_path, number)
+    filler = filler_of(recalling(tmp_path), tmp_path)
+    assert filler.progress() == Progress(3, 3, 0)
+    assert fill(filler, None, never) == Progress(3, 0, 0)
+    assert fill(filler_of(recalling(tmp_path), tmp_path), None, never) == Progress(3, 0, 0)
+
+
+def test_a_bag_that_a_crash_left_open_is_never_digested(tmp_path: Path) -> None:
+    bag(tmp_path, 0)
+    bag(tmp_path, 1, finish=False)
+    assert fill(filler_of(recalling(tmp_path), tmp_path), None, never) == Progress(1, 0, 0)
+
+
+def test_a_bag_that_changed_a_moment_ago_waits(tmp_path: Path) -> None:
+    bag(tmp_path, 0)
+    clock = SettableClock(time.time_ns())
+    filler = filler_of(recalling(tmp_path, clock), tmp_path)
+    [waiting] = filler.waiting()
+    assert not filler.digest(waiting)
+    clock.at += 3 * NS_PER_S
+    assert filler.digest(waiting)
+
+
+def test_a_changed_bag_or_sidecar_has_the_bag_digested_again(tmp_path: Path) -> None:
+    path = bag(tmp_path, 0)
+    memory = recalling(tmp_path)
+    fill(filler_of(memory, tmp_path), None, never)
+    write_handover(path.parent, Handover())
+    assert len(filler_of(recalling(tmp_path), tmp_path).waiting()) == 1
+    fill(filler_of(recalling(tmp_path), tmp_path), None, never)
+    path.write_bytes(bag(tmp_path, 1).read_bytes())
+    assert path in [each.path for each in filler_of(recalling(tmp_path), tmp_path).waiting()]
+
+
+class Meddling(Digester):
+    """Something happens to the bag while it is read."""
+
+    def digest(self, path: Path) -> Digest:
+        found = super().digest(path)
+        write_handover(path.parent, Handover())
+        return found
+
+
+class Failing(Digester):
+    def digest(self, path: Path) -> Digest:
+        raise BagError(str(path), "damaged in the middle")
+
+
+def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
+    bag(tmp_path, 0)
+    memory = recalling(tmp_path)
+    filler = filler_of(memory, tmp_path, Meddling(memory.reader, memory.extractor, 10.0))
+    [waiting] = filler.waiting()
+    assert not filler.digest(waiting)
+    assert memory.recall is not None
+    assert memory.recall.catalogue.paths() == []
+
+
+def test_a_bag_that_cannot_be_digested_is_told_of_and_not_tried_for_ever(tmp_path: Path) -> None:
+    bag(tmp_path, 0)
+    memory = recalling(tmp_path)
+    filler = filler_of(memory, tmp_path, Failing(memory.reader, memory.extractor, 10.0))
+    assert fill(filler, None, never) == Progress(1, 0, 1)
+    assert len(queries.list_recorded_topics(memory, Call())) == 1
+
+
+def test_entries_of_bags_that_are_gone_are_dropped(tmp_path: Path) -> None:
+    paths = [bag(tmp_path, number) for number in range(3)]
+    memory = recalling(tmp_path)
+    fill(filler_of(memory, tmp_path), None, never)
+    paths[0].unlink()
+    filler_of(memory, tmp_path).tidy()
+    assert memory.recall is not None
+    assert sorted(memory.recall.catalogue.paths()) == ["rec/rec_1.mcap", "rec/rec_2.mcap"]
+
+
+def test_a_bag_directory_that_is_gone_for_a_while_keeps_its_entries(tmp_path: Path) -> None:
+    bag_dir, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
+    bag(bag_dir, 0)
+    recall = Recall(Catalogue([tmp_path / FILE], "test"), bag_dir)
+    memory = replace(memory_of(bag_dir), recall=recall)
+    fill(filler_of(memory, bag_dir), None, never)
+    bag_dir.rename(elsewhere)
+    filler_of(memory, bag_dir).tidy()
+    assert recall.catalogue.paths() == ["rec/rec_0.mcap"]
+
+
+async def test_in_the_background_what_closes_is_digested(tmp_path: Path) -> None:
+    bag(tmp_path, 0)
+    filler = filler_of(recalling(tmp_path), tmp_path)
+    with anyio.fail_after(30):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keep_filled, filler, ["/no/such/program"], 0.001)
+            while filler.progress().waiting:
+                await anyio.lowlevel.checkpoint()
+            bag(tmp_path, 1)
+            while filler.progress() != Progress(2, 0, 0):
+                await anyio.lowlevel.checkpoint()
+            tasks.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("helper", [["/no/such/program"], [sys.executable, "-c", "exit(3)"]])
+async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
+    tmp_path: Path, helper: list[str]
+) -> None:
+    for number in range(BACKLOG + 2):
+        bag(tmp_path, number)
+    filler = filler_of(recalling(tmp_path), tmp_path)
+    with anyio.fail_after(60):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keep_filled, filler, helper, 0.001)
+            while filler.progress().waiting:
+                await anyio.lowlevel.checkpoint()
+            tasks.cancel_scope.cancel()
+
+
+async def test_health_tells_how_far_the_catalogue_is(tmp_path: Path) -> None:
+    for number in range(3):
+        bag(tmp_path, number)
+    memory = recalling(tmp_path)
+    filler = filler_of(memory, tmp_path)
+    filler.digest(filler.waiting()[0])
+    told = await Health(memory, "1.2.3", filler)()
+    assert told["catalogue"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
+
+
+# The command
+
+
+@pytest.fixture
+def own_logging() -> Iterator[None]:
+    """Logging as it was before a command set it up."""
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    root.handlers = []
+    yield
+    root.level, root.handlers = level, handlers
+    logging.captureWarnings(capture=False)
+    structlog.reset_defaults()
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_on_a_terminal_one_line_moves_and_elsewhere_only_its_end_is_shown() -> None:
+    terminal, log = Terminal(), io.StringIO()
+    for stream in (terminal, log):
+        bar = Bar(stream)
+        bar.show(Progress(4, 3, 0))
+        bar.end(Progress(4, 0, 1))
+    assert terminal.getvalue().count("\r") == 2
+    assert log.getvalue() == f"{line(Progress(4, 0, 1))}\n"
+    assert "3 of 4 bags are in the catalogue, 1 cannot be" in log.getvalue()
+    assert "0 of 0" in line(Progress(0, 0, 0))
+
+
+@pytest.mark.usefixtures("own_logging")
+def test_the_command_fills_the_catalogue_beside_the_bags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(recorded_before(tmp_path)))
+    path = bag(tmp_path, 0)
+    hour_ago = time.time_ns() - 3600 * NS_PER_S
+    os.utime(path, ns=(hour_ago, hour_ago))
+    assert main(["index"]) == 0
+    assert "1 of 1 bag is in the catalogue" in capsys.readouterr().err
+    assert (tmp_path / FOLDER / FILE).is_file()
+
+
+@pytest.mark.usefixtures("own_logging")
+def test_where_no_catalogue_can_be_written_the_command_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+    (tmp_path / FOLDER).write_text("a file where a folder should be")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / FOLDER))
+    assert main(["index"]) == 2
+    assert "XDG_CACHE_HOME" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("own_logging")
+def test_a_missing_bag_directory_is_what_the_command_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert main(["index", "--bag-dir", str(tmp_path / "gone")]) == 2
+    assert "the bag directory does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("own_logging")
+def test_the_command_counts_the_warnings_of_the_log_instead_of_showing_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "rec_0.mcap").touch()
+    hour_ago = time.time_ns() - 3600 * NS_PER_S
+    os.utime(tmp_path / "rec" / "rec_0.mcap", ns=(hour_ago, hour_ago))
+    assert main(["index", "--bag-dir", str(tmp_path)]) == 0
+    told = capsys.readouterr().err
+    assert "1 warning logged (bag_damaged)" in told
+    assert '"event"' not in told
+
+
+def test_texts_of_the_newest_bag_are_found_before_and_after_it_is_digested(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "scissors")])
+    memory = recalling(tmp_path)
+    before = queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors")
+    fill(filler_of(memory, tmp_path), None, never)
+    assert queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors") == before
+    assert before.found is not None

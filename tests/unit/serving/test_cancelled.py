@@ -1,0 +1,109 @@
+"""A query that nobody waits for any more stops: it reads no further than the bag it is in."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+
+from ros2_memory.bag_dir.stand_in import StandInReader
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.timebase import Deadline
+from ros2_memory.history.context import Call, Limits
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.spec_tools import build_tools
+from tests.bags import detections, odom, tf, transform, write_mcap
+from tests.memories import memory_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from ros2_memory.storage.base import Record
+
+S: Final = 10**9
+BEGIN_S: Final = 1_700_000_000
+BAGS: Final = 6
+MESSAGES: Final = 1500
+"""Of each topic in each bag."""
+AT_MOST: Final = 2 * MESSAGES
+"""Messages that may still be read: those of a bag that is gone through at once."""
+TOOLS: Final = {
+    tool.name: tool for tool in build_tools(Limits(), 25.0, additions=True, writing=False)
+}
+SPAN: Final = {"start": BEGIN_S, "end": BEGIN_S + 4000}
+LONG: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
+    ("trajectory_summary", SPAN),
+    ("recap", SPAN),
+    ("visits", {"x": 1e5, "y": 0.0}),
+    ("list_frames", {}),
+    ("find_matches", {"topic": "/*", "condition_type": "contains", "value": "never"}),
+    ("find_last_match", {"topic": "/vision/*", "condition_type": "contains", "value": "never"}),
+    (
+        "find_last_match",
+        {"topic": "/odom", "condition_type": "above", "value": 1e9, "field": "position.x"},
+    ),
+    (
+        "get_value_when",
+        {
+            "value_topic": "/odom",
+            "condition_topic": "/vision/*",
+            "condition_type": "contains",
+            "value": "never",
+        },
+    ),
+)
+
+
+class Watched(StandInReader):
+    """Counts the messages that are read, and has the client leave after so many."""
+
+    def __init__(self, bag_dir: Path, leaves_after: int) -> None:
+        super().__init__(McapReader(), bag_dir)
+        self.read = 0
+        self.leaves_after = leaves_after
+
+    @property
+    def is_left(self) -> bool:
+        return self.read >= self.leaves_after
+
+    def records(self, *args: Any, **named: Any) -> Iterator[Record]:
+        for record in super().records(*args, **named):
+            self.read += 1
+            yield record
+
+
+@pytest.fixture(scope="module")
+def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bags")
+    for bag in range(BAGS):
+        messages = []
+        for n in range(MESSAGES):
+            at = BEGIN_S * S + (bag * MESSAGES + n) * S // 10
+            messages.append(odom(at, n / 10, float(n % 7)))
+            messages.append(tf(at, transform(at, "odom", "base_link", (n / 10, 0.0, 0.0))))
+            messages.append(detections(at, ["cup"]))
+        write_mcap(folder / "rec" / f"rec_{bag}.mcap", messages)
+    return folder
+
+
+@pytest.mark.parametrize(("name", "given"), LONG)
+def test_a_query_that_nobody_waits_for_reads_no_further(
+    bag_dir: Path, name: str, given: dict[str, Any]
+) -> None:
+    def asked(leaves_after: int) -> Watched:
+        reader = Watched(bag_dir, leaves_after)
+        memory = memory_of(bag_dir, reader=reader)
+        call = Call(Deadline.after(25.0, lambda: math.inf if reader.is_left else 0.0))
+        TOOLS[name].question(given)(memory, call)
+        return reader
+
+    whole = asked(1 << 60).read
+    assert whole > 2 * AT_MOST, "it must have something left to read"
+    reader = Watched(bag_dir, whole // 4)
+    memory = memory_of(bag_dir, reader=reader)
+    call = Call(Deadline.after(25.0, lambda: math.inf if reader.is_left else 0.0))
+    with pytest.raises(QueryTimeoutError):
+        TOOLS[name].question(given)(memory, call)
+    assert reader.read <= whole // 4 + AT_MOST

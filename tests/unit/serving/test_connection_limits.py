@@ -1,0 +1,368 @@
+"""Clients that keep the server waiting, on real sockets; the bounds are made short."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import struct
+import threading
+from collections import deque
+from contextlib import ExitStack, asynccontextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory.core.logging_setup import Refusals
+from ros2_memory.serving import connection_limits
+from ros2_memory.serving.auth import admit
+from tests.unit.serving.test_web_app import GOOD, MCP_HEADERS, SHOWN, app, call_tool
+from tests.webserver import BOUND_S, listening
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import uvicorn
+
+GET = b"GET / HTTP/1.1\r\nhost: a\r\n\r\n"
+HALF = b"GET / HTTP/1.1\r\nhost: a\r\nx: "
+POST = b"POST / HTTP/1.1\r\nhost: a\r\ncontent-length: 10\r\n\r\n"
+
+
+class App:
+    """Reads bodies and answers; `/flood` never stops sending, `/early` answers before it reads."""
+
+    def __init__(self) -> None:
+        self.under_way = 0
+        self.left = 0
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        self.under_way += 1
+        try:
+            await self._answer(scope, receive, send)
+        finally:
+            self.under_way -= 1
+
+    async def _answer(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["path"] != "/stranger":
+            admit(scope)
+        more = scope["method"] == "POST" and scope["path"] != "/early"
+        while more:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                self.left += 1
+                return
+            more = message["more_body"]
+        length = [] if scope["path"] == "/flood" else [(b"content-length", b"2")]
+        await send({"type": "http.response.start", "status": 200, "headers": length})
+        while scope["path"] == "/flood" and self.under_way:
+            await send({"type": "http.response.body", "body": b"x" * 65536, "more_body": True})
+            await asyncio.sleep(0)  # sending to a client that is gone waits for nothing
+        await send({"type": "http.response.body", "body": b"ok"})
+
+
+class Served:
+    def __init__(self, server: uvicorn.Server, app: App, port: int) -> None:
+        self.server = server
+        self.app = app
+        self.port = port
+
+    async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        return await asyncio.open_connection("127.0.0.1", self.port)
+
+    async def reply(self, *sent: bytes) -> bytes:
+        """Everything until the server ends the connection."""
+        reader, writer = await self.connect()
+        for part in sent:
+            writer.write(part)
+            await writer.drain()
+        async with asyncio.timeout(BOUND_S):
+            told = await reader.read()
+        writer.close()
+        return told
+
+    async def gone(self) -> None:
+        async with asyncio.timeout(BOUND_S):
+            while self.server.server_state.connections:
+                await asyncio.sleep(0.001)
+
+
+@asynccontextmanager
+async def serving() -> AsyncIterator[Served]:
+    app = App()
+    async with listening(app) as server:
+        yield Served(server, app, server.servers[0].sockets[0].getsockname()[1])
+
+
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("HEAD_S", "BODY_S", "UNREAD_S"):
+        monkeypatch.setattr(connection_limits, name, 0.1)
+
+
+@pytest.mark.usefixtures("hurried")
+@pytest.mark.parametrize("sent", [[], [b"G"], [HALF], [HALF, b"y"]])
+async def test_headers_that_do_not_come_to_their_end_are_answered_with_timeout(
+    sent: list[bytes],
+) -> None:
+    async with serving() as served:
+        told = await served.reply(*sent)
+        assert told.startswith(b"HTTP/1.1 408 Request Timeout\r\n")
+        assert told.endswith(b"did not come to its end in time.\n")
+        await served.gone()
+
+
+@pytest.mark.usefixtures("hurried")
+async def test_headers_that_trickle_win_no_time() -> None:
+    async with serving() as served:
+        reader, writer = await served.connect()
+
+        async def trickle() -> None:
+            writer.write(HALF)
+            while not reader.at_eof():
+                writer.write(b"y")
+                await asyncio.sleep(0.005)
+
+        task = asyncio.create_task(trickle())
+        async with asyncio.timeout(BOUND_S):
+            told = await reader.read()
+        assert b" 408 " in told
+        task.cancel()
+        writer.close()
+        await served.gone()
+
+
+@pytest.mark.usefixtures("hurried")
+@pytest.mark.parametrize(
+    "sent",
+    [
+        [POST],
+        [POST, b"12345"],
+        [b"POST / HTTP/1.1\r\nhost: a\r\ntransfer-encoding: chunked\r\n\r\n", b"5\r\nab"],
+    ],
+)
+async def test_a_body_that_does_not_come_to_its_end_is_answered_with_timeout(
+    sent: list[bytes],
+) -> None:
+    async with serving() as served:
+        assert b" 408 " in await served.reply(*sent)
+        await served.gone()
+        assert (served.app.under_way, served.app.left) == (0, 1)
+
+
+@pytest.mark.usefixtures("hurried")
+async def test_what_is_left_of_a_body_that_was_answered_early_is_not_waited_for() -> None:
+    async with serving() as served:
+        told = await served.reply(b"POST /early HTTP/1.1\r\ncontent-length: 99\r\nhost: a\r\n\r\n")
+        assert told.count(b"HTTP/1.1 ") == 1
+        assert told.startswith(b"HTTP/1.1 200")
+        await served.gone()
+
+
+@pytest.mark.usefixtures("hurried")
+async def test_a_reply_that_is_not_read_ends_the_connection_and_the_call() -> None:
+    async with serving() as served:
+        # Not asyncio's: that one reads by itself.
+        with socket.create_connection(("127.0.0.1", served.port)) as client:
+            client.sendall(b"GET /flood HTTP/1.1\r\nhost: a\r\n\r\n")
+            async with asyncio.timeout(BOUND_S):
+                while not served.app.under_way:
+                    await asyncio.sleep(0.001)
+                await served.gone()
+                served.app.under_way = 0
+
+
+async def test_requests_in_time_are_answered_one_after_another_on_one_connection() -> None:
+    async with serving() as served:
+        reader, writer = await served.connect()
+        for request in (GET, POST + b"0123456789", GET, POST + b"0123456789"):
+            writer.write(request)
+            async with asyncio.timeout(BOUND_S):
+                told = await reader.readuntil(b"\r\n\r\nok")
+            assert told.startswith(b"HTTP/1.1 200")
+        writer.close()
+
+
+async def test_requests_sent_without_waiting_are_answered_in_order() -> None:
+    async with serving() as served:
+        reader, writer = await served.connect()
+        writer.write(GET * 20 + (POST + b"0123456789") * 20)
+        async with asyncio.timeout(BOUND_S):
+            for _ in range(40):
+                assert (await reader.readuntil(b"\r\n\r\nok")).startswith(b"HTTP/1.1 200")
+        writer.close()
+
+
+async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connection_limits, "MOST_CONNECTIONS", 3)
+    async with serving() as served:
+        open_ones = [await served.connect() for _ in range(3)]
+        for reader, writer in open_ones:
+            writer.write(GET)
+            async with asyncio.timeout(BOUND_S):
+                await reader.readuntil(b"ok")
+        told = await served.reply()
+        assert told.startswith(b"HTTP/1.1 503 Service Unavailable\r\n")
+        assert told.endswith(b"Too many connections; close some.\n")
+        for reader, writer in open_ones:
+            writer.write(GET)
+            async with asyncio.timeout(BOUND_S):
+                assert b" 200 " in await reader.readuntil(b"ok")
+            writer.close()
+        await served.gone()
+        assert b" 200 " in await served.reply(
+            GET.replace(b"\r\n\r\n", b"\r\nconnection: close\r\n\r\n")
+        )
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"GET / HTTP/1.1\r\nhost: a\r\nx: " + b"y" * 70_000,
+        b"GET /" + b"y" * 70_000,
+        b"GET / HTTP/1.1\r\n" + b"x: y\r\n" * 20_000,
+        b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03",
+        b"\x00" * 70_000,
+    ],
+    ids=["header", "path", "headers", "tls", "zeros"],
+)
+async def test_headers_without_end_and_what_is_no_http_are_refused(head: bytes) -> None:
+    async with serving() as served:
+        told = await served.reply(head)
+        assert told == b"" or told.startswith(b"HTTP/1.1 4")  # may be cut by what was left unread
+        await served.gone()
+
+
+async def test_the_system_keeps_little_and_gives_up_a_peer_that_vanished() -> None:
+    async with serving() as served:
+        _, writer = await served.connect()
+        async with asyncio.timeout(BOUND_S):
+            while not served.server.server_state.connections:
+                await asyncio.sleep(0.001)
+        [connection] = served.server.server_state.connections
+        connected = connection.transport.get_extra_info("socket")
+        waits = connected.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+        assert waits == connection_limits.UNREAD_S * 1000
+        # Linux doubles what it is told, for its own bookkeeping.
+        kept = connected.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+        assert kept <= 2 * connection_limits.KEPT_BYTES
+        writer.close()
+
+
+async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connection_limits, "MOST_STRANGERS", 3)
+    async with serving() as served:
+        known, to_known = await served.connect()
+        to_known.write(GET)
+        async with asyncio.timeout(BOUND_S):
+            await known.readuntil(b"ok")
+        with ExitStack() as stack:
+            strangers = []
+            for _ in range(6):
+                place = ("127.0.0.1", served.port)
+                strangers.append(stack.enter_context(socket.create_connection(place, BOUND_S)))
+                strangers[-1].sendall(b"G")
+                async with asyncio.timeout(BOUND_S):
+                    while len(served.server.server_state.connections) < min(len(strangers), 3) + 1:
+                        await asyncio.sleep(0.001)
+            for each in strangers[:3]:
+                with suppress(ConnectionResetError):
+                    assert await asyncio.to_thread(each.recv, 1) == b""
+            for each in strangers[3:]:
+                each.sendall(GET[1:])
+                assert b" 200 " in await asyncio.to_thread(each.recv, 1000)
+        to_known.write(GET)
+        async with asyncio.timeout(BOUND_S):
+            assert b" 200 " in await known.readuntil(b"ok")
+        to_known.close()
+
+
+async def test_a_request_that_was_not_admitted_leaves_a_stranger() -> None:
+    async with serving() as served:
+        reader, writer = await served.connect()
+        for path, stranger in ((b"/stranger", True), (b"/", False), (b"/stranger", False)):
+            writer.write(b"GET " + path + b" HTTP/1.1\r\nhost: a\r\n\r\n")
+            async with asyncio.timeout(BOUND_S):
+                await reader.readuntil(b"ok")
+            [connection] = served.server.server_state.connections
+            assert isinstance(connection, connection_limits.BoundedConnection)
+            assert connection.is_stranger is stranger
+        writer.close()
+
+
+def flood(port: int, stop: threading.Event) -> int:
+    """Opens connections, sends one byte on each, and leaves it at that; how many it opened."""
+    opened = 0
+    kept: deque[socket.socket] = deque()
+    while not stop.is_set():
+        with suppress(OSError):
+            kept.append(socket.create_connection(("127.0.0.1", port), timeout=BOUND_S))
+            opened += 1
+            kept[-1].sendall(b"P")
+        if len(kept) > 300:
+            kept.popleft().close()
+    for each in kept:
+        each.close()
+    return opened
+
+
+async def test_strangers_do_not_lock_out_whoever_shows_the_token() -> None:
+    web = app(api_token=GOOD)
+    body = json.dumps(call_tool("ask"))
+    headers = {"host": "127.0.0.1", "connection": "close", "content-type": "application/json"}
+    headers |= MCP_HEADERS | SHOWN | {"content-length": str(len(body))}
+    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
+    request = f"POST /mcp HTTP/1.1\r\n{lines}\r\n{body}".encode()
+    statuses, stop = [], threading.Event()
+    async with listening(web, lifespan="on") as server:
+        port = server.servers[0].sockets[0].getsockname()[1]
+        with ExitStack() as silent:
+            for _ in range(257):
+                each = silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+                each.sendall(b"P")
+                await asyncio.sleep(0)
+            flooding = asyncio.create_task(asyncio.to_thread(flood, port, stop))
+            try:
+                for _ in range(50):
+                    # Each over a connection of its own.
+                    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                    writer.write(request)
+                    async with asyncio.timeout(BOUND_S):
+                        statuses.append((await reader.readline()).split()[1])
+                        await reader.read()
+                    writer.close()
+            finally:
+                stop.set()
+                opened = await flooding
+    assert opened
+    assert statuses == [b"200"] * 50
+
+
+@pytest.mark.usefixtures("hurried")
+async def test_peers_that_are_gone_fill_no_log(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection_limits.BoundedConnection, "_refusals", Refusals())
+    garbage = (b"", b"P", HALF, b"\x16\x03\x01", POST, GET + b"\x00" * 99, b"GET / HTTP/9\r\n\r\n")
+    chunked = b"POST /early HTTP/1.1\r\nhost: a\r\ntransfer-encoding: chunked\r\n\r\nzz\r\n"
+    with capture_logs() as logged:
+        async with serving() as served:
+            for sent in (*garbage, chunked) * 12:
+                with socket.create_connection(("127.0.0.1", served.port)) as client:
+                    # Closing then resets, so nothing can be sent any more.
+                    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                    client.sendall(sent)
+                    await asyncio.sleep(0)
+            await served.gone()
+            for sent in (*garbage, chunked) * 12:
+                await served.reply(sent)
+            await served.gone()
+    assert {each["event"] for each in logged} == {"connection_refused"}
+    assert len(logged) == len({each["reason"] for each in logged})
+    tracebacks = [each for each in caplog.records if each.exc_info]
+    assert tracebacks == []

@@ -1,0 +1,420 @@
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import anyio
+import pytest
+import structlog
+from mcp import Client
+from mcp.types import TextContent
+from structlog.testing import LogCapture
+
+from ros2_memory import results
+from ros2_memory.core.errors import (
+    EpisodicError,
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    QueryTimeoutError,
+)
+from ros2_memory.core.model import Sample
+from ros2_memory.history.context import Memory
+from ros2_memory.serving.dispatch import (
+    BLOCKING_AT_ONCE,
+    QUICK_AT_ONCE,
+    Dispatcher,
+)
+from ros2_memory.serving.fair_queue import MOST_WAITING
+from ros2_memory.serving.mcp_server import EpisodicServer
+from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.replies import Replies, Reply
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from mcp.types import CallToolResult
+
+    from ros2_memory.history.context import Call
+    from ros2_memory.tools.reply_json import Answer
+
+NOBODY = cast("Memory", None)
+"""The tools of these tests ask nothing of a memory."""
+
+
+def tool(name: str, ask: Callable[[Call], Answer], *, blocking: bool = False) -> Tool:
+    def question(given: Mapping[str, object]) -> Callable[[Memory, Call], Answer]:
+        if "bad" in given:
+            raise InvalidArgumentsError("bad was given")
+        return lambda _memory, call: ask(call)
+
+    schema: dict[str, Any] = {"type": "object", "properties": {}}
+    return Tool(name, name.title(), f"What {name} does.", schema, blocking, question)
+
+
+def value(shown: Any) -> results.TopicValue:
+    return results.TopicValue("/a", "a/msg/A", Sample(0, shown))
+
+
+def served(*tools: Tool, timeout_s: float = 25.0, max_chars: int = 24_000) -> EpisodicServer:
+    dispatcher = Dispatcher(
+        NOBODY, tools, Replies(Path("bags"), max_chars), call_timeout_s=timeout_s
+    )
+    return EpisodicServer(
+        dispatcher, tools, name="episodic", version="1.2.3", instructions="Ask away."
+    )
+
+
+def told(result: CallToolResult) -> Any:
+    """The reply, held to be one text block and nothing else."""
+    [block] = result.content
+    assert isinstance(block, TextContent)
+    assert result.structured_content is None
+    return json.loads(block.text)
+
+
+def raising(error: BaseException) -> Callable[[Call], Answer]:
+    def ask(_call: Call) -> Answer:
+        raise error
+
+    return ask
+
+
+def until_given_up(call: Call) -> Answer:
+    """A query as the rooms below write it: it looks at its deadline between two bags."""
+    while not call.deadline.expired():
+        threading.Event().wait(0.001)
+    raise QueryTimeoutError(f"the question needs more than {call.deadline.budget_s:g} s")
+
+
+@pytest.fixture
+def log() -> Iterator[LogCapture]:
+    capture = LogCapture()
+    structlog.configure(processors=[structlog.contextvars.merge_contextvars, capture])
+    yield capture
+    structlog.reset_defaults()
+
+
+async def test_a_reply_is_one_text_block_without_structured_content() -> None:
+    async with Client(served(tool("ask", lambda _call: value({"x": 1})))) as client:
+        result = await client.call_tool("ask", {})
+        assert told(result)["value"] == {"x": 1}
+        assert not result.is_error
+        [listed] = (await client.list_tools()).tools
+        assert listed.output_schema is None
+
+
+async def test_tools_are_listed_as_read_only_and_with_nothing_that_says_nothing() -> None:
+    quick, slow = tool("quick", raising(ValueError())), tool("slow", until_given_up, blocking=True)
+    async with Client(served(quick, slow)) as client:
+        listed = (await client.list_tools()).tools
+    assert [each.name for each in listed] == ["quick", "slow"]
+    hints = [each.annotations and each.annotations.model_dump(exclude_none=True) for each in listed]
+    # What is read-only has no other hints; each is paid for by every planner that lists it.
+    assert hints == [{"read_only_hint": True}, {"read_only_hint": True, "title": "Slow (blocking)"}]
+
+
+async def test_the_server_says_its_name_its_version_and_how_to_ask() -> None:
+    async with Client(served()) as client:
+        info = client.server_info
+        assert info is not None
+        assert (info.name, info.version) == ("episodic", "1.2.3")
+        assert client.instructions == "Ask away."
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "error", "is_error"),
+    [
+        ("none", {}, {"error": "no_data", "reason": "gap", "detail": "a hole"}, False),
+        ("none", {"bad": 1}, {"error": "invalid_arguments", "detail": "bad was given"}, True),
+        ("late", {}, {"error": "timeout", "detail": "too long"}, True),
+    ],
+)
+async def test_every_error_is_json(
+    name: str, given: dict[str, Any], error: dict[str, str], is_error: bool
+) -> None:
+    none = tool("none", raising(NoDataError(NoDataReason.GAP, "a hole")))
+    late = tool("late", raising(QueryTimeoutError("too long")))
+    async with Client(served(none, late)) as client:
+        result = await client.call_tool(name, given)
+        assert told(result) == error
+        assert result.is_error == is_error
+
+
+async def test_an_unknown_tool_is_answered_with_the_nearest_names() -> None:
+    async with Client(served(tool("get_position_at", raising(ValueError())))) as client:
+        result = await client.call_tool("get_positon", {})
+        assert result.is_error
+        assert told(result)["error"] == "invalid_arguments"
+        assert told(result)["detail"].endswith("do you mean get_position_at?")
+        assert "there are: get_position_at" in told(await client.call_tool("qqq", {}))["detail"]
+
+
+@pytest.mark.parametrize("error", [KeyError("secret"), RecursionError(), MemoryError()])
+async def test_a_fault_is_logged_and_told_without_its_inside(
+    error: Exception, log: LogCapture
+) -> None:
+    async with Client(served(tool("ask", raising(error)))) as client:
+        result = await client.call_tool("ask", {})
+        again = await client.call_tool("ask", {"bad": 1})
+    assert result.is_error
+    assert told(result)["error"] == "internal"
+    assert "secret" not in told(result)["detail"]
+    assert told(again)["error"] == "invalid_arguments"
+    failed, called, _ = log.entries
+    assert failed["event"] == "tool_failed"
+    assert failed["exc_info"] is True
+    assert failed["correlation_id"] == called["correlation_id"]
+    assert failed["correlation_id"] in told(result)["detail"]
+
+
+class BrokenReplies(Replies):
+    def error(self, error: EpisodicError) -> Reply:
+        raise KeyError("secret")
+
+
+@pytest.mark.parametrize("given", [{}, {"bad": 1}])
+async def test_a_fault_in_telling_an_error_is_told_as_any_other(
+    given: dict[str, Any], log: LogCapture
+) -> None:
+    tools = [tool("none", raising(NoDataError(NoDataReason.GAP, "a hole")))]
+    replies = BrokenReplies(Path("bags"), 24_000)
+    reply = await Dispatcher(NOBODY, tools, replies, call_timeout_s=25).answer("none", given)
+    assert reply.is_error
+    assert json.loads(reply.text)["error"] == "internal"
+    assert "secret" not in reply.text
+    assert [entry["event"] for entry in log.entries] == ["tool_failed", "tool_call"]
+
+
+async def test_each_call_is_logged_once_with_its_outcome_and_times(log: LogCapture) -> None:
+    def ask(call: Call) -> Answer:
+        call.stages.add("read", 2_500_000)
+        return value(1)
+
+    tools = (tool("ask", ask), tool("none", raising(NoDataError(NoDataReason.GAP, "a hole"))))
+    async with Client(served(*tools)) as client:
+        await client.call_tool("ask", {"topic": "/a" * 1000})
+        await client.call_tool("none", {})
+        await client.call_tool("ask", {"bad": 1})
+    asked, none, bad = log.entries
+    assert asked["event"] == "tool_call"
+    assert asked["tool"] == "ask"
+    assert asked["outcome"] == "ok"
+    assert asked["stages_ms"] == {"read": 2.5}
+    assert asked["duration_ms"] > 0
+    assert 0 < len(asked["arguments"]) <= 300
+    assert none["outcome"] == "no_data: gap"
+    assert bad["outcome"] == "invalid_arguments"
+    assert len({entry["correlation_id"] for entry in log.entries}) == 3
+
+
+async def test_arguments_are_left_out_of_the_log_where_they_are_not_wanted(log: LogCapture) -> None:
+    tools = [tool("ask", lambda _: value(1))]
+    replies = Replies(Path("bags"), 24_000)
+    silent = Dispatcher(NOBODY, tools, replies, call_timeout_s=25, log_arguments=False)
+    await silent.answer("ask", {"s3cret": "s3cret"})
+    await silent.answer("s3cret", {"s3cret": "s3cret"})
+    assert [(each["event"], each["tool"]) for each in log.entries] == [
+        ("tool_call", "ask"),
+        ("tool_call", "unknown"),
+    ]
+    assert "s3cret" not in str(log.entries)
+
+
+async def test_a_query_that_takes_too_long_gives_up_by_itself() -> None:
+    async with Client(served(tool("slow", until_given_up), timeout_s=1.0)) as client:
+        result = await client.call_tool("slow", {})
+        assert result.is_error
+        assert told(result) == {"error": "timeout", "detail": "the question needs more than 0.9 s"}
+
+
+async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> None:
+    released = threading.Event()
+
+    def stuck(_call: Call) -> Answer:
+        released.wait(10)
+        return value(1)
+
+    async with Client(served(tool("stuck", stuck), timeout_s=0.05)) as client:
+        result = await client.call_tool("stuck", {})
+        released.set()
+    assert result.is_error
+    assert told(result)["error"] == "timeout"
+    assert told(result)["detail"].startswith("stuck needs more than 0.05 s")
+
+
+async def test_tools_are_listed_while_queries_run_and_wait() -> None:
+    released = threading.Event()
+
+    def stuck(_call: Call) -> Answer:
+        released.wait(10)
+        return value(1)
+
+    async with Client(served(tool("stuck", stuck))) as client, anyio.create_task_group() as tasks:
+        for _ in range(2 * QUICK_AT_ONCE):
+            tasks.start_soon(client.call_tool, "stuck", {})
+        await anyio.wait_all_tasks_blocked()
+        assert len((await client.list_tools()).tools) == 1
+        released.set()
+
+
+async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
+    released = threading.Event()
+
+    def stuck(_call: Call) -> Answer:
+        released.wait(10)
+        return value(1)
+
+    slow, quick = tool("slow", stuck, blocking=True), tool("quick", lambda _call: value(2))
+    async with Client(served(slow, quick)) as client, anyio.create_task_group() as tasks:
+        for _ in range(BLOCKING_AT_ONCE + QUICK_AT_ONCE):
+            tasks.start_soon(client.call_tool, "slow", {})
+        await anyio.wait_all_tasks_blocked()
+        assert told(await client.call_tool("quick", {}))["value"] == 2
+        assert not released.is_set()
+        released.set()
+
+
+async def test_a_query_gives_up_when_its_client_no_longer_waits(log: LogCapture) -> None:
+    started, ended = threading.Event(), threading.Event()
+
+    def ask(call: Call) -> Answer:
+        started.set()
+        try:
+            return until_given_up(call)
+        finally:
+            ended.set()
+
+    dispatcher = served(tool("slow", ask)).dispatcher
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(dispatcher.answer, "slow", {})
+        await anyio.to_thread.run_sync(started.wait)
+        tasks.cancel_scope.cancel()
+    assert ended.wait(10)
+    assert [entry["outcome"] for entry in log.entries] == ["cancelled"]
+
+
+class Held:
+    """A slow question that lasts until the test lets it end; it counts how often it was begun."""
+
+    def __init__(self) -> None:
+        self.released = threading.Event()
+        self.begun = 0
+
+    def ask(self, call: Call) -> Answer:
+        self.begun += 1
+        assert self.released.wait(20)
+        return value(self.begun)
+
+
+async def test_one_client_that_floods_the_server_does_not_starve_another() -> None:
+    may_end = threading.Semaphore(0)
+
+    def long(_call: Call) -> Answer:
+        assert may_end.acquire(timeout=20)
+        return value("long")
+
+    slow = tool("slow", long, blocking=True)
+    search = tool("search", lambda _call: value("found"), blocking=True)
+    dispatcher = served(slow, search).dispatcher
+    async with anyio.create_task_group() as tasks:
+        for _ in range(64):
+            tasks.start_soon(dispatcher.answer, "slow", {}, "flood")
+        await anyio.wait_all_tasks_blocked()
+        assert dispatcher.blocking.waiting == 64 - BLOCKING_AT_ONCE
+        may_end.release()  # one of them; whatever else is begun of the flood lasts
+        reply = await dispatcher.answer("search", {}, "other")
+        assert json.loads(reply.text)["value"] == "found"
+        may_end.release(63)
+
+
+async def test_a_call_that_waits_for_all_of_its_time_is_told_that_the_server_is_busy(
+    log: LogCapture,
+) -> None:
+    held = Held()
+    dispatcher = served(tool("slow", held.ask, blocking=True), timeout_s=0.05).dispatcher
+    replies: list[str] = []
+
+    async def call() -> None:
+        replies.append((await dispatcher.answer("slow", {})).text)
+
+    async with anyio.create_task_group() as tasks:
+        for _ in range(BLOCKING_AT_ONCE + 2):
+            tasks.start_soon(call)
+    held.released.set()
+    told = [json.loads(text) for text in replies]
+    assert sorted(each["error"] for each in told) == ["busy", "busy", "timeout", "timeout"]
+    [detail] = {each["detail"] for each in told if each["error"] == "busy"}
+    assert detail == (
+        "slow waited 0.05 s behind other questions and was not begun; ask again, and fewer at once"
+    )
+    assert held.begun == BLOCKING_AT_ONCE
+    assert dispatcher.blocking.waiting == 0
+
+
+async def test_questions_that_cannot_be_stopped_do_not_become_ever_more_threads() -> None:
+    held = Held()
+    dispatcher = served(tool("stuck", held.ask), timeout_s=0.02).dispatcher
+    for _ in range(3 * QUICK_AT_ONCE):
+        reply = await dispatcher.answer("stuck", {})
+        assert json.loads(reply.text)["error"] in {"timeout", "busy"}
+    assert held.begun == QUICK_AT_ONCE
+    held.released.set()
+
+
+async def test_a_timeout_after_a_wait_says_how_long_the_wait_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ros2_memory.serving.dispatch._WORTH_TELLING_S", 0.0)
+    late = tool("late", raising(QueryTimeoutError("too long", 5)))
+    reply = await served(late).dispatcher.answer("late", {})
+    told = json.loads(reply.text)
+    assert told["detail"] == "too long (it waited 0.0 s of its time behind other questions)"
+    assert "searched_back_to" in told
+
+
+async def test_more_calls_than_may_wait_are_told_so() -> None:
+    held = Held()
+    dispatcher = served(tool("slow", held.ask, blocking=True)).dispatcher
+    told: list[Any] = []
+
+    async def call() -> None:
+        told.append(json.loads((await dispatcher.answer("slow", {}, "flood")).text))
+
+    async with anyio.create_task_group() as tasks:
+        for _ in range(MOST_WAITING + BLOCKING_AT_ONCE + 5):
+            tasks.start_soon(call)
+        await anyio.wait_all_tasks_blocked()
+        assert [each["error"] for each in told] == ["busy"] * 5
+        held.released.set()
+    assert len(told) == MOST_WAITING + BLOCKING_AT_ONCE + 5
+
+
+async def test_stopping_has_running_queries_give_up() -> None:
+    started = threading.Event()
+
+    def ask(call: Call) -> Answer:
+        started.set()
+        return until_given_up(call)
+
+    server = served(tool("slow", ask))
+    results: list[CallToolResult] = []
+
+    async def call(client: Client) -> None:
+        results.append(await client.call_tool("slow", {}))
+
+    async with Client(server) as client, anyio.create_task_group() as tasks:
+        tasks.start_soon(call, client)
+        await anyio.to_thread.run_sync(started.wait)
+        server.dispatcher.stop()
+    assert told(results[0])["error"] == "timeout"
+
+
+async def test_a_reply_stays_below_the_cap() -> None:
+    server = served(tool("ask", lambda _call: value(["x" * 100] * 1000)), max_chars=1500)
+    async with Client(server) as client:
+        result = await client.call_tool("ask", {})
+    assert len(cast("TextContent", result.content[0]).text) <= 1500
+    assert told(result)["notes"]

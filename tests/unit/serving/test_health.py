@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+import json
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import anyio
+import anyio.from_thread
+import anyio.lowlevel
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.serving.health import NAMED, Health, keep_fresh
+from tests.bags import McapLayout, text, write_mcap
+from tests.memories import SettableClock, memory_of
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+    from ros2_memory.index.snapshot import Snapshot
+
+T0 = 1_784_023_200 * NS_PER_S
+
+
+def beat(state: RecorderState, *, updated: int = T0, last_error: str | None = None) -> Heartbeat:
+    return Heartbeat(
+        pid=1,
+        updated=updated,
+        state=state,
+        recordings=(),
+        since=T0,
+        bytes_written=0,
+        subscribed=("/a", "/b"),
+        silent=("/b",),
+        last_error=last_error,
+        interval_s=2.0,
+    )
+
+
+def memory_at(bag_dir: Path, *, seconds: int = 0) -> Memory:
+    return memory_of(bag_dir, clock=SettableClock(T0 + seconds * NS_PER_S))
+
+
+async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
+    assert await Health(memory_at(tmp_path), "1.2.3")() == {
+        "status": "ok",
+        "version": "1.2.3",
+        "bags": 0,
+        "earliest": None,
+        "latest": None,
+        "active": 0,
+        "damaged": 0,
+        "incomplete": 0,
+        "unread": 0,
+        "clock_faults": 0,
+        "index_age_s": 0.0,
+    }
+
+
+async def test_the_span_of_the_memory_is_told(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a"), text(T0 + NS_PER_S, "b")])
+    told = await Health(memory_at(tmp_path), "1")()
+    assert (told["bags"], told["earliest"], told["latest"]) == (1, 1784023200.0, 1784023201.0)
+
+
+async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
+    (tmp_path / "torn.mcap").write_bytes(b"no bag at all, but not empty")
+    told = await Health(memory_at(tmp_path, seconds=3600), "1")()
+    assert told["status"] == "degraded"
+    assert told["damaged"] == 1
+    assert told["problems"] == ["1 damaged bag file; data_time_range lists what does not answer"]
+    assert told["damaged_files"] == [
+        {
+            "file": f"{tmp_path.name}/torn.mcap",
+            "reason": "not an MCAP file: it does not begin as one",
+        }
+    ]
+
+
+async def test_everything_that_does_not_answer_is_counted_and_the_last_of_it_named(
+    tmp_path: Path,
+) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    write_mcap(tmp_path / "cut" / "cut_0.mcap", [text(T0, "a")], McapLayout(None, finish=False))
+    (tmp_path / "r" / "r_1.db3").write_bytes(b"of another storage")
+    for number in range(5):
+        write_mcap(tmp_path / "boot" / f"boot_{number}.mcap", [text(number, "a")])
+    told = await Health(memory_of(tmp_path), "1")()
+    assert told["status"] == "ok"
+    counts = {what: told[what] for what in ("damaged", "incomplete", "unread", "clock_faults")}
+    assert counts == {"damaged": 0, "incomplete": 1, "unread": 1, "clock_faults": 5}
+    assert told["earliest"] == T0 / NS_PER_S
+    lists = [told[name] for name in ("incomplete_files", "unread_files", "clock_fault_files")]
+    assert [len(each) for each in lists if isinstance(each, list)] == [1, 1, NAMED]
+
+
+async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    told = await Health(memory_at(tmp_path, seconds=-3600), "1")()
+    assert told["problems"] == [
+        "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
+    ]
+
+
+async def test_a_missing_bag_directory_is_told(tmp_path: Path) -> None:
+    told = await Health(memory_at(tmp_path / "later"), "1")()
+    assert told["bags"] == 0
+    assert told["status"] == "degraded"
+
+
+async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), restarts=2, missing=("/c",)))
+    told = await Health(memory_at(tmp_path, seconds=3), "1")()
+    assert told["status"] == "ok"
+    assert told["recorder"] == {
+        "state": "recording",
+        "live": True,
+        "heartbeat_age_s": 3.0,
+        "restarts": 2,
+        "silent_topics": ["/b"],
+        "missing_topics": ["/c"],
+        "last_error": None,
+        "age_held": None,
+    }
+
+
+async def test_age_that_is_held_is_shown_and_degrades_nothing(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), age_held="2 bags stay"))
+    told = await Health(memory_at(tmp_path, seconds=3), "1")()
+    assert told["status"] == "ok"
+    assert isinstance(told["recorder"], dict)
+    assert told["recorder"]["age_held"] == "2 bags stay"
+
+
+@pytest.mark.parametrize(
+    ("heartbeat", "seconds", "problem"),
+    [
+        (beat(RecorderState.RECORDING), 600, "the recorder has stopped without saying so"),
+        (
+            beat(RecorderState.PAUSED, last_error="disk full"),
+            1,
+            "the recorder is paused: disk full",
+        ),
+    ],
+)
+async def test_a_recorder_that_does_not_record_degrades_it(
+    tmp_path: Path, heartbeat: Heartbeat, seconds: int, problem: str
+) -> None:
+    write_heartbeat(tmp_path, heartbeat)
+    told = await Health(memory_at(tmp_path, seconds=seconds), "1")()
+    assert told["status"] == "degraded"
+    assert told["problems"] == [problem]
+
+
+async def test_a_recorder_that_was_stopped_is_no_problem(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, beat(RecorderState.STOPPED))
+    assert (await Health(memory_at(tmp_path, seconds=600), "1")())["status"] == "ok"
+
+
+async def test_health_answers_while_the_first_scan_runs(tmp_path: Path) -> None:
+    begun, released, ended = threading.Event(), threading.Event(), threading.Event()
+
+    class Slow(IndexManager):
+        def snapshot(self, reach: int | None = None) -> Snapshot:
+            begun.set()
+            released.wait(10)
+            try:
+                return super().snapshot(reach)
+            finally:
+                ended.set()
+
+    memory = memory_at(tmp_path)
+    slow = Slow(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
+    told = await Health(replace(memory, index=slow), "1", patience_s=0.01)()
+    released.set()
+    # On a busy machine patience may end before it is even begun.
+    assert not begun.is_set() or ended.wait(10)
+    assert told["status"] == "degraded"
+    assert told["problems"] == ["the bag directory is being looked through"]
+
+
+async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
+    tmp_path: Path,
+) -> None:
+    released = threading.Event()
+    looks: list[int] = []
+
+    class Hanging(IndexManager):
+        def snapshot(self, reach: int | None = None) -> Snapshot:
+            looks.append(threading.get_ident())
+            released.wait(10)
+            return super().snapshot(reach)
+
+    memory = memory_at(tmp_path)
+    index = Hanging(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
+    health = Health(replace(memory, index=index), "1", patience_s=0.001)
+    before = threading.active_count()
+    told = [await health() for _ in range(10)]
+    during = threading.active_count()
+    released.set()
+    health.stop()
+    assert {str(each["status"]) for each in told} == {"degraded"}
+    assert during <= before + 1
+    assert len(looks) <= 1
+
+
+async def test_a_bag_that_closes_is_found_without_a_question(tmp_path: Path) -> None:
+    memory = memory_at(tmp_path)
+    patient = IndexManager(
+        tmp_path, memory.reader, memory.clock, refresh_s=3600.0, split_duration_s=10.0
+    )
+    assert patient.snapshot().bags == ()
+    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
+    assert patient.snapshot().bags == ()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(keep_fresh, replace(memory, index=patient), 0.001)
+        with anyio.fail_after(10):
+            while not patient.snapshot().bags:
+                await anyio.lowlevel.checkpoint()
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_scan_that_fails_is_logged_and_tried_again(tmp_path: Path) -> None:
+    calls: list[int] = []
+    again = anyio.Event()
+
+    class Failing(IndexManager):
+        def refresh(self) -> Snapshot:
+            calls.append(1)
+            if len(calls) == 2:
+                anyio.from_thread.run_sync(again.set)
+            raise RuntimeError("no such disk")
+
+    memory = memory_at(tmp_path)
+    failing = Failing(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
+    with capture_logs() as logs:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keep_fresh, replace(memory, index=failing), 0.001)
+            await again.wait()
+            tasks.cancel_scope.cancel()
+    assert logs[0]["event"] == "index_refresh_failed"
+
+
+async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> None:
+    for number in range(50):
+        (tmp_path / f"{'x' * 200}{number}.mcap").write_bytes(b"no bag at all, but not empty")
+    names = tuple(f"/topic_{n}/{'y' * 300}" for n in range(1000))
+    told = beat(RecorderState.PAUSED, updated=T0 + 3600 * NS_PER_S, last_error="z" * 100_000)
+    write_heartbeat(tmp_path, replace(told, silent=names, subscribed=names, missing=names))
+    said = await Health(memory_at(tmp_path, seconds=3600), "1")()
+    assert len(json.dumps(said)) < 10_000
+    assert said["damaged"] == 50
+    assert isinstance(said["recorder"], dict)
+    assert said["recorder"]["more_silent_topics"] == 980
+    assert said["recorder"]["more_missing_topics"] == 994

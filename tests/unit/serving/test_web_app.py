@@ -1,0 +1,349 @@
+from __future__ import annotations
+
+import json
+import socket
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import anyio
+import httpx2
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory import results
+from ros2_memory.core.model import Sample
+from ros2_memory.history.context import Memory
+from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.serving.mcp_server import EpisodicServer
+from ros2_memory.serving.web_app import GRACE_S, Guard, WebApp, web_app
+from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.replies import Replies
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+HOME = "http://127.0.0.1:9203"
+EVERYWHERE = ".".join("0000")
+GOOD = "kJ7-x._~+/0123456789=="
+SHOWN = {"authorization": f"Bearer {GOOD}"}
+MCP_HEADERS = {"accept": "application/json, text/event-stream"}
+
+
+def app(
+    host: str = "127.0.0.1",
+    background: Any = anyio.sleep_forever,
+    api_token: str | None = None,
+) -> WebApp:
+    schema: dict[str, Any] = {"type": "object", "properties": {}}
+    reply = results.TopicValue("/a", "a/msg/A", Sample(0, 7))
+    tool = Tool("ask", "Ask", "Asks.", schema, blocking=False, question=lambda _: lambda *_: reply)
+    dispatcher = Dispatcher(
+        cast("Memory", None), [tool], Replies(Path("bags"), 1000), call_timeout_s=5
+    )
+    server = EpisodicServer(dispatcher, [tool], name="episodic", version="1", instructions="")
+
+    async def health() -> Any:
+        return {"status": "ok", "bags": 3}
+
+    return web_app(server, host=host, health=health, background=background, api_token=api_token)
+
+
+@asynccontextmanager
+async def running(web: WebApp) -> AsyncIterator[None]:
+    """The application between its startup and its shutdown, as a web server brackets it."""
+    to_app, from_server = anyio.create_memory_object_stream[Any](1)
+    from_app, to_server = anyio.create_memory_object_stream[Any](1)
+    with to_app, from_server, from_app, to_server:
+        async with anyio.create_task_group() as tasks:
+            scope: Any = {"type": "lifespan", "asgi": {"version": "3.0"}, "state": {}}
+            tasks.start_soon(web, scope, from_server.receive, from_app.send)
+            await to_app.send({"type": "lifespan.startup"})
+            assert (await to_server.receive())["type"] == "lifespan.startup.complete"
+            yield
+            await to_app.send({"type": "lifespan.shutdown"})
+            assert (await to_server.receive())["type"] == "lifespan.shutdown.complete"
+
+
+def client(web: WebApp, base_url: str = HOME) -> httpx2.AsyncClient:
+    return httpx2.AsyncClient(transport=httpx2.ASGITransport(app=web), base_url=base_url)
+
+
+def call_tool(name: str) -> dict[str, Any]:
+    return {
+        "jsonrpc": "2.0",
+        "id": 1,
+        "method": "tools/call",
+        "params": {"name": name, "arguments": {}},
+    }
+
+
+async def test_health_is_json() -> None:
+    async with client(app()) as http:
+        response = await http.get("/health")
+    assert response.status_code == 200
+    assert response.json() == {"status": "ok", "bags": 3}
+
+
+async def test_health_shows_its_status_alone_to_whoever_shows_no_token() -> None:
+    async with client(app(api_token=GOOD)) as http:
+        assert (await http.get("/health")).json() == {"status": "ok"}
+        shown = await http.get("/health", headers=SHOWN)
+        assert shown.json() == {"status": "ok", "bags": 3}
+        assert (await http.get("/health", headers={"authorization": "Bearer x"})).status_code == 401
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("GET", "/sse"),
+        ("POST", "/messages/"),
+        ("POST", "/mcp"),
+        ("GET", "/mcp"),
+        ("DELETE", "/mcp"),
+    ],
+)
+async def test_a_token_is_demanded_wherever_tools_are_called(method: str, path: str) -> None:
+    web = app(api_token=GOOD)
+    async with running(web), client(web) as http:
+        for headers in ({}, {"authorization": f"Bearer {GOOD}x"}):
+            response = await http.request(method, path, headers=MCP_HEADERS | headers)
+            assert response.status_code == 401
+            assert response.headers["www-authenticate"].startswith("Bearer ")
+
+
+async def test_a_tool_is_called_by_whoever_shows_the_token() -> None:
+    web = app(api_token=GOOD)
+    async with running(web), client(web) as http:
+        response = await http.post("/mcp", json=call_tool("ask"), headers=MCP_HEADERS | SHOWN)
+    assert response.status_code == 200
+
+
+async def test_a_page_of_another_site_is_refused_before_it_is_asked_for_a_token() -> None:
+    async with client(app(EVERYWHERE, api_token=GOOD)) as http:
+        for headers in ({}, SHOWN):
+            other = await http.get("/mcp", headers={"host": "evil.example"} | headers)
+            assert other.status_code == 421
+            its = {"host": "192.168.7.20:9203", "origin": "http://evil.example"}
+            assert (await http.get("/mcp", headers=its | headers)).status_code == 403
+
+
+async def test_a_tool_is_called_over_mcp_in_one_request_without_a_session() -> None:
+    web = app()
+    async with running(web), client(web) as http:
+        response = await http.post("/mcp", json=call_tool("ask"), headers=MCP_HEADERS)
+    assert response.status_code == 200
+    assert response.headers["content-type"] == "application/json"
+    [block] = response.json()["result"]["content"]
+    assert json.loads(block["text"])["value"] == 7
+
+
+async def test_messages_without_a_session_are_refused() -> None:
+    async with client(app()) as http:
+        response = await http.post("/messages/", json={})
+    assert response.status_code == 400
+
+
+async def test_the_background_runs_from_start_to_end() -> None:
+    events: list[str] = []
+
+    async def background() -> None:
+        events.append("begun")
+        try:
+            await anyio.sleep_forever()
+        finally:
+            events.append("ended")
+
+    async with running(app(background=background)):
+        await anyio.wait_all_tasks_blocked()
+        assert events == ["begun"]
+    assert events == ["begun", "ended"]
+
+
+@pytest.mark.parametrize("path", ["/health", "/sse", "/mcp", "/messages/"])
+@pytest.mark.parametrize("host", ["127.0.0.1", EVERYWHERE, "192.168.7.20", "robot.lan"])
+async def test_every_path_refuses_the_host_names_of_other_sites(path: str, host: str) -> None:
+    async with client(app(host)) as http:
+        for name in ("evil.example", "localhost.evil.example:9203", "", "[", "127.0.0.1.nip.io"):
+            response = await http.get(path, headers={"host": name})
+            assert response.status_code == 421, name
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", EVERYWHERE])
+async def test_pages_of_other_sites_are_refused_by_their_origin(host: str) -> None:
+    async with client(app(host)) as http:
+        for origin in ("http://evil.example", "http://6.6.6.6:9203", "null", "http://[", ""):
+            response = await http.get("/health", headers={"origin": origin})
+            assert response.status_code == 403, origin
+
+
+@pytest.mark.parametrize(
+    ("host", "name"),
+    [
+        ("127.0.0.1", "127.0.0.1:9203"),
+        ("127.0.0.1", "localhost"),
+        ("localhost", "[::1]:9203"),
+        (EVERYWHERE, "localhost:9203"),
+        (EVERYWHERE, "192.168.7.20:9203"),
+        ("::", "[fd00::7]:9203"),
+        (EVERYWHERE, f"{socket.gethostname()}:9203"),
+        (EVERYWHERE, f"{socket.gethostname().upper()}.local"),
+        ("robot.lan", "robot.lan:9203"),
+    ],
+)
+async def test_the_server_answers_to_its_own_names_and_addresses(host: str, name: str) -> None:
+    async with client(app(host)) as http:
+        response = await http.get("/health", headers={"host": name, "origin": f"http://{name}"})
+    assert response.status_code == 200
+
+
+async def test_a_loopback_server_does_not_answer_to_other_addresses() -> None:
+    async with client(app("127.0.0.1")) as http:
+        response = await http.get("/health", headers={"host": "192.168.7.20:9203"})
+    assert response.status_code == 421
+
+
+PATHS = ["/", "/health", "/sse", "/mcp", "/messages/"]
+VISIT = {"sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "javascript://localhost",
+        "http://localhost:6274",
+        "http://127.0.0.1",
+        "http://127.0.0.1:9204",
+        "http://[::1]:9203",
+        "ftp://127.0.0.1:9203",
+        "http://127.0.0.1:9203/",
+        "http://user@127.0.0.1:9203",
+        "http://127.0.0.1:9203 http://evil.example",
+        "127.0.0.1:9203",
+        "file://",
+    ],
+)
+async def test_other_ports_and_malformed_origins_are_other_sites(path: str, origin: str) -> None:
+    async with client(app()) as http:
+        assert (await http.get(path, headers={"origin": origin})).status_code == 403
+        both = [("origin", HOME), ("origin", origin)]
+        assert (await http.get(path, headers=both)).status_code == 403
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "", "other", "none, cross-site"])
+@pytest.mark.parametrize("method", ["GET", "POST", "HEAD", "OPTIONS"])
+async def test_requests_that_another_site_is_behind_are_refused(
+    path: str, site: str, method: str
+) -> None:
+    async with client(app()) as http:
+        for more in ({}, {"sec-fetch-mode": "no-cors"}, {**VISIT, "sec-fetch-dest": "iframe"}):
+            headers = {"sec-fetch-site": site, **more}
+            assert (await http.request(method, path, headers=headers)).status_code == 403
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site", "none", "same-origin"])
+async def test_a_person_may_follow_a_link_to_the_page_and_to_nothing_else(site: str) -> None:
+    async with client(app()) as http:
+        response = await http.get("/", headers={"sec-fetch-site": site, **VISIT})
+        assert response.status_code == 200
+        if site in {"cross-site", "same-site"}:
+            for path in PATHS[1:]:
+                other = await http.get(path, headers={"sec-fetch-site": site, **VISIT})
+                assert other.status_code == 403
+            posted = await http.post("/", headers={"sec-fetch-site": site, **VISIT})
+            assert posted.status_code == 403
+
+
+@pytest.mark.parametrize("site", ["none", "same-origin"])
+async def test_what_the_page_itself_and_a_person_ask_is_answered(site: str) -> None:
+    async with client(app()) as http:
+        headers = {"sec-fetch-site": site, "origin": HOME}
+        assert (await http.get("/health", headers=headers)).status_code == 200
+
+
+async def test_refusals_of_other_sites_are_counted_and_logged_now_and_then() -> None:
+    with capture_logs() as logged:
+        async with client(app()) as http:
+            for _ in range(50):
+                await http.get("/health", headers={"origin": "http://evil.example"})
+                await http.get("/health", headers={"sec-fetch-site": "cross-site"})
+    told = [(each["event"], each["reason"], each["refused"]) for each in logged]
+    assert told == [
+        ("request_refused", "the origin of another site", 1),
+        ("request_refused", "a request from another site", 1),
+    ]
+
+
+class Connection:
+    """One HTTP request held open, with what was sent to it."""
+
+    def __init__(self, path: str, method: str = "GET") -> None:
+        headers = [(b"host", b"127.0.0.1:9203"), (b"content-length", b"2")]
+        self.scope: Any = {
+            "type": "http",
+            "asgi": {"version": "3.0"},
+            "http_version": "1.1",
+            "method": method,
+            "path": path,
+            "raw_path": path.encode(),
+            "root_path": "",
+            "scheme": "http",
+            "query_string": b"",
+            "headers": headers,
+            "server": ("127.0.0.1", 9203),
+            "client": ("127.0.0.1", 40000),
+        }
+        self.sent: list[Any] = []
+        self.begun = anyio.Event()
+
+    async def receive(self) -> Any:
+        await anyio.sleep_forever()
+
+    async def send(self, message: Any) -> None:
+        self.sent.append(message)
+        self.begun.set()
+
+    @property
+    def is_complete(self) -> bool:
+        last = self.sent[-1]
+        return last["type"] == "http.response.body" and not last.get("more_body", False)
+
+
+async def test_stopping_ends_event_streams_at_once() -> None:
+    web = app()
+    stream = Connection("/sse")
+    async with running(web):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(web, stream.scope, stream.receive, stream.send)
+            await stream.begun.wait()
+            assert stream.sent[0]["status"] == 200
+            web.stop()
+        assert stream.is_complete
+
+
+async def test_stopping_answers_requests_that_do_not_end_with_unavailable() -> None:
+    async def stuck(_scope: Any, _receive: Any, _send: Any) -> None:
+        await anyio.sleep_forever()
+
+    web = WebApp(stuck)
+    request = Connection("/mcp", "POST")
+    with anyio.fail_after(GRACE_S * 20):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(web, request.scope, request.receive, request.send)
+            await anyio.wait_all_tasks_blocked()
+            web.stop()
+    assert request.sent[0]["status"] == 503
+    assert request.is_complete
+
+
+async def test_the_guard_leaves_other_scopes_alone() -> None:
+    seen: list[str] = []
+
+    async def inner(scope: Any, _receive: Any, _send: Any) -> None:
+        seen.append(scope["type"])
+
+    nothing: Any = None
+    await Guard(inner, "127.0.0.1")({"type": "lifespan"}, nothing, nothing)
+    assert seen == ["lifespan"]

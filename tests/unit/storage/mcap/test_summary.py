@@ -1,0 +1,95 @@
+"""What is read of a summary section, held against what the MCAP library reads of it."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.opcode import Opcode
+
+from ros2_memory.storage.errors import UnreadableError
+from ros2_memory.storage.file_io import OpenFile
+from ros2_memory.storage.mcap.index import index_from_summary
+from ros2_memory.storage.mcap.summary import DoubtError, read_summary
+from tests.bags import boolean, text, write_mcap
+from tests.mcap_surgery import SMALL, chunks_of, edit_summary
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def bag(path: Path) -> Path:
+    """Several chunks, of one topic and of two."""
+    messages = [text(time, f"{time:0100d}") for time in range(11)]
+    return write_mcap(
+        path, [text(0, ""), boolean(0, data=True), *messages, boolean(12, data=True)], SMALL
+    )
+
+
+def test_chunks_are_those_that_the_library_reads(tmp_path: Path) -> None:
+    path = bag(tmp_path / "a.mcap")
+    with OpenFile(path) as file:
+        found = read_summary(file).chunks
+    assert [
+        (chunk.offset, chunk.length, chunk.start, chunk.end, chunk.index_offsets) for chunk in found
+    ] == [
+        (
+            chunk.chunk_start_offset,
+            chunk.chunk_length,
+            chunk.message_start_time,
+            chunk.message_end_time,
+            chunk.message_index_offsets,
+        )
+        for chunk in chunks_of(path)
+    ]
+    assert all(chunk.channels == chunk.index_offsets.keys() for chunk in found)
+    assert {len(chunk.channels) for chunk in found} == {1, 2}
+
+
+@pytest.mark.parametrize(
+    ("opcode", "size_at", "reason"),
+    [
+        (Opcode.CHUNK_INDEX, 32, "a chunk index is shorter than it states"),
+        (Opcode.STATISTICS, 42, "the statistics are shorter than they state"),
+    ],
+)
+@pytest.mark.parametrize("more", [1, 30, 1 << 30])
+def test_a_record_that_states_more_than_it_holds_is_not_believed(
+    tmp_path: Path, opcode: Opcode, size_at: int, reason: str, more: int
+) -> None:
+    path = bag(tmp_path / "a.mcap")
+
+    def state_more(body: bytearray) -> None:
+        (size,) = struct.unpack_from("<I", body, size_at)
+        struct.pack_into("<I", body, size_at, size + more)
+
+    edit_summary(path, opcode, state_more)
+    with OpenFile(path) as file:
+        with pytest.raises(UnreadableError, match=reason):
+            read_summary(file)
+        with pytest.raises(DoubtError, match=f"its summary section is not used .*{reason}"):
+            index_from_summary(file)
+
+
+def test_what_other_bags_declare_is_not_taken_for_what_a_bag_declares(tmp_path: Path) -> None:
+    messages = [text(1, "a"), boolean(2, data=True), text(3, "b", "/more"), text(4, "c", "/last")]
+    declared = [{each.topic for each in messages[:n]} for n in range(1, 5)]
+    for n in (2, 1, 4, 3, 2, 1):
+        path = write_mcap(tmp_path / f"{n}.mcap", messages[:n])
+        with OpenFile(path) as file:
+            summary = read_summary(file)
+        assert {channel.topic for channel in summary.channels.values()} == declared[n - 1]
+        assert {channel.schema.name for channel in summary.channels.values()} == {
+            each.type for each in messages[:n]
+        }
+        assert summary.declarations.resolved
+
+
+def test_a_bag_that_repeats_another_ones_beginning_is_read_to_its_own_end(tmp_path: Path) -> None:
+    short, long = ([text(n, "x", f"/{n}") for n in range(count)] for count in (3, 9))
+    for messages in (short, long, short, long):
+        with OpenFile(write_mcap(tmp_path / "a.mcap", messages, SMALL)) as file:
+            summary = read_summary(file)
+        assert len(summary.channels) == len(messages)
+        assert sum(len(chunk.channels) for chunk in summary.chunks) == len(messages)

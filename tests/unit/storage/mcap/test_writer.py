@@ -1,0 +1,261 @@
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import Reader as RosbagsReader
+
+from ros2_memory.core.errors import BagError, BagVanishedError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import Channel, Closing, Record, Schema
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.limits import files_limited_to
+from tests.shared_bags import REAL, RECORDED, needs_real, needs_recorded
+from tests.shelves import LAYOUTS
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+T0 = 1_790_000_000 * S
+EVERYTHING = TimeWindow.everything()
+
+
+def messages(count: int = 40) -> list[Msg]:
+    times = [T0 + n * S // 10 for n in range(count)]
+    return [
+        tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static"),
+        *(odom(time, 1.0, 2.0, log_time=time + 70) for time in times),
+        *(text(T0 + n * S, f"line {n}") for n in range(3)),
+    ]
+
+
+def contents(path: Path) -> list[Record]:
+    reader = McapReader()
+    topics = [each.topic for each in reader.summarize(path).topics]
+    return list(reader.records(path, topics, EVERYTHING))
+
+
+def raw_contents(path: Path) -> list[tuple[object, ...]]:
+    """Everything of every message, by the format's own library and in file order."""
+    with path.open("rb") as stream:
+        return [
+            (
+                channel.topic,
+                channel.metadata,
+                schema and (schema.name, schema.encoding, schema.data),
+                message.sequence,
+                message.log_time,
+                message.publish_time,
+                message.data,
+            )
+            for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False)
+        ]
+
+
+def cut(whole: Path, size: int) -> Path:
+    """A copy of the first so many bytes."""
+    target = whole.with_name("cut.mcap")
+    target.write_bytes(whole.read_bytes()[:size])
+    return target
+
+
+class TestRewriting:
+    @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+    def test_keeps_every_message_with_its_times_sequence_and_channel(
+        self, tmp_path: Path, layout: McapLayout
+    ) -> None:
+        layout = replace(layout, chunk_size=layout.chunk_size and 2000, profile="ros2")
+        source = write_mcap(tmp_path / "a.mcap", messages(), layout)
+        target = tmp_path / "b.mcap"
+        result = McapWriter().rewrite(source, target)
+        complete = write_mcap(tmp_path / "c.mcap", messages())
+        assert raw_contents(target) == raw_contents(complete)
+        assert (result.messages, result.lost_bytes) == (len(messages()), 0)
+
+    @pytest.mark.parametrize("compression", list(CompressionType))
+    def test_a_file_that_its_writer_did_not_finish_is_closed_with_all_that_reached_the_disk(
+        self, tmp_path: Path, compression: CompressionType
+    ) -> None:
+        layout = McapLayout(chunk_size=2000, compression=compression, finish=False)
+        source = write_mcap(tmp_path / "a.mcap", messages(), layout)
+        before = contents(source)
+        McapWriter().rewrite(source, tmp_path / "b.mcap")
+        reader = McapReader()
+        assert reader.closing(source) is Closing.OPEN
+        assert reader.closing(tmp_path / "b.mcap") is Closing.CLOSED
+        assert contents(tmp_path / "b.mcap") == before
+        assert 0 < len(before) < len(messages())
+
+    def test_messages_of_the_last_partial_chunk_are_kept(self, tmp_path: Path) -> None:
+        layout = McapLayout(chunk_size=10_000_000)
+        whole = write_mcap(tmp_path / "a.mcap", messages(), layout)
+        source = cut(whole, 20_000)
+        result = McapWriter().rewrite(source, tmp_path / "b.mcap")
+        assert 0 < result.messages < len(messages())
+        assert result.lost_bytes > 0
+        assert any("ends early" in note for note in result.notes)
+
+    @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+    @given(share=st.floats(0.0, 1.0), name=st.sampled_from(["small chunks", "zstd", "unchunked"]))
+    def test_wherever_a_file_is_cut_what_was_readable_is_in_the_copy(
+        self, tmp_path: Path, share: float, name: str
+    ) -> None:
+        layout = replace(LAYOUTS[name], profile="ros2", chunk_size=LAYOUTS[name].chunk_size and 900)
+        whole = write_mcap(tmp_path / "a.mcap", messages(12), layout)
+        source = cut(whole, max(8, round(share * whole.stat().st_size)))
+        target = tmp_path / "b.mcap"
+        target.unlink(missing_ok=True)
+        McapWriter().rewrite(source, target)
+        reader = McapReader()
+        assert contents(target) == contents(source)
+        after = reader.summarize(target)
+        assert (after.complete, after.notes) == (True, ())
+
+    def test_a_damaged_chunk_is_left_out_and_those_behind_it_are_kept(self, tmp_path: Path) -> None:
+        layout = McapLayout(chunk_size=2000, compression=CompressionType.ZSTD, finish=False)
+        source = write_mcap(tmp_path / "a.mcap", messages(), layout)
+        data = bytearray(source.read_bytes())
+        data[len(data) // 2] ^= 0xFF
+        source.write_bytes(data)
+        result = McapWriter().rewrite(source, tmp_path / "b.mcap")
+        assert result.lost_bytes > 0
+        assert contents(tmp_path / "b.mcap") == contents(source)
+
+    def test_metadata_attachments_and_the_profile_are_kept(self, tmp_path: Path) -> None:
+        source = tmp_path / "a.mcap"
+        with source.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start(profile="ros2", library="some recorder")
+            writer.add_metadata("rosbag2", {"serialized_metadata": "version: 9"})
+            writer.add_attachment(1, 2, "map.png", "image/png", b"pixels")
+            schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+            channel = writer.register_channel("/a", "cdr", schema, {"any": "thing"})
+            writer.add_message(channel, 5, b"\0\1\0\0", 4, 77)
+            writer.flush()
+        McapWriter().rewrite(source, tmp_path / "b.mcap")
+        with (tmp_path / "b.mcap").open("rb") as stream:
+            reader = make_reader(stream)
+            assert [each.metadata for each in reader.iter_metadata()] == [
+                {"serialized_metadata": "version: 9"}
+            ]
+            (attachment,) = reader.iter_attachments()
+            assert (attachment.name, attachment.data) == ("map.png", b"pixels")
+            header = reader.get_header()
+            assert header.profile == "ros2"
+            assert header.library.startswith("some recorder")
+            ((_, found, message),) = reader.iter_messages()
+            assert (found.metadata, message.sequence) == ({"any": "thing"}, 77)
+            assert (message.log_time, message.publish_time) == (5, 4)
+
+    def test_progress_ends_at_the_last_whole_record(self, tmp_path: Path) -> None:
+        source = write_mcap(tmp_path / "a.mcap", messages(), McapLayout(chunk_size=2000))
+        told: list[int] = []
+        McapWriter().rewrite(source, tmp_path / "b.mcap", told.append)
+        assert told == sorted(told)
+        assert 0.9 * source.stat().st_size < told[-1] <= source.stat().st_size
+
+    def test_what_is_no_mcap_file_is_refused_and_leaves_nothing(self, tmp_path: Path) -> None:
+        source = tmp_path / "a.mcap"
+        source.write_bytes(b"SQLite format 3\0 and more")
+        with pytest.raises(BagError, match="does not begin as one"):
+            McapWriter().rewrite(source, tmp_path / "b.mcap")
+        assert sorted(tmp_path.iterdir()) == [source]
+
+    def test_a_source_that_is_gone_is_said_to_be(self, tmp_path: Path) -> None:
+        with pytest.raises(BagVanishedError):
+            McapWriter().rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap")
+        assert not list(tmp_path.iterdir())
+
+    def test_a_file_of_the_targets_name_is_not_overwritten(self, tmp_path: Path) -> None:
+        source = write_mcap(tmp_path / "a.mcap", messages())
+        target = tmp_path / "b.mcap"
+        target.write_bytes(b"somebody's")
+        with pytest.raises(BagError, match="File exists"):
+            McapWriter().rewrite(source, target)
+        assert target.read_bytes() == b"somebody's"
+
+    @needs_recorded
+    @pytest.mark.parametrize(
+        ("name", "count"),
+        [
+            ("session_killed_chunk64k/session_killed_chunk64k_2", 251),
+            ("extra/full_truncated/fullsmall_4", 94),
+        ],
+    )
+    def test_what_a_killed_recorder_left_is_read_by_other_libraries_afterwards(
+        self, tmp_path: Path, name: str, count: int
+    ) -> None:
+        source, target = RECORDED / f"{name}.mcap", tmp_path / "b.mcap"
+        assert McapWriter().rewrite(source, target).messages == count
+        before = contents(source)
+        with RosbagsReader(target) as reader:
+            assert reader.message_count == count
+            read = [(c.topic, time, bytes(data)) for c, time, data in reader.messages()]
+        assert sorted(read) == sorted(
+            (each.channel.topic, each.log_time, each.payload) for each in before
+        )
+
+    @needs_real
+    def test_what_anybody_recorded_is_the_same_afterwards(self, tmp_path: Path) -> None:
+        sources = [path for path in sorted(REAL.rglob("*.mcap")) if path.name != "Dockerfile.mcap"]
+        for number, source in enumerate(sources):
+            target = tmp_path / f"{number}.mcap"
+            McapWriter().rewrite(source, target)
+            assert contents(target) == contents(source), source
+
+
+class TestWriting:
+    def test_what_is_written_is_read_again(self, tmp_path: Path) -> None:
+        source = write_mcap(tmp_path / "a.mcap", messages())
+        McapWriter().write(tmp_path / "b.mcap", contents(source))
+        assert contents(tmp_path / "b.mcap") == contents(source)
+        reader = McapReader()
+        assert set(reader.channels(tmp_path / "b.mcap")) == set(reader.channels(source))
+        after = McapReader().summarize(tmp_path / "b.mcap")
+        assert (after.complete, after.notes) == (True, ())
+
+    def test_messages_of_a_sqlite_bag_keep_their_definitions_and_qos(self, tmp_path: Path) -> None:
+        source = write_db3(tmp_path / "a.db3", messages())
+        reader = Rosbag2Reader()
+        records = list(reader.records(source, ["/tf_static"], EVERYTHING))
+        McapWriter().write(tmp_path / "b.mcap", records)
+        (channel,) = McapReader().channels(tmp_path / "b.mcap")
+        assert channel.latched
+        assert channel.schema.text
+        assert dict(channel.metadata)["offered_qos_profiles"].startswith("- history")
+
+    def test_an_empty_bag_can_be_written(self, tmp_path: Path) -> None:
+        McapWriter().write(tmp_path / "b.mcap", [])
+        assert McapReader().summarize(tmp_path / "b.mcap").empty
+
+    def test_a_time_that_the_format_cannot_hold_is_refused_and_leaves_nothing(
+        self, tmp_path: Path
+    ) -> None:
+        channel = Channel("/a", "cdr", Schema("std_msgs/msg/String"))
+        with pytest.raises(BagError):
+            McapWriter().write(tmp_path / "b.mcap", [Record(channel, -1, -1, b"")])
+        assert not list(tmp_path.iterdir())
+
+    def test_a_directory_that_is_missing_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(BagError, match="cannot be made: No such file"):
+            McapWriter().write(tmp_path / "gone" / "b.mcap", [])
+
+    def test_a_disk_that_takes_no_more_is_said_to_be_so_and_nothing_is_left(
+        self, tmp_path: Path
+    ) -> None:
+        channel = Channel("/a", "cdr", Schema("std_msgs/msg/String"))
+        noise = random.Random(1)
+        records = [Record(channel, n, n, noise.randbytes(100_000)) for n in range(20)]
+        with files_limited_to(500_000), pytest.raises(BagError, match="cannot be written: File"):
+            McapWriter().write(tmp_path / "b.mcap", records)
+        assert not list(tmp_path.iterdir())

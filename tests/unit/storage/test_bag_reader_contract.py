@@ -1,0 +1,398 @@
+"""What `storage/base.py` promises of a `BagReader`, held against the fake and every adapter."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.core.errors import (
+    BagError,
+    BagVanishedError,
+    EpisodicError,
+    UndecodableError,
+)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import Channel, Closing, Record, Schema
+from tests.bags import Msg, boolean, detections, odom, text, tf, transform, typestore
+from tests.shelves import ALL, FILES, Shelf
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from ros2_memory.storage.base import BagReader
+
+on_every_shelf = pytest.mark.parametrize("shelf", ALL, ids=str)
+on_every_file = pytest.mark.parametrize("shelf", FILES, ids=str)
+
+STRING, BOOL = "std_msgs/msg/String", "std_msgs/msg/Bool"
+
+
+class Seen(NamedTuple):
+    """A record, or a message written, as far as every format keeps it."""
+
+    topic: str
+    type: str
+    log_time: int
+    payload: bytes
+
+
+def seen(record: Record) -> Seen:
+    return Seen(record.channel.topic, record.channel.type, record.log_time, record.payload)
+
+
+def expected(
+    messages: list[Msg], topics: Collection[str], window: TimeWindow | None = None
+) -> list[Seen]:
+    """By the contract: inside the window, by log time, ties in file order."""
+    span = window or TimeWindow.everything()
+    wanted = [m for m in messages if m.topic in topics and span.start <= m.log_time < span.stop]
+    return [
+        Seen(m.topic, m.type, m.log_time, m.payload)
+        for m in sorted(wanted, key=lambda message: message.log_time)
+    ]
+
+
+def read(
+    reader: BagReader,
+    path: Path,
+    topics: Collection[str],
+    window: TimeWindow | None = None,
+    *,
+    newest_first: bool = False,
+) -> list[Seen]:
+    span = window or TimeWindow.everything()
+    return [seen(r) for r in reader.records(path, topics, span, newest_first=newest_first)]
+
+
+TOPICS = ("/a", "/b", "/c")
+# Few distinct times, so that ties are common; drawn out of order.
+_times = st.one_of(st.integers(0, 12), st.integers(10**18, 10**18 + 3))
+
+
+@st.composite
+def _messages(draw: st.DrawFn) -> list[Msg]:
+    entries = draw(st.lists(st.tuples(st.sampled_from(TOPICS), _times, st.booleans()), max_size=30))
+    return [
+        boolean(time, place % 2 == 0, topic)
+        if as_boolean
+        else text(time, f"message {place}", topic)
+        for place, (topic, time, as_boolean) in enumerate(entries)
+    ]
+
+
+_some_topics = st.sets(st.sampled_from((*TOPICS, "/not/recorded")))
+_windows = st.tuples(st.integers(-1, 14), st.integers(-1, 14)).map(lambda ends: TimeWindow(*ends))
+
+
+@on_every_shelf
+@settings(max_examples=30)
+@given(messages=_messages(), topics=_some_topics, window=_windows)
+def test_messages_come_by_log_time_and_newest_first_is_exactly_the_reverse(
+    shelf: Shelf, messages: list[Msg], topics: set[str], window: TimeWindow
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        reader, path = _stocked(shelf, folder, messages)
+        for span in (window, TimeWindow.everything()):
+            found = read(reader, path, topics, span)
+            assert found == expected(messages, topics, span)
+            assert read(reader, path, topics, span, newest_first=True) == found[::-1]
+            for topic in TOPICS:
+                newest = reader.newest(path, topic, span)
+                last = expected(messages, [topic], span)[-1:]
+                assert [seen(newest)] == last if newest is not None else not last
+
+
+@on_every_shelf
+@settings(max_examples=20)
+@given(messages=_messages(), window=_windows)
+def test_log_times_are_those_of_the_records(
+    shelf: Shelf, messages: list[Msg], window: TimeWindow
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        reader, path = _stocked(shelf, folder, messages)
+        for topic in TOPICS:
+            times = list(reader.log_times(path, topic, window))
+            assert times == [record.log_time for record in reader.records(path, [topic], window)]
+
+
+@on_every_shelf
+@settings(max_examples=20)
+@given(messages=_messages())
+def test_a_summary_counts_what_the_messages_say(shelf: Shelf, messages: list[Msg]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        reader, path = _stocked(shelf, folder, messages)
+        summary = reader.summarize(path)
+    times: dict[tuple[str, str], list[int]] = {}
+    for message in messages:
+        times.setdefault((message.topic, message.type), []).append(message.log_time)
+    found = {(t.topic, t.type): (t.count, t.first, t.last) for t in summary.topics}
+    assert found == {key: (len(at), min(at), max(at)) for key, at in times.items()}
+    assert len(summary.topics) == len(found)
+    assert summary.complete
+    assert summary.notes == ()
+
+
+def _stocked(shelf: Shelf, folder: str, messages: list[Msg]) -> tuple[BagReader, Path]:
+    stocked = shelf.stocked(Path(folder), messages)
+    return stocked.reader, stocked.path
+
+
+@on_every_shelf
+def test_a_window_includes_its_start_and_excludes_its_stop(shelf: Shelf, tmp_path: Path) -> None:
+    # A message of 100 bytes each, so that in small chunks the ends of chunks are among the bounds.
+    messages = [text(time, f"{time:0100d}") for time in range(10, 40)]
+    reader, path = _stocked(shelf, str(tmp_path), messages)
+    for start in range(9, 41):
+        for stop in (start, start + 1, start + 2, start + 7):
+            window = TimeWindow(start, stop)
+            assert [r.log_time for r in read(reader, path, ["/chatter"], window)] == [
+                time for time in range(10, 40) if start <= time < stop
+            ]
+
+
+@on_every_shelf
+def test_both_types_of_a_topic_that_has_two_are_read(shelf: Shelf, tmp_path: Path) -> None:
+    messages = [text(1, "one", "/t"), boolean(2, True, "/t"), text(3, "three", "/t")]
+    reader, path = _stocked(shelf, str(tmp_path), messages)
+    assert [record.type for record in read(reader, path, ["/t"])] == [STRING, BOOL, STRING]
+    assert [(t.topic, t.type, t.count) for t in reader.summarize(path).topics] == [
+        ("/t", BOOL, 1),
+        ("/t", STRING, 2),
+    ]
+
+
+@on_every_shelf
+def test_topics_without_messages_are_declared_and_silent(shelf: Shelf, tmp_path: Path) -> None:
+    silent = [("/quiet", STRING), ("/still", BOOL)]
+    stocked = shelf.stocked(tmp_path, [text(1, "x")], declared=silent)
+    summary = stocked.reader.summarize(stocked.path)
+    assert [topic.topic for topic in summary.topics] == ["/chatter"]
+    assert summary.silent == ("/quiet", "/still")
+    channels = stocked.reader.channels(stocked.path)
+    assert {(c.topic, c.type) for c in channels} == {("/chatter", STRING), *silent}
+    assert read(stocked.reader, stocked.path, ["/quiet"]) == []
+
+
+@on_every_shelf
+def test_an_empty_bag_has_no_topics_and_no_times(shelf: Shelf, tmp_path: Path) -> None:
+    stocked = shelf.stocked(tmp_path, declared=[("/quiet", STRING)])
+    summary = stocked.reader.summarize(stocked.path)
+    assert summary.empty
+    assert summary.topics == ()
+    assert summary.silent == (("/quiet",) if shelf.writes_silent_topics else ())
+    assert stocked.reader.closing(stocked.path) is Closing.CLOSED
+    assert list(stocked.reader.log_times(stocked.path, "/quiet", TimeWindow.everything())) == []
+
+
+@on_every_shelf
+def test_a_topic_offered_as_transient_local_is_latched(shelf: Shelf, tmp_path: Path) -> None:
+    static = tf(1, transform(1, "base_link", "laser", (0.1, 0.0, 0.2)), topic="/tf_static")
+    reader, path = _stocked(shelf, str(tmp_path), [static, odom(2, 0.0, 0.0)])
+    assert {t.topic: t.latched for t in reader.summarize(path).topics} == {
+        "/tf_static": True,
+        "/odom": False,
+    }
+    assert {c.topic: c.latched for c in reader.channels(path)} == {
+        "/tf_static": True,
+        "/odom": False,
+    }
+
+
+@on_every_shelf
+def test_messages_decode_as_plain_rosbags_decodes_them(shelf: Shelf, tmp_path: Path) -> None:
+    messages = [
+        odom(1, 1.5, -2.5, 0.3),
+        detections(2, ["cup", "scissors"]),
+        tf(3, transform(3, "odom", "base_link", (1.0, 2.0, 0.0), 0.5)),
+        text(4, "hello"),
+    ]
+    reader, path = _stocked(shelf, str(tmp_path), messages)
+    topics = {message.topic for message in messages}
+    records = list(reader.records(path, topics, TimeWindow.everything()))
+    for record, message in zip(records, messages, strict=True):
+        assert reader.undecodable(record.channel) is None
+        plain = typestore().deserialize_cdr(message.payload, message.type)
+        assert repr(reader.decode(record)) == repr(plain)
+
+
+@on_every_shelf
+def test_publish_times_are_kept_where_the_format_keeps_them(shelf: Shelf, tmp_path: Path) -> None:
+    messages = [odom(5, 0.0, 0.0, log_time=7), odom(6, 0.0, 0.0, log_time=9)]
+    reader, path = _stocked(shelf, str(tmp_path), messages)
+    records = list(reader.records(path, ["/odom"], TimeWindow.everything()))
+    published = [5, 6] if shelf.keeps_publish_time else [7, 9]
+    assert [(r.log_time, r.publish_time) for r in records] == list(
+        zip([7, 9], published, strict=True)
+    )
+
+
+@on_every_shelf
+def test_a_payload_that_does_not_fit_is_undecodable_and_says_so(
+    shelf: Shelf, tmp_path: Path
+) -> None:
+    broken = Msg("/odom", "nav_msgs/msg/Odometry", 1, b"\x00\x01\x00\x00short")
+    reader, path = _stocked(shelf, str(tmp_path), [broken, text(2, "whole")])
+    first, second = reader.records(path, ["/odom", "/chatter"], TimeWindow.everything())
+    with pytest.raises(UndecodableError, match=r"^/odom \(nav_msgs/msg/Odometry\): "):
+        reader.decode(first)
+    assert getattr(reader.decode(second), "data", None) == "whole"
+
+
+@on_every_shelf
+def test_an_unknown_type_is_undecodable_with_a_reason_that_needs_no_message(
+    shelf: Shelf, tmp_path: Path
+) -> None:
+    reader, _ = _stocked(shelf, str(tmp_path), [])
+    channel = Channel("/oddity", "cdr", Schema("nowhere_msgs/msg/Oddity"))
+    reason = reader.undecodable(channel)
+    assert reason
+    with pytest.raises(UndecodableError) as caught:
+        reader.decode(Record(channel, 1, 1, b"\x00\x01\x00\x00\x00"))
+    assert caught.value.reason == reason
+
+
+@on_every_shelf
+def test_a_bag_that_is_gone_has_vanished_for_every_question(shelf: Shelf, tmp_path: Path) -> None:
+    stocked = shelf.stocked(tmp_path, [text(1, "x")])
+    reader, path = stocked.reader, stocked.path
+    list(reader.records(path, ["/chatter"], TimeWindow.everything()))
+    stocked.remove()
+    everything = TimeWindow.everything()
+    lazy = reader.records(path, ["/chatter"], everything)
+    questions = (
+        lambda: next(lazy),
+        lambda: reader.summarize(path),
+        lambda: reader.closing(path),
+        lambda: reader.channels(path),
+        lambda: reader.log_times(path, "/chatter", everything),
+    )
+    for question in questions:
+        with pytest.raises(BagVanishedError) as caught:
+            question()
+        assert caught.value.path == str(path)
+
+
+@on_every_shelf
+def test_what_is_no_bag_counts_as_closed_and_says_what_is_wrong(
+    shelf: Shelf, tmp_path: Path
+) -> None:
+    stocked = shelf.stocked(tmp_path, [text(1, "x")])
+    stocked.spoil(b"FROM ros:jazzy\nRUN true\n" * 30)
+    assert stocked.reader.closing(stocked.path) is Closing.CLOSED
+    everything = TimeWindow.everything()
+    questions = (
+        lambda: stocked.reader.summarize(stocked.path),
+        lambda: stocked.reader.channels(stocked.path),
+        lambda: list(stocked.reader.records(stocked.path, ["/chatter"], everything)),
+        lambda: stocked.reader.log_times(stocked.path, "/chatter", everything),
+    )
+    for question in questions:
+        with pytest.raises(BagError) as caught:
+            question()
+        assert not isinstance(caught.value, BagVanishedError)
+        assert caught.value.path == str(stocked.path)
+        assert caught.value.reason
+
+
+@on_every_file
+def test_an_empty_file_is_open_and_nothing_had_reached_the_disk(
+    shelf: Shelf, tmp_path: Path
+) -> None:
+    stocked = shelf.stocked(tmp_path, [])
+    stocked.path.write_bytes(b"")
+    assert stocked.reader.closing(stocked.path) is Closing.OPEN
+    with pytest.raises(BagError, match="empty file: nothing had reached the disk"):
+        stocked.reader.summarize(stocked.path)
+
+
+@on_every_file
+def test_a_folder_in_place_of_a_bag_is_an_error_that_names_it(shelf: Shelf, tmp_path: Path) -> None:
+    reader = shelf.make_reader()
+    path = tmp_path / f"folder{shelf.suffix}"
+    path.mkdir()
+    with pytest.raises(BagError, match="not a regular file"):
+        reader.summarize(path)
+    with pytest.raises(EpisodicError):
+        reader.closing(path)
+
+
+@on_every_file
+def test_a_pipe_in_place_of_a_bag_does_not_hang(shelf: Shelf, tmp_path: Path) -> None:
+    path = tmp_path / f"pipe{shelf.suffix}"
+    os.mkfifo(path)
+    with pytest.raises(BagError, match="not a regular file"):
+        shelf.make_reader().summarize(path)
+
+
+@on_every_file
+def test_reading_leaves_no_trace_beside_the_bag(shelf: Shelf, tmp_path: Path) -> None:
+    stocked = shelf.stocked(tmp_path, [text(time, "x") for time in range(20)])
+    before = [(file.name, file.stat().st_mtime_ns) for file in tmp_path.iterdir()]
+    stocked.reader.summarize(stocked.path)
+    read(stocked.reader, stocked.path, ["/chatter"])
+    stocked.reader.log_times(stocked.path, "/chatter", TimeWindow.everything())
+    assert [(file.name, file.stat().st_mtime_ns) for file in tmp_path.iterdir()] == before
+
+
+@on_every_file
+def test_a_bag_deleted_while_it_is_read_still_answers_to_the_end(
+    shelf: Shelf, tmp_path: Path
+) -> None:
+    messages = [text(time, f"{time:0100d}") for time in range(50)]
+    stocked = shelf.stocked(tmp_path, messages)
+    records = stocked.reader.records(stocked.path, ["/chatter"], TimeWindow.everything())
+    first = seen(next(records))
+    stocked.remove()
+    assert [first, *map(seen, records)] == expected(messages, ["/chatter"])
+
+
+@on_every_file
+def test_a_bag_rewritten_in_place_is_read_anew(shelf: Shelf, tmp_path: Path) -> None:
+    stocked = shelf.stocked(tmp_path, [text(1, "old")])
+    assert stocked.reader.summarize(stocked.path).count == 1
+    stocked.remove()
+    later = [text(2, "new"), text(3, "newer")]
+    shelf.write(stocked.path, later, ())
+    assert stocked.reader.summarize(stocked.path).count == 2
+    assert read(stocked.reader, stocked.path, ["/chatter"]) == expected(later, ["/chatter"])
+
+
+@on_every_shelf
+def test_threads_that_read_at_once_all_get_the_same(shelf: Shelf, tmp_path: Path) -> None:
+    messages = [text(time, f"{time:0100d}", TOPICS[time % 3]) for time in range(60)]
+    reader, path = _stocked(shelf, str(tmp_path), messages)
+
+    def ask(turn: int) -> list[Seen]:
+        return read(reader, path, TOPICS, newest_first=turn % 2 == 1)
+
+    with ThreadPoolExecutor(max_workers=4) as pool:
+        answers = list(pool.map(ask, range(16)))
+    whole = expected(messages, TOPICS)
+    assert answers == [whole if turn % 2 == 0 else whole[::-1] for turn in range(16)]
+
+
+@on_every_file
+def test_an_iteration_given_up_closes_the_file(shelf: Shelf, tmp_path: Path) -> None:
+    stocked = shelf.stocked(tmp_path, [text(time, "x") for time in range(20)])
+    read(stocked.reader, stocked.path, ["/chatter"])
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    records = stocked.reader.records(stocked.path, ["/chatter"], TimeWindow.everything())
+    next(records)
+    assert len(list(Path("/proc/self/fd").iterdir())) > before
+    del records
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+@on_every_shelf
+def test_kinds_are_judged_by_name_alone(shelf: Shelf) -> None:
+    reader = shelf.make_reader()
+    assert reader.reads(Path(f"/nowhere/bag{shelf.suffix}"))
+    for name in ("metadata.yaml", "bag.mcap.part", "bag.zstd", "mcap", ".mcap", ".db3.zstd"):
+        assert not reader.reads(Path("/nowhere") / name), name

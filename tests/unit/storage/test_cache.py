@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.storage.base import Schema
+from ros2_memory.storage.cache import ByteLru, Shared
+
+
+def test_what_was_used_last_is_kept() -> None:
+    cache: ByteLru[str] = ByteLru(10)
+    cache.put("a", "A", 4)
+    cache.put("b", "B", 4)
+    assert cache.get("a") == "A"
+    cache.put("c", "C", 4)
+    assert (cache.get("a"), cache.get("b"), cache.get("c")) == ("A", None, "C")
+
+
+def test_what_is_larger_than_the_whole_cache_is_not_kept_and_evicts_nothing() -> None:
+    cache: ByteLru[str] = ByteLru(10)
+    cache.put("a", "A", 4)
+    cache.put("b", "B", 11)
+    assert (cache.get("a"), cache.get("b")) == ("A", None)
+
+
+def test_a_replaced_value_counts_once() -> None:
+    cache: ByteLru[str] = ByteLru(10)
+    cache.put("a", "old", 6)
+    cache.put("a", "new", 8)
+    assert (cache.get("a"), cache.bytes_held) == ("new", 8)
+    cache.put("a", "too large", 11)
+    assert (cache.get("a"), cache.bytes_held) == (None, 0)
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 15))))
+def test_what_is_held_never_passes_the_bound(puts: list[tuple[int, int]]) -> None:
+    cache: ByteLru[int] = ByteLru(20)
+    for key, size in puts:
+        cache.put(key, size, size)
+        assert cache.bytes_held <= 20
+    held = [cache.get(key) for key in range(6)]
+    assert sum(size for size in held if size is not None) == cache.bytes_held
+
+
+def test_equal_objects_become_one() -> None:
+    shared: Shared[Schema] = Shared(lambda schema: len(schema.name))
+    first = shared.of(Schema("a/msg/A"))
+    assert shared.of(Schema("a/msg/A")) is first
+    assert shared.of(Schema("a/msg/B")) == Schema("a/msg/B")

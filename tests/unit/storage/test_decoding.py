@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.core.errors import UndecodableError
+from ros2_memory.storage.base import Channel, Record, Schema
+from ros2_memory.storage.decoding import Decoding
+from tests.bags import definition, odom, text
+
+if TYPE_CHECKING:
+    from tests.bags import Msg
+
+
+CDR = b"\x00\x01\x00\x00"
+
+
+def record_of(message: Msg, schema: Schema | None = None) -> Record:
+    given = schema or Schema(message.type, "ros2msg", definition(message.type).encode())
+    return Record(Channel(message.topic, "cdr", given), 1, 1, message.payload)
+
+
+def test_big_endian_messages_are_read() -> None:
+    payload = b"\x00\x00\x00\x00" + b"\x00\x00\x00\x03hi\x00"
+    record = record_of(text(1, "x"))._replace(payload=payload)
+    assert getattr(Decoding().decode(record), "data", "") == "hi"
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\x00",
+        b"\x00\x01\x00\x00",
+        b"\x00\x01\x00\x00\xff\xff\xff\xff",
+        b"\x07\x00\x00\x00abc",
+    ],
+)
+def test_payloads_that_do_not_fit_are_undecodable(payload: bytes) -> None:
+    record = record_of(text(1, "x"))._replace(payload=payload)
+    with pytest.raises(UndecodableError, match="does not fit the definition") as caught:
+        Decoding().decode(record)
+    assert caught.value.topic == "/chatter"
+
+
+def test_every_cut_of_a_payload_is_undecodable_and_nothing_else() -> None:
+    whole = record_of(odom(1, 2.0, 3.0))
+    decoding = Decoding()
+    for size in range(len(whole.payload)):
+        with pytest.raises(UndecodableError):
+            decoding.decode(whole._replace(payload=whole.payload[:size]))
+    assert decoding.decode(whole)
+
+
+def test_a_message_of_a_type_whose_definition_is_empty_names_what_to_set() -> None:
+    record = record_of(text(1, "a text"), Schema("a_msgs/msg/Lost", "ros2msg", b""))
+    decoding = Decoding()
+    with pytest.raises(UndecodableError, match=r"reader\.custom_msg_paths"):
+        decoding.decode(record)
+    nothing = record._replace(payload=b"\x00\x01\x00\x00\x00")
+    assert decoding.decode(nothing) is not None
+
+
+def test_equal_channels_of_two_bags_decode_alike_and_different_ones_each_in_their_way() -> None:
+    decoding = Decoding()
+    message = text(1, "x")
+    for _ in range(3):
+        own = record_of(message)
+        assert getattr(decoding.decode(own), "data", "") == "x"
+        other = record_of(
+            message, Schema(message.type, "ros2msg", b"uint32 size\nuint8[2] bytes\n")
+        )
+        assert getattr(decoding.decode(other), "size", 0) == 2
+
+
+def test_the_reason_for_a_channel_is_the_reason_for_its_messages() -> None:
+    decoding = Decoding()
+    record = record_of(text(1, "x"), Schema("nowhere_msgs/msg/X"))
+    reason = decoding.undecodable(record.channel)
+    with pytest.raises(UndecodableError) as caught:
+        decoding.decode(record)
+    assert caught.value.reason == reason
+    assert decoding.undecodable(record_of(text(1, "x")).channel) is None

@@ -1,0 +1,302 @@
+"""A damaged chunk costs its own messages, and is told where these were looked for.
+
+A damaged index costs none, and is told too.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from functools import partial
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.opcode import Opcode
+
+from ros2_memory import queries
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import View
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.asking import asked as asked_tool
+from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
+from tests.mcap_surgery import SMALL, chatter, chunks_of, edit_summary, spoil_chunk
+from tests.memories import memory_of
+from tests.recalled import recalling
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+    from ros2_memory.results import Match
+    from ros2_memory.storage.base import BagReader
+
+S = 10**9
+T0 = 1_700_000_000 * S
+LATCHED = McapLayout(chunk_size=1, latched=frozenset({"/dock"}))
+EVERYTHING = TimeWindow.everything()
+
+
+def damaged_bag(path: Path) -> tuple[Path, range]:
+    """A bag of 40 messages at 0, 1, 2 ... ns, and which of them stand in a damaged chunk."""
+    write_mcap(path, chatter(40), SMALL)
+    lost = chunks_of(path)[3]
+    spoil_chunk(path, 3)
+    return path, range(lost.message_start_time, lost.message_end_time + 1)
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda _: McapReader(),
+        lambda _: Rosbag2Reader(),
+        lambda _: CountingReader(McapReader()),
+        lambda root: ConfinedReader(McapReader(), root),
+    ],
+)
+def test_reading_goes_on_behind_a_damaged_chunk(
+    tmp_path: Path, made: Callable[[Path], BagReader], newest_first: bool
+) -> None:
+    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    records = made(tmp_path).records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
+    before: list[int] = []
+    with pytest.raises(BagError) as told:
+        before.extend(each.log_time for each in iter(partial(next, records), None))
+    assert told.value.lost == (lost[0], lost[-1])
+    whole = [time for time in range(40) if time not in lost]
+    if newest_first:
+        whole.reverse()
+    assert [*before, *(each.log_time for each in records)] == whole
+    assert before == whole[: len(before)]
+    assert all((time > lost[-1]) == newest_first for time in before)
+
+
+def test_what_of_a_damaged_chunk_is_outside_of_the_window_is_not_lost(tmp_path: Path) -> None:
+    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    reader = McapReader()
+    assert [
+        each.log_time for each in reader.records(path, ["/chatter"], TimeWindow(0, lost[0]))
+    ] == [*range(lost[0])]
+    with pytest.raises(BagError) as told:
+        list(reader.records(path, ["/chatter"], TimeWindow(lost[0], lost[0] + 1)))
+    assert told.value.lost == (lost[0], lost[0])
+
+
+def test_the_newest_message_stands_before_the_damaged_chunk_where_that_is_the_last(
+    tmp_path: Path,
+) -> None:
+    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    view = View(memory_of(tmp_path), Call())
+    found = view.newest("/chatter", TimeWindow.until(lost[-1]))
+    assert found is not None
+    assert found.time == lost[0] - 1
+    [told] = view.notes
+    assert told.startswith(f"rec/{path.name} could not be read whole: ")
+
+
+def overlapping(folder: Path) -> Memory:
+    """A damaged bag up to 1 s, one of its recording from 2 s on, and one that overlaps this."""
+    first = write_mcap(folder / "a" / "a_0.mcap", [text(S, "hello")])
+    spoil_chunk(first, 0)
+    write_mcap(folder / "a" / "a_1.mcap", [text(2 * S, "person"), text(20 * S, "person")])
+    write_mcap(folder / "b" / "b_0.mcap", [text(S // 2, "nobody"), text(3 * S, "nobody")])
+    return memory_of(folder)
+
+
+def asked(memory: Memory, pattern: str, wanted: str) -> Match:
+    return queries.find_last_match(memory, Call(), pattern, "contains", wanted)
+
+
+def test_a_match_behind_a_damaged_chunk_is_found_and_the_chunk_is_told(tmp_path: Path) -> None:
+    damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    found = asked(memory_of(tmp_path), "/chatter", f"{3:0100d}")
+    assert found.found is not None
+    assert found.found.sample.time == 3
+    assert any("rec_0.mcap could not be read whole" in note for note in found.notes)
+
+
+def test_a_chunk_damaged_before_the_match_is_told_neither_with_a_catalogue_nor_without(
+    tmp_path: Path,
+) -> None:
+    """What overlaps has the search look further back for copies than it was asked to."""
+    plain = overlapping(tmp_path)
+    found = queries.find_last_match(plain, Call(), "/*", "contains", "person", before_s=10.0)
+    assert found.found is not None
+    assert not any("could not be read" in note for note in found.notes)
+    recalled = recalling(plain, tmp_path)
+    again = queries.find_last_match(recalled, Call(), "/*", "contains", "person", before_s=10.0)
+    assert repr(again) == repr(found)
+    # Asked for what may stand in it, it is told.
+    assert "a_0.mcap could not be read whole" in asked(plain, "/*", "hello").notes[0]
+
+
+def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_told(
+    tmp_path: Path,
+) -> None:
+    dock = text(10 * S, "docked", "/dock")
+    other = text(9 * S, "undocked", "/dock")
+    first = write_mcap(tmp_path / "a" / "a_0.mcap", [other, dock], LATCHED)
+    spoil_chunk(first, 1)
+    again = Msg("/dock", dock.type, 100 * S, dock.body, 10 * S)
+    write_mcap(tmp_path / "b" / "b_0.mcap", [again], LATCHED)
+    plain = memory_of(tmp_path)
+    for memory in (plain, recalling(plain, tmp_path)):
+        found = asked(memory, "/dock", "docked")
+        assert found.found is not None
+        assert found.found.sample.time == 100 * S
+        assert "a_0.mcap could not be read whole" in found.notes[0]
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_what_is_read_for_copies_alone_is_not_told_when_it_is_damaged(
+    tmp_path: Path, newest_first: bool
+) -> None:
+    memory = overlapping(tmp_path)
+    view = View(memory, Call())
+    found = view.stream(["/chatter"], TimeWindow(2 * S, 4 * S), newest_first=newest_first)
+    assert len(list(found)) == 2
+    assert view.notes == ()
+    list(view.stream(["/chatter"], TimeWindow(S, 4 * S), newest_first=newest_first))
+    assert len(view.notes) == 1
+
+
+def test_sightings_tell_what_is_damaged_in_the_time_that_they_span(tmp_path: Path) -> None:
+    memory = overlapping(tmp_path)
+    for each in (memory, recalling(memory, tmp_path)):
+        ask = partial(find_matches, each, Call(), "/*", "contains", "person")
+        assert ask(start_s=2.0).notes == ()
+        assert "a_0.mcap could not be read whole" in ask(start_s=0.5).notes[0]
+        assert "a_0.mcap could not be read whole" in ask(limit=5).notes[0]
+        assert ask(end_s=10.0, limit=5).notes != ()
+        assert ask(limit=1).notes == ()
+
+
+def test_damaged_bags_are_told_in_one_order_whichever_was_found_first(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        path = write_mcap(tmp_path / name / f"{name}_0.mcap", [text(ord(name) * S, "hello")])
+        spoil_chunk(path, 0)
+    told = []
+    for newest_first in (False, True):
+        view = View(memory_of(tmp_path), Call())
+        list(view.stream(["/chatter"], EVERYTHING, newest_first=newest_first))
+        told.append(view.notes)
+    assert told[0] == told[1]
+    [told_once] = told[0]
+    assert told_once.startswith("2 bags could not be read whole: a/a_0.mcap (")
+
+
+class TestAnIndexThatContradictsItsMessages:
+    """One bit of a message index is another: nothing that is asked for is missed or moved."""
+
+    def driven(self, bag_dir: Path) -> Path:
+        """Ten seconds at 1 m/s; one message is indexed as if it lay 0.2 s later."""
+        moving = [
+            each
+            for n in range(100)
+            for at in [T0 + n * S // 10]
+            for each in (
+                odom(at, n / 10, 0.0),
+                tf(at, transform(at, "odom", "base", (n / 10, 0.0, 0.0))),
+            )
+        ]
+        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", moving, McapLayout(chunk_size=8000))
+        self.right = path.read_bytes()
+        chunk = chunks_of(path)[2]
+        for offset in chunk.message_index_offsets.values():
+            data = bytearray(path.read_bytes())
+            at = offset + 15 + 16 * 5
+            (time,) = struct.unpack_from("<Q", data, at)
+            self.at = time
+            struct.pack_into("<Q", data, at, time + S // 5)
+            path.write_bytes(data)
+        return path
+
+    def test_where_the_robot_was_is_what_its_messages_say(self, tmp_path: Path) -> None:
+        self.driven(tmp_path)
+        true = (self.at - T0) / S
+        for storage in ("mcap", "rosbag2"):
+            memory = memory_of(tmp_path, storage=storage)
+            at_s = self.at / S
+            told = asked_tool(memory, tmp_path, "get_position_at", topic="/odom", timestamp=at_s)
+            assert told["x"] == pytest.approx(true, abs=1e-6)
+            assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+            frames = {"parent": "odom", "child": "base"}
+            told = asked_tool(memory, tmp_path, "get_transform_at", timestamp=at_s, **frames)
+            assert told["translation"]["x"] == pytest.approx(true, abs=1e-6)
+            told = asked_tool(
+                memory, tmp_path, "get_topic_in_range", topic="/odom", start=at_s, end=at_s + 0.15
+            )
+            assert [sample["timestamp"] for sample in told["samples"]] == [
+                pytest.approx(at_s + n / 10, abs=1e-5) for n in range(2)
+            ]
+
+    def test_a_search_finds_what_it_finds_in_the_same_bag_with_a_right_index(
+        self, tmp_path: Path
+    ) -> None:
+        self.driven(tmp_path / "wrong")
+        whole = self.driven(tmp_path / "right")
+        whole.write_bytes(self.right)
+        near = json.dumps({"x": (self.at - T0) / S, "y": 0.0})
+        asks = {"topic": "/odom", "condition_type": "near_position", "value": near}
+        wrong, right = (
+            asked_tool(memory_of(tmp_path / name), tmp_path / name, "find_matches", **asks)
+            for name in ("wrong", "right")
+        )
+        assert any("contradicts itself" in note for note in wrong.pop("notes"))
+        assert wrong == right
+
+
+class TestASummarySectionThatDeclaresOtherThanItsChunks:
+    """What a chunk declares is protected by its checksum; the summary section repeats it."""
+
+    def misnamed(self, bag_dir: Path) -> Path:
+        """A drive whose summary section has the numbers of two topics of one type swapped."""
+        moving = [
+            each
+            for n in range(100)
+            for at in [T0 + n * S // 10]
+            for each in (odom(at, n / 10, 0.0), odom(at, -n / 10, 0.0, topic="/ghost"))
+        ]
+        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", moving, McapLayout(chunk_size=8000))
+        numbers = {b"\x01\x00": b"\x02\x00", b"\x02\x00": b"\x01\x00"}
+
+        def swapped(body: bytearray) -> None:
+            body[:2] = numbers[bytes(body[:2])]
+
+        edit_summary(path, Opcode.CHANNEL, swapped)
+        return path
+
+    @pytest.mark.parametrize("storage", ["mcap", "rosbag2"])
+    def test_where_the_robot_was_is_what_the_chunks_say(self, tmp_path: Path, storage: str) -> None:
+        self.misnamed(tmp_path)
+        plain = memory_of(tmp_path, storage=storage)
+        for memory in (plain, recalling(plain, tmp_path)):
+            for topic, sign in (("/odom", 1), ("/ghost", -1)):
+                told = asked_tool(
+                    memory, tmp_path, "get_position_at", topic=topic, timestamp=T0 / S + 5
+                )
+                assert told["x"] == pytest.approx(sign * 5.0, abs=1e-6)
+                assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+
+    def test_a_topic_that_the_summary_section_calls_otherwise_is_found(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "dock"), text(T0 + S, "bay")])
+        edit_summary(
+            path,
+            Opcode.CHANNEL,
+            lambda body: body.__setitem__(slice(None), body.replace(b"/chatter", b"/chattes")),
+        )
+        asks = {"topic": "/chatter", "condition_type": "contains", "value": "dock"}
+        told = asked_tool(memory_of(tmp_path), tmp_path, "find_last_match", **asks)
+        assert told["timestamp"] == pytest.approx(T0 / S)
+        assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+        topics = asked_tool(memory_of(tmp_path), tmp_path, "list_recorded_topics")
+        assert [each["topic"] for each in topics] == ["/chatter"]

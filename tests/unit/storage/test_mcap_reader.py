@@ -1,0 +1,574 @@
+from __future__ import annotations
+
+import os
+import struct
+from typing import TYPE_CHECKING, Any
+
+import lz4.frame  # type: ignore[import-untyped]
+import pytest
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType, Writer
+
+from ros2_memory.core.errors import (
+    BagContradictionError,
+    BagError,
+    ConfigError,
+    UndecodableError,
+)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
+from tests.mcap_surgery import (
+    FOOTER,
+    RECORD,
+    SMALL,
+    change_index,
+    chatter,
+    chunks_of,
+    edit_summary,
+    one_chunk,
+    raw_mcap,
+    rewrite_summary,
+    spoil_chunk,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from mcap.records import ChunkIndex
+
+    from ros2_memory.storage.base import Record
+
+EVERYTHING = TimeWindow.everything()
+STRING = "std_msgs/msg/String"
+
+
+def read(reader: McapReader, path: Path, *topics: str, **how: Any) -> list[Record]:
+    return list(reader.records(path, topics or ("/chatter",), EVERYTHING, **how))
+
+
+def from_bytes(number: bytes) -> int:
+    return int.from_bytes(number, "little")
+
+
+def times(records: list[Record]) -> list[int]:
+    return [record.log_time for record in records]
+
+
+class TestReadingOnlyWhatIsWanted:
+    def test_a_summary_and_log_times_need_no_chunk(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        for number in range(len(chunks_of(path))):
+            spoil_chunk(path, number)
+        reader = McapReader()
+        assert reader.summarize(path).count == 20
+        assert list(reader.log_times(path, "/chatter", TimeWindow(5, 9))) == [5, 6, 7, 8]
+        with pytest.raises(BagError, match="does not match its checksum"):
+            read(reader, path)
+
+    def test_a_damaged_chunk_disturbs_only_the_windows_that_it_overlaps(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        spoilt = chunks_of(path)[1]
+        spoil_chunk(path, 1)
+        reader = McapReader()
+        before = TimeWindow(0, spoilt.message_start_time)
+        after = TimeWindow(spoilt.message_end_time + 1, 100)
+        found = [
+            record.log_time
+            for window in (before, after)
+            for record in reader.records(path, ["/chatter"], window)
+        ]
+        lost = set(range(20)) - set(found)
+        assert lost == set(range(spoilt.message_start_time, spoilt.message_end_time + 1))
+
+    def test_a_chunk_without_the_topic_is_not_read(self, tmp_path: Path) -> None:
+        messages = [*chatter(12), *(boolean(time, True) for time in range(12, 40))]
+        path = write_mcap(tmp_path / "a.mcap", messages, SMALL)
+        spoil_chunk(path, 0)
+        assert times(read(McapReader(), path, "/bumper")) == list(range(12, 40))
+
+    def test_newest_first_begins_at_the_end_of_the_file(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        spoil_chunk(path, 0)
+        newest = McapReader().records(path, ["/chatter"], EVERYTHING, newest_first=True)
+        assert [next(newest).log_time for _ in range(3)] == [19, 18, 17]
+        with pytest.raises(BagError):
+            list(newest)
+
+    def test_what_was_read_is_kept_within_the_cache(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        reader = McapReader()
+        whole = read(reader, path)
+        status = path.stat()
+        data = bytearray(path.read_bytes())
+        data[8:-8] = bytes(len(data) - 16)
+        with path.open("r+b") as stream:
+            stream.write(data)
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+        assert read(reader, path) == whole
+        assert McapReader().summarize(path).count == 0
+
+    def test_without_a_cache_everything_is_read_again(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        reader = McapReader(cache_mb=0)
+        assert times(read(reader, path)) == times(read(reader, path)) == list(range(20))
+
+
+def read_on(
+    reader: McapReader, path: Path, *, newest_first: bool = False
+) -> tuple[list[int], list[str]]:
+    """The log times of all messages, and what is said of contradictions on the way."""
+    told: list[str] = []
+    found: list[int] = []
+    records = reader.records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
+    while True:
+        try:
+            for each in records:
+                found.append(each.log_time)  # noqa: PERF401 - what came before an error counts
+        except BagContradictionError as error:
+            told.append(error.reason)
+        else:
+            return found, told
+
+
+class TestIndexesThatAreWrong:
+    def test_a_damaged_summary_is_replaced_by_the_messages(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        data = bytearray(path.read_bytes())
+        data[-60] ^= 1
+        path.write_bytes(data)
+        summary = McapReader().summarize(path)
+        assert (summary.count, summary.start, summary.end) == (20, 0, 19)
+        assert summary.complete
+        assert "its summary section does not match its checksum" in summary.notes
+
+    def test_statistics_that_are_wrong_are_noted_and_not_believed(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+
+        edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, 21))
+        reader = McapReader()
+        summary = reader.summarize(path)
+        assert summary.count == len(read(reader, path)) == 20
+        assert any("its own statistics are wrong" in note for note in summary.notes)
+        assert any("21 messages" in note for note in summary.notes)
+
+    def test_a_chunk_index_that_states_wrong_times_is_not_believed(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20, start=100), SMALL)
+
+        def state_later(body: bytearray) -> None:
+            (start,) = struct.unpack_from("<Q", body)
+            if start == 100:
+                struct.pack_into("<Q", body, 0, 101)
+
+        edit_summary(path, Opcode.CHUNK_INDEX, state_later)
+        edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 26, 101))
+        reader = McapReader()
+        assert reader.summarize(path).start == 100
+        found = reader.records(path, ["/chatter"], TimeWindow(100, 102))
+        assert [record.log_time for record in found] == [100, 101]
+
+    def test_no_message_is_lost_in_a_chunk_that_is_said_to_end_before_it_begins(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20, start=100), SMALL)
+        at = chunks_of(path)[1].message_start_time
+
+        def state_much_later(body: bytearray) -> None:
+            if struct.unpack_from("<Q", body) == (at,):
+                struct.pack_into("<Q", body, 0, (1 << 64) - 1)
+
+        edit_summary(path, Opcode.CHUNK_INDEX, state_much_later)
+        reader = McapReader()
+        assert reader.summarize(path).count == 20
+        assert times(read(reader, path)) == list(range(100, 120))
+
+    @pytest.mark.parametrize(
+        ("count", "layout"),
+        [
+            pytest.param(12, SMALL, id="few in a chunk"),
+            pytest.param(120, McapLayout(chunk_size=5000), id="many in a chunk"),
+        ],
+    )
+    @pytest.mark.parametrize(
+        ("at", "value"),
+        [
+            pytest.param(0, 1, id="another time"),
+            pytest.param(8, 7, id="another place"),
+            pytest.param(8, 1 << 40, id="a place outside"),
+            pytest.param(8, (1 << 64) - 60, id="a place before"),
+        ],
+    )
+    def test_a_message_index_that_is_wrong_costs_no_message_and_is_named(
+        self, tmp_path: Path, at: int, value: int, count: int, layout: McapLayout
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(count), layout)
+        wrong = chunks_of(path)[1]
+        first = wrong.message_start_time
+        change_index(path, wrong, at, first + value if at == 0 else value)
+        reason = "damaged: a message is not where its index says; its messages were read without"
+        for newest_first in (False, True):
+            found, told = read_on(McapReader(), path, newest_first=newest_first)
+            assert found == sorted(range(count), reverse=newest_first)
+            assert told == [f"{reason} its indexes"]
+        reader = McapReader()
+        with pytest.raises(BagContradictionError):
+            next(reader.records(path, ["/chatter"], TimeWindow(first, first + 1)))
+        # From now on it is known, and named in every answer.
+        with pytest.raises(BagError):
+            reader.newest(path, "/chatter", EVERYTHING)
+        found, told = read_on(reader, path)
+        assert found == [*range(count)]
+        assert len(told) == 1
+        assert any("without its indexes" in note for note in reader.summarize(path).notes)
+
+    def test_what_a_wrong_message_index_says_is_in_no_summary_and_no_log_times(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", [*chatter(9), boolean(9, True)])
+        (chunk,) = chunks_of(path)
+        change_index(path, chunk, 0, 1)
+        assert McapReader().summarize(path).of("/chatter")[0].first == 0
+        assert McapReader().log_times(path, "/chatter", TimeWindow(0, 2)) == [0, 1]
+        whole = write_mcap(tmp_path / "b.mcap", [*chatter(9), boolean(9, True)])
+        assert McapReader().summarize(whole).notes == ()
+
+    @pytest.mark.parametrize(
+        ("kind", "old", "new"),
+        [
+            pytest.param(Opcode.CHANNEL, b"/chatter", b"/chattes", id="topic"),
+            pytest.param(Opcode.CHANNEL, b"\x01\x00\x01\x00", b"\x01\x00\x02\x00", id="schema"),
+            pytest.param(Opcode.CHANNEL, b"cdr", b"cbr", id="encoding"),
+            pytest.param(Opcode.CHANNEL, b"volatile", b"volatild", id="metadata"),
+            pytest.param(Opcode.SCHEMA, b"msg/String", b"msg/Strinh", id="type"),
+            pytest.param(Opcode.SCHEMA, b"ros2msg", b"ros2mso", id="kind of definition"),
+            pytest.param(Opcode.SCHEMA, b"string data", b"string dada", id="definition"),
+        ],
+    )
+    @pytest.mark.parametrize("cache_mb", [64, 0])
+    def test_what_a_summary_section_declares_otherwise_than_the_chunks_is_named(
+        self, tmp_path: Path, kind: Opcode, old: bytes, new: bytes, cache_mb: int
+    ) -> None:
+        """Also after the index was let go of, and of a message in another chunk."""
+        both = [each for n in range(20) for each in (*chatter(1, start=n), boolean(n, True))]
+        path = write_mcap(tmp_path / "a.mcap", both, SMALL)
+        (right,) = (each for each in McapReader().channels(path) if each.topic == "/chatter")
+        before = path.read_bytes()
+
+        def otherwise(body: bytearray) -> None:
+            body[:] = body.replace(old, new, 1)
+
+        edit_summary(path, kind, otherwise)
+        assert path.read_bytes() != before
+        reader = McapReader(cache_mb=cache_mb)
+        summary = reader.summarize(path)
+        assert [each.type for each in summary.of("/chatter")] == [STRING]
+        reason = (
+            "its summary section declares other channels or types than its messages; its messages"
+            " were read without its indexes"
+        )
+        assert summary.notes == (reason,)
+        found, told = read_on(reader, path)
+        assert found == [*range(20)]
+        assert told == [reason]
+        records = reader.records(path, ["/chatter"], TimeWindow(15, 20))
+        with pytest.raises(BagContradictionError):
+            next(records)
+        assert next(records).channel == right
+        # Where there is nothing else to go by, it is noted all the same.
+        data = path.read_bytes()
+        path.write_bytes(data[:-60] + bytes((data[-60] ^ 1,)) + data[-59:])
+        assert [each.type for each in McapReader().summarize(path).of("/chatter")] == [STRING]
+
+    def test_a_channel_that_two_chunks_declare_in_two_ways_is_noted(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(12), SMALL)
+        assert McapReader().summarize(path).notes == ()
+        data = path.read_bytes()
+        other = write_mcap(tmp_path / "b.mcap", [text(n, "x", "/chattes") for n in range(3)], SMALL)
+        cut = chunks_of(other)[0].chunk_start_offset
+        behind = other.read_bytes()[cut:]
+        last = chunks_of(path)[-1]
+        at = last.chunk_start_offset + last.chunk_length + last.message_index_length
+        path.write_bytes(data[:at] + behind)
+        assert any(
+            "declares a channel or a type in more than one way" in note
+            for note in McapReader().summarize(path).notes
+        )
+
+    def test_an_index_that_names_a_message_twice_is_not_believed(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", [text(5, f"{n:0100d}") for n in range(4)])
+        (chunk,) = chunks_of(path)
+        (index_at,) = chunk.message_index_offsets.values()
+        data = bytearray(path.read_bytes())
+        data[index_at + 15 : index_at + 31] = data[index_at + 31 : index_at + 47]
+        path.write_bytes(data)
+        found, told = read_on(McapReader(), path)
+        assert found == [5] * 4
+        assert len(told) == 1
+
+    @pytest.mark.parametrize(
+        ("at", "value"),
+        [
+            pytest.param(0, lambda chunk: chunk.message_start_time + 1, id="a later start"),
+            pytest.param(8, lambda chunk: chunk.message_end_time - 1, id="an earlier end"),
+            pytest.param(16, lambda _: 8, id="no chunk"),
+            pytest.param(16, None, id="another chunk"),
+            pytest.param(24, lambda chunk: chunk.chunk_length - 1, id="another length"),
+        ],
+    )
+    def test_a_chunk_index_that_does_not_agree_with_its_chunk_is_named(
+        self, tmp_path: Path, at: int, value: Callable[[ChunkIndex], int] | None
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        _, second, _, other, *_ = chunks_of(path)
+        stated = other.chunk_start_offset if value is None else value(second)
+
+        def of_the_second(body: bytearray) -> None:
+            if struct.unpack_from("<Q", body, 16) == (second.chunk_start_offset,):
+                struct.pack_into("<Q", body, at, stated)
+
+        edit_summary(path, Opcode.CHUNK_INDEX, of_the_second)
+        reader = McapReader()
+        summary = reader.summarize(path)
+        assert summary.count == 20
+        assert any("its chunk indexes do not " in note for note in summary.notes)
+        for start in range(20):
+            found = reader.records(path, ["/chatter"], TimeWindow(start, start + 3))
+            assert [each.log_time for each in found] == [*range(start, min(start + 3, 20))]
+
+    def test_a_channel_that_a_chunk_index_lacks_is_not_lost(self, tmp_path: Path) -> None:
+        both = [*chatter(12), *(boolean(time, True) for time in range(12))]
+        path = write_mcap(tmp_path / "a.mcap", both)
+
+        def without_the_first_channel(opcode: int, body: bytes) -> bytes:
+            if opcode != Opcode.CHUNK_INDEX:
+                return body
+            size = from_bytes(body[32:36])
+            return body[:32] + struct.pack("<I", size - 10) + body[46:]
+
+        rewrite_summary(path, without_the_first_channel)
+        reader = McapReader()
+        assert reader.summarize(path).count == 24
+        assert times(read(reader, path)) == times(read(reader, path, "/bumper")) == [*range(12)]
+        [note] = reader.summarize(path).notes
+        assert note == "its message indexes do not hold what its statistics state"
+
+    def test_a_channel_that_a_chunk_index_calls_by_another_number_is_not_lost(
+        self, tmp_path: Path
+    ) -> None:
+        both = [each for n in range(20) for each in (*chatter(1, start=n), boolean(n, True))]
+        path = write_mcap(tmp_path / "a.mcap", both, SMALL)
+        middle = chunks_of(path)[2].chunk_start_offset
+
+        def renamed(body: bytearray) -> None:
+            if from_bytes(bytes(body[16:24])) == middle:
+                body[36:38] = struct.pack("<H", 999)
+
+        edit_summary(path, Opcode.CHUNK_INDEX, renamed)
+        for newest_first in (False, True):
+            reader = McapReader()
+            found, told = read_on(reader, path, newest_first=newest_first)
+            assert found == sorted(range(20), reverse=newest_first)
+            assert told or reader.summarize(path).notes
+            assert times(read(McapReader(), path, "/bumper")) == [*range(20)]
+
+    def test_a_chunk_that_neither_indexes_nor_statistics_know_is_not_lost(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        hidden = chunks_of(path)[2]
+        left = 20 - (hidden.message_end_time - hidden.message_start_time + 1)
+
+        def without_it(opcode: int, body: bytes) -> bytes | None:
+            if opcode == Opcode.CHUNK_INDEX:
+                return None if from_bytes(body[16:24]) == hidden.chunk_start_offset else body
+            if opcode == Opcode.STATISTICS:
+                chunks = struct.pack("<I", from_bytes(body[22:26]) - 1)
+                count = struct.pack("<Q", left)
+                return count + body[8:22] + chunks + body[26:-8] + count
+            return body
+
+        rewrite_summary(path, without_it)
+        reader = McapReader()
+        assert reader.summarize(path).count == 20
+        assert times(read(reader, path)) == [*range(20)]
+        assert any("all of its chunks" in note for note in reader.summarize(path).notes)
+
+    def test_messages_outside_chunks_are_not_lost_beside_chunks(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(6), SMALL)
+        data = path.read_bytes()
+        body = struct.pack("<HIQQ", 1, 0, 3, 3) + text(3, "loose").payload
+        loose = RECORD.pack(Opcode.MESSAGE, len(body)) + body
+        # Before the data end: behind the last message index, which moves the summary on.
+        chunk = chunks_of(path)[-1]
+        at = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+        moved = bytearray(data[:at] + loose + data[at:])
+        footer_at = len(moved) - 8 - FOOTER.size
+        kind, length, start, _, _ = FOOTER.unpack_from(moved, footer_at)
+        FOOTER.pack_into(moved, footer_at, kind, length, start + len(loose), 0, 0)
+        path.write_bytes(moved)
+        edit_summary(path, Opcode.STATISTICS, lambda body: struct.pack_into("<Q", body, 0, 7))
+        reader = McapReader()
+        assert reader.summarize(path).count == 7
+        assert times(read(reader, path)) == [0, 1, 2, 3, 3, 4, 5]
+        assert times(read(reader, path, newest_first=True)) == [5, 4, 3, 3, 2, 1, 0]
+
+
+class TestWhatAWriterMayDo:
+    def test_two_channels_of_one_topic_and_type_are_one_topic(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            schema = writer.register_schema(STRING, "ros2msg", definition(STRING).encode())
+            first = writer.register_channel("/t", "cdr", schema)
+            second = writer.register_channel(
+                "/t", "cdr", schema, {"offered_qos_profiles": "durability: 1\n"}
+            )
+            for time, channel in ((1, first), (2, second), (3, first)):
+                writer.add_message(channel, time, text(time, "x").payload, time)
+
+        path = raw_mcap(tmp_path / "a.mcap", fill)
+        reader = McapReader()
+        (topic,) = reader.summarize(path).topics
+        assert (topic.count, topic.first, topic.last, topic.latched) == (3, 1, 3, True)
+        assert times(read(reader, path, "/t")) == [1, 2, 3]
+        assert [channel.latched for channel in reader.channels(path)] == [False, True]
+
+    @pytest.mark.parametrize(
+        ("qos", "latched"),
+        [
+            ("- durability: 1\n", True),
+            ("- durability: transient_local\n", True),
+            ("- durability: volatile\n- durability: transient_local\n", True),
+            ("- durability: 2\n", False),
+            ("- durability: 10\n", False),
+            (VOLATILE, False),
+            ("", False),
+        ],
+    )
+    def test_latched_is_what_some_publisher_offered_as_transient_local(
+        self, qos: str, latched: bool, tmp_path: Path
+    ) -> None:
+        def fill(writer: Writer) -> None:
+            channel = writer.register_channel("/t", "cdr", 0, {"offered_qos_profiles": qos})
+            writer.add_message(channel, 1, b"\x00", 1)
+
+        (topic,) = McapReader().summarize(raw_mcap(tmp_path / "a.mcap", fill)).topics
+        assert topic.latched is latched
+
+    def test_attachments_and_metadata_between_the_messages_are_passed_over(
+        self, tmp_path: Path
+    ) -> None:
+        def fill(writer: Writer) -> None:
+            channel = writer.register_channel("/t", "json", 0)
+            for time in range(4):
+                writer.add_message(channel, time, b"{}", time)
+                writer.add_attachment(time, time, "note", "text/plain", b"\x05" * 100)
+                writer.add_metadata("rosbag2", {"robot": "r1"})
+
+        for number, chunked in enumerate((True, False)):
+            path = raw_mcap(tmp_path / f"{number}.mcap", fill, use_chunking=chunked)
+            assert times(read(McapReader(), path, "/t")) == [0, 1, 2, 3]
+
+    def test_json_is_read_as_what_it_says(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            schema = writer.register_schema("Mouse", "jsonschema", b"{}")
+            channel = writer.register_channel("mouse", "json", schema)
+            writer.add_message(channel, 1, b'{"x": 1.5, "far": NaN, "tags": ["a"]}', 1)
+            writer.add_message(channel, 2, b"{not json", 2)
+            writer.add_message(channel, 3, b"[" * 100_000, 3)
+
+        reader = McapReader()
+        good, bad, deep = read(reader, raw_mcap(tmp_path / "a.mcap", fill), "mouse")
+        value = reader.decode(good)
+        assert isinstance(value, dict)
+        assert value["x"] == 1.5
+        assert value["far"] != value["far"]
+        assert reader.undecodable(good.channel) is None
+        for record in (bad, deep):
+            with pytest.raises(UndecodableError, match=r"mouse \(Mouse\): the payload is not JSON"):
+                reader.decode(record)
+
+    def test_a_foreign_encoding_is_listed_and_named(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            schema = writer.register_schema("foxglove.Pose", "protobuf", b"\x0a")
+            writer.add_message(writer.register_channel("p", "protobuf", schema), 1, b"\x08", 1)
+
+        reader = McapReader()
+        path = raw_mcap(tmp_path / "a.mcap", fill)
+        (record,) = read(reader, path, "p")
+        assert [t.topic for t in reader.summarize(path).topics] == ["p"]
+        with pytest.raises(UndecodableError, match="message encoding 'protobuf' is not read"):
+            reader.decode(record)
+
+    def test_a_message_that_was_compressed_by_itself_comes_plain(self, tmp_path: Path) -> None:
+        message = text(1, "hello " * 50)
+        packed = Msg("/chatter", STRING, 1, zstandard.compress(message.payload))
+        path = write_mcap(tmp_path / "a.mcap", [packed])
+        reader = McapReader()
+        (record,) = read(reader, path)
+        assert record.payload == message.payload
+        assert getattr(reader.decode(record), "data", "") == "hello " * 50
+
+    def test_a_compressed_message_that_is_damaged_is_undecodable(self, tmp_path: Path) -> None:
+        packed = zstandard.compress(text(1, "hello " * 50).payload)[:-3]
+        path = write_mcap(tmp_path / "a.mcap", [Msg("/chatter", STRING, 1, packed)])
+        reader = McapReader()
+        (record,) = read(reader, path)
+        with pytest.raises(UndecodableError, match="compressed payload is damaged"):
+            reader.decode(record)
+
+    def test_times_that_no_clock_shows_are_left_out_and_told(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            channel = writer.register_channel("/t", "json", 0)
+            for time in (5, 2**63 + 1, 2**64 - 1):
+                writer.add_message(channel, time, b"{}", time)
+
+        for number, chunked in enumerate((True, False)):
+            path = raw_mcap(tmp_path / f"{number}.mcap", fill, use_chunking=chunked)
+            reader = McapReader()
+            summary = reader.summarize(path)
+            assert (summary.count, summary.start, summary.end) == (1, 5, 5)
+            assert "2 messages bear no possible log time" in summary.notes
+            assert times(read(reader, path, "/t")) == [5]
+
+    def test_messages_without_a_channel_are_left_out_and_told(self, tmp_path: Path) -> None:
+        def fill(writer: Writer) -> None:
+            channel = writer.register_channel("/t", "json", 0)
+            writer.add_message(channel, 1, b"{}", 1)
+            writer.add_message(99, 2, b"{}", 2)
+
+        path = raw_mcap(tmp_path / "a.mcap", fill)
+        summary = McapReader().summarize(path)
+        assert summary.count == 1
+        assert "1 messages belong to no declared channel and were left out" in summary.notes
+
+
+class TestBounds:
+    def test_a_chunk_larger_than_allowed_is_refused_by_its_true_size(self, tmp_path: Path) -> None:
+        big = [text(time, "0" * 100_000) for time in range(30)]
+        for number, compression in enumerate(CompressionType):
+            layout = McapLayout(chunk_size=8 << 20, compression=compression)
+            path = write_mcap(tmp_path / f"{number}.mcap", big, layout)
+            reader = McapReader(max_chunk_mb=1)
+            assert reader.summarize(path).count == 30
+            with pytest.raises(BagError, match="larger than the 1 MiB allowed"):
+                read(reader, path)
+
+    def test_a_stated_size_is_not_allocated(self, tmp_path: Path) -> None:
+        packed = bytearray(zstandard.compress(b"\0" * 10))
+        # A frame header that states 2^56 bytes (RFC 8878, 3.1.1.1): 8 bytes of content size.
+        bomb = b"\x28\xb5\x2f\xfd\xe0" + (1 << 56).to_bytes(8, "little") + packed[6:]
+        assert zstandard.frame_content_size(bomb) == 1 << 56
+        for name, data in (("zstd", bomb), ("lz4", lz4.frame.compress(b"x")[:-1]), ("", b"x")):
+            path = tmp_path / f"{name or 'none'}.mcap"
+            path.write_bytes(one_chunk(name, bytes(data)))
+            reader = McapReader()
+            summary = reader.summarize(path)
+            assert summary.empty
+            assert any("damaged" in note for note in summary.notes)
+
+    def test_folders_of_definitions_that_are_wrong_stop_the_start(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match=r"nowhere is not a folder"):
+            McapReader([tmp_path / "nowhere"])

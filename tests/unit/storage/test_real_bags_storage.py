@@ -1,0 +1,379 @@
+"""Public robots' bags and recorded sessions, read by the storage room alone.
+
+`expected.json` was made with other tools over the same files; `truth.json` says what was published.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import Closing
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.shared_bags import BAGS, REAL, RECORDED, needs_real, needs_recorded
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.core.model import BagSummary, TopicSummary
+    from ros2_memory.storage.base import BagReader, Record
+
+EVERYTHING = TimeWindow.everything()
+NO_BAG = {"Dockerfile.mcap"}
+
+# Why a type may be refused, and which: everything else must decode.
+REFUSED = {
+    "rosbag2_v1_2018_db3": {
+        "test_msgs/msg/StaticArrayPrimitives": "no definition",
+        "test_msgs/msg/Primitives": "no definition",
+    },
+    "rosbag2_service_events_mcap": {
+        "test_msgs/srv/BasicTypes_Event": "a service definition; service events are not decoded"
+    },
+    "novatel_customtypes_nometa_db3": {
+        "novatel_oem7_msgs/msg/INSPVA": "reader.custom_msg_paths",
+        "novatel_oem7_msgs/msg/BESTPOS": "reader.custom_msg_paths",
+        "novatel_oem7_msgs/msg/BESTVEL": "reader.custom_msg_paths",
+        "novatel_oem7_msgs/msg/BESTUTM": "reader.custom_msg_paths",
+        "gps_msgs/msg/GPSFix": "reader.custom_msg_paths",
+    },
+    "rerun_json_protobuf_mcap": {"foxglove.PoseInFrame": "message encoding 'protobuf'"},
+    "tiryoh_small_and_truncated": {"sensor_msgs/msg/PointCloud2": "does not fit the definition"},
+    "mcap_conformance_2022": {"Example": "message encoding 'a'"},
+}
+
+
+@functools.cache
+def expectations() -> dict[str, Any]:
+    path = REAL / "expected.json"
+    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+
+
+@functools.cache
+def rosbag2() -> Rosbag2Reader:
+    return Rosbag2Reader()
+
+
+@functools.cache
+def mcap() -> McapReader:
+    return McapReader()
+
+
+def readers_of(path: Path) -> list[BagReader]:
+    return [reader for reader in (mcap(), rosbag2()) if reader.reads(path)]
+
+
+def files_of(name: str) -> list[Path]:
+    paths = sorted(path for path in (REAL / name).iterdir() if rosbag2().reads(path))
+    return [path for path in paths if path.name not in NO_BAG]
+
+
+def topics_of(summary: BagSummary) -> set[str]:
+    return {topic.topic for topic in summary.topics}
+
+
+def all_records(reader: BagReader, path: Path) -> list[Record]:
+    return list(reader.records(path, topics_of(reader.summarize(path)), EVERYTHING))
+
+
+every_set = pytest.mark.parametrize("name", list(expectations()))
+every_recorded_file = pytest.mark.parametrize(
+    "path",
+    sorted(p for p in RECORDED.rglob("*") if rosbag2().reads(p)) if RECORDED.is_dir() else [],
+    ids=lambda path: str(path.relative_to(BAGS)),
+)
+
+
+@needs_real
+@every_set
+def test_each_file_holds_what_is_expected(name: str) -> None:
+    files = expectations()[name]["expected"].get("files", {})
+    for path in files_of(name):
+        if path.name not in files:
+            continue
+        for reader in readers_of(path):
+            summary = reader.summarize(path)
+            expected = files[path.name]
+            assert (summary.count, summary.start, summary.end) == (
+                expected["count"],
+                expected["start_ns"],
+                expected["end_ns"],
+            ), path
+
+
+@needs_real
+@pytest.mark.parametrize(
+    "name", [name for name, what in expectations().items() if "topics" in what["expected"]]
+)
+def test_each_topic_holds_what_is_expected(name: str) -> None:
+    expected = expectations()[name]["expected"]
+    found: dict[str, list[TopicSummary]] = {}
+    silent: set[str] = set()
+    for path in files_of(name):
+        summary = rosbag2().summarize(path)
+        silent |= set(summary.silent)
+        for topic in summary.topics:
+            found.setdefault(topic.topic, []).append(topic)
+    assert {topic: _joined(parts) for topic, parts in found.items()} == {
+        topic: (_full_type(what["type"]), what["count"], what["first_ns"], what["last_ns"])
+        for topic, what in expected["topics"].items()
+    }
+    declared = expected["declared_topics"]
+    # Of the bag of 2018 its makers could not tell which topics it declares.
+    if declared is not None:
+        assert silent - set(found) == set(expected["empty_topics"])
+        assert len(silent | set(found)) == declared
+
+
+def _full_type(name: str) -> str:
+    return name.replace("/", "/msg/") if name.count("/") == 1 else name
+
+
+def _joined(parts: list[TopicSummary]) -> tuple[str, int, int, int]:
+    (type_name,) = {part.type for part in parts}
+    return (
+        type_name,
+        sum(part.count for part in parts),
+        min(part.first for part in parts),
+        max(part.last for part in parts),
+    )
+
+
+@needs_real
+@every_set
+def test_messages_are_as_many_as_summarised_in_order_and_reversible(name: str) -> None:
+    for path in files_of(name):
+        for reader in readers_of(path):
+            summary = reader.summarize(path)
+            records = all_records(reader, path)
+            assert len(records) == summary.count
+            times = [record.log_time for record in records]
+            assert times == sorted(times)
+            topics = topics_of(summary)
+            backwards = list(reader.records(path, topics, EVERYTHING, newest_first=True))
+            assert backwards == records[::-1]
+            for topic in topics:
+                assert list(reader.log_times(path, topic, EVERYTHING)) == [
+                    record.log_time for record in records if record.channel.topic == topic
+                ]
+
+
+@needs_real
+@every_set
+def test_only_what_may_be_refused_is_refused_and_with_its_reason(name: str) -> None:
+    refused: dict[str, str] = {}
+    decoded: Counter[str] = Counter()
+    for path in files_of(name):
+        reader = readers_of(path)[0]
+        for record in all_records(reader, path):
+            try:
+                reader.decode(record)
+            except UndecodableError as error:
+                refused[record.channel.type] = error.reason
+            else:
+                decoded[record.channel.type] += 1
+    allowed = REFUSED.get(name, {})
+    assert refused.keys() == allowed.keys()
+    for type_name, words in allowed.items():
+        assert words in refused[type_name]
+        assert decoded[type_name] == 0
+
+
+@needs_real
+def test_of_the_bag_without_definitions_the_standard_types_decode() -> None:
+    (path,) = files_of("novatel_customtypes_nometa_db3")
+    reader = rosbag2()
+    good = [r for r in all_records(reader, path) if reader.undecodable(r.channel) is None]
+    assert Counter(record.channel.type for record in good) == {
+        "nav_msgs/msg/Odometry": 11,
+        "sensor_msgs/msg/NavSatFix": 11,
+    }
+
+
+@needs_real
+def test_the_topics_beside_service_events_decode() -> None:
+    (path,) = files_of("rosbag2_service_events_mcap")
+    good = [r for r in all_records(mcap(), path) if mcap().undecodable(r.channel) is None]
+    assert [record.channel.type for record in good] == ["test_msgs/msg/Strings"] * 2
+    assert all(mcap().decode(record) for record in good)
+
+
+@needs_real
+@pytest.mark.parametrize(
+    ("name", "cut"),
+    [
+        (name, cut)
+        for name, what in expectations().items()
+        for cut in what["expected"].get("truncate", [])
+    ],
+    ids=lambda value: value if isinstance(value, str) else str(value["bytes"]),
+)
+def test_a_file_cut_short_gives_what_had_reached_the_disk(
+    name: str, cut: dict[str, Any], tmp_path: Path
+) -> None:
+    (source,) = files_of(name)
+    path = tmp_path / source.name
+    path.write_bytes(source.read_bytes()[: cut["bytes"]])
+    count = cut.get("messages_if_partial_uncompressed_chunk_is_walked")
+    if count is None:
+        count = cut["messages_in_complete_chunks"]
+    for reader in readers_of(path):
+        summary = reader.summarize(path)
+        assert reader.closing(path) is Closing.OPEN
+        assert not summary.complete
+        assert any("the file ends early" in note for note in summary.notes)
+        # Of a chunk that the cut goes through, some may be recovered beyond the whole chunks.
+        assert summary.count >= count
+        records = all_records(reader, path)
+        assert len(records) == summary.count
+        if "range2_ns" in cut:
+            assert summary.count == count
+            assert [summary.start, summary.end] == cut["range2_ns"]
+        original = set(all_records(reader, source))
+        assert original.issuperset(records)
+
+
+@needs_real
+def test_every_legal_layout_of_the_summary_section_is_read() -> None:
+    per_file = expectations()["mcap_conformance_2022"]["expected"]["per_file"]
+    paths = files_of("mcap_conformance_2022")
+    assert {path.name for path in paths} == set(per_file)
+    for path in paths:
+        expected = per_file[path.name]
+        summary = mcap().summarize(path)
+        assert summary.count == expected["messages"], path
+        assert sorted(topics_of(summary)) == expected["topics"]
+        assert summary.complete
+        assert summary.notes == ()
+        assert mcap().closing(path) is Closing.CLOSED
+        if expected["log_ns"] is not None:
+            assert [summary.start, summary.end] == expected["log_ns"]
+
+
+@needs_real
+def test_a_text_file_with_a_bags_name_is_refused_by_name_and_reason() -> None:
+    path = REAL / "tiryoh_small_and_truncated" / "Dockerfile.mcap"
+    for reader in readers_of(path):
+        assert reader.closing(path) is Closing.CLOSED
+        with pytest.raises(BagError, match=r"Dockerfile\.mcap: not an MCAP file"):
+            reader.summarize(path)
+
+
+@needs_real
+def test_statistics_that_are_wrong_are_told_and_not_believed() -> None:
+    (path,) = files_of("rosbag2_time0_mcap")
+    summary = mcap().summarize(path)
+    assert summary.start == 0
+    assert [note for note in summary.notes if "its own statistics are wrong" in note]
+
+
+@needs_real
+def test_the_truncated_file_holds_its_whole_chunk() -> None:
+    path = REAL / "tiryoh_small_and_truncated" / "test_sample_truncated.mcap"
+    whole = path.with_name("test_sample.mcap")
+    assert all_records(mcap(), path) == all_records(mcap(), whole)
+    summary = mcap().summarize(path)
+    assert not summary.complete
+    assert summary.notes == ("the file ends early: the last 58 bytes could not be read",)
+
+
+SESSIONS = ("session_mcap", "session_sqlite3", "session_zstd", "session_zstd_file")
+
+
+@needs_recorded
+@pytest.mark.parametrize("session", SESSIONS)
+def test_a_session_holds_what_was_published(session: str) -> None:
+    truth = json.loads((RECORDED / f"{session}.truth.json").read_text(encoding="utf-8"))
+    counts: Counter[str] = Counter()
+    latched: set[str] = set()
+    for path in sorted((RECORDED / session).iterdir()):
+        if rosbag2().reads(path):
+            summary = rosbag2().summarize(path)
+            assert summary.complete
+            assert rosbag2().closing(path) is Closing.CLOSED
+            counts.update({topic.topic: topic.count for topic in summary.topics})
+            latched |= {topic.topic for topic in summary.topics if topic.latched}
+    published = truth["published"]
+    assert latched == {"/tf_static"}
+    assert counts.keys() == published.keys()
+    # Only the first recorder outlived its publisher.
+    late = 0 if session == "session_mcap" else 20
+    for topic, count in published.items():
+        assert count - late <= counts[topic] <= count
+
+
+@needs_recorded
+def test_a_killed_session_is_read_as_far_as_it_reached_the_disk() -> None:
+    folder = RECORDED / "session_killed_chunk64k"
+    cut = folder / "session_killed_chunk64k_2.mcap"
+    summary = mcap().summarize(cut)
+    assert mcap().closing(cut) is Closing.OPEN
+    assert not summary.complete
+    assert summary.count == 251
+    assert summary.notes == ("the file ends early: the last 54 bytes could not be read",)
+    t0 = json.loads((RECORDED / "session_killed_chunk64k.truth.json").read_text())["t0_ns"]
+    assert 24.0 < (summary.end - t0) / 1e9 < 24.5
+    empty = RECORDED / "session_killed" / "session_killed_2.mcap"
+    assert mcap().closing(empty) is Closing.OPEN
+    with pytest.raises(BagError, match="empty file: nothing had reached the disk"):
+        mcap().summarize(empty)
+
+
+@needs_recorded
+@every_recorded_file
+def test_every_recorded_file_is_read_or_says_why_not(path: Path) -> None:
+    for reader in readers_of(path):
+        if not path.stat().st_size:
+            with pytest.raises(BagError):
+                reader.summarize(path)
+            continue
+        summary = reader.summarize(path)
+        assert summary.complete == (reader.closing(path) is Closing.CLOSED)
+        records = all_records(reader, path)
+        assert len(records) == summary.count
+        for record in records:
+            if reader.undecodable(record.channel) is None:
+                reader.decode(record)
+            else:
+                assert path.parent.name == "nodef"
+                assert record.channel.topic == "/desc"
+
+
+@needs_recorded
+def test_a_definition_that_the_recorder_lacked_comes_from_the_folders() -> None:
+    path = RECORDED / "extra" / "nodef" / "nodef_0.mcap"
+    reader = McapReader([BAGS.parent / "interfaces"])
+    records = [r for r in all_records(reader, path) if r.channel.topic == "/desc"]
+    assert len(records) == 45
+    assert all(getattr(reader.decode(record), "data", "") for record in records)
+    without = mcap().undecodable(records[0].channel)
+    assert without is not None
+    assert "reader.custom_msg_paths" in without
+
+
+@needs_recorded
+def test_latched_transforms_lie_where_they_were_received() -> None:
+    held = {
+        path.name: [t.count for t in mcap().summarize(path).topics if t.topic == "/tf_static"]
+        for path in sorted((RECORDED / "extra" / "tfs").glob("*.mcap"))
+    }
+    assert {name: counts for name, counts in held.items() if counts} == {
+        "tfs_0.mcap": [2],
+        "tfs_3.mcap": [1],
+    }
+
+
+@needs_recorded
+def test_a_split_cut_short_by_a_full_disk_is_read_as_far_as_it_goes() -> None:
+    path = RECORDED / "extra" / "full_truncated" / "fullsmall_4.mcap"
+    summary = mcap().summarize(path)
+    assert not summary.complete
+    assert summary.count == 94
+    assert len(all_records(mcap(), path)) == 94

@@ -1,0 +1,457 @@
+from __future__ import annotations
+
+import gc
+import os
+import sqlite3
+import tempfile
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import zstandard
+
+from ros2_memory.core.errors import (
+    BagContradictionError,
+    BagError,
+    UndecodableError,
+)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import Closing
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.bags import McapLayout, Msg, boolean, detections, odom, text, write_db3, write_mcap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.storage.base import Record
+
+EVERYTHING = TimeWindow.everything()
+STRING = "std_msgs/msg/String"
+
+
+@pytest.fixture
+def scratch_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where temporary files of this test lie."""
+    root = tmp_path / "temporary"
+    root.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(root))
+    return root
+
+
+def chatter(count: int, size: int = 10) -> list[Msg]:
+    return [text(time, f"{time:0{size}d}") for time in range(count)]
+
+
+def read(reader: Rosbag2Reader, path: Path, *topics: str) -> list[Record]:
+    return list(reader.records(path, topics or ("/chatter",), EVERYTHING))
+
+
+def times(records: list[Record]) -> list[int]:
+    return [record.log_time for record in records]
+
+
+def change(path: Path, *statements: str) -> Path:
+    with closing(sqlite3.connect(path)) as base:
+        for statement in statements:
+            base.execute(statement)
+        base.commit()
+    return path
+
+
+def compressed(path: Path, *, frames: int = 1) -> Path:
+    """Replaces a bag by its compressed file."""
+    data = path.read_bytes()
+    step = -(-len(data) // frames)
+    packed = [zstandard.compress(data[at : at + step]) for at in range(0, len(data), step)]
+    target = path.with_name(path.name + ".zstd")
+    target.write_bytes(b"".join(packed))
+    path.unlink()
+    return target
+
+
+def size_of(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+class TestSqliteSchemas:
+    def test_the_bag_of_2018_has_no_format_column_and_short_type_names(
+        self, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "old.db3"
+        change(
+            path,
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY,name TEXT NOT NULL,type TEXT NOT NULL)",
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY,topic_id INTEGER NOT NULL,"
+            "timestamp INTEGER NOT NULL, data BLOB NOT NULL)",
+            "INSERT INTO topics VALUES (1, '/chatter', 'std_msgs/String')",
+        )
+        with closing(sqlite3.connect(path)) as base:
+            base.execute("INSERT INTO messages VALUES (1, 1, 7, ?)", (text(7, "hello").payload,))
+            base.commit()
+        reader = Rosbag2Reader()
+        (topic,) = reader.summarize(path).topics
+        assert (topic.type, topic.encoding, topic.count, topic.latched) == (STRING, "cdr", 1, False)
+        (record,) = read(reader, path)
+        assert getattr(reader.decode(record), "data", "") == "hello"
+
+    def test_without_definitions_standard_types_decode_and_others_say_what_is_missing(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_db3(
+            tmp_path / "a.db3", [odom(1, 2.0, 3.0), detections(2, ["cup"])], definitions=False
+        )
+        reader = Rosbag2Reader()
+        first, second = read(reader, path, "/odom", "/vision/scene/scene_objects")
+        assert reader.undecodable(first.channel) is None
+        assert reader.decode(first)
+        with pytest.raises(UndecodableError, match=r"reader\.custom_msg_paths"):
+            reader.decode(second)
+
+    def test_a_missing_index_by_time_changes_no_answer(self, tmp_path: Path) -> None:
+        messages = [text(time, "x") for time in (3, 1, 2, 1)]
+        path = write_db3(tmp_path / "a.db3", messages)
+        reader = Rosbag2Reader()
+        with_index = read(reader, path)
+        change(path, "DROP INDEX timestamp_idx")
+        assert read(reader, path) == with_index
+        assert times(with_index) == [1, 1, 2, 3]
+
+    @pytest.mark.parametrize("asked_first", ["newest", "records", "log_times", "summarize"])
+    def test_an_index_that_is_declared_descending_and_stored_ascending_is_not_believed(
+        self, tmp_path: Path, asked_first: str
+    ) -> None:
+        path = write_db3(tmp_path / "a.db3", [text(at, "x") for at in range(1000, 1400)])
+        change(
+            path,
+            "PRAGMA writable_schema = 1",
+            "UPDATE sqlite_master SET sql = replace(sql, 'ASC', 'DESC') WHERE type = 'index'",
+        )
+        upto = TimeWindow(0, 1200)
+        reader = Rosbag2Reader()
+        if asked_first == "newest":
+            with pytest.raises(BagError, match="index by time is damaged"):
+                reader.newest(path, "/chatter", upto)
+        elif asked_first == "log_times":
+            assert list(reader.log_times(path, "/chatter", upto)) == [*range(1000, 1200)]
+        elif asked_first == "records":
+            with pytest.raises(BagContradictionError):
+                read(reader, path)
+        assert any("index by time is damaged" in note for note in reader.summarize(path).notes)
+        for newest_first in (False, True):
+            records = reader.records(path, ["/chatter"], upto, newest_first=newest_first)
+            with pytest.raises(BagContradictionError):
+                next(records)
+            found = [each.log_time for each in records]
+            assert found == sorted(range(1000, 1200), reverse=newest_first)
+        assert list(reader.log_times(path, "/chatter", upto)) == [*range(1000, 1200)]
+
+    def test_a_time_that_no_clock_shows_is_left_out_and_told(self, tmp_path: Path) -> None:
+        path = write_db3(tmp_path / "a.db3", chatter(3))
+        change(path, "UPDATE messages SET timestamp = 9223372036854775807 WHERE id = 2")
+        summary = Rosbag2Reader().summarize(path)
+        assert summary.count == len(read(Rosbag2Reader(), path)) == 2
+        assert summary.notes == ("1 messages bear no possible log time",)
+
+    def test_a_message_that_the_index_has_elsewhere_is_found_where_it_is(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_db3(tmp_path / "a.db3", [text(at, "x") for at in range(1_000_000, 1_000_400)])
+        data = path.read_bytes()
+        # A record of the index: its header, the time, and the row.
+        at = data.rindex((1_000_150).to_bytes(3, "big") + (151).to_bytes(2, "big"))
+        path.write_bytes(data[:at] + (900_000).to_bytes(3, "big") + data[at + 3 :])
+        window = TimeWindow(0, 1_000_151)
+        with pytest.raises(BagError):
+            Rosbag2Reader().newest(path, "/chatter", window)
+        reader = Rosbag2Reader()
+        records = reader.records(path, ["/chatter"], window, newest_first=True)
+        with pytest.raises(BagContradictionError):
+            next(records)
+        assert next(records).log_time == 1_000_150
+
+    @pytest.mark.parametrize(
+        "statement",
+        [
+            "UPDATE messages SET timestamp = 'noon' WHERE id = 2",
+            "UPDATE messages SET timestamp = 1.5 WHERE id = 2",
+            "UPDATE messages SET data = 'text' WHERE id = 2",
+            "UPDATE messages SET data = 5 WHERE id = 2",
+        ],
+    )
+    def test_columns_of_the_wrong_type_are_an_error_about_the_file(
+        self, statement: str, tmp_path: Path
+    ) -> None:
+        path = change(write_db3(tmp_path / "a.db3", chatter(3)), statement)
+        with pytest.raises(BagError, match=r"a\.db3: damaged: messages without an integer"):
+            Rosbag2Reader().summarize(path)
+
+    def test_a_payload_that_is_no_blob_ends_the_iteration(self, tmp_path: Path) -> None:
+        path = change(
+            write_db3(tmp_path / "a.db3", chatter(3)), "UPDATE messages SET data = 5 WHERE id = 2"
+        )
+        records = Rosbag2Reader().records(path, ["/chatter"], EVERYTHING)
+        assert next(records).log_time == 0
+        with pytest.raises(BagError, match="without a binary payload"):
+            next(records)
+
+    @pytest.mark.parametrize("table", ["messages", "topics"])
+    def test_a_database_of_something_else_is_refused(self, table: str, tmp_path: Path) -> None:
+        path = change(write_db3(tmp_path / "a.db3", chatter(3)), f"DROP TABLE {table}")
+        with pytest.raises(BagError, match="not a rosbag2 file"):
+            Rosbag2Reader().summarize(path)
+
+    def test_messages_of_no_topic_are_left_out_and_told(self, tmp_path: Path) -> None:
+        path = change(
+            write_db3(tmp_path / "a.db3", chatter(3)),
+            "UPDATE messages SET topic_id = 99 WHERE id = 2",
+        )
+        reader = Rosbag2Reader()
+        summary = reader.summarize(path)
+        assert summary.count == len(read(reader, path)) == 2
+        assert summary.notes == ("1 messages belong to no topic and were left out",)
+
+    def test_a_message_that_was_compressed_by_itself_comes_plain(self, tmp_path: Path) -> None:
+        plain = text(1, "hello " * 50)
+        packed = Msg("/chatter", STRING, 1, zstandard.compress(plain.payload))
+        (record,) = read(Rosbag2Reader(), write_db3(tmp_path / "a.db3", [packed]))
+        assert record.payload == plain.payload
+
+    def test_times_before_the_epoch_keep_their_order(self, tmp_path: Path) -> None:
+        path = write_db3(tmp_path / "a.db3", [text(time, "x") for time in (5, -7, 0)])
+        reader = Rosbag2Reader()
+        assert reader.summarize(path).start == -7
+        assert times(read(reader, path)) == [-7, 0, 5]
+
+    def test_a_name_with_odd_characters_is_found(self, tmp_path: Path) -> None:
+        path = write_db3(tmp_path / "50% off?" / "a#b.db3", chatter(2))
+        assert Rosbag2Reader().summarize(path).count == 2
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[tuple[Path, sqlite3.Connection]]:
+    """A bag whose recorder writes ahead, as with rosbag2's `resilient` preset, and goes on."""
+    path = write_db3(tmp_path / "bags" / "live.db3", chatter(2))
+    with closing(sqlite3.connect(path)) as base:
+        base.execute("PRAGMA journal_mode=WAL").fetchall()
+        base.execute("PRAGMA wal_autocheckpoint=0").fetchall()
+        payload = text(5, "in the WAL").payload
+        base.execute("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,5,?)", (payload,))
+        base.commit()
+        yield path, base
+
+
+class TestJournals:
+    def test_a_database_with_a_wal_is_open_until_that_is_gone(
+        self, live: tuple[Path, sqlite3.Connection]
+    ) -> None:
+        path, base = live
+        reader = Rosbag2Reader()
+        assert reader.closing(path) is Closing.OPEN
+        base.close()
+        assert reader.closing(path) is Closing.CLOSED
+
+    @pytest.mark.parametrize("suffix", ["-wal", "-journal"])
+    def test_an_empty_journal_is_none(self, suffix: str, tmp_path: Path) -> None:
+        path = write_db3(tmp_path / "a.db3", chatter(2))
+        journal = path.with_name(path.name + suffix)
+        journal.touch()
+        assert Rosbag2Reader().closing(path) is Closing.CLOSED
+        journal.write_bytes(b"\0")
+        assert Rosbag2Reader().closing(path) is Closing.OPEN
+
+    def test_what_stands_in_the_wal_is_read_and_the_folder_left_as_it_was(
+        self, live: tuple[Path, sqlite3.Connection], tmp_path: Path
+    ) -> None:
+        left = tmp_path / "left"
+        left.mkdir()
+        for file in live[0].parent.iterdir():
+            if not file.name.endswith("-shm"):
+                (left / file.name).write_bytes(file.read_bytes())
+        path = left / live[0].name
+        before = {file.name: file.read_bytes() for file in left.iterdir()}
+        assert len(before) == 2
+        reader = Rosbag2Reader()
+        summary = reader.summarize(path)
+        assert times(read(reader, path)) == [0, 1, 5]
+        assert (summary.count, summary.complete) == (3, False)
+        assert summary.notes[0].startswith("its writer did not finish it")
+        assert list(reader.log_times(path, "/chatter", EVERYTHING)) == [0, 1, 5]
+        assert {file.name: file.read_bytes() for file in left.iterdir()} == before
+
+    def test_a_wal_that_grows_is_read_anew(self, live: tuple[Path, sqlite3.Connection]) -> None:
+        path, base = live
+        reader = Rosbag2Reader()
+        assert times(read(reader, path)) == [0, 1, 5]
+        base.execute("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,9,x'00')")
+        base.commit()
+        assert times(read(reader, path)) == [0, 1, 5, 9]
+
+    def test_a_transaction_that_was_cut_off_is_rolled_back(self, tmp_path: Path) -> None:
+        path = write_db3(tmp_path / "live" / "a.db3", chatter(2))
+        with closing(sqlite3.connect(path, isolation_level=None)) as base:
+            base.execute("PRAGMA cache_size=1").fetchall()
+            base.execute("BEGIN")
+            rows = [(time, b"\0" * 4000) for time in range(100, 300)]
+            base.executemany("INSERT INTO messages(topic_id,timestamp,data) VALUES (1,?,?)", rows)
+            killed = tmp_path / "killed"
+            killed.mkdir()
+            for file in path.parent.iterdir():
+                (killed / file.name).write_bytes(file.read_bytes())
+        assert (killed / "a.db3-journal").stat().st_size
+        reader = Rosbag2Reader()
+        assert reader.closing(killed / "a.db3") is Closing.OPEN
+        assert times(read(reader, killed / "a.db3")) == [0, 1]
+
+
+class TestCompressedFiles:
+    def test_a_file_of_several_frames_is_read_whole(self, tmp_path: Path) -> None:
+        path = compressed(write_mcap(tmp_path / "a.mcap", chatter(50)), frames=3)
+        skippable = b"\x50\x2a\x4d\x18\x04\x00\x00\x00note"
+        path.write_bytes(skippable + path.read_bytes())
+        reader = Rosbag2Reader()
+        assert reader.closing(path) is Closing.CLOSED
+        assert times(read(reader, path)) == list(range(50))
+        assert reader.summarize(path).complete
+
+    def test_it_is_closed_only_at_the_very_end_of_its_frames(self, tmp_path: Path) -> None:
+        whole = compressed(write_mcap(tmp_path / "a.mcap", chatter(3)), frames=2).read_bytes()
+        path = tmp_path / "cut.mcap.zstd"
+        reader = Rosbag2Reader()
+        closed = []
+        for size in range(len(whole) + 1):
+            path.write_bytes(whole[:size])
+            if reader.closing(path) is Closing.CLOSED:
+                closed.append(size)
+        # A cut between two whole frames cannot be told from a file that ends there.
+        assert closed == [_block_starts(whole)[-1], len(whole)]
+
+    def test_of_a_file_that_is_cut_the_first_messages_are_read(self, tmp_path: Path) -> None:
+        messages = [Msg("/noise", STRING, time, os.urandom(4000)) for time in range(300)]
+        layout = McapLayout(chunk_size=50_000)
+        path = compressed(write_mcap(tmp_path / "a.mcap", messages, layout))
+        path.write_bytes(path.read_bytes()[:600_000])
+        reader = Rosbag2Reader()
+        summary = reader.summarize(path)
+        assert reader.closing(path) is Closing.OPEN
+        assert 50 < summary.count < 200
+        assert not summary.complete
+        assert summary.notes[0] == "its compressed file ends early"
+        records = read(reader, path, "/noise")
+        assert [r.payload for r in records] == [m.payload for m in messages[: summary.count]]
+
+    def test_a_damaged_file_is_read_up_to_the_damage(self, tmp_path: Path) -> None:
+        messages = [Msg("/noise", STRING, time, os.urandom(4000)) for time in range(300)]
+        layout = McapLayout(chunk_size=50_000)
+        path = compressed(write_mcap(tmp_path / "a.mcap", messages, layout))
+        data = bytearray(path.read_bytes())
+        # The type of a block that is far inside: reserved.
+        at = _block_starts(bytes(data))[4]
+        data[at] |= 6
+        path.write_bytes(data)
+        summary = Rosbag2Reader().summarize(path)
+        assert 50 < summary.count < 200
+        assert not summary.complete
+        assert "is damaged" in summary.notes[0]
+
+    def test_what_cannot_be_decompressed_at_all_is_refused_by_its_own_name(
+        self, tmp_path: Path
+    ) -> None:
+        path = compressed(write_mcap(tmp_path / "a.mcap", chatter(3)))
+        path.write_bytes(path.read_bytes()[:20])
+        with pytest.raises(BagError, match=r"a\.mcap\.zstd: nothing of it can be decompressed"):
+            Rosbag2Reader().summarize(path)
+
+    def test_unpacked_files_stay_within_their_bound(
+        self, tmp_path: Path, scratch_root: Path
+    ) -> None:
+        paths = [
+            compressed(write_mcap(tmp_path / f"{n}.mcap", [text(1, "0" * 400_000)]))
+            for n in range(5)
+        ]
+        reader = Rosbag2Reader(unpack_max_mb=1)
+        for _ in range(2):
+            for path in paths:
+                assert len(read(reader, path)) == 1
+                assert 400_000 < size_of(scratch_root) <= 1 << 20
+
+    def test_a_file_that_is_larger_unpacked_than_allowed_is_refused(
+        self, tmp_path: Path, scratch_root: Path
+    ) -> None:
+        path = tmp_path / "bomb.mcap.zstd"
+        path.write_bytes(zstandard.compress(b"\x89MCAP0\r\n" + bytes(64 << 20)))
+        assert path.stat().st_size < 10_000
+        reader = Rosbag2Reader(unpack_max_mb=2)
+        with pytest.raises(BagError, match=r"more than the 2 MiB allowed .* raise unpack_max_mb"):
+            reader.summarize(path)
+        assert size_of(scratch_root) == 0
+        small = compressed(write_mcap(tmp_path / "a.mcap", chatter(3)))
+        assert len(read(reader, small)) == 3
+
+    def test_a_file_in_use_is_not_deleted_to_make_room(
+        self, tmp_path: Path, scratch_root: Path
+    ) -> None:
+        one, other = (
+            compressed(write_mcap(tmp_path / f"{n}.mcap", [text(1, "0" * 700_000)]))
+            for n in range(2)
+        )
+        reader = Rosbag2Reader(unpack_max_mb=1)
+        held = reader.records(one, ["/chatter"], EVERYTHING)
+        next(held)
+        with pytest.raises(BagError, match="raise unpack_max_mb"):
+            reader.summarize(other)
+        assert list(held) == []
+        assert reader.summarize(other).count == 1
+
+    def test_temporary_files_go_with_the_reader(self, tmp_path: Path, scratch_root: Path) -> None:
+        path = compressed(write_db3(tmp_path / "a.db3", chatter(3)))
+        reader = Rosbag2Reader()
+        assert len(read(reader, path)) == 3
+        assert list(scratch_root.iterdir())
+        del reader
+        gc.collect()
+        assert list(scratch_root.iterdir()) == []
+
+    def test_a_temporary_file_that_somebody_deleted_is_made_again(
+        self, tmp_path: Path, scratch_root: Path
+    ) -> None:
+        path = compressed(write_mcap(tmp_path / "a.mcap", chatter(3)))
+        reader = Rosbag2Reader()
+        assert len(read(reader, path)) == 3
+        for file in scratch_root.rglob("*.mcap"):
+            file.unlink()
+        assert len(read(reader, path)) == 3
+
+
+def _block_starts(data: bytes) -> list[int]:
+    """Where the blocks of the first frame begin, and where it ends (RFC 8878, 3.1.1.2)."""
+    at, starts, last = zstandard.frame_header_size(data), [], False
+    while not last:
+        header = int.from_bytes(data[at : at + 3], "little")
+        starts.append(at)
+        last = bool(header & 1)
+        at += 3 + (1 if header >> 1 & 3 == 1 else header >> 3)
+    return [*starts, at]
+
+
+class TestKinds:
+    def test_one_reader_tells_all_four_kinds(self, tmp_path: Path) -> None:
+        messages = [text(1, "x"), boolean(2, True)]
+        paths = [
+            write_mcap(tmp_path / "a.mcap", messages),
+            write_db3(tmp_path / "a.db3", messages),
+            compressed(write_mcap(tmp_path / "b.mcap", messages)),
+            compressed(write_db3(tmp_path / "b.db3", messages)),
+        ]
+        reader = Rosbag2Reader()
+        assert [reader.reads(path) for path in paths] == [True] * 4
+        assert {reader.summarize(path).topics for path in paths} == {
+            reader.summarize(paths[0]).topics
+        }
+
+    def test_a_kind_that_is_not_read_is_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.bag"
+        path.write_bytes(b"#ROSBAG V2.0\n")
+        assert not Rosbag2Reader().reads(path)
+        with pytest.raises(BagError, match="not of a kind that is read"):
+            Rosbag2Reader().summarize(path)

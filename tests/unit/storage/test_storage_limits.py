@@ -1,0 +1,362 @@
+"""What a small file may make its reader do: hold no more, and work no longer, than it is worth."""
+
+from __future__ import annotations
+
+import random
+import sqlite3
+import struct
+import tracemalloc
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import zstandard
+
+from ros2_memory.analysis.sights import Sights
+from ros2_memory.catalogue.digest import Digester
+from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.context import Call
+from ros2_memory.history.time_arguments import Span
+from ros2_memory.messages.to_json import MAX_EXACT_NUMBERS
+from ros2_memory.queries import topic_range
+from ros2_memory.storage.base import Channel, Record, Schema
+from ros2_memory.storage.decoding import Decoding
+from ros2_memory.storage.errors import UnreadableError
+from ros2_memory.storage.limits import (
+    MAX_CHANNELS,
+    MAX_CHUNK_MESSAGES,
+    MAX_CHUNKS,
+    most_unpacked,
+)
+from ros2_memory.storage.mcap.chunk import walk
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.storage.sqlite_guard import guard
+from ros2_memory.storage.zstd import unpacked_zstd
+from tests.bags import Msg, make, text, write_db3, write_mcap
+from tests.fuzz.bombs import rle_frame
+from tests.fuzz.records import (
+    MAGIC,
+    Piece,
+    channel,
+    chunk_of,
+    header,
+    message,
+    schema,
+    without_summary,
+)
+from tests.memories import extractor, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MB = 1 << 20
+EVERYTHING = TimeWindow.everything()
+STRINGS = [schema(1, "std_msgs/msg/String", "ros2msg", b"string data\n"), channel(1, 1, "/chatter")]
+
+
+def said(name: str = "x", time: int = 5) -> Piece:
+    return message(1, time, text(0, name).payload)
+
+
+def bytes_of(records: list[Piece]) -> bytes:
+    return b"".join(each.data for each in records)
+
+
+def bomb(size: int) -> Piece:
+    """A chunk of some bytes that unpacks to `size` bytes, which make no record."""
+    return chunk_of(b"", "zstd", packed=rle_frame(size), size=10, crc=0)
+
+
+def bag(folder: Path, *records: Piece, name: str = "run/run_0.mcap") -> Path:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(without_summary([header(), *records]))
+    return path
+
+
+class TestChunks:
+    def test_a_chunk_larger_than_allowed_is_left_out_and_named(self, tmp_path: Path) -> None:
+        whole = chunk_of(bytes_of([*STRINGS, said()]))
+        summary = McapReader(max_chunk_mb=1).summarize(bag(tmp_path, whole, bomb(2 * MB)))
+        assert summary.count == 1
+        assert "larger than the 1 MiB allowed" in summary.notes[0]
+        assert "reader.max_chunk_mb" in summary.notes[0]
+
+    def test_a_frame_that_states_more_than_its_blocks_can_hold_is_refused(self) -> None:
+        with pytest.raises(UnreadableError, match="states more than it can hold"):
+            unpacked_zstd(rle_frame(10, stated=50 * MB), 64 * MB)
+
+    @pytest.mark.parametrize("size", [0, 1, 131_072, 131_073, MB])
+    def test_a_frame_that_holds_what_it_states_is_read_however_small_it_is(self, size: int) -> None:
+        assert unpacked_zstd(rle_frame(size, stated=size), 64 * MB) == bytes(size)
+        assert unpacked_zstd(zstandard.compress(bytes(size)), 64 * MB) == bytes(size)
+
+    def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
+        self, tmp_path: Path
+    ) -> None:
+        whole = chunk_of(bytes_of([*STRINGS, said()]))
+        many = [bomb(30 * MB)] * 5
+        summary = McapReader().summarize(bag(tmp_path, whole, *many, whole))
+        assert summary.count == 1
+        assert "4 damaged records" not in summary.notes[0]
+        assert "damaged records were left out" in summary.notes[0]
+
+    def test_a_chunk_of_more_messages_than_are_kept_in_mind_is_refused(self) -> None:
+        one = message(1, 5, b"").data
+        assert walk(one * 10).messages == 10
+        with pytest.raises(UnreadableError, match=f"more than {MAX_CHUNK_MESSAGES} messages"):
+            walk(one * (MAX_CHUNK_MESSAGES + 40_000))
+
+    def test_a_chunk_that_declares_more_than_any_writer_does_is_refused(self) -> None:
+        assert len(walk(STRINGS[0].data * 20_000).declarations) == 20_000
+        with pytest.raises(UnreadableError, match="declares more than 20000 things"):
+            walk(STRINGS[0].data * 20_001)
+
+    def test_a_message_outside_of_chunks_that_is_larger_than_allowed_is_left_out(
+        self, tmp_path: Path
+    ) -> None:
+        path = bag(tmp_path, *STRINGS, said("x" * 2 * MB), said("y", 9))
+        reader = McapReader(max_chunk_mb=1)
+        summary = reader.summarize(path)
+        assert (summary.count, summary.start) == (1, 9)
+        assert "a message is larger" in summary.notes[0]
+        assert [each.log_time for each in reader.records(path, ["/chatter"], EVERYTHING)] == [9]
+
+    def test_repairing_a_bag_of_bombs_counts_them_as_lost(self, tmp_path: Path) -> None:
+        whole = chunk_of(bytes_of([*STRINGS, said()]))
+        path = bag(tmp_path, whole, *[bomb(30 * MB)] * 6)
+        path.write_bytes(path.read_bytes()[: -len(MAGIC)])
+        rewritten = McapWriter().rewrite(path, tmp_path / "repaired.mcap")
+        assert rewritten.messages == 1
+        assert rewritten.lost_bytes
+
+    def test_large_chunks_that_overlap_in_time_are_not_all_held_at_once(
+        self, tmp_path: Path
+    ) -> None:
+        count, size = 8, 9 * MB
+        noise = random.Random(1).randbytes(size)
+        chunks = [
+            chunk_of(
+                bytes_of([*STRINGS, message(1, time, noise), said("b", 100 + time)]),
+                "zstd",
+                span=(time, 100 + time),
+            )
+            for time in range(count)
+        ]
+        path = bag(tmp_path, *chunks)
+        reader = McapReader(cache_mb=1)
+        reader.summarize(path)
+        tracemalloc.start()
+        try:
+            times = [each.log_time for each in reader.records(path, ["/chatter"], EVERYTHING)]
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert times == [*range(count), *range(100, 100 + count)]
+        assert peak < 5 * size
+
+    def test_a_bag_of_more_topics_than_any_robot_has_is_not_read(self, tmp_path: Path) -> None:
+        many = [channel(n, 1, f"/t{n}") for n in range(1, MAX_CHANNELS + 2)]
+        with pytest.raises(BagError, match="declares more than 5000 topics"):
+            McapReader().summarize(bag(tmp_path, STRINGS[0], *many, said()))
+        assert McapReader().summarize(bag(tmp_path, STRINGS[0], *many[:-1], said())).count == 1
+
+    def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(self, tmp_path: Path) -> None:
+        first, each = chunk_of(bytes_of([*STRINGS, said()])), chunk_of(said().data)
+        summary = McapReader().summarize(bag(tmp_path, first, *[each] * (MAX_CHUNKS + 1)))
+        assert summary.count == MAX_CHUNKS
+        assert "more than 150000 chunks" in summary.notes[0]
+
+
+class TestTies:
+    def test_samples_of_messages_of_one_log_time_are_evenly_spaced_and_read_once(
+        self, tmp_path: Path
+    ) -> None:
+        same = [message(1, 5, text(0, f"{n}").payload) for n in range(1000)]
+        bag(tmp_path, chunk_of(bytes_of([*STRINGS, *same]), span=(5, 5)))
+        memory = memory_of(tmp_path)
+        answer = topic_range(memory, Call(), "/chatter", Span(start_s=0, end_s=1), max_samples=4)
+        assert answer.total == 1000
+        values = [each.value for each in answer.samples]
+        assert values == [{"value": f"{n}"} for n in (0, 333, 666, 999)]
+
+
+class TestMessages:
+    def test_a_compressed_message_larger_than_allowed_cannot_be_decoded_and_the_next_can(
+        self, tmp_path: Path
+    ) -> None:
+        large = message(1, 5, zstandard.compress(text(0, "x" * 2 * MB).payload))
+        path = bag(tmp_path, *STRINGS, large, said("y", 9))
+        reader = McapReader(max_chunk_mb=1)
+        first, second = reader.records(path, ["/chatter"], EVERYTHING)
+        with pytest.raises(UndecodableError, match="damaged or too large"):
+            reader.decode(first)
+        assert getattr(reader.decode(second), "data", None) == "y"
+
+    def test_a_message_of_more_messages_than_there_is_room_for_is_not_decoded(self) -> None:
+        definition = b"std_msgs/Bool[] data\n" + b"=" * 80 + b"\nMSG: std_msgs/Bool\nbool data\n"
+        known = Channel("/t", "cdr", Schema("pkg/msg/Many", "ros2msg", definition))
+
+        def record(count: int) -> Record:
+            return Record(known, 1, 1, b"\0\1\0\0" + struct.pack("<I", count) + bytes(count))
+
+        few = Decoding().decode(record(1000))
+        assert len(getattr(few, "data", ())) == 1000
+        with pytest.raises(UndecodableError, match="more than 200000 texts or messages"):
+            Decoding().decode(record(300_000))
+
+    def test_messages_that_cannot_be_decoded_are_not_kept_with_their_errors(self) -> None:
+        known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
+        reader = McapReader()
+        record = Record(known, 1, 1, b"\0\1\0\0" + bytes([255] * 20))
+        [error] = Sights(reader, extractor()).of([record])
+        assert isinstance(error, UndecodableError)
+        assert error.__traceback__ is None
+        assert error.__cause__ is None
+
+    def test_a_large_array_of_numbers_is_decoded(self) -> None:
+        known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
+        payload = b"\0\1\0\0" + struct.pack("<I", MB) + bytes(MB)
+        assert len(getattr(Decoding().decode(Record(known, 1, 1, payload)), "data", ())) == MB
+
+    def test_json_longer_than_is_read_is_refused(self) -> None:
+        known = Channel("/t", "json", Schema("Thing", "jsonschema", b"{}"))
+        payload = b"[" + b"0," * (2 * MB) + b"0]"
+        with pytest.raises(UndecodableError, match="longer than the 4 MiB"):
+            Decoding().decode(Record(known, 1, 1, payload))
+
+    def test_an_array_of_more_numbers_than_anybody_looks_for_is_told_by_its_length(self) -> None:
+        def exact(count: int) -> object:
+            numbers = np.zeros(count, dtype=np.uint16)
+            layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+            wide = make("std_msgs/msg/UInt16MultiArray", layout=layout, data=numbers)
+            value = extractor().exact(wide, "std_msgs/msg/UInt16MultiArray")
+            assert isinstance(value, dict)
+            return value["data"]
+
+        assert exact(3) == [0, 0, 0]
+        assert exact(MAX_EXACT_NUMBERS + 1) == {"numbers": MAX_EXACT_NUMBERS + 1}
+
+
+class TestWholeFiles:
+    def test_a_file_that_unpacks_to_far_more_than_its_size_is_not_unpacked(
+        self, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "bag.mcap.zstd"
+        start = zstandard.compress(MAGIC + header().data)
+        path.write_bytes(start + rle_frame(most_unpacked(MB)))
+        with pytest.raises(BagError, match="unpacks to more than 100 times its size"):
+            Rosbag2Reader().summarize(path)
+
+    def test_a_file_of_more_frames_or_blocks_than_any_writer_makes_is_named(
+        self, tmp_path: Path
+    ) -> None:
+        path = tmp_path / "bag.mcap.zstd"
+        for data in (rle_frame(1) * 10_001, rle_frame(10)[:6] + b"\x08\0\0x" * 1_000_001):
+            path.write_bytes(data)
+            with pytest.raises(BagError, match="it is made of more than"):
+                Rosbag2Reader().closing(path)
+
+    def test_a_closed_bag_of_which_nothing_could_be_read_is_listed_as_damaged(
+        self, tmp_path: Path
+    ) -> None:
+        path = bag(tmp_path, bomb(300 * MB))
+        snapshot = memory_of(tmp_path).index.snapshot()
+        assert snapshot.empty == 0
+        [aside] = snapshot.damaged
+        assert aside.path == path
+        assert "larger than the 64 MiB allowed" in aside.reason
+
+
+class TestSqlite:
+    def edited(self, folder: Path, *statements: str) -> Path:
+        path = write_db3(folder / "bag.db3", [text(n, "x") for n in range(5)])
+        with closing(sqlite3.connect(path)) as base:
+            for statement in statements:
+                base.executescript(statement)
+            base.commit()
+        return path
+
+    def test_an_endless_view_in_place_of_a_table_is_refused(self, tmp_path: Path) -> None:
+        path = self.edited(
+            tmp_path,
+            "ALTER TABLE messages RENAME TO m",
+            "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1"
+            " FROM n) SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n",
+        )
+        with pytest.raises(BagError, match="its messages is no plain table"):
+            Rosbag2Reader().summarize(path)
+
+    def test_a_computed_column_is_refused(self, tmp_path: Path) -> None:
+        path = self.edited(
+            tmp_path, "ALTER TABLE messages ADD COLUMN more AS (zeroblob(900000000))"
+        )
+        with pytest.raises(BagError, match="its messages is no plain table"):
+            Rosbag2Reader().summarize(path)
+
+    def test_a_table_of_messages_without_their_columns_is_refused(self, tmp_path: Path) -> None:
+        path = self.edited(tmp_path, "ALTER TABLE messages RENAME COLUMN data TO other")
+        with pytest.raises(BagError, match="lacks the tables topics and messages"):
+            Rosbag2Reader().summarize(path)
+
+    def test_more_topics_than_any_robot_has_and_enormous_definitions_are_refused(
+        self, tmp_path: Path
+    ) -> None:
+        path = self.edited(tmp_path)
+        text_of_mb = "x" * 1_000_000
+        with closing(sqlite3.connect(path)) as base:
+            base.executemany(
+                "INSERT INTO message_definitions VALUES (?, 'a/msg/B', 'ros2msg', ?, '')",
+                ((n, text_of_mb) for n in range(10, 80)),
+            )
+            base.commit()
+        with pytest.raises(BagError, match="definitions are larger"):
+            Rosbag2Reader().summarize(path)
+        with closing(sqlite3.connect(path)) as base:
+            base.execute("DELETE FROM message_definitions")
+            base.executemany(
+                "INSERT INTO topics VALUES (?, ?, 'a/msg/B', 'cdr', '', '')",
+                ((n, f"/t{n}") for n in range(10, 5010)),
+            )
+            base.commit()
+        with pytest.raises(BagError, match="declares more than 5000 topics"):
+            Rosbag2Reader().summarize(path)
+
+    def test_a_message_larger_than_allowed_is_named(self, tmp_path: Path) -> None:
+        messages = [text(1, "x"), Msg("/chatter", "std_msgs/msg/String", 2, bytes(2 * MB))]
+        path = write_db3(tmp_path / "bag.db3", messages)
+        reader = Rosbag2Reader(max_chunk_mb=1)
+        read = reader.records(path, ["/chatter"], EVERYTHING)
+        with pytest.raises(BagError, match="too big"):
+            list(read)
+
+    def test_what_works_longer_than_the_size_explains_is_interrupted(self) -> None:
+        with closing(sqlite3.connect(":memory:")) as base:
+            guard(base, MB, 1000)
+            endless = (
+                "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+                " SELECT count(*) FROM n"
+            )
+            with pytest.raises(sqlite3.OperationalError, match="interrupted"):
+                base.execute(endless)
+
+
+class TestDigests:
+    def test_a_bag_whose_messages_unpack_to_far_more_than_it_is_not_digested(
+        self, tmp_path: Path
+    ) -> None:
+        packed = zstandard.compress(text(0, "x" * 30 * MB).payload)
+        path = bag(tmp_path, *STRINGS, *(message(1, n, packed) for n in range(4)))
+        with pytest.raises(BagError, match="unpack to more"):
+            Digester(McapReader(), extractor(), 10.0).digest(path)
+
+    def test_the_words_of_a_text_of_megabytes_are_not_kept(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "bag.mcap", [text(1, "ab " * MB)])
+        digest = Digester(McapReader(), extractor(), 10.0).digest(path)
+        [topic] = digest.topics
+        assert topic.evidence.words is None
+        assert topic.evidence.texts

@@ -1,0 +1,128 @@
+"""Files whose writer never finished them: killed, out of disk, or without power."""
+
+from __future__ import annotations
+
+import random
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.writer import CompressionType
+
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import Closing
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.bags import McapLayout, Msg, text, write_mcap
+from tests.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.storage.base import Record
+
+EVERYTHING = TimeWindow.everything()
+
+
+def read(reader: McapReader, path: Path, *topics: str, **how: bool) -> list[Record]:
+    return list(reader.records(path, topics or ("/chatter",), EVERYTHING, **how))
+
+
+def times(records: list[Record]) -> list[int]:
+    return [record.log_time for record in records]
+
+
+@pytest.mark.parametrize("layout", [McapLayout(), SMALL, McapLayout(chunk_size=None)])
+def test_of_uncompressed_files_every_message_that_reached_the_disk_is_read(
+    layout: McapLayout, tmp_path: Path
+) -> None:
+    messages = [text(time, f"{time}", f"/{time % 2}") for time in (3, 1, 2, 5, 4, 0)]
+    whole = write_mcap(tmp_path / "whole.mcap", messages, layout).read_bytes()
+    ends = sorted(whole.index(m.payload) + len(m.payload) for m in messages)
+    path = tmp_path / "cut.mcap"
+    reader = McapReader()
+    for size in range(8, len(whole) - 8):
+        path.write_bytes(whole[:size])
+        summary = reader.summarize(path)
+        on_disk = sum(end <= size for end in ends)
+        assert summary.count == on_disk, size
+        assert len(read(reader, path, "/0", "/1")) == on_disk
+        assert reader.closing(path) is Closing.OPEN
+        path.unlink()
+
+
+def test_the_note_says_how_much_could_not_be_read(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(5))
+    whole = path.read_bytes()
+    third = whole.index(chatter(5)[2].payload)
+    path.write_bytes(whole[: third + 10])
+    summary = McapReader().summarize(path)
+    assert summary.count == 2
+    assert not summary.complete
+    # Its record begins 31 bytes before the payload.
+    assert summary.notes == ("the file ends early: the last 41 bytes could not be read",)
+
+
+def test_zeros_behind_the_last_record_are_what_a_power_cut_leaves(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(5), McapLayout(chunk_size=None, finish=False))
+    path.write_bytes(path.read_bytes() + bytes(4096))
+    summary = McapReader().summarize(path)
+    assert summary.count == 5
+    assert summary.notes == ("the file ends early: the last 4096 bytes could not be read",)
+
+
+def test_a_file_whose_writer_stopped_between_records_has_lost_nothing(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(5), McapLayout(chunk_size=None, finish=False))
+    summary = McapReader().summarize(path)
+    assert (summary.count, summary.complete) == (5, False)
+    assert summary.notes == ("the file ends early: its writer did not finish it",)
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_of_a_compressed_chunk_that_is_cut_what_can_be_decompressed_counts(
+    compression: CompressionType, tmp_path: Path
+) -> None:
+    messages = [
+        Msg("/noise", "std_msgs/msg/String", time, random.Random(time).randbytes(4000))
+        for time in range(300)
+    ]
+    path = write_mcap(
+        tmp_path / "a.mcap", messages, McapLayout(chunk_size=8 << 20, compression=compression)
+    )
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    reader = McapReader()
+    summary = reader.summarize(path)
+    assert 60 < summary.count < 240
+    assert not summary.complete
+    assert any("only a part could be read" in note for note in summary.notes)
+    found = read(reader, path, "/noise")
+    assert [r.payload for r in found] == [m.payload for m in messages[: summary.count]]
+
+
+def test_a_cut_behind_the_messages_has_lost_none_and_says_so(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(5))
+    path.write_bytes(path.read_bytes()[:-20])
+    summary = McapReader().summarize(path)
+    assert (summary.count, summary.complete) == (5, False)
+    assert summary.notes == ("the file ends early, behind its messages: none is lost",)
+
+
+def test_a_few_bytes_are_no_bag_yet(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"\x89MCA")
+    assert McapReader().closing(path) is Closing.OPEN
+    with pytest.raises(BagError, match="only its first 4 bytes had reached the disk"):
+        McapReader().summarize(path)
+
+
+def test_one_damaged_chunk_of_an_unfinished_file_is_left_out_and_told(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+    lost = chunks_of(path)[1]
+    spoil_chunk(path, 1)
+    path.write_bytes(path.read_bytes()[:-100])
+    reader = McapReader()
+    summary = reader.summarize(path)
+    kept = set(range(20)) - set(range(lost.message_start_time, lost.message_end_time + 1))
+    assert times(read(reader, path)) == sorted(kept)
+    assert summary.count == len(kept)
+    assert any(note.startswith("1 damaged records were left out") for note in summary.notes)

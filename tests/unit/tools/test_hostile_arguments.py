@@ -1,0 +1,125 @@
+"""Whatever a client sends as arguments is answered: with an answer, or with what is wrong."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import anyio
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.schema import Signature
+from ros2_memory.tools.spec_tools import build_tools
+from tests.hostile import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested
+from tests.memories import memory_of
+from tests.questions import ANSWERED, write_run
+
+if TYPE_CHECKING:
+    from ros2_memory.tools.replies import Reply
+
+LONGEST_REPLY = 24_000
+LONGEST_DETAIL = 2_000
+TOOLS: dict[str, Any] = {
+    tool.name: tool.schema for tool in build_tools(memory_of(Path("bags")).limits, 25, writing=True)
+}
+CODES = {"invalid_arguments", "no_data", "timeout", "refused"}
+
+
+@pytest.fixture(scope="module")
+def dispatcher(tmp_path_factory: pytest.TempPathFactory) -> Dispatcher:
+    bag_dir = tmp_path_factory.mktemp("hostile")
+    write_run(bag_dir)
+    memory = memory_of(bag_dir)
+    tools = build_tools(memory.limits, 25, writing=True)
+    return Dispatcher(memory, tools, Replies(bag_dir, LONGEST_REPLY), call_timeout_s=25)
+
+
+def asked(dispatcher: Dispatcher, name: str, arguments: dict[str, Any]) -> Reply:
+    async def ask() -> Reply:
+        return await dispatcher.answer(name, arguments)
+
+    return anyio.run(ask)
+
+
+def held(reply: Reply) -> Any:
+    """The reply as JSON, held to what every reply promises."""
+    assert len(reply.text) <= LONGEST_REPLY
+    reply.text.encode()
+    told = json.loads(reply.text, parse_constant=pytest.fail)
+    if isinstance(told, dict) and "error" in told:
+        assert told["error"] in CODES, told
+        assert 0 < len(told["detail"]) <= LONGEST_DETAIL
+    return told
+
+
+@settings(
+    max_examples=300, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+)
+@given(call=calls(TOOLS))
+def test_any_arguments_are_answered_or_told_what_is_wrong(
+    dispatcher: Dispatcher, call: tuple[str, dict[str, Any]]
+) -> None:
+    held(asked(dispatcher, *call))
+
+
+EVERY = [(name, argument) for name, schema in TOOLS.items() for argument in schema["properties"]]
+
+
+@pytest.mark.parametrize(("name", "argument"), EVERY)
+def test_every_argument_stands_every_hostile_value(
+    dispatcher: Dispatcher, name: str, argument: str
+) -> None:
+    good = next((given for tool, given, _ in ANSWERED if tool == name), {"label": "here"})
+    for value in (*NUMBERS, *TEXTS, *OTHERS):
+        told = held(asked(dispatcher, name, {**good, argument: value}))
+        if isinstance(told, dict) and told.get("error") == "invalid_arguments":
+            assert argument in told["detail"] or "start" in told["detail"], (value, told)
+
+
+def test_a_thousand_unknown_arguments_are_told_in_few_words(dispatcher: Dispatcher) -> None:
+    told = held(asked(dispatcher, "list_frames", {f"x{n}": n for n in range(1000)}))
+    assert told["error"] == "invalid_arguments"
+    assert "995 more" in told["detail"]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {f"x{n}": n for n in range(1_000_000)},
+        {"topic": [0] * 1_000_000},
+        {"topic": {"a": [[[0] * 4000] * 4]}},
+        {"topic": nested(DEEP)},
+    ],
+)
+def test_too_many_arguments_are_told_before_any_is_looked_at(
+    dispatcher: Dispatcher, given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Signature, "read", lambda *_: pytest.fail("it was looked at"))
+    told = held(asked(dispatcher, "find_last_match", given))
+    assert told["error"] == "invalid_arguments"
+    assert re.search(r"^(topic|more than) .*(values|levels|arguments)", told["detail"])
+
+
+@pytest.mark.parametrize("name", ["x" * MEGABYTE, "\ud800", "", "\x00", "get_position_at\x00"])
+def test_an_unknown_tool_is_told_in_few_words(dispatcher: Dispatcher, name: str) -> None:
+    told = held(asked(dispatcher, name, {}))
+    assert told["error"] == "invalid_arguments"
+    assert "there is no tool" in told["detail"]
+
+
+def test_a_reversed_window_is_told(dispatcher: Dispatcher) -> None:
+    for start, end in ((2, 1), (1e9, 0), (1.5, 1.4999)):
+        told = held(asked(dispatcher, "trajectory_summary", {"start": start, "end": end}))
+        assert (told["error"], "start" in told["detail"]) == ("invalid_arguments", True)
+
+
+def test_deep_values_are_refused_wherever_they_stand(dispatcher: Dispatcher) -> None:
+    for value in (nested(DEEP), nested(DEEP, kind="object")):
+        given = {"topic": "/odom", "condition_type": "near_position", "value": {"x": value}}
+        told = held(asked(dispatcher, "find_last_match", given))
+        assert (told["error"], "value" in told["detail"]) == ("invalid_arguments", True)

@@ -1,0 +1,484 @@
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory import results
+from ros2_memory.analysis.trajectory import Trajectory, Waypoint
+from ros2_memory.analysis.transform_tree import FrameEdge
+from ros2_memory.core.errors import (
+    BagVanishedError,
+    ConfigError,
+    EpisodicError,
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    QueryTimeoutError,
+    UndecodableError,
+)
+from ros2_memory.core.model import Pose, Sample, SetAside, Transform, Twist
+from ros2_memory.core.timebase import NS_PER_S, ns_from_unix, unix_rounded_up
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.reply_json import Answer, shown
+
+BAGS = Path("bags")
+T0 = 1_784_023_200 * NS_PER_S
+REPLIES = Replies(BAGS, 24_000)
+
+
+def said(answer: Answer, replies: Replies = REPLIES) -> Any:
+    reply = replies.answer(answer)
+    assert not reply.is_error
+    return json.loads(reply.text)
+
+
+def value(at: int = T0, shown_value: Any = 1.5, **more: Any) -> results.TopicValue:
+    return results.TopicValue("/a", "std_msgs/msg/Float64", Sample(at, shown_value), **more)
+
+
+def row(number: int) -> results.TopicRow:
+    return results.TopicRow(f"/topic_{number:04}", "std_msgs/msg/String", T0, T0 + 1, 7)
+
+
+def odom(x: float, y: float) -> dict[str, Any]:
+    """What the extractor shows of an Odometry message of a wheeled robot."""
+    return {
+        "position": {"x": round(x, 4), "y": round(y, 4), "z": 0.0},
+        "orientation": {"roll_deg": 0.0, "pitch_deg": 0.0, "yaw_deg": 123.45},
+        "linear_velocity": {"x": 0.4321, "y": 0.0, "z": 0.0},
+        "angular_velocity": {"x": 0.0, "y": 0.0, "z": -0.1234},
+    }
+
+
+def of_samples(values: list[Any], notes: tuple[str, ...] = ()) -> results.TopicRange:
+    samples = tuple(Sample(T0 + n * 123_456_789, each) for n, each in enumerate(values))
+    return results.TopicRange("/odom", "nav_msgs/msg/Odometry", 5000, samples, notes)
+
+
+def trajectory(**other: Any) -> results.TrajectorySummary:
+    way: dict[str, Any] = {
+        "distance_m": 12.34567,
+        "duration_s": 60.00049,
+        "avg_speed": 0.205761,
+        "max_speed": 0.5,
+        "max_speed_from": "twist",
+        "waypoints": (
+            Waypoint(T0, (0.0, 1.00004, -0.0), math.pi / 2),
+            Waypoint(T0 + 1, (1.0, 2.0, 0.0), None),
+        ),
+        "waypoint_error_m": 0.05,
+        "poses": 3000,
+        "invalid": 0,
+        "jumps": 0,
+        "jumped_m": 0.0,
+    }
+    return results.TrajectorySummary("/odom", "odom", T0, T0 + 1, Trajectory(**way | other))
+
+
+def test_topics_are_a_bare_list() -> None:
+    rows = (row(1), results.TopicRow("/x", "a/msg/B", T0, T0, 1, "no definition"))
+    assert said(rows) == [
+        {
+            "topic": "/topic_0001",
+            "type": "std_msgs/msg/String",
+            "first_ts": 1784023200.0,
+            "last_ts": 1784023200.000001,
+            "count": 7,
+        },
+        {
+            "topic": "/x",
+            "type": "a/msg/B",
+            "first_ts": 1784023200.0,
+            "last_ts": 1784023200.0,
+            "count": 1,
+        },
+    ]
+
+
+def test_no_topics_are_an_empty_list() -> None:
+    assert said(()) == []
+
+
+ROW_KEYS = ["topic", "type", "first_ts", "last_ts", "count"]
+
+
+@given(
+    st.lists(
+        st.tuples(st.text(min_size=1, max_size=900), st.integers(0, 2**63 - 1), st.integers(0, 9)),
+        max_size=60,
+    ),
+    st.integers(500, 3000),
+)
+def test_topics_are_always_a_list_of_rows_of_five_keys_with_the_busiest_first(
+    topics: list[tuple[str, int, int]], max_chars: int
+) -> None:
+    rows = tuple(
+        results.TopicRow(name, "a/msg/B", T0 + n, T0 + n + extent, count, "why", ("odd",))
+        for n, (name, count, extent) in enumerate(topics)
+    )
+    reply = Replies(BAGS, max_chars).answer(rows)
+    listed = json.loads(reply.text)
+    assert len(reply.text) <= max(max_chars, 2)
+    assert all([*each] == ROW_KEYS for each in listed)
+    assert sum(each["count"] for each in listed) == sum(count for _, count, _ in topics)
+    if len(listed) == len(rows) and not (listed and listed[-1]["type"] == ""):
+        assert [each["count"] for each in listed] == [count for _, count, _ in topics]
+        return
+    *told, rest = listed
+    left_out = sorted(rows, key=lambda row: -row.count)[len(told) :]
+    assert [each["count"] for each in told] == sorted((row.count for row in rows), reverse=True)[
+        : len(told)
+    ]
+    assert (rest["topic"], rest["type"]) == (f"({len(left_out)} more: use pattern)", "")
+    assert rest["first_ts"] == unix_rounded_up(min(row.first for row in left_out))
+    assert rest["last_ts"] == unix_rounded_up(max(row.last for row in left_out))
+
+
+def test_the_busiest_of_649_topics_stands_first_and_the_last_row_counts_the_others() -> None:
+    rows = [row(number) for number in range(649)]
+    rows[600] = replace(rows[600], count=10**6)
+    listed = said(tuple(rows))
+    assert listed[0]["topic"] == "/topic_0600"
+    assert listed[-1] == {
+        "topic": f"({650 - len(listed)} more: use pattern)",
+        "type": "",
+        "first_ts": 1784023200.0,
+        "last_ts": 1784023200.000001,
+        "count": 7 * (650 - len(listed)),
+    }
+    assert 100 < len(listed) < 649
+
+
+def test_a_timestamp_is_rounded_up_so_that_it_finds_its_own_message() -> None:
+    at = T0 + 123_456_001
+    assert ns_from_unix(said(value(at))["timestamp"]) >= at
+    assert said(value(at))["timestamp"] == 1784023200.123457
+
+
+def test_a_topic_value_has_no_age_and_no_notes_unless_there_are_some() -> None:
+    assert said(value()) == {
+        "topic": "/a",
+        "type": "std_msgs/msg/Float64",
+        "timestamp": 1784023200.0,
+        "value": 1.5,
+    }
+    told = said(value(age=1_234_567_890, notes=("thinned",)))
+    assert told["age_s"] == 1.235
+    assert told["notes"] == ["thinned"]
+
+
+def test_an_empty_memory_has_nulls_for_its_span() -> None:
+    empty = results.TimeRange(None, None, T0, 0, (), (), (), (), (), 0, ("there is nothing",))
+    told = said(empty)
+    assert [told[key] for key in ("earliest", "latest", "earliest_local", "latest_local")] == [
+        None
+    ] * 4
+    assert told["now"] == 1784023200.0
+    assert told["bags"] == 0
+    assert told["notes"] == ["there is nothing"]
+
+
+def test_the_span_lists_gaps_and_files_below_the_bag_directory() -> None:
+    told = said(
+        results.TimeRange(
+            T0,
+            T0 + 90 * NS_PER_S,
+            T0 + 100 * NS_PER_S,
+            3,
+            (results.Gap(T0 + 10 * NS_PER_S, T0 + 70 * NS_PER_S),),
+            (SetAside(BAGS / "r1" / "r1_2.mcap", "left open"),),
+            (SetAside(BAGS / "r2" / "r2_0.mcap", "being written"),),
+            (SetAside(Path("/else/where.mcap"), "no bag"),),
+            (),
+            4,
+        )
+    )
+    gap = {"start": 1784023210.0, "end": 1784023270.0, "duration_s": 60.0}
+    assert told["gaps"] == [gap]
+    assert told["incomplete"] == [{"file": "r1/r1_2.mcap", "reason": "left open"}]
+    assert told["active"] == [{"file": "r2/r2_0.mcap", "reason": "being written"}]
+    assert told["damaged"] == [{"file": "where.mcap", "reason": "no bag"}]
+    assert told["unread"] == []
+    assert told["silent_topics"] == 4
+    assert told["latest_local"].startswith("2026-07-1")
+    assert "notes" not in told
+
+
+def test_long_lists_of_files_show_the_last_ones_and_their_number() -> None:
+    damaged = tuple(SetAside(BAGS / f"{n:03}.mcap", "torn") for n in range(50))
+    told = said(results.TimeRange(T0, T0, T0, 1, (), (), (), damaged, (), 0))
+    assert [each["file"] for each in told["damaged"]] == [f"{n:03}.mcap" for n in range(30, 50)]
+    assert told["damaged_count"] == 50
+    assert told["notes"] == ["damaged: the last 20 of 50 are listed"]
+
+
+def test_a_hundred_samples_of_odometry_stay_below_20_000_characters() -> None:
+    whole = [odom(-1.2345 * n / 50, 2.3456 - n / 70) for n in range(100)]
+    reply = REPLIES.answer(of_samples(whole))
+    assert len(reply.text) < 20_000
+    told = json.loads(reply.text)
+    assert len(told["samples"]) == 100
+    assert told["samples"][1]["value"]["orientation"] == {"yaw_deg": 123.45}
+    assert "0 in every sample and left out: position.z, orientation.roll_deg" in told["notes"][0]
+
+
+def test_a_hundred_positions_stay_below_8_000_characters() -> None:
+    narrow = [{"position": odom(-1.2345 - n / 90, 2.3456)["position"]} for n in range(100)]
+    reply = REPLIES.answer(of_samples(narrow))
+    assert len(reply.text) < 8_000
+    assert len(json.loads(reply.text)["samples"]) == 100
+
+
+def test_a_short_range_keeps_its_zeros() -> None:
+    told = said(of_samples([odom(1.0, 2.0), odom(2.0, 2.0)], ("5000 in all",)))
+    assert told["samples"][0] == {"timestamp": 1784023200.0, "value": odom(1.0, 2.0)}
+    assert told["total"] == 5000
+    assert told["notes"] == ["5000 in all"]
+
+
+def test_a_range_beyond_the_cap_is_thinned_and_keeps_its_ends() -> None:
+    values = [{"text": f"{n} " + "x" * 900} for n in range(100)]
+    told = said(of_samples(values))
+    assert told["samples"][0]["value"] == values[0]
+    assert told["samples"][-1]["value"] == values[-1]
+    assert "of 100 kept, evenly spaced" in told["notes"][0]
+
+
+def test_a_position_is_in_metres_and_degrees_with_null_for_what_is_not_known() -> None:
+    pose = Pose((1.234567, math.nan, -0.00001), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)), "odom")
+    assert said(results.Position("/odom", T0, pose, age=2 * NS_PER_S)) == {
+        "x": 1.2346,
+        "y": None,
+        "z": 0.0,
+        "yaw_deg": 90.0,
+        "timestamp": 1784023200.0,
+        "topic": "/odom",
+        "frame_id": "odom",
+        "age_s": 2.0,
+    }
+
+
+@pytest.mark.parametrize("orientation", [None, (0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0)])
+def test_a_position_without_a_rotation_has_no_yaw(orientation: Any) -> None:
+    told = said(results.Position("/gps", T0, Pose((1.0, 2.0, 3.0), orientation)))
+    assert told["yaw_deg"] is None
+    assert told["frame_id"] is None
+
+
+def test_a_velocity_has_a_linear_and_an_angular_part() -> None:
+    twist = Twist((0.50001, 0.0, math.inf), (0.0, 0.0, -0.12345), "base_link")
+    assert said(results.Velocity("/odom", T0, twist, ("odd",))) == {
+        "linear": {"x": 0.5, "y": 0.0, "z": None},
+        "angular": {"x": 0.0, "y": 0.0, "z": -0.1235},
+        "timestamp": 1784023200.0,
+        "topic": "/odom",
+        "frame_id": "base_link",
+        "notes": ["odd"],
+    }
+
+
+def test_a_transform_has_translation_rotation_and_yaw() -> None:
+    half = math.sqrt(0.5)
+    transform = Transform((0.123456, 0.0, 0.2), (0.0, 0.0, -half, half))
+    assert said(results.TransformAt("odom", "laser", T0, transform, "log")) == {
+        "translation": {"x": 0.1235, "y": 0.0, "z": 0.2},
+        "rotation": {"x": 0.0, "y": 0.0, "z": -0.707107, "w": 0.707107},
+        "yaw_deg": -90.0,
+        "timestamp": 1784023200.0,
+        "parent": "odom",
+        "child": "laser",
+        "clock": "log",
+    }
+
+
+def test_frames_are_named_once_and_sorted() -> None:
+    edges = (FrameEdge("odom", "base", static=False), FrameEdge("base", "laser", static=True))
+    assert said(results.Frames(edges)) == {
+        "frames": ["base", "laser", "odom"],
+        "transforms": [
+            {"parent": "base", "child": "laser", "static": True},
+            {"parent": "odom", "child": "base", "static": False},
+        ],
+    }
+
+
+def test_a_complete_search_without_a_match_is_null() -> None:
+    assert REPLIES.answer(results.Match(None)).text == "null"
+    assert REPLIES.answer(results.ValueWhen(None)).text == "null"
+
+
+@pytest.mark.parametrize("kind", [results.Match, results.ValueWhen])
+def test_an_incomplete_search_without_a_match_says_what_it_missed(kind: Any) -> None:
+    assert said(kind(None, notes=("a.mcap is damaged",))) == {
+        "timestamp": None,
+        "value": None,
+        "notes": ["a.mcap is damaged"],
+    }
+
+
+def test_a_match_says_when_what_and_where_with_each_note_once() -> None:
+    found = value(age=NS_PER_S, notes=("b.mcap was left open", "thinned"))
+    assert said(results.Match(found, ("b.mcap was left open",))) == {
+        "timestamp": 1784023200.0,
+        "value": 1.5,
+        "topic": "/a",
+        "type": "std_msgs/msg/Float64",
+        "age_s": 1.0,
+        "notes": ["b.mcap was left open", "thinned"],
+    }
+
+
+def test_a_value_when_another_matched_has_both() -> None:
+    matched = value(T0, {"data": True})
+    held = results.TopicValue("/odom", "nav_msgs/msg/Odometry", Sample(T0 - NS_PER_S, {"x": 1}))
+    assert said(results.ValueWhen(matched, held, ("1 s older",))) == {
+        "timestamp": 1784023200.0,
+        "matched": {"data": True},
+        "value": {"x": 1},
+        "value_timestamp": 1784023199.0,
+        "condition_topic": "/a",
+        "value_topic": "/odom",
+        "notes": ["1 s older"],
+    }
+
+
+def test_a_topic_that_held_nothing_yet_gives_a_null_value() -> None:
+    told = said(results.ValueWhen(value(), None, ("/odom held no message yet",)))
+    assert told["value"] is None
+    assert told["value_timestamp"] is None
+
+
+def test_a_trajectory_is_rounded_to_sense() -> None:
+    assert said(trajectory()) == {
+        "distance_m": 12.3457,
+        "avg_speed": 0.2058,
+        "max_speed": 0.5,
+        "duration_s": 60.0,
+        "waypoints": [
+            {"timestamp": 1784023200.0, "x": 0.0, "y": 1.0, "z": 0.0, "yaw_deg": 90.0},
+            {"timestamp": 1784023200.000001, "x": 1.0, "y": 2.0, "z": 0.0, "yaw_deg": None},
+        ],
+        "topic": "/odom",
+        "frame_id": "odom",
+        "start": 1784023200.0,
+        "end": 1784023200.000001,
+        "poses": 3000,
+    }
+
+
+def test_a_trajectory_says_what_was_left_out_and_how_it_was_measured() -> None:
+    notes = said(
+        trajectory(
+            invalid=3, jumps=2, jumped_m=41.5, max_speed_from="positions", waypoint_error_m=0.31
+        )
+    )["notes"]
+    assert [note.split(" ")[0] for note in notes] == ["3", "2", "max_speed", "the"]
+    assert "41.50 m" in notes[1]
+    assert "0.31 m" in notes[3]
+
+
+def test_a_jump_is_marked_at_the_waypoint_it_led_to() -> None:
+    waypoints = (Waypoint(T0, (0, 0, 0), None), Waypoint(T0 + 1, (90, 0, 0), None, jump=True))
+    told = said(trajectory(waypoints=waypoints, jumps=1, jumped_m=90.0))
+    assert [point.get("jump") for point in told["waypoints"]] == [None, True]
+    assert told["notes"] == [
+        ("1 jump of 90.00 m in all, faster than is plausible, left out of distance and speed"),
+        "of the jumps each leads to a waypoint with jump: true; no way was driven there",
+    ]
+    told = said(trajectory(waypoints=waypoints, jumps=9, jumped_m=99.0))
+    assert told["notes"][1].startswith("of the jumps the longest lead to a waypoint")
+
+
+def test_without_a_single_valid_pose_nothing_is_said_of_the_way() -> None:
+    told = said(
+        trajectory(
+            poses=0,
+            invalid=1,
+            waypoints=(),
+            distance_m=0.0,
+            avg_speed=0.0,
+            max_speed=0.0,
+            max_speed_from="positions",
+        )
+    )
+    assert [told[key] for key in ("distance_m", "avg_speed", "max_speed", "duration_s")] == [
+        None
+    ] * 4
+    assert told["notes"] == ["1 pose left out: the coordinates are no place (NaN or beyond)"]
+
+
+def test_a_mean_above_the_highest_speed_is_told() -> None:
+    [note] = said(trajectory(avg_speed=0.9, max_speed=0.5))["notes"]
+    assert note.startswith("avg_speed, by the positions, is above max_speed")
+    assert "notes" not in said(trajectory(avg_speed=0.501, max_speed=0.5))
+
+
+def test_no_data_tells_what_could_not_be_read() -> None:
+    error = NoDataError(NoDataReason.GAP, "nothing", ("1 bag file could not be read",))
+    told = json.loads(REPLIES.error(error).text)
+    assert told["notes"] == ["1 bag file could not be read"]
+
+
+def test_what_is_no_answer_is_refused() -> None:
+    with pytest.raises(TypeError, match="str is not an answer"):
+        shown("text", BAGS)
+
+
+def test_having_no_data_is_an_answer_with_its_reason() -> None:
+    reply = REPLIES.error(NoDataError(NoDataReason.GAP, "the nearest is 3 s off"))
+    assert json.loads(reply.text) == {
+        "error": "no_data",
+        "reason": "gap",
+        "detail": "the nearest is 3 s off",
+    }
+    assert not reply.is_error
+
+
+def test_an_undecodable_message_is_no_data() -> None:
+    reply = REPLIES.error(UndecodableError("/x", "a/msg/B", "no definition"))
+    assert json.loads(reply.text) == {
+        "error": "no_data",
+        "reason": "undecodable",
+        "detail": "/x (a/msg/B): no definition",
+    }
+    assert not reply.is_error
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (InvalidArgumentsError("say a"), "invalid_arguments"),
+        (QueryTimeoutError("say a"), "timeout"),
+        (ConfigError("say a"), "invalid_config"),
+    ],
+)
+def test_other_errors_are_errors_for_the_protocol_too(error: EpisodicError, code: str) -> None:
+    reply = REPLIES.error(error)
+    assert json.loads(reply.text) == {"error": code, "detail": "say a"}
+    assert reply.is_error
+
+
+def test_a_bag_error_names_the_file_but_no_path_of_the_machine() -> None:
+    replies = Replies(Path("/data/bags"), 1000)
+    reply = replies.error(BagVanishedError("/data/bags/r1/r1_0.mcap", "it is gone"))
+    assert json.loads(reply.text)["detail"] == "r1/r1_0.mcap: it is gone; ask again"
+
+
+def test_a_fault_of_the_server_tells_nothing_but_the_id_of_its_log() -> None:
+    reply = REPLIES.internal("abc123")
+    assert reply.is_error
+    assert json.loads(reply.text)["error"] == "internal"
+    assert "abc123" in reply.text
+
+
+def test_an_error_stays_below_the_cap() -> None:
+    reply = Replies(BAGS, 1000).error(InvalidArgumentsError("why " * 5000))
+    assert len(reply.text) <= 1000
+    assert json.loads(reply.text)["error"] == "invalid_arguments"

@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import json
+import math
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.tools.reply_size import compact, fit, without_constant_zeros
+
+FLOATS = st.floats(allow_nan=True, allow_infinity=True)
+SCALARS = st.none() | st.booleans() | st.integers() | FLOATS | st.text(max_size=60)
+VALUES: st.SearchStrategy[Any] = st.recursive(
+    SCALARS,
+    lambda inner: (
+        st.lists(inner, max_size=60) | st.dictionaries(st.text(max_size=30), inner, max_size=40)
+    ),
+    max_leaves=30,
+)
+REPLIES = st.dictionaries(
+    st.sampled_from(["topic", "value", "samples", "waypoints", "frames", "detail"]), VALUES
+)
+NOTES = st.lists(st.text(max_size=300), max_size=20)
+
+
+def strict(text: str) -> Any:
+    def refuse(name: str) -> Any:
+        raise AssertionError(f"{name} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def samples(count: int, value: Any = None) -> dict[str, Any]:
+    return {
+        "topic": "/odom",
+        "total": count,
+        "samples": [{"timestamp": 1.5 + n, "value": value or {"x": n}} for n in range(count)],
+    }
+
+
+@given(VALUES)
+def test_any_value_becomes_valid_json_without_spaces(value: Any) -> None:
+    text = compact(value)
+    strict(text)
+    assert text.encode("utf-8").decode("utf-8") == text
+    assert text == json.dumps(strict(text), separators=(",", ":"), ensure_ascii=False)
+
+
+def test_what_json_cannot_carry_does_not_leave() -> None:
+    value: Any = {"a": [math.nan, math.inf, -math.inf, -0.0], "b": "\ud800 ä", "\udfff": 1}
+    assert compact(value) == '{"a":[null,null,null,0.0],"b":"? ä","?":1}'
+
+
+def test_a_reply_that_fits_is_left_as_it_is() -> None:
+    reply = samples(3)
+    assert fit(reply, len(compact(reply))) == compact(reply)
+
+
+@given(REPLIES, NOTES, st.integers(500, 5000))
+def test_a_reply_never_passes_the_cap_and_is_always_valid(
+    reply: dict[str, Any], notes: list[Any], cap: int
+) -> None:
+    text = fit({**reply, "notes": notes}, cap)
+    assert len(text) <= cap
+    assert isinstance(strict(text), dict)
+
+
+@given(st.integers(2, 3000), st.integers(1000, 30_000))
+def test_a_thinned_range_keeps_its_ends_and_stays_in_order(count: int, cap: int) -> None:
+    kept = strict(fit(samples(count), cap))["samples"]
+    times = [row["timestamp"] for row in kept]
+    assert times[0] == 1.5
+    assert times[-1] == 0.5 + count
+    assert times == sorted(set(times))
+
+
+@given(st.integers(40, 3000), st.integers(1500, 30_000))
+def test_a_thinned_range_is_evenly_spaced_and_uses_the_room(count: int, cap: int) -> None:
+    reply = samples(count)
+    shown = strict(fit(reply, cap))
+    kept = [row["timestamp"] for row in shown["samples"]]
+    gaps = [after - before for before, after in pairwise(kept)]
+    assert max(gaps) - min(gaps) <= 1
+    if len(kept) < count:
+        assert len(compact(shown)) > cap - 800
+
+
+def test_a_thinned_range_says_how_many_are_left_and_how_to_see_more() -> None:
+    shown = strict(fit({**samples(1000), "notes": ["first"]}, 2000))
+    thinned = (
+        f"samples: {len(shown['samples'])} of 1000 kept, evenly spaced, to keep the reply under "
+        "2000 characters; ask for a shorter window or for fewer fields to see more"
+    )
+    assert shown["notes"] == ["first", thinned]
+    assert list(shown)[-1] == "notes"
+
+
+def test_lists_that_are_not_along_time_keep_their_beginning() -> None:
+    shown = strict(fit({"frames": [f"frame_{n:03}" for n in range(500)]}, 1000))
+    kept = shown["frames"]
+    assert kept == [f"frame_{n:03}" for n in range(len(kept))]
+    assert shown["notes"][0].startswith(f"frames: {len(kept)} of 500 kept, from the beginning")
+
+
+def test_a_single_huge_array_is_thinned_evenly_with_a_note() -> None:
+    shown = strict(fit({"topic": "/scan", "value": {"ranges": list(range(20_000))}}, 2000))
+    ranges = shown["value"]["ranges"]
+    assert (ranges[0], ranges[-1]) == (0, 19_999)
+    assert len(ranges) > 100
+    assert f"ranges (evenly thinned: {len(ranges)} of 20000 kept)" in shown["notes"][0]
+
+
+def test_a_single_huge_text_is_cut_with_a_note_and_fills_the_room() -> None:
+    shown = strict(fit({"topic": "/log", "value": {"msg": "ab" * 50_000}}, 2000))
+    assert shown["topic"] == "/log"
+    assert shown["value"]["msg"].startswith("abab")
+    assert shown["value"]["msg"].endswith("…")
+    assert len(shown["value"]["msg"]) > 1000
+    assert "msg (texts cut)" in shown["notes"][0]
+
+
+def test_a_wide_object_loses_keys_with_a_note() -> None:
+    shown = strict(fit({"value": {f"key_{n:05}": n for n in range(9000)}}, 2000))
+    assert "key_00000" in shown["value"]
+    assert "value (keys left out: 50 of 9000 kept)" in shown["notes"][0]
+
+
+def test_what_cannot_be_shortened_leaves_what_it_is_about() -> None:
+    tree: Any = 1
+    for _ in range(7):
+        tree = {f"branch_{n}": tree for n in range(5)}
+    shown = strict(fit({"topic": "/tree", "timestamp": 1.5, "value": tree}, 1000))
+    assert (shown["topic"], shown["timestamp"]) == ("/tree", 1.5)
+    assert "value" not in shown
+    assert "does not fit into 1000 characters" in shown["notes"][0]
+
+
+def test_a_long_note_does_not_drive_out_the_answer() -> None:
+    shown = strict(fit({"value": 1, "notes": ["n" * 3000] * 50}, 24_000))
+    assert shown["value"] == 1
+    assert shown["notes"][-1] == "and 38 more notes"
+
+
+def odom(x: float, *, vx: float = 0.0) -> dict[str, Any]:
+    return {
+        "position": {"x": x, "y": 2.0, "z": 0.0},
+        "linear_velocity": {"x": vx, "y": 0.0, "z": 0.0},
+        "ok": False,
+    }
+
+
+def test_numbers_that_are_zero_in_every_sample_are_left_out_and_named() -> None:
+    kept, names = without_constant_zeros([odom(1.0, vx=0.5), odom(0.0)])
+    assert kept == [
+        {"position": {"x": 1.0, "y": 2.0}, "linear_velocity": {"x": 0.5}, "ok": False},
+        {"position": {"x": 0.0, "y": 2.0}, "linear_velocity": {"x": 0.0}, "ok": False},
+    ]
+    assert names == ["position.z", "linear_velocity.y", "linear_velocity.z"]
+
+
+def test_a_structure_that_is_zero_throughout_stays_whole() -> None:
+    kept, names = without_constant_zeros([odom(1.0), odom(2.0)])
+    assert kept[0] == {
+        "position": {"x": 1.0, "y": 2.0},
+        "linear_velocity": {"x": 0.0, "y": 0.0, "z": 0.0},
+        "ok": False,
+    }
+    assert names == ["position.z"]
+
+
+@pytest.mark.parametrize("values", [[], [odom(0.0)], [0, 0], [[0], [0]], [None, {"a": 0}]])
+def test_single_samples_lists_and_bare_numbers_are_left_as_they_are(values: list[Any]) -> None:
+    assert without_constant_zeros(values) == (values, [])
+
+
+def test_a_key_that_some_samples_lack_is_no_constant() -> None:
+    values: list[Any] = [{"a": 0, "b": 1}, {"b": 1}]
+    assert without_constant_zeros(values) == (values, [])
+
+
+@given(st.lists(st.dictionaries(st.sampled_from("abc"), VALUES), min_size=2, max_size=5))
+def test_leaving_out_zeros_removes_nothing_else(values: list[Any]) -> None:
+    shown, names = without_constant_zeros(values)
+    kept: list[Any] = [*shown]
+    for before, after in zip(values, kept, strict=True):
+        for name in names:
+            owner, _, leaf = name.rpartition(".")
+            if "." not in owner:
+                held = before if not owner else before[owner]
+                assert held[leaf] == 0
+        assert set(after) | {name for name in names if "." not in name} == set(before)

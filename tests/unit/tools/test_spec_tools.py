@@ -1,0 +1,277 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.history.context import Limits
+from ros2_memory.history.time_arguments import Moment
+from ros2_memory.tools.arguments import At, Search
+from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.instructions import instructions
+from ros2_memory.tools.schema import Signature
+from ros2_memory.tools.spec_tools import build_tools
+
+SNAPSHOTS = Path(__file__).parent / "snapshots"
+TOOLS = {tool.name: tool for tool in build_tools(Limits(), 25.0, writing=True)}
+SPECIFIED = [
+    "list_recorded_topics",
+    "data_time_range",
+    "get_topic_at_time",
+    "get_topic_seconds_ago",
+    "get_topic_in_range",
+    "get_topic_in_last",
+    "get_position_at",
+    "get_position_seconds_ago",
+    "get_velocity_at",
+    "get_velocity_seconds_ago",
+    "get_transform_at",
+    "get_transform_seconds_ago",
+    "list_frames",
+    "find_last_match",
+    "get_value_when",
+    "trajectory_summary",
+    "recent_trajectory_summary",
+]
+ADDED = ["find_matches", "recap", "recap_last", "visits", "memory_status", "list_moments"]
+WRITING = ["remember_moment"]
+NAMES = [*SPECIFIED, *ADDED, *WRITING]
+BLOCKING = {
+    "remember_moment",
+    "visits",
+    "find_matches",
+    "recap",
+    "recap_last",
+    "list_frames",
+    "find_last_match",
+    "get_value_when",
+    "trajectory_summary",
+    "recent_trajectory_summary",
+}
+OPTIONAL = {
+    "remember_moment": {"seconds_before", "seconds_after"},
+    "visits": {"frame_id", "radius_m", "limit"},
+    "find_matches": {"field", "seconds", "start", "end", "oldest_first", "limit"},
+    "list_recorded_topics": {"pattern"},
+    "get_topic_at_time": {"tolerance_s", "fields"},
+    "get_topic_seconds_ago": {"tolerance_s", "fields"},
+    "get_topic_in_range": {"max_samples", "fields"},
+    "get_topic_in_last": {"max_samples", "fields"},
+    "get_position_at": {"topic", "tolerance_s"},
+    "get_position_seconds_ago": {"topic", "tolerance_s"},
+    "get_velocity_at": {"topic", "tolerance_s"},
+    "get_velocity_seconds_ago": {"topic", "tolerance_s"},
+    "find_last_match": {"field", "fields", "before"},
+    "get_value_when": {"field", "fields", "before"},
+    "trajectory_summary": {"topic"},
+    "recent_trajectory_summary": {"topic"},
+}
+PAIRS = [
+    ("get_topic_at_time", "get_topic_seconds_ago"),
+    ("get_topic_in_range", "get_topic_in_last"),
+    ("get_position_at", "get_position_seconds_ago"),
+    ("get_velocity_at", "get_velocity_seconds_ago"),
+    ("get_transform_at", "get_transform_seconds_ago"),
+    ("trajectory_summary", "recent_trajectory_summary"),
+    ("recap", "recap_last"),
+]
+UNFOLDED = {"timestamp", "seconds_ago", "start", "end", "seconds"}
+
+
+def seen(tool: Tool) -> dict[str, Any]:
+    """What a planner reads of a tool."""
+    return {
+        "name": tool.name,
+        "title": tool.title,
+        "description": tool.description,
+        "inputSchema": tool.schema,
+    }
+
+
+def example(tool: Tool) -> dict[str, Any]:
+    arguments: dict[str, Any] = json.loads(tool.description.partition("Example: ")[2])
+    return arguments
+
+
+def refusal(name: str, **given: Any) -> str:
+    with pytest.raises(InvalidArgumentsError) as caught:
+        TOOLS[name].question(given)
+    return str(caught.value)
+
+
+def test_the_seventeen_tools_of_the_specification_come_first_and_in_its_order() -> None:
+    assert list(TOOLS) == NAMES
+    assert len(SPECIFIED) == 17
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_a_description_shows_the_braces_of_a_reply_once(name: str) -> None:
+    shown = TOOLS[name].description.partition("Example:")[0]
+    assert "{{" not in shown
+    assert shown.count("{") == shown.count("}")
+
+
+@pytest.mark.parametrize("name", [name for name in TOOLS if name.endswith("_seconds_ago")])
+def test_a_description_names_the_age_that_the_reply_tells(name: str) -> None:
+    assert "age_s" in TOOLS[name].description
+
+
+def test_additions_and_what_writes_can_be_left_out() -> None:
+    assert [tool.name for tool in build_tools(Limits(), 25.0)] == [*SPECIFIED, *ADDED]
+    alone = build_tools(Limits(), 25.0, additions=False, writing=True)
+    assert [tool.name for tool in alone] == SPECIFIED
+
+
+@pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
+def test_what_the_planner_reads_is_as_reviewed(tool: Tool) -> None:
+    path = SNAPSHOTS / f"{tool.name}.json"
+    text = json.dumps(seen(tool), indent=2, ensure_ascii=False) + "\n"
+    if os.environ.get("UPDATE_SNAPSHOTS"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    assert path.read_text(encoding="utf-8") == text, "if this is meant: UPDATE_SNAPSHOTS=1"
+
+
+def test_there_is_a_snapshot_for_each_tool_and_no_other() -> None:
+    assert {path.stem for path in SNAPSHOTS.glob("*.json")} == set(NAMES)
+
+
+def test_everything_the_planner_reads_fits_into_16_000_characters() -> None:
+    text = json.dumps([seen(tool) for tool in TOOLS.values()], separators=(",", ":"))
+    assert len(text) < 16_000
+
+
+@pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
+def test_every_tool_shows_an_example_that_it_accepts(tool: Tool) -> None:
+    assert set(example(tool)) == set(tool.schema.get("required") or [])  # type: ignore[arg-type]
+    assert callable(tool.question(example(tool)))
+
+
+@pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
+def test_every_tool_names_its_arguments_and_refuses_others(tool: Tool) -> None:
+    properties: Any = tool.schema["properties"]
+    assert set(properties) == set(example(tool)) | OPTIONAL.get(tool.name, set())
+    assert tool.schema["additionalProperties"] is False
+    assert "there is no argument" in refusal(tool.name, **example(tool), nonsense=1)
+
+
+@pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
+def test_tools_that_may_take_long_say_so(tool: Tool) -> None:
+    assert tool.blocking == (tool.name in BLOCKING)
+    assert tool.description.startswith("Blocking, up to 25 s.") == tool.blocking
+
+
+@pytest.mark.parametrize(("absolute", "relative"), PAIRS)
+def test_a_pair_differs_in_its_times_alone(absolute: str, relative: str) -> None:
+    one: Any = TOOLS[absolute].schema["properties"]
+    other: Any = TOOLS[relative].schema["properties"]
+    assert {name: one[name] for name in one if name not in UNFOLDED} == {
+        name: other[name] for name in other if name not in UNFOLDED
+    }
+
+
+def test_descriptions_tell_the_defaults_of_this_deployment() -> None:
+    limits = Limits(pose_topic="/amcl_pose", time_tolerance_s=0.25, position_tolerance_m=2.0)
+    tools = {tool.name: tool.description for tool in build_tools(limits, 8.0)}
+    assert "/amcl_pose" in tools["get_position_at"]
+    assert "default 0.25" in tools["get_topic_at_time"]
+    assert "within 2 m" in tools["find_last_match"]
+    assert "up to 8 s" in tools["find_last_match"]
+    assert "/amcl_pose" in instructions(limits)
+
+
+def test_the_instructions_are_short_enough_for_clients_that_cut_them() -> None:
+    assert 500 < len(instructions(Limits())) < 2_000
+
+
+def test_a_missing_argument_is_named_with_what_is_expected() -> None:
+    assert refusal("get_position_seconds_ago") == (
+        "seconds_ago is missing: a number of at least 0 (Seconds before now), e.g. 10"
+    )
+
+
+def test_a_misspelt_argument_is_answered_with_the_right_one() -> None:
+    assert refusal("get_topic_at_time", topic="/a", timestamp=1, feilds=["x"]) == (
+        'there is no argument "feilds"; do you mean fields?'
+    )
+    assert refusal("list_frames", depth=1) == 'there is no argument "depth"; there are none'
+
+
+def test_all_faults_are_told_at_once() -> None:
+    told = refusal("get_topic_in_last", topic=7, seconds=-1, max_samples=0)
+    assert "topic was 7; expected a text" in told
+    assert "seconds was -1; expected a number of more than 0" in told
+    assert "max_samples was 0; expected a whole number of at least 1 and at most 10000" in told
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (-5, "-5"),
+        ("10", '"10"'),
+        (True, "true"),
+        (None, "null"),
+        ([10], "[10]"),
+        (math.nan, "NaN"),
+        (math.inf, "Infinity"),
+        (10**400, '"a number of 400 digits"'),
+    ],
+)
+def test_seconds_must_be_a_finite_number_of_at_least_zero(value: Any, told: str) -> None:
+    assert refusal("get_position_seconds_ago", seconds_ago=value).startswith(
+        f"seconds_ago was {told}"
+    )
+
+
+@pytest.mark.parametrize("value", [1784023200500, 1784023200500000000])
+def test_milliseconds_and_nanoseconds_are_recognised(value: int) -> None:
+    told = refusal("get_position_at", timestamp=value)
+    assert "too large for Unix seconds; is it in milliseconds or nanoseconds?" in told
+
+
+@pytest.mark.parametrize("topic", ["", "   "])
+def test_a_topic_must_have_a_name(topic: str) -> None:
+    assert "which is empty" in refusal("get_topic_seconds_ago", topic=topic, seconds_ago=1)
+
+
+def test_the_condition_type_must_be_a_known_one() -> None:
+    told = refusal("find_last_match", topic="/a", condition_type="like", value="x")
+    assert 'expected one of "contains", "equals", "above", "below", "near_position"' in told
+
+
+@pytest.mark.parametrize("value", [None, math.nan, {"x": math.inf, "y": 0.0}])
+def test_a_condition_value_must_be_something_finite(value: Any) -> None:
+    told = refusal("find_last_match", topic="/a", condition_type="equals", value=value)
+    assert told.startswith("value was ")
+
+
+def test_a_long_value_is_cut_in_the_refusal() -> None:
+    assert len(refusal("get_position_at", timestamp="x" * 10_000)) < 300
+
+
+def read(given: dict[str, Any]) -> Search:
+    return Signature(Search).read({"topic": "/a", "condition_type": "contains"} | given)
+
+
+@pytest.mark.parametrize("given", ["position", ["position"], '["position"]', ("position",)])
+def test_fields_may_be_one_name_a_list_or_its_json_text(given: Any) -> None:
+    assert read({"value": "x", "fields": given}).fields == ("position",)
+
+
+def test_null_for_an_optional_argument_means_its_default() -> None:
+    assert read({"value": "x", "fields": None, "field": None}) == read({"value": "x"})
+
+
+def test_a_whole_number_may_be_written_with_a_point() -> None:
+    assert callable(
+        TOOLS["get_topic_in_last"].question({"topic": "/a", "seconds": 1, "max_samples": 20.0})
+    )
+
+
+def test_a_when_is_folded_into_its_moment() -> None:
+    assert At(timestamp=5.0).folded() == Moment(at_s=5.0)
