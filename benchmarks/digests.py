@@ -18,15 +18,15 @@ from ros2_memory.analysis.standstills import (
     unpacked_blocks,
     unpacked_poses,
 )
-from ros2_memory.bootstrap import build_filler
+from ros2_memory.bootstrap import build_backfill
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.cli.index import fill
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
-    from ros2_memory.analysis.odometry import Leg, PoseDigest, Stop
-    from ros2_memory.analysis.standstills import StandstillDigest, TimedPosition
-    from ros2_memory.analysis.topic_events import Story
+    from ros2_memory.analysis.odometry import Leg, PoseDigest, TimedPosition
+    from ros2_memory.analysis.standstills import StandstillDigest
+    from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.topic_digest import TopicDigest
     from ros2_memory.core.model import BagSummary
@@ -43,7 +43,7 @@ def digester_of(memory: Memory, settings: Settings) -> Digester:
 
 def made_known(memory: Memory, settings: Settings) -> None:
     """Has the memory's catalogue know every bag, as `ros2-memory index` does."""
-    fill(build_filler(settings, memory), None, lambda: False)
+    fill(build_backfill(settings, memory), None, lambda: False)
 
 
 def cost(case: Case, runs: int) -> Figure:
@@ -123,7 +123,7 @@ def _later(poses: list[TimedPosition], by: int) -> list[TimedPosition]:
     return [pose._replace(time=pose.time + by) for pose in poses]
 
 
-def _moved_story(story: Story, by: int) -> Story:
+def _moved_story(story: TopicEvents, by: int) -> TopicEvents:
     return replace(
         story,
         first=story.first + by,
@@ -138,7 +138,7 @@ def _moved_story(story: Story, by: int) -> Story:
 
 
 def _moved_poses(poses: PoseDigest, by: int) -> PoseDigest:
-    def later(stop: Stop) -> Stop:
+    def later(stop: TimedPosition) -> TimedPosition:
         return stop._replace(time=stop.time + by)
 
     def leg(one: Leg | None) -> Leg | None:

@@ -15,7 +15,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.endpoint import build_server
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -72,7 +72,7 @@ def forgetful(memory: Memory, settings: Settings, known: Split, topic: str) -> M
 
 def position_at(memory: Memory, topic: str, at_s: float) -> tuple[int, float, float]:
     """Log time and place of the newest pose at or before a moment."""
-    found = queries.position(memory, Call(), Moment(at_s=at_s), topic=topic)
+    found = queries.position(memory, Call(), AtTime(at_s=at_s), topic=topic)
     return found.time, found.pose.position[0], found.pose.position[1]
 
 
@@ -114,8 +114,8 @@ def positions_by_tool(
     return asyncio.run(ask())
 
 
-def _span(start: int, stop: int) -> Span:
-    return Span(start_s=unix_from_ns(start), end_s=unix_from_ns(stop))
+def _span(start: int, stop: int) -> TimeRange:
+    return TimeRange(start_s=unix_from_ns(start), end_s=unix_from_ns(stop))
 
 
 def _place(value: JsonValue) -> tuple[float, float]:

@@ -17,10 +17,10 @@ from benchmarks.motion import NOWHERE
 from benchmarks.payloads import NEVER_SEEN
 from benchmarks.questions import Question, Target
 from benchmarks.timing import FLOOR, OURS
-from ros2_memory.bootstrap import build_filler
+from ros2_memory.bootstrap import build_backfill
 from ros2_memory.catalogue.store import BagKey, relative
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.status import memory_status
@@ -65,7 +65,7 @@ class Week:
         if memory.recall is None:
             raise RuntimeError("the memory has no catalogue, so a week cannot be stood in for")
         self._fill(memory.recall.catalogue)
-        filler = build_filler(self.settings, ours.memory(self.settings))
+        filler = build_backfill(self.settings, ours.memory(self.settings))
         progress = filler.progress()
         if progress.waiting or progress.closed != self.whole.bags:
             raise RuntimeError(f"not every bag of the week is in the catalogue: {progress}")
@@ -151,7 +151,7 @@ def recap_of_an_hour(week: Week) -> Question:
     """What happened in an hour in the middle of the week."""
     hour = week.whole.hour
     back = week.whole.recordings // 2 * (hour.end - hour.start)
-    span = Span(start_s=(hour.start - back) / 1e9, end_s=(hour.end - back) / 1e9 - 1e-3)
+    span = TimeRange(start_s=(hour.start - back) / 1e9, end_s=(hour.end - back) / 1e9 - 1e-3)
     return _beside_a_search(
         week, "recap of an hour", lambda: len(recap(week.memory, Call(), span).events)
     )

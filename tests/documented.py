@@ -23,8 +23,8 @@ from ros2_memory.bag_dir.heartbeat import (
     write_heartbeat,
 )
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
-from ros2_memory.bag_dir.moment_file import Keepsake, write_keepsake
-from ros2_memory.bootstrap import limits_of
+from ros2_memory.bag_dir.moment_file import SavedMoment, write_saved_moment
+from ros2_memory.bootstrap import query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.endpoint import build_server
@@ -147,7 +147,7 @@ def replies(bag_dir: Path) -> dict[str, str]:
     """The replies to `CALLS` and `MISTAKES`, asked `NOW`; the moment is kept before the list."""
     clock = SettableClock(NOW)
     settings = load_settings([f"recording.bag_dir={bag_dir}"], env={"MEMORY_DEPLOYMENT": "robot"})
-    memory = memory_of(bag_dir, clock=clock, limits=limits_of(settings))
+    memory = memory_of(bag_dir, clock=clock, limits=query_settings_of(settings))
     server = build_server(settings, memory)
     told = {}
     with recorder_beside(bag_dir, clock):
@@ -166,7 +166,9 @@ def shown_files(bag_dir: Path) -> dict[str, str]:
     overlap = Overlap(cut - 2 * NS_PER_S, cut + 2 * NS_PER_S, (f"{RECORDING}_5.mcap",))
     write_handover(bag_dir, Handover(next="rec_20261120T080058Z", counts_until=cut, end=overlap))
     start = (START_S + 34) * NS_PER_S
-    write_keepsake(bag_dir, Keepsake("5f0c" * 8, "scissors found", start, NOW, NOW, pending=False))
+    write_saved_moment(
+        bag_dir, SavedMoment("5f0c" * 8, "scissors found", start, NOW, NOW, pending=False)
+    )
     names = (HEARTBEAT_FILE, HANDOVER_FILE, MOMENT_FILE)
     return {name: (bag_dir / name).read_text(encoding="utf-8") for name in names}
 

@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE
-from ros2_memory.bag_dir.request_queue import Slot
+from ros2_memory.bag_dir.request_queue import PendingRequest
 from tests.bags import McapLayout, odom, write_mcap
 from tests.keeping import keeper_of
 from tests.memories import SettableClock
@@ -35,9 +35,11 @@ def recording(bag_dir: Path, name: str, start: int, splits: int = 6) -> list[Pat
     return made
 
 
-def asked(bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW) -> Slot:
+def asked(
+    bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW
+) -> PendingRequest:
     """Asks for what was recorded in these seconds."""
-    slot = Slot(bag_dir, label, T0 + start * S, T0 + end * S, at)
+    slot = PendingRequest(bag_dir, label, T0 + start * S, T0 + end * S, at)
     slot.post()
     return slot
 

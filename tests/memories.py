@@ -12,7 +12,7 @@ import yaml
 
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
-from ros2_memory.history.context import Limits, Memory
+from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -48,7 +48,7 @@ def memory_of(
     storage: str = "mcap",
     clock: Clock | None = None,
     reader: BagReader | None = None,
-    limits: Limits | None = None,
+    limits: QuerySettings | None = None,
     include_active: bool = False,
 ) -> Memory:
     """The memory over `bag_dir`, rescanned at every question.
@@ -67,4 +67,4 @@ def memory_of(
         split_duration_s=10.0,
         include_active=include_active,
     )
-    return Memory(index, reader, extractor(), timed, limits or Limits())
+    return Memory(index, reader, extractor(), timed, limits or QuerySettings())

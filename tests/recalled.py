@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ros2_memory.catalogue.digest import Digester
-from ros2_memory.catalogue.lookup import Recall, bags_without_entry
+from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
 from ros2_memory.core.errors import BagError
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     """The memory with a catalogue that knows the first `part` of the closed bags."""
     catalogue = Catalogue([bag_dir / FOLDER / FILE], "test")
-    recall = Recall(catalogue, bag_dir)
+    recall = DigestCache(catalogue, bag_dir)
     limit = memory.limits.max_plausible_speed_mps
     digester = Digester(memory.reader, memory.extractor, limit)
     bags = bags_without_entry(memory.index.snapshot().runs, recall)

@@ -1,1 +1,39 @@
-"""A robot's episodic memory: recorded ROS 2 topics, and answers about the past over MCP."""
+"""ros2-memory: a robot's episodic memory.
+
+Two programs share a directory of bags and nothing else. The **recorder**
+(`ros2_memory.recorder.__main__`) supervises `ros2 bag record`; the **query server**
+(`ros2_memory.server`) answers questions about closed bags over MCP. Neither needs the other to run.
+
+Modules at the top::
+
+    server          entry point of the query server
+    bootstrap       composition root
+    config          the configuration: models, loading, errors, sources
+    queries         one function for each tool of the specification
+    results         what queries and insights return
+    extract         dot-paths from decoded messages to plain values
+    typestore       message definitions
+
+Rooms, from the bottom up. A room imports only from rooms below it::
+
+    core            errors, time, the domain model, geometry, text, logging
+    storage         bag readers and writers; storage.mcap: the MCAP format
+    messages        decoded message -> fields -> plain values
+    bag_dir         the contract between the two programs: file names, heartbeat, handover, lock
+    analysis        pure mathematics: transform tree, odometry, paths, intervals, conditions
+    index           directory scan -> file state -> bag table -> timeline -> snapshot
+    retention       garbage collection, latched carry-forward, repair, saved moments
+    recorder        the recorder; recorder.process: the child; recorder.handover: rotation
+    catalogue       SQLite digests of closed bags; derived, disposable
+    history         one call's view across many bags
+    insights        the tools beyond the specification
+    tools           declarations, arguments, replies as JSON
+    serving         dispatch, MCP, HTTP, access, limits, health
+    observability   Prometheus, OpenTelemetry
+    demo            the simulated robot of `ros2-memory demo`
+    cli             `ros2-memory`
+
+A call: `serving.mcp_server` -> `serving.dispatch` -> a declaration in `tools` -> a function in
+`queries` or `insights` -> `history.view` over `index.snapshot` -> a `storage` adapter ->
+`extract` -> `results` -> `tools.replies`. docs/architecture.md has the whole picture.
+"""

@@ -16,7 +16,7 @@ from ros2_memory.bag_dir.confined import ConfinedReader
 from ros2_memory.bag_dir.layout import has_recorded
 from ros2_memory.bag_dir.stand_in import StandInReader
 from ros2_memory.catalogue.digest import DIGEST_VERSION, Digester
-from ros2_memory.catalogue.lookup import Recall
+from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.config import load_message_schemas
 from ros2_memory.core import directories
@@ -25,10 +25,10 @@ from ros2_memory.core.release import PACKAGE, package_version
 from ros2_memory.core.telemetry import SILENT, Telemetry
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.extract import SchemaExtractor
-from ros2_memory.history.context import Limits, Memory
+from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.observability.gauges import Measuring
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.serving.backfill import Filler
+from ros2_memory.serving.backfill import Backfill
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.settings import NullRecorderNode
 from ros2_memory.tools.replies import Replies
@@ -53,8 +53,8 @@ def build_memory(settings: Settings) -> Memory:
     bag_dir = settings.recording.bag_dir
     counting = CountingReader(build_reader(settings))
     reader = StandInReader(ConfinedReader(counting, bag_dir), bag_dir)
-    reading = way_of_reading(settings, schemas)
-    places = partial(catalogue_places, settings)
+    reading = catalogue_fingerprint(settings, schemas)
+    places = partial(catalogue_paths, settings)
     catalogue = Catalogue(places, reading, waits_for=bag_dir)
     index = IndexManager(
         bag_dir,
@@ -66,11 +66,11 @@ def build_memory(settings: Settings) -> Memory:
         include_active=settings.reader.include_active,
         trusts_mtime=not isinstance(settings.recorder, NullRecorderNode),
     )
-    recall = Recall(catalogue, bag_dir)
-    return Memory(index, reader, extractor, clock, limits_of(settings), recall)
+    recall = DigestCache(catalogue, bag_dir)
+    return Memory(index, reader, extractor, clock, query_settings_of(settings), recall)
 
 
-def catalogue_places(settings: Settings) -> tuple[Path, ...]:
+def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
     """Where the catalogue may lie now, best first.
 
     Beside the bags only where a recorder has been at work, and may be again: a folder of other
@@ -88,7 +88,7 @@ def catalogue_places(settings: Settings) -> tuple[Path, ...]:
     return (*places, cache / PACKAGE / name / FILE) if cache.is_absolute() else places
 
 
-def way_of_reading(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> str:
+def catalogue_fingerprint(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> str:
     """A hash of all that digests depend on besides the bags: settings, definitions, this program.
 
     `schemas` is the schema map of these settings.
@@ -113,19 +113,19 @@ def way_of_reading(settings: Settings, schemas: Mapping[str, Mapping[str, str]])
     return hashlib.sha256(json.dumps(depends_on).encode()).hexdigest()[:16]
 
 
-def build_filler(settings: Settings, memory: Memory) -> Filler:
+def build_backfill(settings: Settings, memory: Memory) -> Backfill:
     """What fills the catalogue of a memory."""
     limit = memory.limits.max_plausible_speed_mps
-    return Filler(
+    return Backfill(
         memory, Digester(memory.reader, memory.extractor, limit), settings.recording.bag_dir
     )
 
 
-def limits_of(settings: Settings) -> Limits:
+def query_settings_of(settings: Settings) -> QuerySettings:
     """What questions need of the configuration."""
     data = settings.data
     records = not isinstance(settings.recorder, NullRecorderNode)
-    return Limits(
+    return QuerySettings(
         position_tolerance_m=data.position_tolerance_m,
         time_tolerance_s=data.time_tolerance_s,
         pose_topic=data.pose_topic,

@@ -28,8 +28,8 @@ from ros2_memory.core.model import (
     Twist,
 )
 from ros2_memory.messages.conversions import (
-    Kind,
     Metric,
+    ValueKind,
     euler,
     kind_of,
     nanoseconds,
@@ -47,7 +47,7 @@ from ros2_memory.messages.fields import (
     names_of,
     parse_path,
 )
-from ros2_memory.messages.to_json import MAX_SQUEEZE, Exact, Rendering, Shown
+from ros2_memory.messages.to_json import MAX_SQUEEZE, ExactJson, Rendering, ReplyJson
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -185,12 +185,12 @@ class SchemaExtractor:
         the limit, and the data of images, point clouds and maps, are summaries here too, and what
         lies deeper than 24 levels (JSON alone can) is null.
         """
-        return self._whole(Exact(self._limit), message, type_name)
+        return self._whole(ExactJson(self._limit), message, type_name)
 
     def exact_at(self, message: object, type_name: str, path: str) -> JsonValue:
         """What `shown` means by one of its `fields`, exactly; null where this message has none."""
         found = self._sought(message, type_name, path)
-        return None if found is ABSENT else Exact(self._limit).value(found, path)
+        return None if found is ABSENT else ExactJson(self._limit).value(found, path)
 
     def shown(self, message: object, type_name: str, fields: Sequence[str] = ()) -> Extracted:
         """The value as it leaves in a reply: strict JSON, thinned and rounded, with notes.
@@ -207,7 +207,7 @@ class SchemaExtractor:
         nodes = {path: self._find(message, type_name, path) for path in fields}
         limit, squeeze = self._limit, 1
         while True:
-            rendering = Shown(limit, squeeze)
+            rendering = ReplyJson(limit, squeeze)
             value: JsonValue = (
                 {path: rendering.value(node, path) for path, node in nodes.items()}
                 if nodes
@@ -453,7 +453,7 @@ def _plain(node: object) -> object:
     """A node that was named by its full path: a quaternion so named is wanted as x, y, z, w."""
     if isinstance(node, list):
         return [_plain(one) for one in node]
-    numbers = xyzw(node) if kind_of(node) is Kind.QUATERNION else None
+    numbers = xyzw(node) if kind_of(node) is ValueKind.QUATERNION else None
     return node if numbers is None else dict(zip("xyzw", numbers, strict=True))
 
 

@@ -53,7 +53,7 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
     return tuple(rows)
 
 
-def data_time_range(memory: Memory, call: Call) -> results.TimeRange:
+def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     """What the memory spans, where it has holes, and which files do not answer.
 
     Bags that a wrong clock dated are listed, and neither begin nor end the span or a hole in it.
@@ -72,7 +72,7 @@ def data_time_range(memory: Memory, call: Call) -> results.TimeRange:
     for sentence in absence_told(absent_splits(snapshot, memory.index.bag_dir)):
         view.note(sentence)
     undecodable = undecodable_topics(view)
-    return results.TimeRange(
+    return results.DataTimeRange(
         earliest=snapshot.dating.earliest,
         latest=snapshot.dating.latest,
         now=now,

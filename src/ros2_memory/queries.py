@@ -33,24 +33,24 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.coverage import (
     moment,
-    nothing_at,
-    nothing_between,
+    no_data_at,
+    no_data_between,
     require_bags,
     resolve_pose_topic,
     resolve_topic,
     seconds,
 )
-from ros2_memory.history.driven_path import carries_no, decoded, way_driven
+from ros2_memory.history.driven_path import carries_no, decoded, driven_path
 from ros2_memory.history.reverse_search import last_match, unsearched
 from ros2_memory.history.robots import note_robots, note_robots_near
 from ros2_memory.history.time_arguments import (
-    Moment,
-    Span,
+    AtTime,
+    TimeRange,
     ns_argument,
     open_moment,
     open_span,
 )
-from ros2_memory.history.unseen import note_edges, note_unseen
+from ros2_memory.history.unseen import note_edges, note_unread
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.insights.field_extremes import (
@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import Extracted
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.duplicates import StoredMessage
 
 __all__ = [
     "data_time_range",
@@ -88,7 +88,7 @@ def topic_value(
     memory: Memory,
     call: Call,
     topic: str,
-    moment: Moment,
+    moment: AtTime,
     *,
     tolerance_s: float | None = None,
     fields: Sequence[str] = (),
@@ -107,7 +107,7 @@ def topic_range(
     memory: Memory,
     call: Call,
     topic: str,
-    span: Span,
+    span: TimeRange,
     *,
     max_samples: int = 100,
     fields: Sequence[str] = (),
@@ -120,13 +120,13 @@ def topic_range(
     name = resolve_topic(view, topic)
     total, chosen = view.pick(name, window, max_samples)
     if not chosen:
-        raise nothing_between(view, (name,), window)
+        raise no_data_between(view, (name,), window)
     samples, types = _samples(view, chosen, window, fields)
     if len(types) > 1:
         view.note(f"the topic was recorded under several types: {', '.join(types)}")
     if len(chosen) < total:
         view.note(samples_note(len(chosen), total))
-    note_unseen(view, window)
+    note_unread(view, window)
     note_edges(view, window)
     extremes: tuple[results.Extremes, ...] = ()
     if fields and total > MOST_MESSAGES:
@@ -139,7 +139,7 @@ def topic_range(
 def position(
     memory: Memory,
     call: Call,
-    moment: Moment,
+    moment: AtTime,
     *,
     topic: str | None = None,
     tolerance_s: float | None = None,
@@ -174,7 +174,7 @@ def position(
 def velocity(
     memory: Memory,
     call: Call,
-    moment: Moment,
+    moment: AtTime,
     *,
     topic: str | None = None,
     tolerance_s: float | None = None,
@@ -191,16 +191,16 @@ def velocity(
 
 
 def transform(
-    memory: Memory, call: Call, parent: str, child: str, moment: Moment
+    memory: Memory, call: Call, parent: str, child: str, moment: AtTime
 ) -> results.TransformAt:
     """The pose of `child` in `parent` at a moment, interpolated by tf2's rules."""
     view, at, now = open_moment(memory, call, moment)
     try:
         found = frame_history.transform_at(view, parent, child, at)
     except NoDataError as error:
-        note_unseen(view, _around(at, TF_CACHE_NS), nothing=True)
+        note_unread(view, _around(at, TF_CACHE_NS), nothing=True)
         raise NoDataError(error.reason, error.detail, view.notes) from error
-    note_unseen(view, _around(at, found.reach))
+    note_unread(view, _around(at, found.reach))
     age = None if now is None else now - at
     return results.TransformAt(
         parent, child, at, found.lookup.transform, found.clock, view.notes, age
@@ -212,7 +212,7 @@ def frames(memory: Memory, call: Call) -> results.Frames:
     view = View(memory, call, memory.clock.now())
     require_bags(view)
     edges = frame_history.edges(view)
-    note_unseen(view, TimeWindow.everything(), nothing=True)
+    note_unread(view, TimeWindow.everything(), nothing=True)
     return results.Frames(edges, view.notes)
 
 
@@ -239,7 +239,7 @@ def find_last_match(
     if found is None:
         return results.Match(None, unsearched(view, TimeWindow(MIN_NS, until)))
     note_robots_near(view, found)
-    note_unseen(view, _searched(view, found, until, now), search=True)
+    note_unread(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
     if counted_from is not None and found.time > counted_from + FUTURE_NS:
         view.note(f"dated {seconds(found.time - counted_from)} after now: when it was is unknown")
@@ -270,12 +270,12 @@ def value_when(
     found = last_match(view, condition_topic, condition, until)
     if found is None:
         return results.ValueWhen(None, notes=unsearched(view, TimeWindow(MIN_NS, until)))
-    note_unseen(view, _searched(view, found, until, now), search=True)
+    note_unread(view, _searched(view, found, until, now), search=True)
     note_robots_near(view, found)
     matched = _value(view, found, (), None)
     upto = TimeWindow.until(found.time)
     held = _newest_beside(view, name, upto, found)
-    note_unseen(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
+    note_unread(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
     if held is None:
         view.note(f"{name} held no message yet at {moment(found.time)}")
         return results.ValueWhen(matched, None, view.notes)
@@ -287,7 +287,9 @@ def value_when(
     return results.ValueWhen(matched, told, view.notes)
 
 
-def _newest_beside(view: View, topic: str, window: TimeWindow, match: Found) -> Found | None:
+def _newest_beside(
+    view: View, topic: str, window: TimeWindow, match: StoredMessage
+) -> StoredMessage | None:
     """The newest message of a topic in a window: of the match's recording, where it has one there.
 
     A note says where recordings of several robots may be mixed.
@@ -308,25 +310,25 @@ def _newest_beside(view: View, topic: str, window: TimeWindow, match: Found) -> 
 
 
 def trajectory_summary(
-    memory: Memory, call: Call, span: Span, *, topic: str | None = None
+    memory: Memory, call: Call, span: TimeRange, *, topic: str | None = None
 ) -> results.TrajectorySummary:
     """The way driven in a window, from one pose topic in log-time order."""
     view, window = open_span(memory, call, span)
     name = resolve_pose_topic(view, topic)
-    way = way_driven(view, name, window)
+    way = driven_path(view, name, window)
     if way is None:
-        raise nothing_between(view, (name,), window)
+        raise no_data_between(view, (name,), window)
     if len(way.frames) > 1:
         view.note(f"poses in several frames were joined: {', '.join(way.frames)}")
     note_robots(view, name, window)
-    note_unseen(view, window)
+    note_unread(view, window)
     note_edges(view, window)
     return results.TrajectorySummary(
         name, way.frames[0], way.first, way.last, way.trajectory, view.notes
     )
 
 
-def _searched(view: View, found: Found, until: Ns, now: Ns) -> TimeWindow:
+def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
     """What a search went through to its match, as far as there has been anything."""
     stop = until if view.memory.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(found.time, max(stop, found.time + 1))
@@ -339,7 +341,7 @@ def _before(before_s: float | None) -> Ns:
     return min(ns_argument("before", before_s) + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
 
 
-def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Found:
+def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> StoredMessage:
     """The newest message of a topic at or before a moment: of any age where it is latched.
 
     Raises:
@@ -360,13 +362,15 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Foun
         elif not limits.latching.holds(view.snapshot, found):
             found = None
     if found is None:
-        raise nothing_at(view, (topic,), at, tolerance)
+        raise no_data_at(view, (topic,), at, tolerance)
     note_robots_near(view, found)
-    note_unseen(view, TimeWindow(found.time, stop))
+    note_unread(view, TimeWindow(found.time, stop))
     return found
 
 
-def _held(view: View, value: results.TopicValue, found: Found, at: Ns) -> results.TopicValue:
+def _held(
+    view: View, value: results.TopicValue, found: StoredMessage, at: Ns
+) -> results.TopicValue:
     """A value with whether it is latched, and then how old it is."""
     if not view.memory.limits.latching.holds(view.snapshot, found):
         return value
@@ -374,14 +378,14 @@ def _held(view: View, value: results.TopicValue, found: Found, at: Ns) -> result
     return replace(value, latched=True, age=age)
 
 
-def _note_held(view: View, found: Found, at: Ns) -> None:
+def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
     """Says of a value that is not shown with its age that it is latched, and how old."""
     if view.memory.limits.latching.holds(view.snapshot, found):
         topic = found.record.channel.topic
         view.note(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
 
 
-def _extracted(view: View, found: Found, fields: Sequence[str]) -> Extracted:
+def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:
     """A message as a reply shows it, with the notes on that message alone."""
     begin = time.perf_counter_ns()
     message = decoded(view, found)
@@ -390,7 +394,9 @@ def _extracted(view: View, found: Found, fields: Sequence[str]) -> Extracted:
     return shown
 
 
-def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> results.TopicValue:
+def _value(
+    view: View, found: StoredMessage, fields: Sequence[str], now: Ns | None
+) -> results.TopicValue:
     """A message as a reply shows it, with the notes of the whole view so far."""
     shown = _extracted(view, found, fields)
     channel = found.record.channel
@@ -404,7 +410,7 @@ def _value(view: View, found: Found, fields: Sequence[str], now: Ns | None) -> r
 
 
 def _samples(
-    view: View, chosen: Sequence[Found], window: TimeWindow, fields: Sequence[str]
+    view: View, chosen: Sequence[StoredMessage], window: TimeWindow, fields: Sequence[str]
 ) -> tuple[tuple[Sample, ...], list[str]]:
     """The samples that can be decoded, and their types in order of appearance.
 
@@ -425,14 +431,14 @@ def _samples(
         for sentence in shown.notes:
             view.note(sentence)
     if failures and not samples:
-        note_unseen(view, window, nothing=True)
+        note_unread(view, window, nothing=True)
         raise NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)), view.notes)
     for detail, count in failures.items():
         view.note(f"{count} samples left out: {detail}")
     return tuple(samples), list(types)
 
 
-def _age(found: Found, now: Ns | None) -> Ns | None:
+def _age(found: StoredMessage, now: Ns | None) -> Ns | None:
     return None if now is None else now - found.time
 
 

@@ -55,7 +55,7 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
-class TimeRange:
+class DataTimeRange:
     """What the memory spans and what is wrong with it; `earliest` and `latest` None when empty."""
 
     earliest: Ns | None

@@ -18,7 +18,7 @@ import anyio
 import uvicorn
 
 from ros2_memory.bootstrap import (
-    build_filler,
+    build_backfill,
     build_memory,
     build_telemetry,
 )
@@ -28,7 +28,7 @@ from ros2_memory.core.release import package_version
 from ros2_memory.core.sd_notify import READY, STOPPING, ServiceManager
 from ros2_memory.endpoint import build_server
 from ros2_memory.serving.api_token import take_token
-from ros2_memory.serving.backfill import keep_filled
+from ros2_memory.serving.backfill import keep_backfilled
 from ros2_memory.serving.connection_limits import (
     ACCEPTED_AT_ONCE,
     BoundedConnection,
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from pydantic import SecretStr
 
     from ros2_memory.history.context import Memory
-    from ros2_memory.serving.backfill import Filler
+    from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.listen import Address
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.serving.web_app import Background, WebApp
@@ -92,7 +92,7 @@ def _run(overrides: Sequence[str]) -> None:
         memory = build_memory(settings)
         telemetry = build_telemetry(settings, memory)
         server = build_server(settings, memory, telemetry)
-    filler = build_filler(settings, memory)
+    filler = build_backfill(settings, memory)
     health = Health(memory, package_version(), filler)
     background = partial(_in_background, memory, filler, settings.reader.index_refresh_s, overrides)
     log.info(
@@ -185,14 +185,14 @@ def _left(code: int) -> int:
 
 
 async def _in_background(
-    memory: Memory, filler: Filler, every_s: float, overrides: Sequence[str]
+    memory: Memory, filler: Backfill, every_s: float, overrides: Sequence[str]
 ) -> None:
     """Keeps the index fresh and the catalogue full, until it is cancelled."""
     program = [sys.executable, "-m", "ros2_memory.cli", "index"]
     helper = [*program, "--for-server", str(os.getpid()), "--", *overrides]
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(keep_fresh, memory, every_s)
-        tasks.start_soon(keep_filled, filler, helper, every_s)
+        tasks.start_soon(keep_backfilled, filler, helper, every_s)
 
 
 async def _serve_stdio(server: EpisodicServer, background: Background) -> None:

@@ -17,15 +17,15 @@ import structlog
 
 from ros2_memory.catalogue.database import RETRY_S
 from ros2_memory.catalogue.digest import Digester
-from ros2_memory.catalogue.lookup import Recall
+from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.core.errors import BagError
 from ros2_memory.serving.backfill import (
     AGAIN_NS,
     BACKLOG,
-    Filler,
+    Backfill,
     Progress,
-    keep_filled,
+    keep_backfilled,
 )
 from tests.faults.world import NOW, fill_up, plainly, served, told, write_bag, write_bags
 from tests.memories import SettableClock
@@ -116,11 +116,11 @@ def warned(logs: Sequence[Mapping[str, object]]) -> list[object]:
     return [each["event"] for each in logs if each["log_level"] in {"warning", "error"}]
 
 
-def trouble_of(filler: Filler) -> str | None:
+def trouble_of(filler: Backfill) -> str | None:
     return filler.trouble
 
 
-def filled_anew(filler: Filler) -> None:
+def filled_anew(filler: Backfill) -> None:
     """What the server's background does, round after round."""
     for _ in range(2):
         filler.look_after()
@@ -251,7 +251,7 @@ class Refusing(Digester):
         raise BagError(str(path), "no digest of it can be made")
 
 
-class Counted(Filler):
+class Counted(Backfill):
     """A filler that counts the rounds in which it was looked after."""
 
     rounds = 0
@@ -270,7 +270,7 @@ def test_what_could_not_be_asked_once_is_asked_again(tmp_path: Path) -> None:
     base = memory.recall.catalogue._base
     opened = base._opened
     assert opened is not None
-    recall = Recall(memory.recall.catalogue, tmp_path)
+    recall = DigestCache(memory.recall.catalogue, tmp_path)
     [run] = memory.index.snapshot().runs
     as_of = recall.as_of()
     base._opened = replace(opened, base=Busy(":memory:"))
@@ -293,7 +293,7 @@ async def test_bags_that_cannot_be_digested_have_the_helper_started_no_second_ti
     started = tmp_path / "started"
     helper = ["sh", "-c", f"echo once >> {started}"]
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(keep_filled, filler, helper, 0.001)
+        tasks.start_soon(keep_backfilled, filler, helper, 0.001)
         with anyio.fail_after(PATIENCE_S):
             while filler.progress().waiting:
                 await anyio.sleep(0.01)
@@ -313,7 +313,7 @@ def test_a_bag_that_could_not_be_digested_is_tried_again_later(tmp_path: Path) -
     memory, _ = served(tmp_path)
     clock = SettableClock(NOW.now())
     memory = replace(memory, clock=clock)
-    refusing = Filler(memory, Refusing(memory.reader, memory.extractor, 10.0), tmp_path)
+    refusing = Backfill(memory, Refusing(memory.reader, memory.extractor, 10.0), tmp_path)
     fill_up(refusing)
     assert refusing.progress() == Progress(2, 0, 2)
     clock.at += AGAIN_NS

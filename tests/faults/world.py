@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ros2_memory import queries
-from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.cli.index import fill
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, FixedClock
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.visits import visits
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ros2_memory.history.context import Memory
-    from ros2_memory.serving.backfill import Filler
+    from ros2_memory.serving.backfill import Backfill
 
 T0_S = 1_700_000_000
 T0 = T0_S * NS_PER_S
@@ -60,7 +60,7 @@ def told(
 
     An error of the tree is an answer too.
     """
-    span = Span(start_s=T0_S, end_s=T0_S + 10 * count)
+    span = TimeRange(start_s=T0_S, end_s=T0_S + 10 * count)
     place = '{"x": 4.0, "y": 0.0}'
 
     def last(wanted: str) -> Callable[[], object]:
@@ -72,7 +72,7 @@ def told(
         *(last(wanted) for wanted in ("thing3", "never", "cup", f"thing{count - 1}")),
         lambda: queries.find_last_match(memory, Call(), "/odom", "near_position", place),
         lambda: queries.trajectory_summary(memory, Call(), span),
-        lambda: queries.topic_value(memory, Call(), "/odom", Moment(at_s=T0_S + 42.0)),
+        lambda: queries.topic_value(memory, Call(), "/odom", AtTime(at_s=T0_S + 42.0)),
         lambda: recap(memory, Call(), span),
         lambda: visits(memory, Call(), 4.0, 0.0),
         lambda: find_matches(memory, Call(), "/vision/*", "contains", "cup"),
@@ -88,17 +88,17 @@ def told(
     return answers
 
 
-def served(bag_dir: Path) -> tuple[Memory, Filler]:
+def served(bag_dir: Path) -> tuple[Memory, Backfill]:
     """A memory as the server builds it, and what fills its catalogue."""
     settings = load_settings((), {"MEMORY_BAG_DIR": str(bag_dir)})
     memory = build_memory(settings)
     # Every question looks, and the clock stands long after the bags.
     plain = memory_of(bag_dir, clock=NOW)
     memory = replace(memory, clock=NOW, index=plain.index, reader=plain.reader)
-    return memory, build_filler(settings, memory)
+    return memory, build_backfill(settings, memory)
 
 
-def fill_up(filler: Filler) -> None:
+def fill_up(filler: Backfill) -> None:
     """Digests all that waits."""
     fill(filler, None, lambda: False)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import structlog
 
 from ros2_memory import cli
-from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.cli.index import Bar, fill
 from ros2_memory.cli.recovery import recover
 from ros2_memory.config import load_settings
@@ -267,7 +267,7 @@ def _count(memory: Memory, bag: Path, notes: tuple[str, ...], verdict: Verdict) 
 
 def _digested(world: World, memory: Memory, verdict: Verdict) -> None:
     begun = time.process_time()
-    fill(build_filler(world.settings, memory), Bar(io.StringIO()), lambda: False)
+    fill(build_backfill(world.settings, memory), Bar(io.StringIO()), lambda: False)
     verdict.digest_s = time.process_time() - begun
     if verdict.digest_s > MOST_S:
         verdict.faults.append(f"slow: digesting took {verdict.digest_s:.1f} s")

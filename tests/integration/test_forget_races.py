@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.moment_file import held_in
+from ros2_memory.bag_dir.moment_file import stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, identity_of
-from ros2_memory.bag_dir.request_queue import Slot
+from ros2_memory.bag_dir.request_queue import PendingRequest
 from tests.bags import odom, write_mcap
 from tests.keeping import size_of
 from tests.memories import ROOT
@@ -68,7 +68,9 @@ class Robot:
     def ask_for_moments(self, number: int, chance: random.Random) -> None:
         for label in range(3):
             start = T0 + (number * SPLITS + chance.randrange(SPLITS)) * 2 * S
-            slot = Slot(self.bag_dir, f"r{number} m{label}", start, start + 3 * S, time.time_ns())
+            slot = PendingRequest(
+                self.bag_dir, f"r{number} m{label}", start, start + 3 * S, time.time_ns()
+            )
             try:
                 slot.post()
                 self.kept.append(until(slot.outcome))
@@ -125,7 +127,7 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
     granted = [each for each in robot.kept if each.moment is not None]
     assert granted
     assert not [each.refused for each in robot.kept if "hard links" in str(each.refused)]
-    moments = {held.folder.name: held for held in held_in(robot.bag_dir)}
+    moments = {held.folder.name: held for held in stored_moments_in(robot.bag_dir)}
     for each in granted:
         held = moments[str(each.moment)]
         files = {

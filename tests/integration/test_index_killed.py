@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S, FixedClock
@@ -80,5 +80,5 @@ def test_after_a_kill_every_answer_is_right_and_the_rest_gets_done(
     assert memory.recall.catalogue.path == catalogue
 
     subprocess.run(command, env=environment, check=True, stderr=subprocess.DEVNULL)
-    assert build_filler(settings, memory).progress().waiting == 0
+    assert build_backfill(settings, memory).progress().waiting == 0
     assert answers(memory) == expected

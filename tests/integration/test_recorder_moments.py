@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
-from ros2_memory.bag_dir.moment_file import Held, held_in
+from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from tests.integration.test_recorder_daemon import Site, at_a_site, sited
 from tests.integration.test_server_process import serving
 from tests.live_recorder import answer
@@ -43,17 +43,17 @@ def asked_about(site: Site) -> Iterator[Served]:
         yield served
 
 
-def complete(bag_dir: Path) -> Held:
+def complete(bag_dir: Path) -> StoredMoment:
     """The one moment that is kept, when nothing of it is waited for any more."""
 
-    def is_complete() -> Held | None:
-        [held] = held_in(bag_dir)
+    def is_complete() -> StoredMoment | None:
+        [held] = stored_moments_in(bag_dir)
         return None if held.keepsake.pending else held
 
     return until(is_complete)
 
 
-def originals(held: Held, bag_dir: Path) -> list[Path]:
+def originals(held: StoredMoment, bag_dir: Path) -> list[Path]:
     """Where the bags of a moment were recorded."""
     return [bag_dir / path.relative_to(held.folder) for path in held.folder.rglob("*.mcap")]
 

@@ -24,8 +24,8 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import NS_PER_S, WallClock
-from ros2_memory.history.context import Call, Limits
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.bags import McapLayout, odom, write_mcap
 from tests.integration.test_recorder_daemon import Site, sited
@@ -62,7 +62,7 @@ class Asker:
     _round: threading.Condition = field(default_factory=threading.Condition)
 
     def __post_init__(self) -> None:
-        limits = Limits(now="latest", split_duration_s=10.0)
+        limits = QuerySettings(now="latest", split_duration_s=10.0)
         self.memory = memory_of(self.bag_dir, clock=WallClock(), limits=limits)
 
     @contextmanager
@@ -76,13 +76,13 @@ class Asker:
             thread.join()
 
     def _ask(self) -> None:
-        now = Moment(ago_s=0.0)
+        now = AtTime(ago_s=0.0)
         questions: list[Callable[[], object]] = [
             lambda: queries.list_recorded_topics(self.memory, Call()),
             lambda: queries.data_time_range(self.memory, Call()),
-            lambda: queries.position(self.memory, Call(), Moment(ago_s=40.0)),
-            lambda: queries.topic_range(self.memory, Call(), "/odom", Span(last_s=60.0)),
-            lambda: queries.trajectory_summary(self.memory, Call(), Span(last_s=100.0)),
+            lambda: queries.position(self.memory, Call(), AtTime(ago_s=40.0)),
+            lambda: queries.topic_range(self.memory, Call(), "/odom", TimeRange(last_s=60.0)),
+            lambda: queries.trajectory_summary(self.memory, Call(), TimeRange(last_s=100.0)),
             lambda: queries.find_last_match(self.memory, Call(), "/chatter", "contains", "no such"),
             lambda: queries.frames(self.memory, Call()),
         ]
@@ -113,12 +113,12 @@ class Asker:
             self.wrong.append(repr(error))
             raise
 
-    def _is_docked(self, moment: Moment) -> None:
+    def _is_docked(self, moment: AtTime) -> None:
         told = queries.topic_value(self.memory, Call(), DOCK, moment)
         if (told.sample.time, told.sample.value) != (self.begin + 1, {"value": "home"}):
             self.wrong.append(f"{told.sample}")
 
-    def _is_placed(self, moment: Moment) -> None:
+    def _is_placed(self, moment: AtTime) -> None:
         told = queries.transform(self.memory, Call(), "base_link", "laser", moment)
         if told.transform.translation != (0.1, 0.0, 0.2):
             self.wrong.append(f"{told.transform}")
@@ -184,8 +184,8 @@ def test_the_budget_is_held_while_it_is_recorded_and_asked(tmp_path: Path) -> No
     assert {path.parent for path in left} == {
         path for path in bag_dir.iterdir() if path.is_dir() and path.name.startswith("rec_")
     }
-    asker._is_docked(Moment(ago_s=0.0))
-    asker._is_placed(Moment(ago_s=0.0))
+    asker._is_docked(AtTime(ago_s=0.0))
+    asker._is_placed(AtTime(ago_s=0.0))
     assert asker.wrong == []
 
 

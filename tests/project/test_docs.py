@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, get_type_hints
 
 import pytest
 
-from ros2_memory.history.context import Limits
+from ros2_memory.history.context import QuerySettings
 from ros2_memory.settings import Ros2BagNode, Settings
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.spec_tools import build_tools
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-TOOLS = build_tools(Limits(), 25.0, writing=True)
+TOOLS = build_tools(QuerySettings(), 25.0, writing=True)
 
 
 def keys(cls: type, prefix: str = "") -> Iterator[str]:

@@ -128,7 +128,7 @@ def environment(home: Path) -> dict[str, str]:
 
 
 def test_every_block_is_of_a_language_that_is_held_here() -> None:
-    known = {"sh", "json", "yaml", "sql", "text"}
+    known = {"sh", "json", "yaml", "sql", "text", "mermaid"}
     assert {block.language for block in BLOCKS if block.holder is None} <= known
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.errors import EpisodicError, NoDataReason
-from ros2_memory.history.context import Limits
+from ros2_memory.history.context import QuerySettings
 from ros2_memory.tools.resources import SCHEMA, STATUS, TOPICS
 from ros2_memory.tools.spec_tools import build_tools
 from tests import reference
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FOLDER = ROOT / "docs" / "reference"
-TOOLS = build_tools(Limits(), 25.0, writing=True)
+TOOLS = build_tools(QuerySettings(), 25.0, writing=True)
 HOW = "write it anew with `UPDATE_DOCS=1 uv run pytest -n0 tests/project/test_reference.py`"
 
 

@@ -15,7 +15,7 @@ from ros2_memory.core.release import package_version
 from ros2_memory.endpoint import build_server
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from ros2_memory.tools.reply_size import compact
+from ros2_memory.tools.reply_size import to_json_text
 from tests.questions import ANSWERED, ask, ask_everything, write_run
 
 if TYPE_CHECKING:
@@ -127,4 +127,4 @@ async def test_the_size_of_replies_is_as_configured(tmp_path: Path) -> None:
     async with Client(build_server(chosen, build_memory(chosen))) as client:
         for name, given, _ in ANSWERED:
             told, _ = await ask(client, name, given)
-            assert len(compact(told)) <= 1000
+            assert len(to_json_text(told)) <= 1000

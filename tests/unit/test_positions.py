@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from ros2_memory.history.context import Limits
+from ros2_memory.history.context import QuerySettings
 from tests.asking import asked
 from tests.bags import (
     Msg,
@@ -126,7 +126,7 @@ CARRIERS = {
 
 
 def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
-    memory = memory_of(bag_dir, limits=Limits(**given.pop("limits", {})))
+    memory = memory_of(bag_dir, limits=QuerySettings(**given.pop("limits", {})))
     return asked(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool, **given)
 
 

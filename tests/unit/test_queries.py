@@ -16,7 +16,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.history.view import View
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.bags import (
@@ -41,8 +41,8 @@ T0 = 1_700_000_000 * 10**9
 S = 10**9
 
 
-def span(start: float, end: float) -> Span:
-    return Span(start_s=T0 / 1e9 + start, end_s=T0 / 1e9 + end)
+def span(start: float, end: float) -> TimeRange:
+    return TimeRange(start_s=T0 / 1e9 + start, end_s=T0 / 1e9 + end)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_a_latched_copy_in_a_later_window_does_not_count_there(tmp_path: Path) -
     memory = memory_of(tmp_path)
     with pytest.raises(NoDataError):
         queries.topic_range(memory, Call(), "/dock", span(590, 610))
-    held = queries.topic_value(memory, Call(), "/dock", Moment(at_s=T0 / 1e9 + 605))
+    held = queries.topic_value(memory, Call(), "/dock", AtTime(at_s=T0 / 1e9 + 605))
     assert held.sample.time == T0
 
 
@@ -200,7 +200,7 @@ def test_why_there_is_no_transform_is_said_of_the_whole_memory(
         )
     with pytest.raises(NoDataError) as caught:
         queries.transform(
-            memory_of(tmp_path), Call(), "odom", "base_link", Moment(at_s=T0 / 1e9 + at)
+            memory_of(tmp_path), Call(), "odom", "base_link", AtTime(at_s=T0 / 1e9 + at)
         )
     assert caught.value.reason == reason
     assert "tolerance_s" not in caught.value.detail

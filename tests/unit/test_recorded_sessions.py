@@ -12,8 +12,8 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
-from ros2_memory.history.context import Call, Limits
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from tests.bags import typestore
 from tests.closed_form import (
     CAMERA,
@@ -74,7 +74,7 @@ def test_the_position_is_the_closed_form_at_the_replys_own_timestamp(
     rng = random.Random(50)
     for _ in range(50):
         asked = session.at(rng.uniform(begin + 0.2, end))
-        answer = queries.position(memory, Call(), Moment(at_s=asked))
+        answer = queries.position(memory, Call(), AtTime(at_s=asked))
         t = session.since(unix_from_ns(answer.time))
         x, y = position(t)
         assert math.dist(answer.pose.position[:2], (x, y)) < 0.005
@@ -86,7 +86,7 @@ def test_the_heading_is_the_closed_form(memory: Memory, session: Session) -> Non
     begin, end = spanned(memory, session)
     for step in range(20):
         asked = session.at(begin + 0.2 + (end - begin - 0.4) * step / 19)
-        answer = queries.topic_value(memory, Call(), "/odom", Moment(at_s=asked))
+        answer = queries.topic_value(memory, Call(), "/odom", AtTime(at_s=asked))
         value = answer.sample.value
         assert isinstance(value, dict)
         orientation = value["orientation"]
@@ -107,7 +107,7 @@ def test_a_transform_is_interpolated_to_the_asked_moment(
     rng = random.Random(7)
     for _ in range(25):
         t = rng.uniform(begin + 0.1, end - 0.1)
-        answer = queries.transform(memory, Call(), "odom", sensor, Moment(at_s=session.at(t)))
+        answer = queries.transform(memory, Call(), "odom", sensor, AtTime(at_s=session.at(t)))
         assert math.dist(answer.transform.translation, mounted(t, mount)) < 0.005
         x, y, z, w = answer.transform.rotation
         yaw = math.degrees(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
@@ -119,8 +119,8 @@ def test_a_transform_is_interpolated_to_the_asked_moment(
 def test_a_transform_and_its_inverse_agree(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
     t = (begin + end) / 2
-    there = queries.transform(memory, Call(), "odom", "laser", Moment(at_s=session.at(t)))
-    back = queries.transform(memory, Call(), "laser", "odom", Moment(at_s=session.at(t)))
+    there = queries.transform(memory, Call(), "odom", "laser", AtTime(at_s=session.at(t)))
+    back = queries.transform(memory, Call(), "laser", "odom", AtTime(at_s=session.at(t)))
     x, y, _ = mounted(t, LASER)
     angle = math.radians(yaw_deg(t))
     expected = (
@@ -135,7 +135,7 @@ def test_a_transform_and_its_inverse_agree(memory: Memory, session: Session) -> 
 @sessions
 def test_the_path_length_is_speed_times_time(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
-    span = Span(start_s=session.at(begin - 1), end_s=session.at(end + 1))
+    span = TimeRange(start_s=session.at(begin - 1), end_s=session.at(end + 1))
     answer = queries.trajectory_summary(memory, Call(), span)
     steps = round((end - begin) * 20)
     assert answer.trajectory.distance_m == pytest.approx(SPEED * steps / 20, rel=1e-3)
@@ -174,10 +174,10 @@ def test_a_thing_never_seen_is_a_complete_search_without_a_match(
 @sessions
 def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
-    span = Span(start_s=session.at(begin), end_s=session.at(end))
+    span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
     for sample in queries.topic_range(memory, Call(), "/odom", span, max_samples=60).samples:
         again = queries.topic_value(
-            memory, Call(), "/odom", Moment(at_s=unix_rounded_up(sample.time)), tolerance_s=0.0
+            memory, Call(), "/odom", AtTime(at_s=unix_rounded_up(sample.time)), tolerance_s=0.0
         )
         assert again.sample.time == sample.time
 
@@ -198,7 +198,7 @@ def test_every_topic_is_counted_exactly(memory: Memory, session: Session) -> Non
 @sessions
 def test_samples_decode_as_plain_rosbags_decodes_them(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
-    span = Span(start_s=session.at(begin), end_s=session.at(end))
+    span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
     answer = queries.topic_range(memory, Call(), "/odom", span, max_samples=1000)
     wanted = {sample.time: sample.value for sample in answer.samples}
     compared = 0
@@ -226,7 +226,7 @@ def test_the_bumper_was_last_pressed_half_a_second_before_it_was_released() -> N
     assert answer.found is not None
     assert session.since(unix_from_ns(answer.found.sample.time)) == pytest.approx(25.5, abs=0.05)
     for t, pressed in ((24.9, False), (25.2, True), (25.9, True), (26.2, False)):
-        moment = Moment(at_s=session.at(t))
+        moment = AtTime(at_s=session.at(t))
         value = queries.topic_value(memory, Call(), "/bumper", moment, tolerance_s=0.6)
         assert value.sample.value == {"value": pressed}
 
@@ -289,8 +289,8 @@ def test_static_frames_of_three_broadcasters_are_all_known() -> None:
 @needs_recorded
 def test_now_can_be_the_newest_recorded_moment() -> None:
     session = SESSIONS["session_mcap"]
-    memory = memory_of(session.folder, limits=Limits(now="latest"))
-    answer = queries.position(memory, Call(), Moment(ago_s=10.0))
+    memory = memory_of(session.folder, limits=QuerySettings(now="latest"))
+    answer = queries.position(memory, Call(), AtTime(ago_s=10.0))
     newest = memory.index.snapshot().latest
     assert newest is not None
     assert answer.age is not None

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue, Quaternion, Vector3
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.storage.base import BagReader, Layout, Record
+    from ros2_memory.storage.base import BagReader, CdrLayout, Record
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Bytes: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.uint8]]"
@@ -45,7 +45,7 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Mould:
+class PayloadTemplate:
     """What is common to all payloads of a mould, and where the rest lies.
 
     Attributes:
@@ -63,7 +63,7 @@ class Mould:
     """
 
     fixed: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    layout: Layout
+    layout: CdrLayout
     numbers: tuple[int, ...]
     times: tuple[int, ...]
     angles: bool
@@ -74,7 +74,7 @@ class Mould:
     velocity: Place | None
     pairs: frozenset[tuple[str, str]]
 
-    def those_like(
+    def matching(
         self, first: Record, records: Sequence[Record], among: Sequence[int]
     ) -> tuple[list[int], Bytes]:
         """Which of some records are of this mould, as `first` is, and their payloads as rows."""
@@ -134,7 +134,7 @@ class Mould:
         return [unix_from_ns(s * NS_PER_S + n) for s, n in zip(whole, rest, strict=True)]
 
 
-class _NoMouldError(Exception):
+class _NoTemplateError(Exception):
     """The value is not the same but for its numbers."""
 
 
@@ -146,7 +146,7 @@ class _Marked:
         reader: BagReader,
         extractor: SchemaExtractor,
         record: Record,
-        layout: Layout,
+        layout: CdrLayout,
         marks: tuple[float, int],
     ) -> None:
         payload = bytearray(record.payload)
@@ -180,16 +180,18 @@ class _Marked:
                 continue
             if unit((x, y, z, w)) == self.pose.orientation:
                 return offset
-        raise _NoMouldError
+        raise _NoTemplateError
 
     def place(self, point: Vector3) -> Place:
         x, y, z = (None if math.isnan(part) else self.offset_of.get(part, -1) for part in point)
         if x is None or y is None or -1 in {x, y, z}:
-            raise _NoMouldError
+            raise _NoTemplateError
         return Place(x, y, z)
 
 
-def mould_of(reader: BagReader, extractor: SchemaExtractor, record: Record) -> Mould | None:
+def template_for(
+    reader: BagReader, extractor: SchemaExtractor, record: Record
+) -> PayloadTemplate | None:
     """The mould of a message that can be decoded; None where it has none."""
     layout = reader.layout(record)
     if layout is None:
@@ -200,7 +202,7 @@ def mould_of(reader: BagReader, extractor: SchemaExtractor, record: Record) -> M
     try:
         return _mould(layout, one, other)
     # Two values that are not even of one shape have leaves that do not pair.
-    except (_NoMouldError, ValueError):
+    except (_NoTemplateError, ValueError):
         return None
 
 
@@ -216,7 +218,7 @@ def _shown_numbers(one: _Marked, other: _Marked) -> tuple[list[int], list[int], 
     for (key, leaf), (_, again) in zip(_leaves(one.value), _leaves(other.value), strict=True):
         if not isinstance(leaf, float) or not isinstance(again, float):
             if leaf != again:
-                raise _NoMouldError
+                raise _NoTemplateError
         elif leaf in one.offset_of and other.offset_of.get(again) == one.offset_of[leaf]:
             numbers.append(one.offset_of[leaf])
         elif leaf in one.time_of and other.time_of.get(again) == one.time_of[leaf]:
@@ -224,11 +226,11 @@ def _shown_numbers(one: _Marked, other: _Marked) -> tuple[list[int], list[int], 
         elif key in ANGLES:
             angles = True
         else:
-            raise _NoMouldError
+            raise _NoTemplateError
     return numbers, times, angles
 
 
-def _fixed(layout: Layout) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _fixed(layout: CdrLayout) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """For each byte whether it is none of a number's."""
     fixed = np.ones(layout.size, dtype=np.bool_)
     for offset in (*layout.doubles, *layout.times):
@@ -238,9 +240,9 @@ def _fixed(layout: Layout) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     return fixed
 
 
-def _mould(layout: Layout, one: _Marked, other: _Marked) -> Mould:
+def _mould(layout: CdrLayout, one: _Marked, other: _Marked) -> PayloadTemplate:
     if hangs_on_numbers(one.value):
-        raise _NoMouldError
+        raise _NoTemplateError
     numbers, times, angles = _shown_numbers(one, other)
     places = tuple(one.place(point) for point in positions(one.value))
     pose = None if one.pose is None else one.place(one.pose.position)
@@ -249,10 +251,10 @@ def _mould(layout: Layout, one: _Marked, other: _Marked) -> Mould:
     if orientation != other.orientation() or (
         orientation is not None and orientation not in layout.doubles
     ):
-        raise _NoMouldError
+        raise _NoTemplateError
     if places != tuple(other.place(point) for point in positions(other.value)):
-        raise _NoMouldError
-    return Mould(
+        raise _NoTemplateError
+    return PayloadTemplate(
         fixed=_fixed(layout),
         layout=layout,
         numbers=tuple(numbers),

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import distance
-from ros2_memory.core.text import glimpse
+from ros2_memory.core.text import abbreviate
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.analysis.zone_map import Evidence
+    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.core.model import JsonValue, Vector3
 
 Scalar: TypeAlias = bool | int | float | str
@@ -88,11 +88,11 @@ class Contains:
         """
         return any(self.equal.is_leaf(each) for each in elements(target))
 
-    def may_match(self, evidence: Evidence) -> bool:
+    def can_match(self, evidence: ZoneMap) -> bool:
         """Whether some value of which this is the evidence may contain the needle."""
-        if self._folded is not None and evidence.may_hold_text(self._folded):
+        if self._folded is not None and evidence.can_contain_text(self._folded):
             return True
-        return self._boolean is not None and evidence.may_hold_boolean(self._boolean)
+        return self._boolean is not None and evidence.can_contain_boolean(self._boolean)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,13 +119,13 @@ class Equals:
         """Whether any leaf at any depth is equal."""
         return any(self.is_leaf(leaf) for leaf in leaves(value))
 
-    def may_match(self, evidence: Evidence) -> bool:
+    def can_match(self, evidence: ZoneMap) -> bool:
         """Whether some value of which this is the evidence may have such a leaf."""
-        if isinstance(self.value, str) and evidence.may_hold_text(self.value.casefold()):
+        if isinstance(self.value, str) and evidence.can_contain_text(self.value.casefold()):
             return True
-        if self._boolean is not None and evidence.may_hold_boolean(self._boolean):
+        if self._boolean is not None and evidence.can_contain_boolean(self._boolean):
             return True
-        return any(evidence.may_hold_number(number) for number in self._numbers)
+        return any(evidence.can_contain_number(number) for number in self._numbers)
 
     def is_leaf(self, leaf: JsonValue) -> bool:
         """Whether this leaf is equal."""
@@ -151,7 +151,7 @@ class Beyond:
             if isinstance(leaf, int | float) and not isinstance(leaf, bool)
         )
 
-    def may_match(self, evidence: Evidence) -> bool:
+    def can_match(self, evidence: ZoneMap) -> bool:
         """Whether some value of which this is the evidence may hold such a number."""
         return evidence.open or self._is_beyond(evidence.high if self.above else evidence.low)
 
@@ -176,14 +176,14 @@ class NearPosition:
         """Whether any position in the value is near."""
         return any(self.is_near(x, y, z) for x, y, z in positions(value))
 
-    def may_match(self, evidence: Evidence) -> bool:
+    def can_match(self, evidence: ZoneMap) -> bool:
         """Whether some value of which this is the evidence may hold a position that is near."""
-        return evidence.may_hold_place(self.x, self.y, self.z, self.tolerance_m)
+        return evidence.can_contain_place(self.x, self.y, self.z, self.tolerance_m)
 
-    def may_match_elsewhere(self, evidence: Evidence) -> bool:
-        """As `may_match`, for positions that stand where only a field leads to."""
+    def can_match_elsewhere(self, evidence: ZoneMap) -> bool:
+        """As `can_match`, for positions that stand where only a field leads to."""
         axes = (self.x, self.y) if self.z is None else (self.x, self.y, self.z)
-        return all(evidence.may_hold_number_near(axis, self.tolerance_m) for axis in axes)
+        return all(evidence.can_contain_number_near(axis, self.tolerance_m) for axis in axes)
 
     def is_near(self, x: float, y: float, z: float) -> bool:
         """Whether this position (m) is near; its z may be NaN where none is asked."""
@@ -212,16 +212,16 @@ class Condition:
             return True
         return self.test.matches(target)
 
-    def may_match(self, evidence: Evidence) -> bool:
+    def can_match(self, evidence: ZoneMap) -> bool:
         """Whether some value of which this is the evidence may match; False rules all of them out.
 
         What a field leads to is part of the value, so what the whole value rules out is out.
         """
         if self.field is not None and isinstance(self.test, NearPosition):
-            return self.test.may_match_elsewhere(evidence)
+            return self.test.can_match_elsewhere(evidence)
         if self.field is not None and isinstance(self.test, Contains):
-            return self.test.may_match(evidence) or self.test.equal.may_match(evidence)
-        return self.test.may_match(evidence)
+            return self.test.can_match(evidence) or self.test.equal.can_match(evidence)
+        return self.test.can_match(evidence)
 
     @property
     def place(self) -> NearPosition | None:
@@ -334,7 +334,7 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
         )
     if unknown := sorted(value.keys() - {"x", "y", "z"}):
         raise InvalidArgumentsError(
-            f"'near_position' knows x, y and z only, not {glimpse(unknown)}; {example}"
+            f"'near_position' knows x, y and z only, not {abbreviate(unknown)}; {example}"
         )
     for axis in ("x", "y", "z") if value.get("z") is not None else ("x", "y"):
         if not math.isfinite(_coordinate(value.get(axis))):
@@ -359,7 +359,7 @@ def _kind(value: JsonValue) -> str:
     """A value as it is named in a sentence."""
     if isinstance(value, list):
         return "a list"
-    return "an object" if isinstance(value, dict) else glimpse(value)
+    return "an object" if isinstance(value, dict) else abbreviate(value)
 
 
 def _step(held: JsonValue, segment: str) -> Iterator[JsonValue]:

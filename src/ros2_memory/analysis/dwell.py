@@ -34,7 +34,7 @@ class Unread(NamedTuple):
 
 
 @dataclass(slots=True)
-class Stay:
+class Dwell:
     """A visit that is gone through from its end.
 
     `closest` is that of the poses read one by one; `unread` are the times of the others. `left`:
@@ -49,7 +49,7 @@ class Stay:
     begun: bool = False
 
 
-class Stays:
+class DwellBuilder:
     """Takes poses from the newest on, near the place or not.
 
     Attributes:
@@ -58,8 +58,8 @@ class Stays:
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        self.all: list[Stay] = []
-        self._open: Stay | None = None
+        self.all: list[Dwell] = []
+        self._open: Dwell | None = None
 
     def near(self, approach: Approach, last: Ns | None = None) -> None:
         """A pose is within the radius; with `last`, every one until then is, at the same place."""
@@ -70,7 +70,7 @@ class Stays:
         """Every pose from `first` to `last` is within the radius, none long after another."""
         self._at(first, last).unread.append(unread)
 
-    def _at(self, first: Ns, last: Ns) -> Stay:
+    def _at(self, first: Ns, last: Ns) -> Dwell:
         """The stay that goes on from `first` to `last`."""
         stay = self._open
         if stay is not None:
@@ -79,7 +79,7 @@ class Stays:
                 self.end()
                 stay = None
         if stay is None:
-            self._open = stay = Stay(last, first)
+            self._open = stay = Dwell(last, first)
             self.all.append(stay)
         stay.arrived = first
         stay.left = False

@@ -46,7 +46,7 @@ _FROM_START: Final = 1
 _TO_END: Final = 2
 
 
-class Presence(NamedTuple):
+class VisibleInterval(NamedTuple):
     """A thing in view: log times of the first and last message that has it (inclusive)."""
 
     label: str
@@ -54,7 +54,7 @@ class Presence(NamedTuple):
     last: Ns
 
 
-class Seen(NamedTuple):
+class IntervalTable(NamedTuple):
     """Presences, by the time of their first message, then by label; a week of bags has many.
 
     Attributes:
@@ -79,19 +79,21 @@ class Seen(NamedTuple):
             return False
         return not self.rows or int(_rows(self.rows)["label"].max()) < len(self.labels)
 
-    def presences(self) -> tuple[Presence, ...]:
+    def presences(self) -> tuple[VisibleInterval, ...]:
         """Each of them."""
         told = _rows(self.rows).tolist()
-        return tuple(Presence(self.labels[label], first, last) for first, last, label, *_ in told)
+        return tuple(
+            VisibleInterval(self.labels[label], first, last) for first, last, label, *_ in told
+        )
 
-    def most_lasting(self, at_most: int) -> Seen:
+    def most_lasting(self, at_most: int) -> IntervalTable:
         """So many of them, those that lasted longest; of equal ones the earliest."""
         if self.size <= at_most:
             return self
         rows = _rows(self.rows)
         rows = rows[np.sort(_by_length(rows)[:at_most])]
         kept, rows["label"] = np.unique(rows["label"], return_inverse=True)
-        return Seen(tuple(self.labels[place] for place in kept.tolist()), rows.tobytes())
+        return IntervalTable(tuple(self.labels[place] for place in kept.tolist()), rows.tobytes())
 
     def throughout(self, start: Ns, end: Ns) -> list[str]:
         """The things that were seen all the time between two moments, at their usual rate."""
@@ -109,25 +111,25 @@ class Seen(NamedTuple):
     def _named(self, rows: Rows) -> list[str]:
         return [self.labels[place] for place in rows["label"].tolist()]
 
-    def without(self, labels: Collection[str]) -> Seen:
+    def without(self, labels: Collection[str]) -> IntervalTable:
         """The presences of all other things."""
         places = [place for place, label in enumerate(self.labels) if label in labels]
         if not places:
             return self
         rows = _rows(self.rows)
-        return Seen(self.labels, rows[~np.isin(rows["label"], places)].tobytes())
+        return IntervalTable(self.labels, rows[~np.isin(rows["label"], places)].tobytes())
 
-    def longest(self, at_most: int) -> tuple[Presence, ...]:
+    def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
         """Those that lasted longest, the longest first; of equal ones the earliest."""
         rows = _rows(self.rows)
-        return Seen(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).presences()
+        return IntervalTable(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).presences()
 
-    def moved(self, by: Ns) -> Seen:
+    def moved(self, by: Ns) -> IntervalTable:
         """The same so many nanoseconds later."""
         rows = _rows(self.rows).copy()
         rows["first"] += by
         rows["last"] += by
-        return Seen(self.labels, rows.tobytes())
+        return IntervalTable(self.labels, rows.tobytes())
 
 
 class Part(NamedTuple):
@@ -135,10 +137,10 @@ class Part(NamedTuple):
 
     first: Ns
     last: Ns
-    seen: Seen
+    seen: IntervalTable
 
 
-class Watcher:
+class IntervalBuilder:
     """Takes the messages of one topic in log-time order.
 
     Args:
@@ -196,7 +198,7 @@ class Watcher:
             )
             for label, each in told
         ]
-        return Part(self._first, self._last, Seen(labels, np.array(rows, _ROW).tobytes()))
+        return Part(self._first, self._last, IntervalTable(labels, np.array(rows, _ROW).tobytes()))
 
 
 class _Open:
@@ -223,16 +225,16 @@ def joined(parts: Sequence[Part]) -> Part:
     return Part(parts[0].first, parts[-1].last, seen)
 
 
-def united(seen: Sequence[Seen]) -> Seen:
+def united(seen: Sequence[IntervalTable]) -> IntervalTable:
     """What several topics saw in the same time: a thing is in view while one of them has it."""
     return _merged(seen, np.zeros(len(seen), np.bool_))
 
 
-def _merged(seen: Sequence[Seen], follow: NDArray[np.bool_]) -> Seen:
+def _merged(seen: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> IntervalTable:
     """All presences, those of one thing joined that overlap or go on in the part that follows."""
     rows = _rows(b"".join([each.rows for each in seen]))
     if not rows.size:
-        return Seen()
+        return IntervalTable()
     part = np.repeat(np.arange(len(seen)), [each.size for each in seen])
     labels, label = _shared_labels(seen, part, rows["label"])
     order = np.lexsort((part, rows["first"], label))
@@ -252,11 +254,11 @@ def _merged(seen: Sequence[Seen], follow: NDArray[np.bool_]) -> Seen:
     found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
     found["ends"] = (ends[begins] & _FROM_START) * (part[begins] == 0)
     found["ends"] |= (ends[stops] & _TO_END) * (part[stops] == len(seen) - 1)
-    return Seen(labels, found[np.lexsort((found["label"], found["first"]))].tobytes())
+    return IntervalTable(labels, found[np.lexsort((found["label"], found["first"]))].tobytes())
 
 
 def _shared_labels(
-    seen: Sequence[Seen], part: NDArray[np.intp], label: NDArray[np.uint32]
+    seen: Sequence[IntervalTable], part: NDArray[np.intp], label: NDArray[np.uint32]
 ) -> tuple[tuple[str, ...], NDArray[np.intp]]:
     """The labels of all, sorted, and of each row the place of its own among them."""
     labels = tuple(sorted({label for each in seen for label in each.labels}))

@@ -71,7 +71,7 @@ Link: TypeAlias = Literal["driven", "gap", "jump", "reset"]
 """What lies between two poses in a row; only what is driven counts as driven."""
 
 
-class Stop(NamedTuple):
+class TimedPosition(NamedTuple):
     """Where the robot was (m), and when."""
 
     time: Ns
@@ -93,8 +93,8 @@ STILL: Final = Pace(0.0, 0.0)
 
 
 def link(
-    before: Stop,
-    after: Stop,
+    before: TimedPosition,
+    after: TimedPosition,
     usual_ns: Ns | None,
     fastest_mps: float,
     near: Pace | None = None,
@@ -120,18 +120,18 @@ def link(
     return "driven"
 
 
-def _is_jump(before: Stop, after: Stop, fastest_mps: float) -> bool:
+def _is_jump(before: TimedPosition, after: TimedPosition, fastest_mps: float) -> bool:
     # A burst squeezes the time between two poses to nothing; it does not make a jump of them.
     elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
     return distance(before.position, after.position) > fastest_mps * elapsed_s * (1 + 1e-9)
 
 
-def _leads_to_origin(before: Stop, after: Stop) -> bool:
+def _leads_to_origin(before: TimedPosition, after: TimedPosition) -> bool:
     step_m = distance(before.position, after.position)
     return step_m > MOVED_M and math.hypot(*after.position) <= MOVED_M
 
 
-def _is_restart(before: Stop, after: Stop, usual_ns: Ns, near: Pace) -> bool:
+def _is_restart(before: TimedPosition, after: TimedPosition, usual_ns: Ns, near: Pace) -> bool:
     step_m = distance(before.position, after.position)
     if step_m <= max(_RESTART_M, _LONGER * near.step_m):
         return False
@@ -143,7 +143,7 @@ def _is_restart(before: Stop, after: Stop, usual_ns: Ns, near: Pace) -> bool:
     return step_m > max(_FASTER * near.speed_mps * elapsed_s, hard_mps2 * elapsed_s * elapsed_s / 4)
 
 
-def _pace(stops: Sequence[Stop]) -> Pace:
+def _pace(stops: Sequence[TimedPosition]) -> Pace:
     """The longest step of a few poses in a row, and the highest speed over half of them."""
     if len(stops) < 2:
         return STILL
@@ -175,8 +175,8 @@ class Leg:
         arriving: its pace near its last pose.
     """
 
-    first: Stop
-    last: Stop
+    first: TimedPosition
+    last: TimedPosition
     poses: int
     period_ns: Ns | None
     length_m: float
@@ -305,8 +305,8 @@ class PoseDigest:
 
     poses: int
     invalid: int
-    first: Stop | None
-    last: Stop | None
+    first: TimedPosition | None
+    last: TimedPosition | None
     head: Leg | None
     tail: Leg | None
     length_m: float
@@ -340,8 +340,8 @@ class Motion:
 
     def __init__(self, max_plausible_speed_mps: float) -> None:
         self._fastest_mps = max_plausible_speed_mps
-        self.first: Stop | None = None
-        self.last: Stop | None = None
+        self.first: TimedPosition | None = None
+        self.last: TimedPosition | None = None
         self.head: Leg | None = None
         self.tail: Leg | None = None
         self.length_m = 0.0
@@ -377,7 +377,7 @@ class Motion:
             return 0.0
         return unix_from_ns(self.last.time - self.first.time)
 
-    def add(self, stops: Sequence[Stop]) -> list[int]:
+    def add(self, stops: Sequence[TimedPosition]) -> list[int]:
         """Takes the poses that come next; gives the indices of those that a jump or reset led to.
 
         The more at a time, the better noise is told from driving.
@@ -444,7 +444,7 @@ class Motion:
         leg = self.tail or self.head
         return None if leg is None else leg.period_ns
 
-    def _go_on(self, before: Stop | None, measured_leg: _MeasuredLeg) -> bool:
+    def _go_on(self, before: TimedPosition | None, measured_leg: _MeasuredLeg) -> bool:
         """Takes the leg that comes next; gives whether a jump or reset led to it from `before`."""
         leg, speed_mps, step_mps = measured_leg
         if speed_mps is not None:
@@ -481,7 +481,7 @@ class Motion:
             self.sum_m += self.tail.sum_m
             self.tail = None
 
-    def _break(self, kind: Link, before: Stop, after: Stop) -> None:
+    def _break(self, kind: Link, before: TimedPosition, after: TimedPosition) -> None:
         """Counts what ends a leg."""
         step_m = distance(before.position, after.position)
         if kind == "gap":
@@ -498,7 +498,7 @@ class Motion:
 _MeasuredLeg: TypeAlias = "tuple[Leg, float | None, float]"
 
 
-def _leg(stops: Sequence[Stop]) -> _MeasuredLeg:
+def _leg(stops: Sequence[TimedPosition]) -> _MeasuredLeg:
     """A leg, the highest speed on it if its poses are enough, else that from one to the next."""
     times = np.array([stop.time for stop in stops], dtype=np.int64)
     apart = np.diff(times)

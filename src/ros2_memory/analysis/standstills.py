@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.odometry import TimedPosition
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -64,13 +65,6 @@ _STEP_M: Final = 0.0001
 _MOST_IN_SLOT: Final = 1_000
 _EDGE_SLOTS: Final = 3
 _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
-
-
-class TimedPosition(NamedTuple):
-    """Where the robot was (m), and when."""
-
-    time: Ns
-    position: Vector3
 
 
 class Box3(NamedTuple):

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.intervals import Part, Seen, Watcher, joined
-from ros2_memory.messages.detections import things_of
+from ros2_memory.analysis.intervals import IntervalBuilder, IntervalTable, Part, joined
+from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -59,10 +59,10 @@ class State(NamedTuple):
 
 
 NOTHING: Final = State()
-NOBODY: Final = Seen()
+NOBODY: Final = IntervalTable()
 
 
-class Flip(NamedTuple):
+class Toggle(NamedTuple):
     """A boolean that is `value` from `time` on, and was the other before."""
 
     path: str
@@ -70,7 +70,7 @@ class Flip(NamedTuple):
     value: bool
 
 
-class Fault(NamedTuple):
+class ReportedError(NamedTuple):
     """An error, and the log times of its first and last report (inclusive)."""
 
     text: str
@@ -79,7 +79,7 @@ class Fault(NamedTuple):
     reports: int
 
 
-class Known(NamedTuple):
+class KnownFlag(NamedTuple):
     """A boolean as it stood at the first message of a bag that has it, and at the last."""
 
     path: str
@@ -89,7 +89,7 @@ class Known(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Story:
+class TopicEvents:
     """What one bag holds of one topic, to be joined with what is before and after.
 
     Attributes:
@@ -108,10 +108,10 @@ class Story:
 
     first: Ns
     last: Ns
-    seen: Seen = NOBODY
-    known: tuple[Known, ...] = ()
-    flips: tuple[Flip, ...] = ()
-    faults: tuple[Fault, ...] = ()
+    seen: IntervalTable = NOBODY
+    known: tuple[KnownFlag, ...] = ()
+    flips: tuple[Toggle, ...] = ()
+    faults: tuple[ReportedError, ...] = ()
     left_out: int = 0
     undecodable: int = 0
     beyond: int = 0
@@ -122,23 +122,23 @@ class Story:
         return not (self.seen.rows or self.known or self.faults or self.undecodable)
 
 
-QUIET: Final = Story(0, 0)
+NO_EVENTS: Final = TopicEvents(0, 0)
 """Stands for the story of messages that say nothing, whenever they were."""
 
 
-def tells(type_name: str) -> bool:
+def has_events(type_name: str) -> bool:
     """Whether messages of a type can say anything."""
     return type_name in _TOLD_OF or not type_name.startswith(_MEASURING)
 
 
 def state_of(value: JsonValue, type_name: str) -> State:
     """What an extracted message of a type says."""
-    if not tells(type_name):
+    if not has_events(type_name):
         return NOTHING
     faults = tuple(_faults(value, _ERROR_LEVELS.get(type_name)))
     if type_name in _ERROR_LEVELS:
         return State(faults=faults) if faults else NOTHING
-    labels = tuple(dict.fromkeys(thing.label for thing in things_of(value)))
+    labels = tuple(dict.fromkeys(thing.label for thing in detections_of(value)))
     flags = tuple(_flags(value, ""))
     if not (labels or flags):
         return NOTHING
@@ -146,16 +146,16 @@ def state_of(value: JsonValue, type_name: str) -> State:
     return State(labels[:MOST_LABELS], flags[:MOST_FLAGS], faults, beyond)
 
 
-class StoryBuilder:
+class TopicEventsBuilder:
     """Takes the messages of one topic, or whole bags of them, in log-time order."""
 
     def __init__(self) -> None:
         self._parts: list[Part] = []
         self._rows = 0
-        self._watcher: Watcher | None = None
-        self._known: dict[str, Known] = {}
-        self._flips: list[Flip] = []
-        self._faults: dict[str, Fault] = {}
+        self._watcher: IntervalBuilder | None = None
+        self._known: dict[str, KnownFlag] = {}
+        self._flips: list[Toggle] = []
+        self._faults: dict[str, ReportedError] = {}
         self._left_out = 0
         self._undecodable = 0
         self._beyond = 0
@@ -167,15 +167,15 @@ class StoryBuilder:
     def add(self, time: Ns, state: State) -> None:
         """Takes the next message."""
         if self._watcher is None:
-            self._watcher = Watcher(MOST_SEEN)
+            self._watcher = IntervalBuilder(MOST_SEEN)
         self._watcher.add(time, state.labels)
         self._beyond = max(self._beyond, state.beyond)
         for path, value in state.flags:
-            self._flag(Known(path, time, value, value))
+            self._flag(KnownFlag(path, time, value, value))
         for text in state.faults:
-            self._fault(Fault(text, time, time, 1))
+            self._fault(ReportedError(text, time, time, 1))
 
-    def join(self, story: Story) -> None:
+    def join(self, story: TopicEvents) -> None:
         """Takes all messages of a bag that come next, as if they were added one by one."""
         self._undecodable += story.undecodable
         if story.first > story.last:
@@ -184,7 +184,7 @@ class StoryBuilder:
         self._take(Part(story.first, story.last, story.seen))
         if story.known:
             flips = [
-                Flip(known.path, known.at, known.first)
+                Toggle(known.path, known.at, known.first)
                 for known in story.known
                 if self._turns(known)
             ]
@@ -197,16 +197,16 @@ class StoryBuilder:
         self._left_out += story.left_out
         self._beyond = max(self._beyond, story.beyond)
 
-    def story(self, at_most: int | None = None) -> Story | None:
+    def story(self, at_most: int | None = None) -> TopicEvents | None:
         """What was told so far, `at_most` of each kind; None without a message."""
         self._settle()
         if not self._parts:
-            return Story(1, 0, undecodable=self._undecodable) if self._undecodable else None
+            return TopicEvents(1, 0, undecodable=self._undecodable) if self._undecodable else None
         first, last, seen = self._one_part()
         faults = sorted(self._faults.values(), key=lambda each: (each.first, each.text))
         told = (seen.size, len(self._flips), len(faults))
         left_out = 0 if at_most is None else sum(max(0, many - at_most) for many in told)
-        return Story(
+        return TopicEvents(
             first,
             last,
             seen if at_most is None else seen.most_lasting(at_most),
@@ -240,30 +240,30 @@ class StoryBuilder:
         self._parts, self._rows = [part._replace(seen=seen)], seen.size
         return self._parts[0]
 
-    def _turns(self, known: Known) -> bool:
+    def _turns(self, known: KnownFlag) -> bool:
         before = self._known.get(known.path)
         return before is not None and before.last != known.first
 
-    def _flag(self, known: Known) -> None:
+    def _flag(self, known: KnownFlag) -> None:
         if self._turns(known):
-            self._turn(Flip(known.path, known.at, known.first))
+            self._turn(Toggle(known.path, known.at, known.first))
         self._learn(known)
 
-    def _learn(self, known: Known) -> None:
+    def _learn(self, known: KnownFlag) -> None:
         before = self._known.get(known.path)
         if before is None and len(self._known) >= MOST_HELD:
             self._left_out += 1
             return
         self._known[known.path] = known if before is None else before._replace(last=known.last)
 
-    def _turn(self, flip: Flip) -> None:
+    def _turn(self, flip: Toggle) -> None:
         """Adds a flip, or counts it where there are too many."""
         if len(self._flips) < MOST_HELD:
             self._flips.append(flip)
         else:
             self._left_out += 1
 
-    def _fault(self, fault: Fault) -> None:
+    def _fault(self, fault: ReportedError) -> None:
         before = self._faults.get(fault.text)
         if before is None and len(self._faults) >= MOST_HELD:
             self._left_out += 1

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Literal
 from ros2_memory.analysis.odometry import (
     Motion,
     PoseDigest,
-    Stop,
+    TimedPosition,
     Vertex,
     faster,
     is_place,
@@ -138,7 +138,9 @@ class _Poses:
         waiting, self._waiting = self._waiting, []
         if not waiting:
             return
-        parted = {*self._motion.add([Stop(time, position) for time, position, _ in waiting])}
+        parted = {
+            *self._motion.add([TimedPosition(time, position) for time, position, _ in waiting])
+        }
         for index, vertex in enumerate(waiting):
             if index in parted:
                 self._path.part()

@@ -63,7 +63,7 @@ class Box(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class ZoneMap:
     """What can have stood in the extracted values of some messages.
 
     Attributes:
@@ -87,7 +87,7 @@ class Evidence:
     box: Box | None = None
     open: bool = False
 
-    def may_hold_text(self, folded: str) -> bool:
+    def can_contain_text(self, folded: str) -> bool:
         """Whether some text may contain this casefolded one."""
         if self.open:
             return True
@@ -96,11 +96,11 @@ class Evidence:
         # A longest run in the needle is part of a longest run in any text that contains it.
         return all(word in self.words for word in words_of(folded))
 
-    def may_hold_boolean(self, value: bool) -> bool:
+    def can_contain_boolean(self, value: bool) -> bool:
         """Whether this boolean may stand somewhere."""
         return self.open or value in self.booleans
 
-    def may_hold_number(self, value: float) -> bool:
+    def can_contain_number(self, value: float) -> bool:
         """Whether a number equal to this one may stand somewhere."""
         if self.open:
             return True
@@ -108,11 +108,11 @@ class Evidence:
             return False
         return self.numbers is None or value in self.numbers
 
-    def may_hold_number_near(self, value: float, reach: float) -> bool:
+    def can_contain_number_near(self, value: float, reach: float) -> bool:
         """Whether a number within `reach` of this one may stand somewhere."""
         return self.open or _near(self.low, self.high, value, reach)
 
-    def may_hold_place(self, x: float, y: float, z: float | None, reach: float) -> bool:
+    def can_contain_place(self, x: float, y: float, z: float | None, reach: float) -> bool:
         """Whether a place within `reach` (m) of this one may stand where it is looked for."""
         return self.open or (self.box is not None and self.box.meets(x, y, z, reach))
 
@@ -120,7 +120,7 @@ class Evidence:
 class Boxes:
     """The boxes of many pieces of evidence, to be asked of one place all at once."""
 
-    def __init__(self, evidence: Mapping[int, Evidence]) -> None:
+    def __init__(self, evidence: Mapping[int, ZoneMap]) -> None:
         self._numbers = list(evidence)
         boxes = [_EVERYWHERE if each.open else each.box or _NOWHERE for each in evidence.values()]
         self._bounds: NDArray[np.float64] = np.array(boxes, dtype=np.float64).reshape(-1, 6).T
@@ -138,7 +138,7 @@ class Boxes:
 _EVERYWHERE: Final = Box(-math.inf, math.inf, -math.inf, math.inf, -math.inf, math.inf)
 _NOWHERE: Final = Box(math.inf, -math.inf, math.inf, -math.inf, math.inf, -math.inf)
 
-OPEN: Final = Evidence(words=None, texts=True, numbers=None, open=True)
+UNBOUNDED: Final = ZoneMap(words=None, texts=True, numbers=None, open=True)
 """Of messages of which nothing is known."""
 
 
@@ -147,14 +147,14 @@ def words_of(folded: str) -> list[str]:
     return _WORD.findall(folded)
 
 
-def united(evidence: Iterable[Evidence]) -> Evidence:
+def united(evidence: Iterable[ZoneMap]) -> ZoneMap:
     """What can have stood in any of several, without the distinct numbers."""
     words: set[str] | None = set()
     texts, booleans, low, high = False, set[bool](), math.inf, -math.inf
     box: Box | None = None
     for each in evidence:
         if each.open:
-            return OPEN
+            return UNBOUNDED
         if words is not None and each.words is not None:
             words.update(each.words.split(WORD_END))
         else:
@@ -165,11 +165,11 @@ def united(evidence: Iterable[Evidence]) -> Evidence:
         if each.box is not None:
             box = each.box if box is None else box.united(each.box)
     joined = None if words is None else joined_words(words)
-    return Evidence(joined, texts, tuple(sorted(booleans)), low, high, None, box)
+    return ZoneMap(joined, texts, tuple(sorted(booleans)), low, high, None, box)
 
 
 def joined_words(words: Iterable[str]) -> str:
-    """Words as `Evidence` keeps them."""
+    """Words as `ZoneMap` keeps them."""
     return "".join(f"{word}{WORD_END}" for word in sorted(words) if word)
 
 

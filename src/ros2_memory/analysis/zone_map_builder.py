@@ -15,16 +15,16 @@ from ros2_memory.analysis.zone_map import (
     MOST_NUMBERS,
     MOST_WORD_CHARS,
     MOST_WORDS,
-    OPEN,
+    UNBOUNDED,
     Box,
-    Evidence,
+    ZoneMap,
     joined_words,
     rounded,
     words_of,
 )
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.bulk_decode import Bytes, Mould
+    from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
     from ros2_memory.core.model import JsonValue
 
 MOST_TEXTS: Final = 2_000
@@ -34,7 +34,7 @@ _MOST_TEXT_CHARS: Final = 1 << 20
 _LARGEST: Final = 1e300
 
 
-class EvidenceCollector:
+class ZoneMapBuilder:
     """Takes extracted values, and says what can have stood in them."""
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class EvidenceCollector:
             for x, y, z in positions(value):
                 self._add_place(x, y, z)
 
-    def add_rows(self, mould: Mould, rows: Bytes) -> None:
+    def add_rows(self, mould: PayloadTemplate, rows: Bytes) -> None:
         """Takes many messages of a mould of which one was added as a value."""
         if self._open:
             return
@@ -89,11 +89,11 @@ class EvidenceCollector:
             if here.size:
                 self._add_places(here)
 
-    def evidence(self) -> Evidence:
+    def evidence(self) -> ZoneMap:
         """What the values so far can have held."""
         if self._open:
-            return OPEN
-        return Evidence(
+            return UNBOUNDED
+        return ZoneMap(
             words=None if self._words is None else joined_words(self._words),
             texts=bool(self._strings),
             booleans=tuple(sorted(self._booleans)),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class KeptNames:
+class HardLinks:
     """The names in moments that are known below one root. Paths are texts, as a scan has them."""
 
     def __init__(self, root: Path) -> None:

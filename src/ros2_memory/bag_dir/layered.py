@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagSummary, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Channel, Closing, Layout, Record
+    from ros2_memory.storage.base import CdrLayout, Channel, Closing, Record
 
 
 class LayeredReader(BagReader):
@@ -89,6 +89,6 @@ class LayeredReader(BagReader):
         """As the innermost reader."""
         return self._decoder.decode(record)
 
-    def layout(self, record: Record) -> Layout | None:
+    def layout(self, record: Record) -> CdrLayout | None:
         """As the innermost reader."""
         return self._decoder.layout(record)

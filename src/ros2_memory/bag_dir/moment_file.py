@@ -39,7 +39,7 @@ _UNSEEN: Final = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
 """Unicode's categories of what controls text or is none: line ends, directions, half characters."""
 
 
-class Wish(NamedTuple):
+class SaveRequest(NamedTuple):
     """What is asked for: to keep what was recorded from `start` to `end` (inclusive)."""
 
     number: str
@@ -50,7 +50,7 @@ class Wish(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Keepsake:
+class SavedMoment:
     """A moment, as its file says.
 
     `number` is that of the wish. `pending`: it waits for bags that are still being written.
@@ -66,16 +66,16 @@ class Keepsake:
     missing: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, wish: Wish) -> Keepsake:
+    def of(cls, wish: SaveRequest) -> SavedMoment:
         """A moment of which nothing is kept yet."""
         return cls(*wish)
 
 
-class Held(NamedTuple):
+class StoredMoment(NamedTuple):
     """A moment in its folder; `files` are its bags' links: by inode their sizes."""
 
     folder: Path
-    keepsake: Keepsake
+    keepsake: SavedMoment
     files: Mapping[int, int]
 
 
@@ -90,14 +90,14 @@ def fault_of_label(label: str) -> str | None:
     return None
 
 
-def folder_name(wish: Wish) -> str:
+def folder_name(wish: SaveRequest) -> str:
     """What a moment's folder is called: when it was asked for (UTC), and its label in ASCII."""
     plain = unicodedata.normalize("NFKD", wish.label).encode("ascii", "ignore").decode().lower()
     slug = "-".join(re.findall(r"[a-z0-9]+", plain))[:_LONGEST_SLUG].strip("-") or "moment"
     return f"{datetime.fromtimestamp(wish.asked // NS_PER_S, tz=UTC):%Y%m%dT%H%M%SZ}-{slug}"
 
 
-def make_folder(bag_dir: Path, wish: Wish) -> Path:
+def make_folder(bag_dir: Path, wish: SaveRequest) -> Path:
     """A new folder for a moment, with a number behind its name where that is taken.
 
     Raises:
@@ -123,7 +123,7 @@ def moments_of(bag_dir: Path) -> Path:
     return bag_dir / MOMENTS_FOLDER
 
 
-def write_keepsake(folder: Path, keepsake: Keepsake) -> None:
+def write_saved_moment(folder: Path, keepsake: SavedMoment) -> None:
     """Replaces a moment's file at once, and has it on the disk.
 
     Raises:
@@ -144,20 +144,20 @@ def write_keepsake(folder: Path, keepsake: Keepsake) -> None:
     write_durably(folder / MOMENT_FILE, text)
 
 
-def read_keepsake(folder: Path) -> Keepsake | None:
+def read_saved_moment(folder: Path) -> SavedMoment | None:
     """What a moment's file says; None where there is none, or it says something else."""
     try:
         fields = json_object(read_small_file(folder / MOMENT_FILE))
-        wish = wish_from(fields)
+        wish = save_request_from(fields)
         pending, missing = fields.get("pending"), fields.get("missing")
         if not isinstance(pending, bool) or not isinstance(missing, list):
             return None
-        return Keepsake(*wish, pending, tuple(str(each) for each in missing))
+        return SavedMoment(*wish, pending, tuple(str(each) for each in missing))
     except (OSError, ValueError, RecursionError):
         return None
 
 
-def held_in(bag_dir: Path) -> Iterator[Held]:
+def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
     """The moments that are kept, in the order of their folders' names.
 
     Raises:
@@ -171,9 +171,9 @@ def held_in(bag_dir: Path) -> Iterator[Held]:
     except (FileNotFoundError, NotADirectoryError):
         return
     for folder in folders:
-        keepsake = None if folder.is_symlink() else read_keepsake(folder)
+        keepsake = None if folder.is_symlink() else read_saved_moment(folder)
         if keepsake is not None:
-            yield Held(folder, keepsake, _files_in(folder))
+            yield StoredMoment(folder, keepsake, _files_in(folder))
 
 
 def json_object(text: str) -> dict[object, object]:
@@ -188,7 +188,7 @@ def json_object(text: str) -> dict[object, object]:
     return value
 
 
-def wish_from(fields: Mapping[object, object]) -> Wish:
+def save_request_from(fields: Mapping[object, object]) -> SaveRequest:
     """The wish in an object.
 
     Raises:
@@ -202,7 +202,7 @@ def wish_from(fields: Mapping[object, object]) -> Wish:
     start, end, asked = (_moment(fields, f"{key}_ns") for key in ("start", "end", "requested"))
     if end < start:
         raise ValueError("end_ns must not be before start_ns")
-    return Wish(number, label, start, end, asked)
+    return SaveRequest(number, label, start, end, asked)
 
 
 def _moment(fields: Mapping[object, object], key: str) -> Ns:

@@ -23,7 +23,7 @@ import structlog
 
 from ros2_memory.bag_dir.durable_write import own_folder, read_small_file
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
-from ros2_memory.bag_dir.moment_file import FORMAT, Wish, json_object, wish_from
+from ros2_memory.bag_dir.moment_file import FORMAT, SaveRequest, json_object, save_request_from
 from ros2_memory.core import directories
 from ros2_memory.core.timebase import NS_PER_S
 
@@ -58,12 +58,12 @@ class Outcome(NamedTuple):
     refused: str | None = None
 
 
-class Slot:
+class PendingRequest:
     """The server's side: one wish and its answer."""
 
     def __init__(self, bag_dir: Path, label: str, start: Ns, end: Ns, asked: Ns) -> None:
         self._folder = requests_of(bag_dir)
-        self.wish = Wish(uuid.uuid4().hex, label, start, end, asked)
+        self.wish = SaveRequest(uuid.uuid4().hex, label, start, end, asked)
 
     def post(self) -> None:
         """Asks.
@@ -98,7 +98,7 @@ class Slot:
         return self._folder / f"{self.wish.number}.{kind}"
 
 
-class Mailbox:
+class RequestQueue:
     """The recorder's side. Not for several threads at once."""
 
     def __init__(self, bag_dir: Path) -> None:
@@ -121,7 +121,7 @@ class Mailbox:
             return False
         return any(name.endswith((".json", ".taken")) and self._counts(name) for name in names)
 
-    def take(self, now: Ns) -> Iterator[Wish]:
+    def take(self, now: Ns) -> Iterator[SaveRequest]:
         """The wishes, those that were begun with before first; what is no wish is reported.
 
         Raises:
@@ -137,7 +137,7 @@ class Mailbox:
                 yield wish
         self._sweep(names, now)
 
-    def answer(self, wish: Wish, outcome: Outcome) -> None:
+    def answer(self, wish: SaveRequest, outcome: Outcome) -> None:
         """Says what came of a wish, and is done with it.
 
         Raises:
@@ -147,7 +147,7 @@ class Mailbox:
         _put(target, {"format": FORMAT, **outcome._asdict()})
         self._drop(wish.number)
 
-    def _taken(self, name: str, now: Ns) -> Wish | None:
+    def _taken(self, name: str, now: Ns) -> SaveRequest | None:
         number = name.partition(".")[0]
         path = self._folder / f"{number}.taken"
         try:
@@ -219,13 +219,13 @@ def _put(target: Path, content: Mapping[str, object]) -> None:
         raise
 
 
-def _read_wish(path: Path) -> Wish:
+def _read_wish(path: Path) -> SaveRequest:
     if path.lstat().st_size > LARGEST:
         raise ValueError(f"it is larger than {LARGEST} bytes")
-    return wish_from(json_object(read_small_file(path)))
+    return save_request_from(json_object(read_small_file(path)))
 
 
-def _fault_of(wish: Wish, number: str, now: Ns) -> str | None:
+def _fault_of(wish: SaveRequest, number: str, now: Ns) -> str | None:
     if wish.number != number:
         return "it has the number of another"
     if abs(now - wish.asked) > STALE_NS:
@@ -233,7 +233,7 @@ def _fault_of(wish: Wish, number: str, now: Ns) -> str | None:
     return None
 
 
-def _written(wish: Wish) -> dict[str, object]:
+def _written(wish: SaveRequest) -> dict[str, object]:
     return {
         "format": FORMAT,
         "request": wish.number,

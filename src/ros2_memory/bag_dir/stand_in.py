@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layered import LayeredReader
 from ros2_memory.bag_dir.moment_file import moments_of
 
@@ -25,7 +25,7 @@ class StandInReader(LayeredReader):
     def __init__(self, reader: BagReader, root: Path) -> None:
         super().__init__(reader)
         self._root = root
-        self._names = KeptNames(root)
+        self._names = HardLinks(root)
 
     def _read_from(self, path: Path) -> Path:
         """The path, or another name of the bag where there is nothing of that one."""

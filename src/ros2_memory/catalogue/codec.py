@@ -12,18 +12,18 @@ import zlib
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.intervals import Seen
-from ros2_memory.analysis.odometry import Leg, Pace, PoseDigest, Stop
+from ros2_memory.analysis.intervals import IntervalTable
+from ros2_memory.analysis.odometry import Leg, Pace, PoseDigest, TimedPosition
 from ros2_memory.analysis.path_length import Creep, End
 from ros2_memory.analysis.standstills import ChainDigest, StandstillDigest
-from ros2_memory.analysis.topic_events import Fault, Flip, Known, Story
-from ros2_memory.core.bag_summary import BagSummary, Heading, shared_shape
+from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
+from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.analysis.odometry import Vertex
-    from ros2_memory.core.bag_summary import Shape
+    from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import JsonValue
 
 _HEAD: Final = struct.Struct("<qqqqqqBdddddddqdddqddd")
@@ -33,10 +33,10 @@ _VERTEX: Final = struct.Struct("<qdddd")
 _STORY: Final = struct.Struct("<qqqqqI")
 _SHORT_TEXT: Final = 256
 """A text of so many bytes is not worth compressing."""
-_NOWHERE: Final = Stop(0, (math.nan, math.nan, math.nan))
+_NOWHERE: Final = TimedPosition(0, (math.nan, math.nan, math.nan))
 
 
-def packed_poses(poses: PoseDigest) -> bytes:
+def encode_poses(poses: PoseDigest) -> bytes:
     """A digest of poses as bytes."""
     legs = [leg for leg in (poses.head, poses.tail) if leg is not None]
     first, last = (_NOWHERE if stop is None else stop for stop in (poses.first, poses.last))
@@ -105,7 +105,7 @@ def _packed_leg(leg: Leg) -> bytes:
     )
 
 
-def unpacked_poses(packed: bytes) -> PoseDigest:
+def decode_poses(packed: bytes) -> PoseDigest:
     """The digest that these bytes are of.
 
     Raises:
@@ -149,7 +149,7 @@ def unpacked_standstills(packed: bytes) -> StandstillDigest:
     )
 
 
-def packed_story(story: Story) -> bytes:
+def encode_topic_events(story: TopicEvents) -> bytes:
     """A story as bytes."""
     counts = (story.first, story.last, story.left_out, story.undecodable, story.beyond)
     # Many booleans have the same paths, and times counted from the first message, in every bag.
@@ -170,7 +170,7 @@ def packed_story(story: Story) -> bytes:
     return _STORY.pack(*counts, len(rows)) + rows + shorter
 
 
-def unpacked_story(packed: bytes) -> Story:
+def decode_topic_events(packed: bytes) -> TopicEvents:
     """The story that these bytes are of.
 
     Raises:
@@ -181,21 +181,23 @@ def unpacked_story(packed: bytes) -> Story:
         end = _STORY.size + size
         labels, (paths, after, values), flips, faults = _told(packed[end:])
         known = tuple(
-            Known(path, first + at, value in "13", value in "23")
+            KnownFlag(path, first + at, value in "13", value in "23")
             for path, at, value in zip(paths, after, values, strict=True)
         )
     except (TypeError, struct.error, zlib.error) as error:
         raise ValueError(f"not a story: {error}") from error
-    seen = Seen(labels, packed[_STORY.size : end])
+    seen = IntervalTable(labels, packed[_STORY.size : end])
     if not seen.is_sound:
         raise ValueError("not a story: it tells of things without a name")
-    return Story(first, last, seen, known, flips, faults, left_out, undecodable, beyond)
+    return TopicEvents(first, last, seen, known, flips, faults, left_out, undecodable, beyond)
 
 
 @lru_cache(2048)
 def _told(
     text: bytes,
-) -> tuple[tuple[str, ...], tuple[list[str], list[int], str], tuple[Flip, ...], tuple[Fault, ...]]:
+) -> tuple[
+    tuple[str, ...], tuple[list[str], list[int], str], tuple[Toggle, ...], tuple[ReportedError, ...]
+]:
     """What a story says in words: of many bags the same, and asked of an hour again and again."""
     plain = text if text.startswith(b"[") else zlib.decompress(text)
     labels, (paths, after, values), flips, faults = json.loads(
@@ -204,8 +206,8 @@ def _told(
     return (
         tuple(labels),
         (paths, after, values),
-        tuple(Flip(*each) for each in flips),
-        tuple(Fault(*each) for each in faults),
+        tuple(Toggle(*each) for each in flips),
+        tuple(ReportedError(*each) for each in faults),
     )
 
 
@@ -247,9 +249,9 @@ def _unpacked_poses(packed: bytes) -> PoseDigest:
     )
 
 
-def _stops(numbers: Sequence[float]) -> tuple[Stop, Stop]:
+def _stops(numbers: Sequence[float]) -> tuple[TimedPosition, TimedPosition]:
     first, ax, ay, az, last, bx, by, bz = numbers
-    return Stop(int(first), (ax, ay, az)), Stop(int(last), (bx, by, bz))
+    return TimedPosition(int(first), (ax, ay, az)), TimedPosition(int(last), (bx, by, bz))
 
 
 def _unpacked_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
@@ -286,13 +288,13 @@ def _frames(text: bytes) -> tuple[str, ...]:
     return tuple(json.loads(text))
 
 
-def shape_text(shape: Shape) -> str:
+def encode_schema(shape: SummarySchema) -> str:
     """A shape as a text, the same for equal ones."""
     topics: JsonValue = [[*heading] for heading in shape.topics]
     return json.dumps([topics, [*shape.silent], shape.complete, [*shape.notes], shape.set_back])
 
 
-def shape_of_text(text: str) -> Shape:
+def decode_schema(text: str) -> SummarySchema:
     """The shape that this text is of.
 
     Raises:
@@ -301,13 +303,15 @@ def shape_of_text(text: str) -> Shape:
     """
     topics, silent, complete, notes, set_back = json.loads(text)
     headings = (
-        Heading(topic, type_name, encoding, bool(latched))
+        TopicHeader(topic, type_name, encoding, bool(latched))
         for topic, type_name, encoding, latched in topics
     )
-    return shared_shape(tuple(headings), tuple(silent), bool(complete), tuple(notes), int(set_back))
+    return shared_schema(
+        tuple(headings), tuple(silent), bool(complete), tuple(notes), int(set_back)
+    )
 
 
-def filled(shape: Shape, counts: bytes) -> BagSummary:
+def filled(shape: SummarySchema, counts: bytes) -> BagSummary:
     """The summary of a bag of this shape.
 
     Raises:

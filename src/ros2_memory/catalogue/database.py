@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.catalogue.file import Opened
+    from ros2_memory.catalogue.file import OpenDatabase
 
 RETRY_S: Final = 10.0
 """How often a file is tried again that could not be opened."""
@@ -42,7 +42,7 @@ T = TypeVar("T")
 log = get_logger(__name__)
 
 
-class KeptBase:
+class CatalogueDatabase:
     """One base after the other, and the numbers of rows told apart by base. Safe for threads.
 
     Args:
@@ -63,7 +63,7 @@ class KeptBase:
         self._waits_for = waits_for
         self._monotonic = monotonic
         self._lock = threading.Lock()
-        self._opened: Opened | None = None
+        self._opened: OpenDatabase | None = None
         self._bases = 0
         self._closed = False
         self._tried_s = 0.0
@@ -182,7 +182,7 @@ class KeptBase:
     def _may_open(self) -> bool:
         return not self._closed and (self._waits_for is None or self._waits_for.is_dir())
 
-    def _ready(self) -> Opened | None:
+    def _ready(self) -> OpenDatabase | None:
         """The open base; None where there is none yet, or no more."""
         if self._opened is None and self._may_open():
             self._tried_s = self._monotonic()
@@ -197,7 +197,7 @@ class KeptBase:
     def _is_due(self) -> bool:
         return self._monotonic() - self._tried_s >= RETRY_S
 
-    def _go_on_at_a_better_place(self, before: Opened) -> None:
+    def _go_on_at_a_better_place(self, before: OpenDatabase) -> None:
         """Opens the file at a place that is preferred to the present one, where there is one now.
 
         What a file held is copied there before; what memory held is found again.

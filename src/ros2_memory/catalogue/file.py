@@ -72,7 +72,7 @@ log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
+class OpenDatabase:
     """An open base, and its file; None in memory.
 
     `file` and `beside` tell the file, its write-ahead log and the index of that from others of the
@@ -105,7 +105,7 @@ class Opened:
 
 def open_file(
     places: Sequence[Path], *, again: bool = False, former: Path | None = None
-) -> Opened | str:
+) -> OpenDatabase | str:
     """The base at the first place that can be written; why not where none can.
 
     Args:
@@ -123,7 +123,7 @@ def open_file(
                 _copy_one_of((former,) if former else places[nth:], path)
             base = _ready(path)
             base.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
-            return Opened(base, path, _identity(path), _identities(path))
+            return OpenDatabase(base, path, _identity(path), _identities(path))
         except _LockedError:
             tell = log.debug if again else log.warning
             tell("catalogue_locked", path=str(path), instead="memory")
@@ -196,11 +196,11 @@ def fault_of(path: Path, *, thorough: bool = False) -> sqlite3.Error | None:
     return None if found == "ok" else sqlite3.DatabaseError(found)
 
 
-def in_memory() -> Opened:
+def in_memory() -> OpenDatabase:
     """An empty base in memory."""
     base = _connected(":memory:")
     base.executescript(_TABLES)
-    return Opened(base, None)
+    return OpenDatabase(base, None)
 
 
 def is_passing(error: Exception) -> bool:

@@ -6,31 +6,31 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.catalogue.codec import shape_of_text
+from ros2_memory.catalogue.codec import decode_schema
 from ros2_memory.core.bag_summary import BagSummary
-from ros2_memory.index.file_state import FormerFile
+from ros2_memory.index.file_state import KnownFile
 
 if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Sequence
 
-    from ros2_memory.core.bag_summary import Shape
+    from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.timebase import Ns
 
 _AT_ONCE: Final = 4096
 """Rows that are held besides what is made of them."""
 
 
-def former_files(base: sqlite3.Connection, config: str, root: str) -> dict[str, FormerFile]:
+def known_files(base: sqlite3.Connection, config: str, root: str) -> dict[str, KnownFile]:
     """The files that have an entry, by `root` and their path.
 
     Raises:
         sqlite3.Error: the base cannot be read.
         ValueError: it holds what is no summary.
     """
-    found: dict[str, FormerFile] = {}
+    found: dict[str, KnownFile] = {}
     for number, text in base.execute("SELECT id, text FROM shapes").fetchall():
-        shape = shape_of_text(text)
+        shape = decode_schema(text)
         cursor = base.execute(
             "SELECT path, size, mtime, sidecar, counts FROM bags WHERE config = ? AND shape = ?",
             (config, number),
@@ -40,11 +40,11 @@ def former_files(base: sqlite3.Connection, config: str, root: str) -> dict[str, 
             for row, start, end in zip(rows, starts, ends, strict=True):
                 path, size, mtime, sidecar, counts = row
                 summary = BagSummary.packed(shape, counts)
-                found[root + path] = FormerFile(size, mtime, sidecar, summary, start, end)
+                found[root + path] = KnownFile(size, mtime, sidecar, summary, start, end)
     return found
 
 
-def _spans(shape: Shape, counts: Sequence[bytes]) -> tuple[list[Ns], list[Ns]]:
+def _spans(shape: SummarySchema, counts: Sequence[bytes]) -> tuple[list[Ns], list[Ns]]:
     """Of bags of one shape, given by their numbers, the log times of the first and last message.
 
     0 for bags without a message.

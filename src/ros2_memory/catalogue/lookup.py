@@ -11,7 +11,7 @@ from collections import OrderedDict
 from typing import TYPE_CHECKING, Final, TypeVar
 from weakref import WeakKeyDictionary
 
-from ros2_memory.analysis.zone_map import OPEN, Boxes, united
+from ros2_memory.analysis.zone_map import UNBOUNDED, Boxes, united
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.core.model import BagState
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.analysis.standstills import StandstillDigest
-    from ros2_memory.analysis.topic_events import Story
-    from ros2_memory.analysis.zone_map import Evidence
+    from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.store import Catalogue
     from ros2_memory.catalogue.topic_digest import EdgeDigest
     from ros2_memory.core.model import BagFile
-    from ros2_memory.index.segment import Run
+    from ros2_memory.index.segment import Segment
     from ros2_memory.storage.base import Record
 
 T = TypeVar("T")
@@ -37,7 +37,7 @@ _IN_DOUBT: Final = -1
 """The state of a catalogue that could not be asked."""
 
 
-class RunNotes:
+class SegmentDigests:
     """What the catalogue says of one run. Bags without an entry are not spoken of.
 
     Attributes:
@@ -48,13 +48,13 @@ class RunNotes:
     def __init__(
         self,
         catalogue: Catalogue,
-        run: Run,
+        run: Segment,
         bag_dir: Path,
         as_of: int,
-        lately: Lately | None = None,
+        lately: RecordLru | None = None,
     ) -> None:
         self._catalogue = catalogue
-        self._lately = Lately() if lately is None else lately
+        self._lately = RecordLru() if lately is None else lately
         before = catalogue.failures
         closed = [bag for bag in run.bags if bag.state is BagState.CLOSED]
         numbers = catalogue.find([BagKey.of(bag, bag_dir) for bag in closed])
@@ -71,22 +71,22 @@ class RunNotes:
             for topic in run.spans
             for held in (run.bags_with(topic),)
         }
-        self._evidence: dict[str, Evidence] = {}
+        self._evidence: dict[str, ZoneMap] = {}
         self._boxes: dict[str, Boxes] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._kept: dict[str, dict[int, tuple[Record, ...]]] = {}
 
-    def evidence_of_all(self, topic: str) -> Evidence:
+    def evidence_of_all(self, topic: str) -> ZoneMap:
         """What can have stood in any message of the topic in the bags with an entry."""
         return self._kept_as(self._evidence, topic, lambda: united(self.evidence(topic).values()))
 
-    def evidence(self, topic: str) -> Mapping[int, Evidence]:
+    def evidence(self, topic: str) -> Mapping[int, ZoneMap]:
         """For each entry that holds the topic what can have stood in it."""
         numbers = self._of(topic)
         known = self._catalogue.evidence(topic, numbers)
         # Where the catalogue failed since the entries were found, nothing is ruled out.
-        return {number: known.get(number, OPEN) for number in numbers}
+        return {number: known.get(number, UNBOUNDED) for number in numbers}
 
     def boxes(self, topic: str) -> Boxes:
         """The places in the evidence; kept, since they are few numbers and asked for often."""
@@ -100,7 +100,7 @@ class RunNotes:
         """For each of these entries that has it where its poses stand still."""
         return self._catalogue.standstills(topic, among)
 
-    def stories(self, topic: str, among: Sequence[int]) -> Mapping[int, Story | None]:
+    def stories(self, topic: str, among: Sequence[int]) -> Mapping[int, TopicEvents | None]:
         """For each of these entries what the messages of the topic say, as the catalogue has it."""
         return self._catalogue.stories(topic, among)
 
@@ -159,14 +159,14 @@ class RunNotes:
         return self._holding.get(topic, [])
 
 
-class Lately:
+class RecordLru:
     """The notes whose messages are held. Safe for several threads at once."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._notes: OrderedDict[RunNotes, None] = OrderedDict()
+        self._notes: OrderedDict[SegmentDigests, None] = OrderedDict()
 
-    def used(self, notes: RunNotes) -> None:
+    def used(self, notes: SegmentDigests) -> None:
         """Puts notes first; those that were used longest ago let go of their messages."""
         with self._lock:
             self._notes[notes] = None
@@ -175,31 +175,31 @@ class Lately:
                 self._notes.popitem(last=False)[0].release()
 
 
-class Recall:
+class DigestCache:
     """Gives the notes on runs. Safe for several threads at once."""
 
     def __init__(self, catalogue: Catalogue, bag_dir: Path) -> None:
         self.catalogue = catalogue
         self._bag_dir = bag_dir
         self._lock = threading.Lock()
-        self._lately = Lately()
-        self._runs: WeakKeyDictionary[Run, RunNotes] = WeakKeyDictionary()
+        self._lately = RecordLru()
+        self._runs: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
 
     def as_of(self) -> int:
         """The state of the catalogue that one question should be answered by."""
         return self.catalogue.newest()
 
-    def notes(self, run: Run, as_of: int) -> RunNotes:
+    def notes(self, run: Segment, as_of: int) -> SegmentDigests:
         """What is known of a run, at that state of the catalogue or a later one."""
         with self._lock:
             known = self._runs.get(run)
         if known is None or not self._holds(known, as_of):
-            known = RunNotes(self.catalogue, run, self._bag_dir, as_of, self._lately)
+            known = SegmentDigests(self.catalogue, run, self._bag_dir, as_of, self._lately)
             with self._lock:
                 self._runs[run] = known
         return known
 
-    def settled(self, run: Run) -> RunNotes | None:
+    def settled(self, run: Segment) -> SegmentDigests | None:
         """The notes on a run that speak of all its bags: no state of the catalogue adds to them.
 
         None where there are none yet. Asks nothing of the catalogue's file.
@@ -225,14 +225,14 @@ class Recall:
         """Keeps what was worked out from these entries, for as long as they stand."""
         self.catalogue.remember(question, numbers, answer)
 
-    def _holds(self, known: RunNotes, as_of: int) -> bool:
+    def _holds(self, known: SegmentDigests, as_of: int) -> bool:
         """Whether another look would say no more."""
         if known.as_of == as_of:
             return True
         return known.whole and self.catalogue.is_same_base(known.as_of, as_of)
 
 
-def bags_without_entry(runs: Sequence[Run], recall: Recall) -> list[BagFile]:
+def bags_without_entry(runs: Sequence[Segment], recall: DigestCache) -> list[BagFile]:
     """The closed bags of which the catalogue knows nothing, in order."""
     as_of = recall.as_of()
     return [

@@ -10,13 +10,13 @@ import hashlib
 import json
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.topic_events import Story
-from ros2_memory.analysis.zone_map import OPEN, Box, Evidence
+from ros2_memory.analysis.topic_events import TopicEvents
+from ros2_memory.analysis.zone_map import UNBOUNDED, Box, ZoneMap
 from ros2_memory.catalogue.codec import (
-    packed_poses,
+    encode_poses,
+    encode_schema,
+    encode_topic_events,
     packed_standstills,
-    packed_story,
-    shape_text,
 )
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def put(
     base: sqlite3.Connection, config: str, key: tuple[str, int, int, int], digest: Digest
 ) -> None:
     """Inserts an entry; `key` is path, size, mtime and sidecar's mtime."""
-    shape = _number(base, "shapes", "text", shape_text(digest.summary.shape))
+    shape = _number(base, "shapes", "text", encode_schema(digest.summary.shape))
     cursor = base.execute(
         "INSERT INTO bags (config, path, size, mtime, sidecar, shape, counts)"
         " VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -119,7 +119,7 @@ def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
             evidence.high,
             None if evidence.numbers is None else json.dumps(evidence.numbers),
             *(evidence.box or (None,) * 6),
-            None if topic.poses is None else packed_poses(topic.poses),
+            None if topic.poses is None else encode_poses(topic.poses),
             pairs,
             None if edges is None else edges.first_stamp,
             None if edges is None else edges.last_stamp,
@@ -133,9 +133,9 @@ def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
 
 def _put_tale(base: sqlite3.Connection, bag: int, topic: TopicDigest, summary: BagSummary) -> None:
     """Inserts where a topic's poses stand still and what its messages say, if there is any."""
-    story = b"" if topic.story is None else packed_story(topic.story)
+    story = b"" if topic.story is None else encode_topic_events(topic.story)
     spans = [(each.first, each.last) for each in summary.of(topic.topic)]
-    quiet = Story(min(first for first, _ in spans), max(last for _, last in spans))
+    quiet = TopicEvents(min(first for first, _ in spans), max(last for _, last in spans))
     if topic.standstills is None and topic.story == quiet:
         return
     base.execute(
@@ -196,12 +196,12 @@ def _number(base: sqlite3.Connection, table: str, column: str, text: str) -> int
     return int(row[0])
 
 
-def evidence_of(row: sqlite3.Row) -> Evidence:
+def evidence_of(row: sqlite3.Row) -> ZoneMap:
     """The evidence in the columns `EVIDENCE` of a row."""
     _, flags, words, low, high, numbers, *box = row
     if flags & _OPEN:
-        return OPEN
-    return Evidence(
+        return UNBOUNDED
+    return ZoneMap(
         words=words,
         texts=bool(flags & _TEXTS),
         booleans=(False,) * bool(flags & _FALSE) + (True,) * bool(flags & _TRUE),

@@ -15,14 +15,14 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.topic_events import QUIET
+from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.codec import (
-    unpacked_poses,
+    decode_poses,
+    decode_topic_events,
     unpacked_standstills,
-    unpacked_story,
 )
-from ros2_memory.catalogue.database import KeptBase
-from ros2_memory.catalogue.former import former_files
+from ros2_memory.catalogue.database import CatalogueDatabase
+from ros2_memory.catalogue.former import known_files
 from ros2_memory.catalogue.sql import (
     EVIDENCE,
     drop,
@@ -44,12 +44,12 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.analysis.standstills import StandstillDigest
-    from ros2_memory.analysis.topic_events import Story
-    from ros2_memory.analysis.zone_map import Evidence
+    from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.file_state import FormerFile
+    from ros2_memory.index.file_state import KnownFile
 
 FOLDER: Final = ".episodic"
 FILE: Final = "catalogue.sqlite"
@@ -91,7 +91,7 @@ class Catalogue:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config = config
-        self._base = KeptBase(places, waits_for=waits_for, monotonic=monotonic)
+        self._base = CatalogueDatabase(places, waits_for=waits_for, monotonic=monotonic)
         self._read = self._base.read
         self._write = self._base.write
         self._channels: dict[int, Channel] = {}
@@ -145,9 +145,9 @@ class Catalogue:
 
         return self._read(ask, 0)
 
-    def summaries(self, bag_dir: Path) -> dict[str, FormerFile]:
+    def summaries(self, bag_dir: Path) -> dict[str, KnownFile]:
         """What is known of every file below the bag directory, by its whole path."""
-        return self._read(partial(former_files, config=self._config, root=f"{bag_dir}{os.sep}"), {})
+        return self._read(partial(known_files, config=self._config, root=f"{bag_dir}{os.sep}"), {})
 
     def paths(self) -> list[str]:
         """The files that have an entry, below the bag directory."""
@@ -169,10 +169,10 @@ class Catalogue:
         found: dict[BagKey, int] = self._read(ask, {})
         return [found.get(key) for key in keys]
 
-    def evidence(self, topic: str, numbers: Sequence[int]) -> dict[int, Evidence]:
+    def evidence(self, topic: str, numbers: Sequence[int]) -> dict[int, ZoneMap]:
         """What the entries say of the topic; those that hold none of it are left out."""
 
-        def ask(base: sqlite3.Connection) -> dict[int, Evidence]:
+        def ask(base: sqlite3.Connection) -> dict[int, ZoneMap]:
             first, here = self._base.first, self._base.here(numbers)
             rows = held_rows(base, EVIDENCE, topic, here)
             return {first + row[0]: evidence_of(row) for row in rows}
@@ -186,7 +186,7 @@ class Catalogue:
             first, here = self._base.first, self._base.here(numbers)
             rows = held_rows(base, "poses", topic, here)
             return {
-                first + number: unpacked_poses(packed)
+                first + number: decode_poses(packed)
                 for number, packed in rows
                 if packed is not None
             }
@@ -203,19 +203,19 @@ class Catalogue:
 
         return self._read(ask, {})
 
-    def stories(self, topic: str, numbers: Sequence[int]) -> dict[int, Story | None]:
+    def stories(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """What the messages of the topic in the entries say.
 
-        `QUIET` where they say nothing; None where none can be decoded. Entries that hold none of
-        it are left out, and so are those that were dropped meanwhile.
+        `NO_EVENTS` where they say nothing; None where none can be decoded. Entries that hold
+        none of it are left out, and so are those that were dropped meanwhile.
         """
 
-        def ask(base: sqlite3.Connection) -> dict[int, Story | None]:
+        def ask(base: sqlite3.Connection) -> dict[int, TopicEvents | None]:
             first, here = self._base.first, self._base.here(numbers)
             held = held_rows(base, "NULL", topic, here)
-            found: dict[int, Story | None] = {first + number: QUIET for number, _ in held}
+            found: dict[int, TopicEvents | None] = {first + number: NO_EVENTS for number, _ in held}
             for number, text in tale_rows(base, "story", topic, here):
-                found[first + number] = unpacked_story(text) if text else None
+                found[first + number] = decode_topic_events(text) if text else None
             return found
 
         return self._read(ask, {})

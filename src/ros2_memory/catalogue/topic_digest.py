@@ -7,22 +7,22 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.bulk_decode import mould_of
+from ros2_memory.analysis.bulk_decode import template_for
 from ros2_memory.analysis.odometry import is_place
 from ros2_memory.analysis.standstills import StandstillCollector
-from ros2_memory.analysis.topic_events import MOST_TOLD, StoryBuilder, state_of
+from ros2_memory.analysis.topic_events import MOST_TOLD, TopicEventsBuilder, state_of
 from ros2_memory.analysis.trajectory import PoseCollector
-from ros2_memory.analysis.zone_map_builder import EvidenceCollector
+from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from ros2_memory.core.errors import UndecodableError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.bulk_decode import Mould
+    from ros2_memory.analysis.bulk_decode import PayloadTemplate
     from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.analysis.standstills import StandstillDigest
-    from ros2_memory.analysis.topic_events import State, Story
-    from ros2_memory.analysis.zone_map import Evidence
+    from ros2_memory.analysis.topic_events import State, TopicEvents
+    from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
@@ -70,10 +70,10 @@ class TopicDigest:
     """
 
     topic: str
-    evidence: Evidence
+    evidence: ZoneMap
     poses: PoseDigest | None
     standstills: StandstillDigest | None
-    story: Story | None
+    story: TopicEvents | None
     edges: EdgeDigest | None
     kept: tuple[Record, ...] | None
     undecodable: tuple[tuple[str, str], ...] = ()
@@ -113,15 +113,15 @@ class TopicCollector:
         self._reader = reader
         self._extractor = extractor
         self._latched = latched
-        self._evidence = EvidenceCollector()
+        self._evidence = ZoneMapBuilder()
         self._poses: PoseCollector | None = PoseCollector(max_plausible_speed_mps)
         self._standstills = StandstillCollector()
-        self._story = StoryBuilder()
+        self._story = TopicEventsBuilder()
         self._pairs: set[tuple[str, str]] | None = set()
         self._ends: tuple[Record, Record] | None = None
         self._kept: list[Record] | None = []
         self._kept_bytes = 0
-        self._moulds: list[tuple[Mould, Record, State]] = []
+        self._moulds: list[tuple[PayloadTemplate, Record, State]] = []
         self._more_moulds = _MOST_MOULDS if count > _FEW else 0
         self._waiting: list[Record] = []
         self._waiting_bytes = 0
@@ -230,12 +230,12 @@ class TopicCollector:
         for record, each in zip(records, seen, strict=True):
             self._take(record, each)
 
-    def _new_mould(self, record: Record) -> Mould | None:
+    def _new_mould(self, record: Record) -> PayloadTemplate | None:
         """The mould of a message that could be decoded; one failure is the last try."""
         if not self._more_moulds:
             return None
         self._more_moulds -= 1
-        mould = mould_of(self._reader, self._extractor, record)
+        mould = template_for(self._reader, self._extractor, record)
         if mould is None or mould.pairs != {
             (each.parent, each.child) for each in self._transforms(record)
         }:
@@ -246,7 +246,7 @@ class TopicCollector:
 
     def _cast(
         self,
-        mould: Mould,
+        mould: PayloadTemplate,
         model: tuple[Record, State],
         records: Sequence[Record],
         rest: deque[int],
@@ -254,7 +254,7 @@ class TopicCollector:
     ) -> deque[int]:
         """Takes those of `rest` that are of the mould of `model`; gives the others."""
         first, state = model
-        chosen, rows = mould.those_like(first, records, rest)
+        chosen, rows = mould.matching(first, records, rest)
         if not chosen:
             return rest
         self._evidence.add_rows(mould, rows)

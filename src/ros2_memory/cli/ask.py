@@ -25,7 +25,7 @@ from ros2_memory.cli.settling import settings_for
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Limits, Memory
+from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.replies import Reply
 from ros2_memory.tools.spec_tools import build_tools
@@ -38,7 +38,7 @@ Schemas = Mapping[str, Mapping[str, object]]
 
 def complete(incomplete: str) -> list[str]:
     """The tools whose names begin so, for the shell."""
-    names = (tool.name for tool in build_tools(Limits(), 1.0, writing=True))
+    names = (tool.name for tool in build_tools(QuerySettings(), 1.0, writing=True))
     return [name for name in names if name.startswith(incomplete)]
 
 

@@ -22,13 +22,13 @@ from ros2_memory.core.errors import (
     NoDataReason,
     UndecodableError,
 )
-from ros2_memory.core.globs import matching
+from ros2_memory.core.globs import match_topics
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.core.wording import counted
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.duplicates import Found
-from ros2_memory.history.unseen import lost_in, note_unseen
+from ros2_memory.history.duplicates import StoredMessage
+from ros2_memory.history.unseen import lost_in, note_unread
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import ROS2_PROFILE, Record
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -85,7 +85,7 @@ def export(
         view = View(memory, Call())
         window = window_of(memory, view.snapshot, start, end, last)
         topics = _topics(view, topic or ())
-        note_unseen(view, window)
+        note_unread(view, window)
         with _progress(view, window) as tell:
             held = _held(view, topics, window.start) if latched else []
             within = view.stream(topics, window)
@@ -111,14 +111,14 @@ def _topics(view: View, globs: Sequence[str]) -> list[str]:
         NoDataError: there is none.
     """
     names = view.snapshot.topics()
-    chosen = [name for glob in globs or ("*",) for name in matching(names, glob)]
+    chosen = [name for glob in globs or ("*",) for name in match_topics(names, glob)]
     if not chosen:
         asked = f"no recorded topic matches {', '.join(globs)}" if globs else "nothing is recorded"
         raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{asked}; see ros2-memory topics")
     return sorted(set(chosen))
 
 
-def _held(view: View, topics: Sequence[str], start: Ns) -> list[Found]:
+def _held(view: View, topics: Sequence[str], start: Ns) -> list[StoredMessage]:
     """The latched messages of before that hold at a moment, with their own times.
 
     That is the newest of a topic; and of transforms the newest of each child frame, since every
@@ -126,7 +126,7 @@ def _held(view: View, topics: Sequence[str], start: Ns) -> list[Found]:
     """
     before = TimeWindow(MIN_NS, start)
     latching = view.memory.limits.latching
-    held: dict[tuple[str, str], Found] = {}
+    held: dict[tuple[str, str], StoredMessage] = {}
     for topic in topics:
         if not latching.may_hold(view.snapshot, topic):
             continue
@@ -143,7 +143,7 @@ def _held(view: View, topics: Sequence[str], start: Ns) -> list[Found]:
     return sorted(once.values(), key=lambda found: found.time)
 
 
-def _frames(memory: Memory, found: Found) -> set[str]:
+def _frames(memory: Memory, found: StoredMessage) -> set[str]:
     """The child frames of a message of transforms; none where it cannot be decoded."""
     try:
         message = memory.reader.decode(found.record)
@@ -153,7 +153,9 @@ def _frames(memory: Memory, found: Found) -> set[str]:
     return {edge.child for edge in edges}
 
 
-def _profile(view: View, topics: Sequence[str], window: TimeWindow, held: Sequence[Found]) -> str:
+def _profile(
+    view: View, topics: Sequence[str], window: TimeWindow, held: Sequence[StoredMessage]
+) -> str:
     """The MCAP profile of all the bags that hold the messages; empty where they differ."""
     chosen = frozenset(topics)
     within = view.snapshot.overlapping(window)
@@ -167,7 +169,7 @@ def _profile(view: View, topics: Sequence[str], window: TimeWindow, held: Sequen
     return profiles.pop() if len(profiles) == 1 else ""
 
 
-def as_mcap(path: Path, found: Iterator[Found], profile: str = ROS2_PROFILE) -> str:
+def as_mcap(path: Path, found: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> str:
     """Writes the file, which is there when it is whole; what was done, in a sentence.
 
     Raises:
@@ -198,7 +200,9 @@ def as_mcap(path: Path, found: Iterator[Found], profile: str = ROS2_PROFILE) -> 
     return f"{counted(written, 'message')} in {path}"
 
 
-def _as_parquet(path: Path, found: Iterator[Found], memory: Memory, robot: str | None) -> str:
+def _as_parquet(
+    path: Path, found: Iterator[StoredMessage], memory: Memory, robot: str | None
+) -> str:
     """Writes the rows; what was done, in a sentence.
 
     Raises:
@@ -217,7 +221,7 @@ def _as_parquet(path: Path, found: Iterator[Found], memory: Memory, robot: str |
     return f"{counted(dataset.rows, 'message')} in {counted(dataset.files, 'file')} below {path}"
 
 
-def _told(found: Iterator[Found], tell: Callable[[Ns], None]) -> Iterator[Found]:
+def _told(found: Iterator[StoredMessage], tell: Callable[[Ns], None]) -> Iterator[StoredMessage]:
     for number, each in enumerate(found):
         if number % _TELL_EVERY == 0:
             tell(each.time)

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.cli.index import Bar, die_with, fill, orphaned, step_back
 from ros2_memory.cli.opening import opened
 from ros2_memory.cli.running import CANNOT_RUN, BagDir, Overrides, Verbose, reporting
@@ -37,7 +37,7 @@ def _for_people(settings: Settings, *, verbose: bool) -> None:
     memory = opened(settings, verbose=verbose)
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
-    filler = build_filler(settings, memory)
+    filler = build_backfill(settings, memory)
     if filler.in_memory:
         raise ConfigError(
             "no catalogue can be written, neither beside the bags nor in the cache folder: "
@@ -52,6 +52,6 @@ def _beside(settings: Settings, server: int) -> None:
     configure_logging(
         settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
     )
-    filler = build_filler(settings, build_memory(settings))
+    filler = build_backfill(settings, build_memory(settings))
     step_back()
     fill(filler, None, orphaned())

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.adapters import GB, build_recorder
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
-from ros2_memory.bootstrap import limits_of
+from ros2_memory.bootstrap import query_settings_of
 from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
@@ -357,7 +357,7 @@ def of_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Findi
     except EpisodicError as error:
         yield Finding(Level.ERROR, "topics", str(error), "correct recording.topics_file")
         return
-    missing = never_heard(selection, snapshot, limits_of(settings).latching)
+    missing = never_heard(selection, snapshot, query_settings_of(settings).latching)
     heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
     live = heartbeat is not None and heartbeat.is_live(now)
     unoffered = [*heartbeat.missing] if live and heartbeat is not None else []

@@ -14,7 +14,7 @@ from ros2_memory.core.wording import counted
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ros2_memory.serving.backfill import Filler, Progress
+    from ros2_memory.serving.backfill import Backfill, Progress
 
 NICENESS: Final = 15
 """So low that whoever answers meanwhile goes first."""
@@ -58,7 +58,7 @@ def line(progress: Progress) -> str:
     return f"[{bar:<{_WIDTH}}] {known} of {bags} in the catalogue{refused}"
 
 
-def fill(filler: Filler, bar: Bar | None, abandoned: Callable[[], bool]) -> Progress:
+def fill(filler: Backfill, bar: Bar | None, abandoned: Callable[[], bool]) -> Progress:
     """Digests until nothing waits, the newest first, and gives where that has led.
 
     A bag that changed a moment ago is left for later.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.storage.base import BagReader
 
 SCHEMA: Final = pa.schema(
@@ -115,7 +115,7 @@ class Dataset:
             for part in parts:
                 part.beside.unlink(missing_ok=True)
 
-    def add(self, found: Found) -> None:
+    def add(self, found: StoredMessage) -> None:
         """Adds one message.
 
         Raises:
@@ -127,7 +127,7 @@ class Dataset:
         if len(part.rows) >= _ROWS_AT_ONCE:
             part.flush()
 
-    def _part(self, found: Found) -> _Part:
+    def _part(self, found: StoredMessage) -> _Part:
         date = datetime.fromtimestamp(found.time // NS_PER_S, tz=UTC).date()
         name = quote(found.bag.recording.name, safe=" ")
         folder = self._root / f"recording={name}" / f"date={date}"
@@ -151,7 +151,7 @@ class Dataset:
         number = self._numbers[folder] = self._numbers.get(folder, -1) + 1
         return _Part(folder / f"part-{number}.parquet")
 
-    def _row(self, found: Found) -> Row:
+    def _row(self, found: StoredMessage) -> Row:
         record = found.record
         row: Row = {
             "topic": record.channel.topic,

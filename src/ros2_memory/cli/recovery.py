@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE
 from ros2_memory.core import directories
@@ -240,7 +240,7 @@ def _files(path: Path, clock: Clock) -> tuple[list[Path], int]:
     if walked.problem is not None:
         raise RecorderError(f"{path} cannot be listed: {walked.problem}")
     # What a moment keeps is a second name of a bag that was whole.
-    kept = KeptNames(path)
+    kept = HardLinks(path)
     found = sorted(Path(each) for each in walked.looked_at if not kept.is_kept(each))
     files = [file for file in found if file.suffix == _MCAP]
     return files, len(found) - len(files)

@@ -1,8 +1,8 @@
 """What one bag holds, topic by topic, kept so that 60,000 bags fit into a small memory.
 
 Nearly all bags of a robot hold the same topics and differ in counts and times alone. So a summary
-is a `Shape`, which many share, and its numbers as bytes; a `TopicSummary` is made when it is asked
-for.
+is a `SummarySchema`, which many share, and its numbers as bytes; a `TopicSummary` is made when it
+is asked for.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class TopicSummary:
     latched: bool = False
 
 
-class Heading(NamedTuple):
+class TopicHeader(NamedTuple):
     """What of a `TopicSummary` does not differ from bag to bag."""
 
     topic: str
@@ -54,10 +54,10 @@ class Heading(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Shape:
+class SummarySchema:
     """All of a summary but its numbers; see `BagSummary` for what the fields say."""
 
-    topics: tuple[Heading, ...]
+    topics: tuple[TopicHeader, ...]
     silent: tuple[str, ...] = ()
     complete: bool = True
     notes: tuple[str, ...] = ()
@@ -100,20 +100,22 @@ def set_back_while_written(by: Ns) -> str:
 
 
 @lru_cache(maxsize=_SHAPES_AT_HAND)
-def shared_shape(
-    topics: tuple[Heading, ...],
+def shared_schema(
+    topics: tuple[TopicHeader, ...],
     silent: tuple[str, ...],
     complete: bool,
     notes: tuple[str, ...],
     set_back: Ns = 0,
-) -> Shape:
+) -> SummarySchema:
     """One shape for all bags that have it, with one copy of each name."""
     intern = sys.intern
     headings = tuple(
-        Heading(intern(each.topic), intern(each.type), intern(each.encoding), each.latched)
+        TopicHeader(intern(each.topic), intern(each.type), intern(each.encoding), each.latched)
         for each in topics
     )
-    return Shape(headings, tuple(intern(name) for name in silent), complete, notes, set_back)
+    return SummarySchema(
+        headings, tuple(intern(name) for name in silent), complete, notes, set_back
+    )
 
 
 class BagSummary:
@@ -134,7 +136,7 @@ class BagSummary:
 
     __slots__ = ("numbers", "shape")
 
-    shape: Shape
+    shape: SummarySchema
     numbers: bytes
 
     def __init__(
@@ -145,13 +147,15 @@ class BagSummary:
         notes: tuple[str, ...] = (),
         set_back: Ns = 0,
     ) -> None:
-        headings = (Heading(each.topic, each.type, each.encoding, each.latched) for each in topics)
-        self.shape = shared_shape(tuple(headings), silent, complete, notes, set_back)
+        headings = (
+            TopicHeader(each.topic, each.type, each.encoding, each.latched) for each in topics
+        )
+        self.shape = shared_schema(tuple(headings), silent, complete, notes, set_back)
         numbers = (part for each in topics for part in (each.count, each.first, each.last))
         self.numbers = self.shape.layout.pack(*numbers)
 
     @classmethod
-    def packed(cls, shape: Shape, numbers: bytes) -> Self:
+    def packed(cls, shape: SummarySchema, numbers: bytes) -> Self:
         """The summary of these numbers, which must be as many as the shape has."""
         made = cls.__new__(cls)
         made.shape = shape

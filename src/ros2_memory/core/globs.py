@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
-def matching(names: Iterable[str], glob: str) -> list[str]:
+def match_topics(names: Iterable[str], glob: str) -> list[str]:
     """The names that a glob matches, in their order; upper and lower case differ.
 
     `fnmatch` matches likewise, but keeps the last 32,768 globs: what clients may send without end

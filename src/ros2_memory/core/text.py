@@ -16,7 +16,7 @@ _LONGEST_NUMBER_BITS: Final = 128
 _MORE: Final = "…"
 
 
-def glimpse(value: object, max_chars: int = 80) -> str:
+def abbreviate(value: object, max_chars: int = 80) -> str:
     """The value in the manner of JSON, of at most `max_chars` characters.
 
     Takes no longer for a value of any depth, length or number of digits than for a short one. What

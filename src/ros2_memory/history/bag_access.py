@@ -16,17 +16,17 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.core.wording import Reason
-from ros2_memory.history.duplicates import Found
+from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.catalogue.lookup import RunNotes
+    from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.index.segment import Run
+    from ros2_memory.index.segment import Segment
     from ros2_memory.storage.base import Channel, Record
 
 _CHECK_EVERY: Final = 256
@@ -45,7 +45,7 @@ class _Thing(NamedTuple):
     last: Ns
 
 
-class Reading:
+class BagAccess:
     """A snapshot, what the catalogue says of it, a deadline, and notes on the way."""
 
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
@@ -140,7 +140,7 @@ class Reading:
             "bags so far: wait for it, or "
         )
 
-    def recalled(self, run: Run) -> RunNotes | None:
+    def recalled(self, run: Segment) -> SegmentDigests | None:
         """What the catalogue says of a run of the snapshot; None without a catalogue."""
         recall = self.memory.recall
         if recall is None:
@@ -153,13 +153,13 @@ class Reading:
             self._as_of = recall.as_of()
         return recall.notes(run, self._as_of)
 
-    def entry(self, bag: BagFile) -> tuple[RunNotes, int] | None:
+    def entry(self, bag: BagFile) -> tuple[SegmentDigests, int] | None:
         """The notes that speak of a bag and the number of its entry; None where it has none."""
         notes = self.recalled(self.snapshot.run_of(bag))
         number = None if notes is None else notes.numbers.get(bag.file)
         return None if notes is None or number is None else (notes, number)
 
-    def used(self, found: Iterator[Found]) -> Iterator[Found]:
+    def used(self, found: Iterator[StoredMessage]) -> Iterator[StoredMessage]:
         """The messages; where one stands in a bag that a crash left open, they are not all.
 
         Remembers whether one stands in a bag that is still being written.
@@ -210,7 +210,9 @@ class Reading:
             reason = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE
             self.note_thing(reason, name, error.reason, last)
 
-    def unsay_before(self, moment: Ns, said: Collection[tuple[Reason, str]] = frozenset()) -> None:
+    def retract_notes_before(
+        self, moment: Ns, said: Collection[tuple[Reason, str]] = frozenset()
+    ) -> None:
         """Takes back the notes on what could not be read where all of it lies before a moment.
 
         For a question that did not need it: how far back is read besides what is asked for depends
@@ -231,7 +233,7 @@ class Reading:
         *,
         newest_first: bool = False,
         since: Ns = MIN_NS,
-    ) -> Iterator[Found]:
+    ) -> Iterator[StoredMessage]:
         """One bag's messages; what of it cannot be read is noted, and disturbs no other.
 
         Not noted is what is lost before `since` alone: what is read there is read for copies only.
@@ -242,7 +244,7 @@ class Reading:
             known = _known(bag, window)
             return self._read(bag, topics, known, newest_first=newest_first, since=since)
         ordered = reversed(kept) if newest_first else iter(kept)
-        return (Found(bag, each) for each in ordered if window.contains(each.log_time))
+        return (StoredMessage(bag, each) for each in ordered if window.contains(each.log_time))
 
     def _read(
         self,
@@ -252,7 +254,7 @@ class Reading:
         *,
         newest_first: bool,
         since: Ns,
-    ) -> Iterator[Found]:
+    ) -> Iterator[StoredMessage]:
         records: Iterator[Record] | None = None
         clock, spent, count = time.perf_counter_ns, 0, 0
         while True:
@@ -266,7 +268,7 @@ class Reading:
                     count += 1
                     if count % _CHECK_EVERY == 0:
                         self.check_deadline()
-                    yield Found(bag, record)
+                    yield StoredMessage(bag, record)
                     begin = clock()
             except BagError as error:
                 self.skip(bag, error, since)
@@ -278,7 +280,7 @@ class Reading:
                 self.call.stages.add("read", spent)
                 spent = 0
 
-    def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> Found | None:
+    def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> StoredMessage | None:
         """What `read` gives first when it reads newest first; for less."""
         if self._kept(bag, [topic]) is not None:
             return next(self.read(bag, [topic], window, newest_first=True), None)
@@ -294,7 +296,7 @@ class Reading:
             return next(self.read(bag, [topic], window, newest_first=True), None)
         finally:
             self.call.stages.add("read", time.perf_counter_ns() - begin)
-        return None if record is None else Found(bag, record)
+        return None if record is None else StoredMessage(bag, record)
 
     def _kept(self, bag: BagFile, topics: Sequence[str]) -> Sequence[Record] | None:
         """All the bag's messages of one topic of which the catalogue keeps them; else None."""

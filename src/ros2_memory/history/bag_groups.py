@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.duplicates import Found, Holding
-    from ros2_memory.history.merged_stream import Streams
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.history.merged_stream import MergedStream
 
 
-def groups_of(view: Streams, topic: str, window: TimeWindow) -> list[Group]:
+def groups_of(view: MergedStream, topic: str, window: TimeWindow) -> list[Group]:
     """The groups of bags that hold messages of the topic in the window, in order."""
     holdings = view.holdings([topic], window)
-    if view.received_twice([topic]) and holdings:
+    if view.may_be_relatched([topic]) and holdings:
         return [Group(view, topic, window, holdings, received_twice=True)]
-    groups: list[list[Holding]] = []
+    groups: list[list[BagSpan]] = []
     reach: dict[Path, Ns] = {}
     for held in holdings:
         recording = held.bag.recording
@@ -52,10 +52,10 @@ class Group:
 
     def __init__(
         self,
-        view: Streams,
+        view: MergedStream,
         topic: str,
         window: TimeWindow,
-        holdings: Sequence[Holding],
+        holdings: Sequence[BagSpan],
         *,
         received_twice: bool,
     ) -> None:
@@ -63,7 +63,7 @@ class Group:
         self._topic = topic
         self._window = window
         self.holdings = holdings
-        self.received_twice = received_twice
+        self.may_be_relatched = received_twice
         self._mixed = received_twice or (
             len(holdings) > 1 and len({held.bag.recording for held in holdings}) > 1
         )
@@ -75,7 +75,7 @@ class Group:
         alone = len(self.holdings) == 1 and not self._mixed
         return held.bag if alone and self._window.covers(held.first, held.last) else None
 
-    def once(self) -> Iterator[Found]:
+    def once(self) -> Iterator[StoredMessage]:
         """The messages of the group in order, each one once."""
         return self._view.stream([self._topic], self._window, among=self.holdings)
 
@@ -88,7 +88,7 @@ class Group:
             return sum(each.count for each in bag.summary.of(self._topic))
         return len(self._located())
 
-    def fetch(self, indices: Sequence[int]) -> Iterator[Found]:
+    def fetch(self, indices: Sequence[int]) -> Iterator[StoredMessage]:
         """The messages at these positions of the group, which must ascend."""
         if not indices:
             return
@@ -97,7 +97,7 @@ class Group:
             yield from (each for index, each in enumerate(self.once()) if index in wanted)
             return
         places = self._located()
-        at_once: Iterator[Found] = iter(())
+        at_once: Iterator[StoredMessage] = iter(())
         at: tuple[Ns, int] | None = None
         passed = 0
         for index in indices:
@@ -141,7 +141,7 @@ def _numbered(times: Iterable[Ns]) -> Iterator[tuple[Ns, int]]:
         yield moment, nth
 
 
-def _belongs(held: Holding, recording: Path, reach: Mapping[Path, Ns]) -> bool:
+def _belongs(held: BagSpan, recording: Path, reach: Mapping[Path, Ns]) -> bool:
     """Whether a bag can hold messages before, or copies of, what the bags before it hold.
 
     `recording` is the bag's own; `reach` is the last log time so far of each recording. Splits of

@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.catalogue.lookup import RunNotes
+    from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import Run
+    from ros2_memory.index.segment import Segment
 
 
-class Stretch(NamedTuple):
+class SearchWindow(NamedTuple):
     """A half-open span of time, and what in it is not ruled out: the topics, and the files."""
 
     window: TimeWindow
@@ -41,7 +41,7 @@ class _Candidate(NamedTuple):
     bag: BagFile
 
 
-class Candidates:
+class CandidateBags:
     """Looks for bags that may hold a match on any of the topics.
 
     Attributes:
@@ -55,7 +55,7 @@ class Candidates:
         self._until = until
         self.ruled_out = False
 
-    def stretches(self) -> Iterator[Stretch]:
+    def stretches(self) -> Iterator[SearchWindow]:
         """The stretches in which a match may lie before `until`, newest first, none twice."""
         group: list[_Candidate] = []
         start = until = self._until
@@ -89,12 +89,12 @@ class Candidates:
             else:
                 yield heapq.heappop(waiting)[2]
 
-    def _in_run(self, run: Run, topic: str) -> Iterator[_Candidate]:
+    def _in_run(self, run: Segment, topic: str) -> Iterator[_Candidate]:
         notes = self._view.recalled(run)
         known = {} if notes is None else notes.numbers
         possible: Collection[int] = ()
         if notes is not None and known:
-            if self._condition.may_match(notes.evidence_of_all(topic)):
+            if self._condition.can_match(notes.evidence_of_all(topic)):
                 possible = self._possible(notes, topic)
             if notes.whole and not possible:
                 self.ruled_out = True
@@ -108,20 +108,20 @@ class Candidates:
             else:
                 self.ruled_out = True
 
-    def _possible(self, notes: RunNotes, topic: str) -> Collection[int]:
+    def _possible(self, notes: SegmentDigests, topic: str) -> Collection[int]:
         """The entries that may hold a match."""
         place = self._condition.place
         if place is not None:
             boxes = notes.boxes(topic)
             return boxes.meeting(place.x, place.y, place.z, place.tolerance_m)
         said = notes.evidence(topic)
-        return {number for number, each in said.items() if self._condition.may_match(each)}
+        return {number for number, each in said.items() if self._condition.can_match(each)}
 
 
-def _stretch(group: Sequence[_Candidate], start: Ns, until: Ns) -> Stretch:
+def _stretch(group: Sequence[_Candidate], start: Ns, until: Ns) -> SearchWindow:
     stop = min(until, max(each.last for each in group) + 1)
     bags = [each.bag for each in group]
-    return Stretch(
+    return SearchWindow(
         TimeWindow(start, stop),
         tuple(sorted({each.topic for each in group})),
         frozenset(bag.file for bag in bags),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.catalogue.lookup import Recall
+    from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.index.snapshot import Snapshot
@@ -28,7 +28,7 @@ NowOfMemory = Literal["wall", "latest"]
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class QuerySettings:
     """The knobs of the configuration that questions need.
 
     `kept` is how much the recorder keeps; None where nothing is recorded, and nothing deleted.
@@ -66,8 +66,8 @@ class Memory:
     reader: BagReader
     extractor: SchemaExtractor
     clock: Clock
-    limits: Limits
-    recall: Recall | None = None
+    limits: QuerySettings
+    recall: DigestCache | None = None
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """The bags that retention neither deletes nor counts, since the recorder did not make them.

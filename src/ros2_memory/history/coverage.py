@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
-from ros2_memory.core.globs import matching
+from ros2_memory.core.globs import match_topics
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     MAX_NS,
@@ -17,7 +17,7 @@ from ros2_memory.core.timebase import (
     unix_rounded_up,
 )
 from ros2_memory.core.wording import counted, listed
-from ros2_memory.history.unseen import may_be_written, note_unseen
+from ros2_memory.history.unseen import may_be_written, note_unread
 
 if TYPE_CHECKING:
     from ros2_memory.history.view import View
@@ -116,7 +116,7 @@ def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
     """
     if not any(mark in pattern for mark in "*?["):
         return (resolve_topic(view, pattern),)
-    matched = tuple(matching(view.snapshot.topics(), pattern))
+    matched = tuple(match_topics(view.snapshot.topics(), pattern))
     if not matched:
         raise not_recorded(view, pattern)
     return matched
@@ -162,11 +162,11 @@ def not_recorded(view: View, name: str) -> NoDataError:
         stem = name.rstrip("/").rpartition("/")[2].strip("*")
         close = [topic for topic in snapshot.topics() if stem and stem in topic][:5]
     hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
-    note_unseen(view, TimeWindow.everything(), nothing=True)
+    note_unread(view, TimeWindow.everything(), nothing=True)
     return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}", view.notes)
 
 
-def nothing_at(
+def no_data_at(
     view: View,
     topics: tuple[str, ...],
     at: Ns,
@@ -199,11 +199,11 @@ def nothing_at(
     reason = between(view, window) if older and newer else beyond(view, at)
     acceptable = older.time if older and tolerance is not None else None
     told.append(_advice(view, reason, at, acceptable))
-    note_unseen(view, window, nothing=True)
+    note_unread(view, window, nothing=True)
     return NoDataError(reason, "; ".join(told), view.notes)
 
 
-def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
+def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
     """No message of these topics in a window."""
     older = next(view.stream(topics, TimeWindow.until(window.start - 1), newest_first=True), None)
     newer = next(view.stream(topics, TimeWindow(window.stop, TimeWindow.everything().stop)), None)
@@ -216,7 +216,7 @@ def nothing_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         told.append(f"the first one after is at {moment(newer.time)}")
     reason = between(view, window) if older and newer else beyond(view, end)
     told.append(_advice(view, reason, window.start, None))
-    note_unseen(view, window, nothing=True)
+    note_unread(view, window, nothing=True)
     return NoDataError(reason, "; ".join(told), view.notes)
 
 
@@ -250,7 +250,7 @@ def undecodable_in(
     view: View, window: TimeWindow, topic: str, type_name: str, error: UndecodableError
 ) -> NoDataError:
     """As `undecodable`, of all that a window holds, with the notes on what else was not read."""
-    note_unseen(view, window, nothing=True)
+    note_unread(view, window, nothing=True)
     told = undecodable(topic, type_name, error)
     return NoDataError(told.reason, told.detail, view.notes)
 

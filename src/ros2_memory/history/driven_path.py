@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
-from ros2_memory.analysis.odometry import Stop, is_place
-from ros2_memory.analysis.sights import Sights
+from ros2_memory.analysis.odometry import TimedPosition, is_place
+from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
-from ros2_memory.catalogue.codec import packed_poses, unpacked_poses
+from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.wording import counted, listed
 from ros2_memory.history.coverage import topics_with, undecodable, undecodable_in
-from ros2_memory.history.stored_parts import Kept, Kind, is_whole
+from ros2_memory.history.stored_parts import DigestKind, StoredPart, is_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.core.model import Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
 _MOST_AT_ONCE: Final = 1024
@@ -40,7 +40,7 @@ class TakesPoses(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class DrivenPath:
     """The way, its frames in order of appearance, and the times of its first and last message."""
 
     trajectory: Trajectory
@@ -49,15 +49,15 @@ class Way:
     last: Ns
 
 
-POSES: Final = Kind(
+POSES: Final = DigestKind(
     "poses",
     ask=lambda notes, topic, among: notes.poses(topic, among),
-    packed=lambda digest: packed_poses(digest).hex(),
-    unpacked=lambda text: unpacked_poses(bytes.fromhex(text)),
+    packed=lambda digest: encode_poses(digest).hex(),
+    unpacked=lambda text: decode_poses(bytes.fromhex(text)),
 )
 
 
-def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
+def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None:
     """The way in a window by the poses of one topic; None where there is no message.
 
     Messages that cannot be decoded are left out, with a note.
@@ -68,8 +68,8 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
     """
     failures: list[UndecodableError] = []
     builder = TrajectoryBuilder(max_plausible_speed_mps=view.memory.limits.max_plausible_speed_mps)
-    digests = Kept(view, topic, POSES, window)
-    sights = Sights(view.memory.reader, view.memory.extractor)
+    digests = StoredPart(view, topic, POSES, window)
+    sights = MotionDecoder(view.memory.reader, view.memory.extractor)
     first: Ns | None = None
     last: Ns | None = None
     for group in view.groups(topic, window):
@@ -97,7 +97,7 @@ def way_driven(view: View, topic: str, window: TimeWindow) -> Way | None:
         view.note(f"poses left out, since they cannot be decoded: {len(failures)} ({error.reason})")
     if first is None or last is None:
         return None
-    return Way(builder.result(), builder.frames, first, last)
+    return DrivenPath(builder.result(), builder.frames, first, last)
 
 
 def length_notes(way: Trajectory) -> Iterator[str]:
@@ -136,8 +136,8 @@ def length_notes(way: Trajectory) -> Iterator[str]:
 def add_poses(
     view: View,
     to: TakesPoses,
-    sights: Sights,
-    messages: Iterable[Found],
+    sights: MotionDecoder,
+    messages: Iterable[StoredMessage],
     failures: list[UndecodableError],
 ) -> tuple[Ns, Ns] | None:
     """Adds the poses of messages, and gives the times of the first and last; None without any.
@@ -163,9 +163,9 @@ def add_poses(
     return None if first is None or last is None else (first, last)
 
 
-def _batches(messages: Iterable[Found]) -> Iterator[list[Found]]:
+def _batches(messages: Iterable[StoredMessage]) -> Iterator[list[StoredMessage]]:
     """The messages, as many at a time as may be held."""
-    some: list[Found] = []
+    some: list[StoredMessage] = []
     size = 0
     for found in messages:
         some.append(found)
@@ -177,7 +177,7 @@ def _batches(messages: Iterable[Found]) -> Iterator[list[Found]]:
         yield some
 
 
-def stops(view: View, messages: Iterable[Found]) -> Iterator[Stop]:
+def stops(view: View, messages: Iterable[StoredMessage]) -> Iterator[TimedPosition]:
     """Where the poses of messages are; what is no place is left out.
 
     So is, with a note, what cannot be decoded.
@@ -190,7 +190,7 @@ def stops(view: View, messages: Iterable[Found]) -> Iterator[Stop]:
             continue
         pose = view.memory.extractor.pose(message, found.record.channel.type)
         if pose is not None and is_place(pose.position):
-            yield Stop(found.time, pose.position)
+            yield TimedPosition(found.time, pose.position)
 
 
 def leave_out(view: View, error: UndecodableError) -> None:
@@ -199,7 +199,7 @@ def leave_out(view: View, error: UndecodableError) -> None:
     view.note(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")
 
 
-def decoded(view: View, found: Found) -> object:
+def decoded(view: View, found: StoredMessage) -> object:
     """The message that was found.
 
     Raises:
@@ -211,7 +211,7 @@ def decoded(view: View, found: Found) -> object:
         raise undecodable(error.topic, error.type_name, error) from error
 
 
-def carries_no(view: View, what: str, found: Found) -> str:
+def carries_no(view: View, what: str, found: StoredMessage) -> str:
     """The sentence for a topic that is asked for what its type does not have."""
     channel = found.record.channel
     has = f"carries no {what}"

@@ -26,7 +26,7 @@ _LONGEST_ROW_NS: Final[Ns] = 3 * COPY_HORIZON_NS
 """Bounds what is held of a topic whose messages are all alike, their publish times too."""
 
 
-class Found(NamedTuple):
+class StoredMessage(NamedTuple):
     """One undecoded message and the bag it stands in."""
 
     bag: BagFile
@@ -38,7 +38,7 @@ class Found(NamedTuple):
         return self.record.log_time
 
 
-class Holding(NamedTuple):
+class BagSpan(NamedTuple):
     """A bag that holds messages of the topics asked for; `first` and `last` are inclusive."""
 
     first: Ns
@@ -61,16 +61,16 @@ def copy_key(record: Record) -> Copy:
     return Copy(record.channel.topic, record.publish_time, len(payload), hash(payload))
 
 
-def contested(holdings: Iterable[Holding]) -> list[tuple[Ns, Ns]]:
+def is_overlapped(holdings: Iterable[BagSpan]) -> list[tuple[Ns, Ns]]:
     """The half-open spans in which bags of different recordings can hold copies, merged.
 
     Two bags contest the time that both hold, widened by the horizon at both ends.
     """
-    return contested_spans((held.first, held.last, held.bag.recording) for held in holdings)
+    return overlap_spans((held.first, held.last, held.bag.recording) for held in holdings)
 
 
-def contested_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
-    """As `contested`, of first and last log time (inclusive) and recording."""
+def overlap_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
+    """As `is_overlapped`, of first and last log time (inclusive) and recording."""
     spans: list[tuple[Ns, Ns]] = []
     open_ones: list[tuple[Ns, Path]] = []
     for first, last, recording in sorted(held, key=lambda each: each[0]):
@@ -100,7 +100,9 @@ def _inside(spans: Sequence[tuple[Ns, Ns]], moment: Ns) -> bool:
     return index >= 0 and moment < spans[index][1]
 
 
-def once_forward(found: Iterable[Found], spans: Sequence[tuple[Ns, Ns]]) -> Iterator[Found]:
+def deduplicate_forward(
+    found: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
+) -> Iterator[StoredMessage]:
     """An ascending stream without the later copies.
 
     Where one recording holds a message n times and another m times, max(n, m) remain.
@@ -123,13 +125,15 @@ def once_forward(found: Iterable[Found], spans: Sequence[tuple[Ns, Ns]]) -> Iter
             yield each
 
 
-def once_backward(found: Iterable[Found], spans: Sequence[tuple[Ns, Ns]]) -> Iterator[Found]:
-    """A descending stream without the copies that `once_forward` leaves out.
+def deduplicate_backward(
+    found: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
+) -> Iterator[StoredMessage]:
+    """A descending stream without the copies that `deduplicate_forward` leaves out.
 
     Held back until no earlier copy can come. Where copies follow each other for longer than
     `_LONGEST_ROW_NS`, with never a pause of `COPY_HORIZON_NS`, other ones of them may be left out.
     """
-    held: deque[tuple[Found, _Row | None]] = deque()
+    held: deque[tuple[StoredMessage, _Row | None]] = deque()
     rows: dict[Copy, _Row] = {}
     for each in found:
         while held and (held[0][1] is None or held[0][1].is_over(each.time)):
@@ -152,7 +156,7 @@ class _Row:
 
     def __init__(self, key: Copy) -> None:
         self.key = key
-        self.messages: list[Found] = []
+        self.messages: list[StoredMessage] = []
         self._kept: set[int] | None = None
 
     def is_over(self, now: Ns) -> bool:
@@ -162,17 +166,21 @@ class _Row:
         first, last = self.messages[-1].time, self.messages[0].time
         return now < max(first - COPY_HORIZON_NS, last - _LONGEST_ROW_NS)
 
-    def keeps(self, found: Found) -> bool:
+    def keeps(self, found: StoredMessage) -> bool:
         """Whether one of its messages counts; it is over then."""
         if len(self.messages) == 1:
             return True
         if self._kept is None:
             everywhere = [(MIN_NS, MAX_NS)]
-            self._kept = {id(each) for each in once_forward(reversed(self.messages), everywhere)}
+            self._kept = {
+                id(each) for each in deduplicate_forward(reversed(self.messages), everywhere)
+            }
         return id(found) in self._kept
 
 
-def _released(each: Found, row: _Row | None, rows: dict[Copy, _Row]) -> Iterator[Found]:
+def _released(
+    each: StoredMessage, row: _Row | None, rows: dict[Copy, _Row]
+) -> Iterator[StoredMessage]:
     if row is None or row.keeps(each):
         yield each
     if row is not None and rows.get(row.key) is row:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
-from ros2_memory.core.globs import matching
+from ros2_memory.core.globs import match_topics
 from ros2_memory.index.pace import is_rare
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.snapshot import Snapshot
 
 
@@ -42,7 +42,7 @@ class Latching:
         said = self._configured(topic)
         return snapshot.is_held(topic) if said is None else said
 
-    def holds(self, snapshot: Snapshot, found: Found) -> bool:
+    def holds(self, snapshot: Snapshot, found: StoredMessage) -> bool:
         """Whether a message is latched, by the pace of its topic in its own recording."""
         channel = found.record.channel
         said = self._configured(channel.topic)
@@ -63,9 +63,11 @@ class Latching:
 
     def _configured(self, topic: str) -> bool | None:
         """What the configuration says of a topic; None where it says nothing."""
-        if any(matching((topic,), glob) for glob in self.exclude):
+        if any(match_topics((topic,), glob) for glob in self.exclude):
             return False
-        if topic in self.static_topics or any(matching((topic,), glob) for glob in self.include):
+        if topic in self.static_topics or any(
+            match_topics((topic,), glob) for glob in self.include
+        ):
             return True
         return None
 

@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S
-from ros2_memory.history.bag_access import Reading
+from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.duplicates import (
     COPY_HORIZON_NS,
+    BagSpan,
     Copy,
-    Found,
-    Holding,
-    contested,
-    contested_spans,
+    StoredMessage,
     copy_key,
-    once_backward,
-    once_forward,
+    deduplicate_backward,
+    deduplicate_forward,
+    is_overlapped,
+    overlap_spans,
     united,
 )
 
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.sessions import Sessions
-    from ros2_memory.index.segment import Run
+    from ros2_memory.index.segment import Segment
 
-RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
+RELATCHED_NS: Final[Ns] = NS_PER_S
 """A latched message logged this long after it was published may have been received before."""
 _FEW_SOUGHT: Final = 8
 
 
-class Streams(Reading):
+class MergedStream(BagAccess):
     """One call's sight of all bags together.
 
     Attributes:
@@ -58,7 +58,7 @@ class Streams(Reading):
         self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
         self._sought: Counter[str] = Counter()
 
-    def holdings(self, topics: Collection[str], window: TimeWindow) -> list[Holding]:
+    def holdings(self, topics: Collection[str], window: TimeWindow) -> list[BagSpan]:
         """The bags that hold messages of these topics in the window, in order.
 
         Each with the times of its first and last message of these topics, in the window or not.
@@ -68,13 +68,13 @@ class Streams(Reading):
             # The entry of a bag is then all that it holds of these topics.
             extents = self.snapshot.extents(names[0], window)
             return sorted(
-                [Holding(first, last, bag) for bag, first, last in extents], key=_in_order
+                [BagSpan(first, last, bag) for bag, first, last in extents], key=_in_order
             )
-        found: dict[str, Holding] = {}
+        found: dict[str, BagSpan] = {}
         for topic in names:
             for bag, *_ in self.snapshot.extents(topic, window):
                 if bag.file not in found:
-                    found[bag.file] = holding_of(bag, names)
+                    found[bag.file] = bag_span_of(bag, names)
         return sorted(found.values(), key=_in_order)
 
     def stream(
@@ -83,8 +83,8 @@ class Streams(Reading):
         window: TimeWindow,
         *,
         newest_first: bool = False,
-        among: Sequence[Holding] | None = None,
-    ) -> Iterator[Found]:
+        among: Sequence[BagSpan] | None = None,
+    ) -> Iterator[StoredMessage]:
         """The messages of the topics in the window in log-time order, each one once.
 
         `among` narrows the search to some of the bags.
@@ -102,11 +102,11 @@ class Streams(Reading):
             )
         )
 
-    def last_of(self, topic: str, window: TimeWindow) -> Found | None:
+    def last_of(self, topic: str, window: TimeWindow) -> StoredMessage | None:
         """What `stream` gives first of the topic when it is newest first."""
-        if len(self._parts([topic], window)) == 1 and not self.received_twice([topic]):
+        if len(self._parts([topic], window)) == 1 and not self.may_be_relatched([topic]):
             holdings = self.holdings([topic], _with_horizon(window))
-            if not contested(holdings):
+            if not is_overlapped(holdings):
                 inside = [held for held in holdings if window.overlaps(held.first, held.last)]
                 if not inside:
                     return None
@@ -121,9 +121,9 @@ class Streams(Reading):
         if len(recordings) < 2:
             return []
         # First by whole recordings, which are few; then by bags, where these overlap.
-        coarse = contested_spans((*span, folder) for folder, span in recordings.items())
+        coarse = overlap_spans((*span, folder) for folder, span in recordings.items())
         near = [TimeWindow(*span) for span in coarse if window.overlaps(span[0], span[1] - 1)]
-        return united(span for each in near for span in contested(self.holdings([topic], each)))
+        return united(span for each in near for span in is_overlapped(self.holdings([topic], each)))
 
     def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """The window cut where runs of bags begin: a stream then holds few of them at a time."""
@@ -140,41 +140,41 @@ class Streams(Reading):
         self,
         topics: Sequence[str],
         window: TimeWindow,
-        among: Sequence[Holding] | None,
+        among: Sequence[BagSpan] | None,
         *,
         newest_first: bool,
-    ) -> Iterator[Found]:
+    ) -> Iterator[StoredMessage]:
         wider = _with_horizon(window)
         holdings = self.holdings(topics, wider) if among is None else among
-        spans = contested(holdings)
-        found: Iterator[Found]
+        spans = is_overlapped(holdings)
+        found: Iterator[StoredMessage]
         if spans:
             merged = self.merged(
                 holdings, topics, wider, newest_first=newest_first, since=window.start
             )
-            once = (once_backward if newest_first else once_forward)(merged, spans)
+            once = (deduplicate_backward if newest_first else deduplicate_forward)(merged, spans)
             found = (each for each in once if window.contains(each.time))
         else:
             found = self.merged(holdings, topics, window, newest_first=newest_first)
-        if self.received_twice(topics):
+        if self.may_be_relatched(topics):
             return (each for each in found if not self._received_again(each))
         return found
 
-    def received_twice(self, topics: Iterable[str]) -> bool:
+    def may_be_relatched(self, topics: Iterable[str]) -> bool:
         """Whether a latched message of these topics may have been received by two recordings."""
         return any(
             self.snapshot.is_transient_local(topic) and len(self.snapshot.recordings(topic)) > 1
             for topic in topics
         )
 
-    def seek_first(self, found: Found) -> None:
+    def seek_first(self, found: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
-        if _is_late(found) and self.received_twice([found.record.channel.topic]):
+        if _is_late(found) and self.may_be_relatched([found.record.channel.topic]):
             record = found.record
             window = TimeWindow(record.publish_time, found.time)
             self._seek(record.channel.topic, copy_key(record), window)
 
-    def _received_again(self, found: Found) -> bool:
+    def _received_again(self, found: StoredMessage) -> bool:
         record = found.record
         if not _is_late(found):
             return False
@@ -209,13 +209,13 @@ class Streams(Reading):
 
     def merged(
         self,
-        holdings: Sequence[Holding],
+        holdings: Sequence[BagSpan],
         topics: Sequence[str],
         window: TimeWindow,
         *,
         newest_first: bool,
         since: Ns = MIN_NS,
-    ) -> Iterator[Found]:
+    ) -> Iterator[StoredMessage]:
         """All messages in order, copies too, opening a bag only when the stream reaches it.
 
         What cannot be read is noted where it was asked for: not all of it lies before `since`.
@@ -235,9 +235,9 @@ class Streams(Reading):
                 ),
             )
         )
-        heap: list[tuple[int, int, Found, Iterator[Found]]] = []
+        heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
 
-        def push(rank: int, source: Iterator[Found]) -> None:
+        def push(rank: int, source: Iterator[StoredMessage]) -> None:
             found = next(source, None)
             if found is not None:
                 heapq.heappush(heap, (sign * found.time, rank, found, source))
@@ -254,9 +254,9 @@ class Streams(Reading):
                 push(rank, source)
 
 
-def _is_late(found: Found) -> bool:
+def _is_late(found: StoredMessage) -> bool:
     record = found.record
-    return record.channel.latched and found.time - record.publish_time > RECEIVED_AGAIN_NS
+    return record.channel.latched and found.time - record.publish_time > RELATCHED_NS
 
 
 def _with_horizon(window: TimeWindow) -> TimeWindow:
@@ -264,20 +264,20 @@ def _with_horizon(window: TimeWindow) -> TimeWindow:
     return TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
 
 
-def _begins(run: Run) -> Ns:
+def _begins(run: Segment) -> Ns:
     """Log time of the first message of the first bag: runs lie in its order."""
     return run.bags[0].start
 
 
-def _in_order(held: Holding) -> tuple[Ns, Ns, str]:
+def _in_order(held: BagSpan) -> tuple[Ns, Ns, str]:
     return held.first, held.last, held.bag.file
 
 
-def holding_of(bag: BagFile, topics: Collection[str]) -> Holding:
+def bag_span_of(bag: BagFile, topics: Collection[str]) -> BagSpan:
     """A bag with the times of its first and last message of these topics; it must hold some."""
-    return Holding(*bag.summary.span_of(topics), bag)
+    return BagSpan(*bag.summary.span_of(topics), bag)
 
 
-def _edge(held: Holding, *, newest_first: bool) -> Ns:
+def _edge(held: BagSpan, *, newest_first: bool) -> Ns:
     """The first moment at which a bag can have something for the stream, in the heap's sign."""
     return -held.last if newest_first else held.first

@@ -14,22 +14,22 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.core.wording import Reason
-from ros2_memory.history.candidates import Candidates
+from ros2_memory.history.candidates import CandidateBags
 from ros2_memory.history.coverage import matching_topics, moment, undecodable_in
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.unseen import is_searched, note_unseen
+from ros2_memory.history.unseen import is_searched, note_unread
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.candidates import Stretch
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.candidates import SearchWindow
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
 
-def last_match(view: View, pattern: str, condition: Condition, until: Ns) -> Found | None:
+def last_match(view: View, pattern: str, condition: Condition, until: Ns) -> StoredMessage | None:
     """The newest match before a moment; what could not be tested is noted.
 
     Raises:
@@ -57,11 +57,11 @@ class Search:
         self._tested = False
         self._back_to: Ns | None = None
 
-    def candidates(self, until: Ns) -> Candidates:
+    def candidates(self, until: Ns) -> CandidateBags:
         """The bags that may hold a match before a moment."""
-        return Candidates(self._view, self.topics, self._condition, until)
+        return CandidateBags(self._view, self.topics, self._condition, until)
 
-    def newest(self, until: Ns) -> Found | None:
+    def newest(self, until: Ns) -> StoredMessage | None:
         """The newest match before a moment, as `last_match` gives it."""
         candidates = self.candidates(until)
         said = self._view.noted_things()
@@ -69,7 +69,7 @@ class Search:
             for stretch in candidates.stretches():
                 for found in self._messages(stretch):
                     if self.matches(found):
-                        self._view.unsay_before(found.time, said)
+                        self._view.retract_notes_before(found.time, said)
                         self._view.seek_first(found)
                         self.note_undecodable()
                         return found
@@ -82,7 +82,7 @@ class Search:
         self.close(candidates, TimeWindow(MIN_NS, until), found=False)
         return None
 
-    def close(self, candidates: Candidates, window: TimeWindow, *, found: bool) -> None:
+    def close(self, candidates: CandidateBags, window: TimeWindow, *, found: bool) -> None:
         """Ends a search that looked everywhere in a window: notes what could not be tested.
 
         Raises:
@@ -125,7 +125,7 @@ class Search:
         value = self._view.memory.extractor.exact(message, found.record.channel.type)
         return untestable(self._condition, value)
 
-    def _messages(self, stretch: Stretch) -> Iterator[Found]:
+    def _messages(self, stretch: SearchWindow) -> Iterator[StoredMessage]:
         """The messages of a stretch, newest first.
 
         Of bags that are ruled out those are read which may hold the original of a copy. Of topics
@@ -140,7 +140,7 @@ class Search:
         ]
         return self._view.stream(stretch.topics, window, newest_first=True, among=among)
 
-    def matches(self, found: Found) -> bool | None:
+    def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
         begin = time.perf_counter_ns()
         channel = found.record.channel
@@ -184,5 +184,5 @@ def unsearched(view: View, window: TimeWindow | None = None) -> tuple[str, ...]:
     searched = window or TimeWindow.everything()
     if is_searched(view, searched):
         return ()
-    note_unseen(view, searched, nothing=True)
+    note_unread(view, searched, nothing=True)
     return view.notes

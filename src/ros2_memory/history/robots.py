@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
 _NEAR_NS: Final[Ns] = 10 * NS_PER_S
@@ -46,7 +46,7 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
         return
     finally:
         # The answer itself needed nothing of what was read here.
-        view.unsay_before(MAX_NS, said)
+        view.retract_notes_before(MAX_NS, said)
     if apart:
         names = sorted(each.name for each in apart)
         view.note(
@@ -55,7 +55,7 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
         )
 
 
-def note_robots_near(view: View, found: Found) -> None:
+def note_robots_near(view: View, found: StoredMessage) -> None:
     """As `note_robots`, of the time of a message."""
     start, stop = max(found.time - _NEAR_NS, MIN_NS), min(found.time + _NEAR_NS + 1, MAX_NS)
     note_robots(view, found.record.channel.topic, TimeWindow(start, stop))
@@ -87,7 +87,7 @@ def _are_apart(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow
     return bool(some) and not any(_stands_in(view, topic, other, each) for each in some)
 
 
-def _stands_in(view: View, topic: str, recording: Path, found: Found) -> bool:
+def _stands_in(view: View, topic: str, recording: Path, found: StoredMessage) -> bool:
     """Whether a recording holds a copy of a message."""
     start, stop = found.time - COPY_HORIZON_NS, found.time + COPY_HORIZON_NS + 1
     near = TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
@@ -95,6 +95,8 @@ def _stands_in(view: View, topic: str, recording: Path, found: Found) -> bool:
     return any(copy_key(each.record) == key for each in _messages(view, topic, recording, near))
 
 
-def _messages(view: View, topic: str, recording: Path, window: TimeWindow) -> Iterator[Found]:
+def _messages(
+    view: View, topic: str, recording: Path, window: TimeWindow
+) -> Iterator[StoredMessage]:
     held = [each for each in view.holdings([topic], window) if each.bag.recording == recording]
     return view.merged(held, [topic], window, newest_first=False)

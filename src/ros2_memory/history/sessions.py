@@ -20,7 +20,7 @@ from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import CARRY_FOLDER
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile
-    from ros2_memory.history.bag_access import Reading
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.bag_access import BagAccess
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.timeline import Timeline
 
 Session: TypeAlias = frozenset[str]
@@ -56,7 +56,7 @@ class Sessions:
 
     def __init__(
         self,
-        view: Reading,
+        view: BagAccess,
         moving: Sequence[str],
         static: Sequence[str],
         poses: str,
@@ -65,7 +65,7 @@ class Sessions:
         self._view = view
         self._topics = {"moving": tuple(moving), "static": tuple(static)}
         self._children = children
-        self._names = KeptNames(view.memory.index.bag_dir)
+        self._names = HardLinks(view.memory.index.bag_dir)
         self._root = str(view.memory.index.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
         self._spans: dict[str, dict[str, tuple[Ns, Ns]]] = {
@@ -81,7 +81,7 @@ class Sessions:
         """Where a recording lies, or lay when it was recorded, if a moment keeps it."""
         return self._names.recorded_as(str(recording))
 
-    def has(self, session: Session, found: Found) -> bool:
+    def has(self, session: Session, found: StoredMessage) -> bool:
         """Whether a message is of a session; a carried one that names no recording is of each."""
         folder = self.folder(found.bag.recording)
         if folder != self._carried:

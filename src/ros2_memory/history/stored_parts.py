@@ -15,7 +15,7 @@ from ros2_memory.core.model import BagState
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from ros2_memory.catalogue.lookup import RunNotes
+    from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Group
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Kind(Generic[T]):
+class DigestKind(Generic[T]):
     """What is kept of a topic in a bag.
 
     Attributes:
@@ -36,7 +36,7 @@ class Kind(Generic[T]):
     """
 
     name: str
-    ask: Callable[[RunNotes, str, Sequence[int]], Mapping[int, T]]
+    ask: Callable[[SegmentDigests, str, Sequence[int]], Mapping[int, T]]
     packed: Callable[[T], str]
     unpacked: Callable[[str], T]
 
@@ -49,21 +49,21 @@ def is_whole(group: Group, window: TimeWindow) -> bool:
     )
 
 
-class Kept(Generic[T]):
+class StoredPart(Generic[T]):
     """What the catalogue keeps of one topic in a window; of one run of bags at a time."""
 
-    def __init__(self, view: View, topic: str, kind: Kind[T], window: TimeWindow) -> None:
+    def __init__(self, view: View, topic: str, kind: DigestKind[T], window: TimeWindow) -> None:
         self._view = view
         self._topic = topic
         self._kind = kind
         self._window = window
         self._question = f"{kind.name} {topic}"
-        self._notes: RunNotes | None = None
+        self._notes: SegmentDigests | None = None
         self._known: Mapping[int, T] = {}
 
     def of(self, group: Group) -> tuple[T, tuple[Ns, Ns]] | None:
         """What is kept of a group, and the times of its first and last message; None: nothing."""
-        if group.received_twice:
+        if group.may_be_relatched:
             return None
         if len(group.holdings) > 1:
             return self._remembered(group)
@@ -89,7 +89,7 @@ class Kept(Generic[T]):
         recall, numbers = self._view.memory.recall, self._numbers(group)
         if recall is None or numbers is None or len(numbers) < 2 or not self._view.complete:
             return
-        if group.received_twice:
+        if group.may_be_relatched:
             return
         recall.remember(self._question, numbers, json.dumps([self._kind.packed(kept), *span]))
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class AtTime:
     """A moment asked about: at Unix seconds, or so many seconds before now. Exactly one is set."""
 
     at_s: float | None = None
@@ -41,7 +41,7 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class TimeRange:
     """An inclusive window asked about: from `start_s` to `end_s`, or the last so many seconds."""
 
     start_s: float | None = None
@@ -57,7 +57,7 @@ def _now(memory: Memory, view: View) -> Ns:
     return view.snapshot.latest
 
 
-def open_moment(memory: Memory, call: Call, moment: Moment) -> tuple[View, Ns, Ns | None]:
+def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, Ns | None]:
     """The view for a moment, the moment itself, and now where the question was relative."""
     if moment.at_s is not None:
         at = ns_argument("timestamp", moment.at_s)
@@ -96,7 +96,7 @@ def _relative(memory: Memory, call: Call, ago: Ns) -> tuple[View, Ns]:
     return view, now
 
 
-def open_span(memory: Memory, call: Call, span: Span) -> tuple[View, TimeWindow]:
+def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWindow]:
     """The view for a window, and the window itself.
 
     Raises:

@@ -38,8 +38,8 @@ from ros2_memory.history.coverage import (
     between,
     beyond,
     moment,
+    no_data_at,
     not_recorded,
-    nothing_at,
     seconds,
 )
 from ros2_memory.history.duplicates import united
@@ -50,10 +50,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile
-    from ros2_memory.history.duplicates import Found, Holding
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import Run
+    from ros2_memory.index.segment import Segment
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
 """How far around the moment dynamic transforms are read; the last is as far as tf2 remembers."""
@@ -228,7 +228,7 @@ def sessions_of(view: View) -> Sessions:
 
 def own_holdings(
     view: View, topic: str, window: TimeWindow, recording: Path
-) -> list[Holding] | None:
+) -> list[BagSpan] | None:
     """What the session of a recording holds of a topic in a window; None where it never has any."""
     sessions = sessions_of(view)
     own = sessions.of(recording)
@@ -297,7 +297,7 @@ def _is_edge(pair: tuple[str, str]) -> bool:
 
 
 def _known_pairs(
-    view: View, run: Run, topic: str, window: TimeWindow, among: Session | None
+    view: View, run: Segment, topic: str, window: TimeWindow, among: Session | None
 ) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
     """The pairs that the catalogue has of a run of bags, and the time of bags it has none of."""
     notes = view.recalled(run) if topic in run.spans else None
@@ -349,7 +349,7 @@ def _explained(
     """
     topics = _recorded(view, view.memory.limits.tf_topics)
     if topics and nothing_near:
-        return nothing_at(view, topics, at, None, around=TF_CACHE_NS)
+        return no_data_at(view, topics, at, None, around=TF_CACHE_NS)
     if failure.reason in _OF_ALL_TIMES:
         then = _of_then(failure, at)
         unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
@@ -453,7 +453,7 @@ def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]
     ]
 
 
-def _first(found: Iterator[Found]) -> Iterable[Found]:
+def _first(found: Iterator[StoredMessage]) -> Iterable[StoredMessage]:
     first = next(found, None)
     return () if first is None else (first,)
 
@@ -489,7 +489,7 @@ def _transforms(
 
 def _holdings(
     view: View, topics: Sequence[str], window: TimeWindow, among: Session
-) -> list[Holding]:
+) -> list[BagSpan]:
     held = view.holdings(topics, window)
     sessions = sessions_of(view)
     recordings = {each.bag.recording for each in held}
@@ -501,7 +501,7 @@ def _is_among(view: View, bag: BagFile, among: Session | None) -> bool:
     return among is None or sessions_of(view).folder(bag.recording) in among
 
 
-def _decoded(view: View, found: Found, *, static: bool) -> tuple[StampedTransform, ...]:
+def _decoded(view: View, found: StoredMessage, *, static: bool) -> tuple[StampedTransform, ...]:
     begin = time.perf_counter_ns()
     try:
         message = view.memory.reader.decode(found.record)

@@ -40,13 +40,13 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.bag_access import Reading
+    from ros2_memory.history.bag_access import BagAccess
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
 
 
-def note_unseen(
-    view: Reading, window: TimeWindow, *, nothing: bool = False, search: bool = False
+def note_unread(
+    view: BagAccess, window: TimeWindow, *, nothing: bool = False, search: bool = False
 ) -> None:
     """Notes what of a window could not be read.
 
@@ -57,14 +57,14 @@ def note_unseen(
         return
     absent = _absent(view) if nothing or search else ()
     odd = [bag for bag in view.snapshot.odd(window) if not _is_noted(view, bag)]
-    for sentence in unseen(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
+    for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.note(sentence)
     # Of more than are named a reason is not given for each.
     if len({bag.summary.remarks for bag in odd}) <= NAMED:
         view.note_remarks(odd)
 
 
-def note_edges(view: Reading, window: TimeWindow) -> None:
+def note_edges(view: BagAccess, window: TimeWindow) -> None:
     """Says where a window was asked to reach past what the memory can answer."""
     snapshot = view.snapshot
     asked_from, asked_to = window.asked()
@@ -92,7 +92,7 @@ def _moment(at: Ns) -> str:
     return f"{unix_rounded_up(at):.6f}"
 
 
-def is_searched(view: Reading, window: TimeWindow) -> bool:
+def is_searched(view: BagAccess, window: TimeWindow) -> bool:
     """Whether a search of a window that found nothing read all that closed files hold of it.
 
     That one is being written is no reason to doubt it, or a robot that records would never be told
@@ -102,12 +102,12 @@ def is_searched(view: Reading, window: TimeWindow) -> bool:
     return view.complete and not lost and not any(map(_may_lack, view.snapshot.odd(window)))
 
 
-def _is_noted(view: Reading, bag: BagFile) -> bool:
+def _is_noted(view: BagAccess, bag: BagFile) -> bool:
     """Whether the notes have what is amiss of a bag; that it was left open they have not."""
     return bag.state is not BagState.INCOMPLETE and view.has_noted(bag)
 
 
-def _absent(view: Reading) -> Sequence[SetAside]:
+def _absent(view: BagAccess) -> Sequence[SetAside]:
     return absent_files(view.snapshot, view.memory.index.bag_dir)
 
 
@@ -123,7 +123,7 @@ def _is_whole(note: str) -> bool:
     return note.endswith(READ_WITHOUT_INDEXES) or note == LOG_CLOCK_NOTE
 
 
-def unseen(
+def unread_spans(
     snapshot: Snapshot,
     window: TimeWindow,
     *,

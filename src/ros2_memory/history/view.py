@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.bag_access import short_name
 from ros2_memory.history.bag_groups import groups_of
-from ros2_memory.history.duplicates import once_forward
-from ros2_memory.history.merged_stream import Streams
+from ros2_memory.history.duplicates import deduplicate_forward
+from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.messages.downsample import evenly
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Group
-    from ros2_memory.history.duplicates import Found, Holding
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
 
 __all__ = ["Census", "View", "short_name"]
 
@@ -32,18 +32,18 @@ class Census:
     count: int
 
 
-class View(Streams):
+class View(MergedStream):
     """One call's consistent sight of the memory: a snapshot, a deadline, and notes on the way."""
 
-    def newest(self, topic: str, window: TimeWindow) -> Found | None:
+    def newest(self, topic: str, window: TimeWindow) -> StoredMessage | None:
         """The latest message of the topic in the window."""
         return self.last_of(topic, window)
 
-    def oldest(self, topic: str, window: TimeWindow) -> Found | None:
+    def oldest(self, topic: str, window: TimeWindow) -> StoredMessage | None:
         """The earliest message of the topic in the window."""
         return next(self.stream([topic], window), None)
 
-    def pick(self, topic: str, window: TimeWindow, at_most: int) -> tuple[int, list[Found]]:
+    def pick(self, topic: str, window: TimeWindow, at_most: int) -> tuple[int, list[StoredMessage]]:
         """How many messages the window holds, and `at_most` of them, evenly spaced.
 
         The first and the last are always among them. Reads payloads of the chosen ones only,
@@ -52,7 +52,7 @@ class View(Streams):
         groups = self.groups(topic, window)
         sizes = [group.count() for group in groups]
         total = sum(sizes)
-        chosen: list[Found] = []
+        chosen: list[StoredMessage] = []
         begin, position = 0, 0
         indices = evenly(total, at_most)
         for group, size in zip(groups, sizes, strict=True):
@@ -71,7 +71,7 @@ class View(Streams):
     def census(self, topic: str) -> dict[str, Census]:
         """What is recorded of a topic under each of its types, each message counted once."""
         everything = TimeWindow.everything()
-        if self.received_twice([topic]):
+        if self.may_be_relatched([topic]):
             return _counted(self.stream([topic], everything))
         counted = {
             type_name: Census(*stated) for type_name, stated in self.snapshot.stated(topic).items()
@@ -106,11 +106,11 @@ class View(Streams):
         return counted
 
     def _count_contest(
-        self, topic: str, window: TimeWindow, involved: Sequence[Holding]
+        self, topic: str, window: TimeWindow, involved: Sequence[BagSpan]
     ) -> dict[str, tuple[Census, Census]]:
         standing = _counted(self.merged(involved, [topic], window, newest_first=False))
         merged = self.merged(involved, [topic], window, newest_first=False)
-        once = _counted(once_forward(merged, [(window.start, window.stop)]))
+        once = _counted(deduplicate_forward(merged, [(window.start, window.stop)]))
         return {type_name: (standing[type_name], once[type_name]) for type_name in once}
 
 
@@ -121,7 +121,7 @@ def _contest(answer: str) -> dict[str, tuple[Census, Census]]:
     }
 
 
-def _counted(found: Iterable[Found]) -> dict[str, Census]:
+def _counted(found: Iterable[StoredMessage]) -> dict[str, Census]:
     """A census by message type of an ascending stream."""
     counted: dict[str, Census] = {}
     for each in found:

@@ -6,21 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.core.errors import BagVanishedError
-from ros2_memory.index.file_state import FileNotes, Standing, judge
+from ros2_memory.index.file_state import FileNotes, FileState, classify
 from ros2_memory.index.scan import Tree
 from ros2_memory.index.snapshot import Snapshot, Timeline
-from ros2_memory.index.unchanged_bags import Dormant
-from ros2_memory.index.verdicts import Verdicts
+from ros2_memory.index.unchanged_bags import UnchangedBags
+from ros2_memory.index.verdicts import CountedBags
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.file_state import FormerFile, Scene, Verdict
+    from ros2_memory.index.file_state import Classification, KnownFile, ScanContext
     from ros2_memory.index.scan import Stamp, Walked
     from ros2_memory.storage.base import BagReader
 
@@ -29,7 +29,7 @@ PATROL: Final = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownBags:
     """What the index knows of the bag directory, by path.
 
     `counted` are the verdicts on bags, of two forms of one only that which answers; `hidden` are
@@ -37,7 +37,7 @@ class Known:
     recordings that the recorder last said it is writing.
     """
 
-    counted: Mapping[str, Verdict]
+    counted: Mapping[str, Classification]
     hidden: Collection[str]
     files: Mapping[str, FileNotes]
     named: Collection[str]
@@ -45,7 +45,7 @@ class Known:
     kept: Collection[str] = ()
 
 
-class Change(NamedTuple):
+class TableChange(NamedTuple):
     """What a look found otherwise than the one before: the bags that left and those that came.
 
     `news`: whether anything is otherwise, be it no bag. With the first look everything is.
@@ -65,7 +65,7 @@ class _Oddities(NamedTuple):
     described: tuple[str, ...] = ()
 
 
-class Survey:
+class BagTable:
     """What is known of the files of one bag directory. Not for several threads at once.
 
     `known` tells, by path, of closed files that were read earlier: they are not read again while
@@ -78,23 +78,23 @@ class Survey:
         bag_dir: Path,
         reader: BagReader,
         *,
-        known: Callable[[], Mapping[str, FormerFile]] | None,
+        known: Callable[[], Mapping[str, KnownFile]] | None,
         all_awake: bool,
     ) -> None:
         self._reader = reader
         self._known = known
         self._all_awake = all_awake
         self._tree = Tree(bag_dir)
-        self._dormant = Dormant()
+        self._dormant = UnchangedBags()
         self._files: dict[str, FileNotes] = {}
-        self._names = KeptNames(bag_dir)
-        self._verdicts = Verdicts(self._files, self._dormant, self._names)
+        self._names = HardLinks(bag_dir)
+        self._verdicts = CountedBags(self._files, self._dormant, self._names)
         self._watched: set[str] = set()
         self._patrol: list[str] = []
         self._odd: _Oddities | None = None
         self._timeline = Timeline()
 
-    def look(self, scene: Scene, *, patrolling: bool) -> Change:
+    def look(self, scene: ScanContext, *, patrolling: bool) -> TableChange:
         """Looks at what may have changed; `patrolling`: and at some of what lies still.
 
         Where it raises, some of what the walk has shown is lost: then a new survey has to begin.
@@ -111,12 +111,12 @@ class Survey:
         added = [*recalled, *added]
         self._timeline = self._timeline.changed(removed, added)
         before, self._odd = self._odd, _oddities(walked)
-        return Change(removed, added, bool(changed or recalled) or self._odd != before)
+        return TableChange(removed, added, bool(changed or recalled) or self._odd != before)
 
     def snapshot(self, now: Ns) -> Snapshot:
         """What the last look left known."""
         timeline, odd = self._timeline, self._odd or _Oddities()
-        aside: dict[Standing, list[SetAside]] = {}
+        aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
         empty = 0
         for verdict in self._verdicts.set_aside.values():
@@ -127,9 +127,9 @@ class Survey:
                 silent.update(verdict.silent)
         return Snapshot(
             bags=timeline.recorded,
-            active=_by_path(aside.get(Standing.ACTIVE, ())),
-            damaged=_by_path([*aside.get(Standing.DAMAGED, ()), *odd.damaged]),
-            unread=_by_path([*aside.get(Standing.UNREAD, ()), *odd.links]),
+            active=_by_path(aside.get(FileState.ACTIVE, ())),
+            damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *odd.damaged]),
+            unread=_by_path([*aside.get(FileState.UNREAD, ()), *odd.links]),
             empty=empty,
             silent_topics=frozenset(silent - timeline.types.keys()),
             scanned_at=now,
@@ -138,10 +138,12 @@ class Survey:
             timeline=timeline,
         )
 
-    def known(self, named: Collection[str], now: Ns) -> Known:
+    def known(self, named: Collection[str], now: Ns) -> KnownBags:
         """What deletion weighs; `named`: the recordings that the recorder last said it writes."""
         verdicts = self._verdicts
-        return Known(verdicts.counted, verdicts.hidden, self._files, named, now, self._names.known)
+        return KnownBags(
+            verdicts.counted, verdicts.hidden, self._files, named, now, self._names.known
+        )
 
     def _next_on_patrol(self) -> list[str]:
         if not self._patrol:
@@ -150,13 +152,13 @@ class Survey:
         del self._patrol[-PATROL:]
         return [path for path in following if path in self._files or path in self._dormant]
 
-    def _known_at_first(self) -> Mapping[str, FormerFile]:
+    def _known_at_first(self) -> Mapping[str, KnownFile]:
         """What was known earlier, where the scan begins anew."""
         begun = self._files or self._dormant
         return {} if self._known is None or begun else self._known()
 
     def _recall(
-        self, stamps: dict[str, Stamp], known: Mapping[str, FormerFile], scene: Scene
+        self, stamps: dict[str, Stamp], known: Mapping[str, KnownFile], scene: ScanContext
     ) -> list[BagFile]:
         """The bags of files that look as they are known, which need no further look."""
         if self._all_awake or not known:
@@ -167,7 +169,7 @@ class Survey:
         stamps.update(kept)
         return bags
 
-    def _rouse(self, walked: Walked, scene: Scene) -> None:
+    def _rouse(self, walked: Walked, scene: ScanContext) -> None:
         """Wakes the files that went, look otherwise, or have got another form."""
         if not self._dormant:
             return
@@ -180,7 +182,7 @@ class Survey:
         for path in walked.gone:
             self._wake(path, scene)
 
-    def _wake(self, path: str, scene: Scene) -> None:
+    def _wake(self, path: str, scene: ScanContext) -> None:
         woken = self._dormant.wake(path, scene.now)
         if woken is not None:
             self._files[path], verdict = woken
@@ -198,7 +200,7 @@ class Survey:
         return forgotten
 
     def _examine(
-        self, stamps: dict[str, Stamp], known: Mapping[str, FormerFile], scene: Scene
+        self, stamps: dict[str, Stamp], known: Mapping[str, KnownFile], scene: ScanContext
     ) -> set[str]:
         """Judges these files; gives those of which the verdict changed."""
         changed = set()
@@ -214,7 +216,7 @@ class Survey:
             elif not notes.look(stamp, scene.now) and path not in self._watched:
                 continue
             try:
-                verdict = judge(notes, self._reader, scene)
+                verdict = classify(notes, self._reader, scene)
             except BagVanishedError:
                 self._tree.distrust(path)
                 changed |= self._forget([path])

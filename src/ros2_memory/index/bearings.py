@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.clock_faults import Dating
-    from ros2_memory.index.segment import Run
+    from ros2_memory.index.segment import Segment
     from ros2_memory.index.timeline import Timeline
 
 
@@ -47,7 +47,7 @@ def place(timeline: Timeline, aside: SetAside, now: Ns, *, growing: bool) -> Tim
     if aside.until is not None:
         return TimeWindow(min(aside.until + 1, MAX_NS), MAX_NS)
     near = _near(timeline, aside)
-    return unreadable_span.whereabouts(
+    return unreadable_span.unreadable_span(
         aside.path.parent.name, near, aside.written, now, growing=growing
     )
 
@@ -77,7 +77,7 @@ def lost_until(bag: BagFile) -> Ns:
     return written if behind else bag.end
 
 
-def _parts(runs: Sequence[Run]) -> list[Part]:
+def _parts(runs: Sequence[Segment]) -> list[Part]:
     parts = [
         Part(
             run.recorded,
@@ -89,11 +89,11 @@ def _parts(runs: Sequence[Run]) -> list[Part]:
     return parts or [Part(run.bags, run.latest) for run in runs]
 
 
-def _steps(runs: Sequence[Run]) -> list[StepBack]:
+def _steps(runs: Sequence[Segment]) -> list[StepBack]:
     between = steps_of([run.courses for run in runs], lambda at: _bags(runs, at))
     within = (bag for run in runs for bag in run.set_back)
     return [*between, *(StepBack(bag, bag, bag.summary.shape.set_back) for bag in within)]
 
 
-def _bags(runs: Sequence[Run], at: Sequence[int]) -> chain[BagFile]:
+def _bags(runs: Sequence[Segment], at: Sequence[int]) -> chain[BagFile]:
     return chain.from_iterable(runs[number].bags for number in at)

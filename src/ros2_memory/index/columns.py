@@ -11,14 +11,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.bag_summary import Shape
+    from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile, TimeWindow
 
 
 class Alike(NamedTuple):
     """Bags of one shape: where they lie in their run, and their numbers by bag and topic."""
 
-    shape: Shape
+    shape: SummarySchema
     at: NDArray[np.intp]
     numbers: NDArray[np.int64]
 

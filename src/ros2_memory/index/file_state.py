@@ -59,7 +59,7 @@ _NO_MESSAGE = (
 _METADATA_LIMIT: Final = 1 << 26
 
 
-class Standing(IntEnum):
+class FileState(IntEnum):
     """What a file is to the index. Of two forms of one bag the higher standing answers."""
 
     UNREAD = 0
@@ -71,21 +71,21 @@ class Standing(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Classification:
     """How one file stands: as a bag, set aside with a reason, or without a message.
 
     Both a bag and set aside is only an active file that answers. `silent` are the topics that a bag
     without a message declares.
     """
 
-    standing: Standing
+    standing: FileState
     bag: BagFile | None = None
     aside: SetAside | None = None
     silent: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class ScanContext:
     """What one scan knows besides the files themselves.
 
     `open_recordings` are those that a live heartbeat names; None without a live heartbeat.
@@ -118,7 +118,7 @@ class Scene:
         return path.name in self._finished[folder]
 
 
-class FormerFile(NamedTuple):
+class KnownFile(NamedTuple):
     """A closed file as it looked when it was read, and what it held then.
 
     `start` and `end` are log times (inclusive); 0 where it holds no message.
@@ -182,22 +182,22 @@ class FileNotes:
         self.trusted = settled(stamp.mtime_ns, now)
         return outdated
 
-    def grew_lately(self, scene: Scene) -> bool:
+    def grew_lately(self, scene: ScanContext) -> bool:
         """Whether the file grew within the last three splits."""
         age = scene.now - self.stamp.mtime_ns
         return self.was_seen_growing(scene) or -YOUNG_NS < age <= scene.three_splits
 
-    def was_seen_growing(self, scene: Scene) -> bool:
+    def was_seen_growing(self, scene: ScanContext) -> bool:
         """Whether two scans saw the file grow, within the last three splits."""
         return self.grew_at is not None and scene.now - self.grew_at <= scene.three_splits
 
-    def must_be_watched(self, verdict: Verdict, scene: Scene) -> bool:
+    def must_be_watched(self, verdict: Classification, scene: ScanContext) -> bool:
         """Whether the next scan must look at the file though its directory did not change."""
-        if verdict.standing is Standing.UNREAD:
+        if verdict.standing is FileState.UNREAD:
             return False
         return (
             not self.trusted
-            or verdict.standing in {Standing.ACTIVE, Standing.DAMAGED}
+            or verdict.standing in {FileState.ACTIVE, FileState.DAMAGED}
             or self.closing is Closing.OPEN
             or (self.kind == ".db3" and scene.now - self.stamp.mtime_ns <= scene.three_splits)
         )
@@ -217,14 +217,14 @@ class FileNotes:
         )
 
 
-def judge(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
+def classify(notes: FileNotes, reader: BagReader, scene: ScanContext) -> Classification:
     """How the file stands; reads of it only what the notes do not have.
 
     Raises:
         BagVanishedError: the file is not there any more.
     """
     if not reader.reads(notes.path):
-        return _aside(Standing.UNREAD, notes, _not_read(notes))
+        return _aside(FileState.UNREAD, notes, _not_read(notes))
     try:
         if notes.closing is None and notes.fault is None:
             # An open MCAP is 0 bytes until its first chunk is full.
@@ -239,7 +239,7 @@ def judge(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
     except BagError as error:
         notes.fault, notes.passing = error.reason, isinstance(error, BagUnreachableError)
     if notes.summary is None:
-        return _aside(Standing.DAMAGED, notes, notes.fault or "it cannot be read")
+        return _aside(FileState.DAMAGED, notes, notes.fault or "it cannot be read")
     return _readable(notes, notes.summary)
 
 
@@ -261,7 +261,7 @@ def files_in_metadata(path: Path) -> frozenset[str]:
     return frozenset(PurePosixPath(entry).name for entry in entries if bag_kind(entry))
 
 
-def _is_active(notes: FileNotes, scene: Scene) -> bool:
+def _is_active(notes: FileNotes, scene: ScanContext) -> bool:
     if notes.closing is Closing.OPEN:
         if scene.open_recordings is not None:
             return scene.names(notes.path)
@@ -275,7 +275,7 @@ def _is_active(notes: FileNotes, scene: Scene) -> bool:
     )
 
 
-def _is_copy(notes: FileNotes, reader: BagReader, scene: Scene) -> bool:
+def _is_copy(notes: FileNotes, reader: BagReader, scene: ScanContext) -> bool:
     """Whether a file looks as being written for no other reason than when it was copied.
 
     Raises:
@@ -295,7 +295,7 @@ def _is_copy(notes: FileNotes, reader: BagReader, scene: Scene) -> bool:
     return abs(notes.stamp.mtime_ns - notes.summary.end) > scene.three_splits
 
 
-def _active(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
+def _active(notes: FileNotes, reader: BagReader, scene: ScanContext) -> Classification:
     """An active file; as a bag, too, as far as it can be one.
 
     Raises:
@@ -303,8 +303,8 @@ def _active(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
     """
     aside = SetAside(notes.path, _ACTIVE)
     if not scene.include_active or notes.kind != ".mcap":
-        return Verdict(Standing.ACTIVE, aside=aside)
-    nothing_yet = Verdict(Standing.ACTIVE, aside=replace(aside, answers=True))
+        return Classification(FileState.ACTIVE, aside=aside)
+    nothing_yet = Classification(FileState.ACTIVE, aside=replace(aside, answers=True))
     if notes.stamp.size == 0:
         return nothing_yet
     if notes.summary is None:
@@ -314,7 +314,7 @@ def _active(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
             raise
         except BagError:
             # The file may be about to be one. If it is none, that is found when it stays so.
-            return Verdict(Standing.ACTIVE, aside=aside)
+            return Classification(FileState.ACTIVE, aside=aside)
     summary = notes.summary
     if not summary.complete:
         # The first note tells how the file ends; it goes on.
@@ -322,21 +322,21 @@ def _active(notes: FileNotes, reader: BagReader, scene: Scene) -> Verdict:
     if summary.empty:
         return nothing_yet
     bag = _bag(notes, BagState.ACTIVE, summary)
-    return Verdict(
-        Standing.ACTIVE, bag, SetAside(notes.path, _ANSWERS, answers=True, until=bag.end)
+    return Classification(
+        FileState.ACTIVE, bag, SetAside(notes.path, _ANSWERS, answers=True, until=bag.end)
     )
 
 
-def _readable(notes: FileNotes, summary: BagSummary) -> Verdict:
+def _readable(notes: FileNotes, summary: BagSummary) -> Classification:
     closed = notes.closing is Closing.CLOSED and summary.complete
     if summary.empty:
         if closed and not summary.notes:
-            return Verdict(Standing.EMPTY, silent=summary.silent)
+            return Classification(FileState.EMPTY, silent=summary.silent)
         if closed:
-            return _aside(Standing.DAMAGED, notes, "; ".join(summary.notes))
-        return _aside(Standing.DAMAGED, notes, _NO_MESSAGE)
+            return _aside(FileState.DAMAGED, notes, "; ".join(summary.notes))
+        return _aside(FileState.DAMAGED, notes, _NO_MESSAGE)
     bag = _bag(notes, BagState.CLOSED if closed else BagState.INCOMPLETE, summary)
-    return Verdict(Standing.CLOSED if closed else Standing.INCOMPLETE, bag=bag)
+    return Classification(FileState.CLOSED if closed else FileState.INCOMPLETE, bag=bag)
 
 
 def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
@@ -353,8 +353,8 @@ def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
     )
 
 
-def _aside(standing: Standing, notes: FileNotes, reason: str) -> Verdict:
-    return Verdict(standing, aside=SetAside(notes.path, reason, notes.stamp.mtime_ns))
+def _aside(standing: FileState, notes: FileNotes, reason: str) -> Classification:
+    return Classification(standing, aside=SetAside(notes.path, reason, notes.stamp.mtime_ns))
 
 
 def _not_read(notes: FileNotes) -> str:

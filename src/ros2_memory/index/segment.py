@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from ros2_memory.bag_dir.layout import CARRY_FILE, is_carried
 from ros2_memory.core.model import BagState
 from ros2_memory.index.columns import all_alike, column_of, rows_in
-from ros2_memory.index.split_order import courses_of
+from ros2_memory.index.split_order import split_ranges_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.bag_summary import Shape
+    from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile, TimeWindow, TopicSummary
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.columns import Alike, Column
-    from ros2_memory.index.split_order import Course, Series
+    from ros2_memory.index.split_order import Series, SplitRange
 
 _RUNS_AT_HAND: Final = 64
 """Two days of splits."""
 
-Held: TypeAlias = "tuple[BagFile, TopicSummary]"
+HeldMessages: TypeAlias = "tuple[BagFile, TopicSummary]"
 """A bag, and what it holds of one topic under one type."""
 
 
@@ -72,7 +72,7 @@ class Tally(NamedTuple):
     messages: int
 
 
-class Run:
+class Segment:
     """Some consecutive bags of a timeline; never without any."""
 
     def __init__(self, bags: Sequence[BagFile]) -> None:
@@ -121,9 +121,9 @@ class Run:
         return found
 
     @cached_property
-    def courses(self) -> dict[Series, Course]:
+    def courses(self) -> dict[Series, SplitRange]:
         """How far each recording's splits reach among the bags, by their count."""
-        return courses_of(self.bags)
+        return split_ranges_of(self.bags)
 
     @cached_property
     def odd(self) -> tuple[BagFile, ...]:
@@ -140,7 +140,7 @@ class Run:
         return tuple(bag for bag in self.recorded if bag.summary.shape.set_back)
 
     @cached_property
-    def _shapes(self) -> tuple[Shape, ...]:
+    def _shapes(self) -> tuple[SummarySchema, ...]:
         """The shapes of the bags. Most runs have one."""
         return tuple({id(bag.summary.shape): bag.summary.shape for bag in self.bags}.values())
 
@@ -177,7 +177,7 @@ class Run:
             spans[folder] = wider(spans.get(folder), (first, last))
         return spans
 
-    def holding(self, topic: str, window: TimeWindow | None = None) -> Iterator[Held]:
+    def holding(self, topic: str, window: TimeWindow | None = None) -> Iterator[HeldMessages]:
         """The bags that hold messages of the topic, one entry for each type, in bag order.
 
         With a window, those that may hold some in it.
@@ -308,6 +308,6 @@ class _Numbers:
 
 
 @lru_cache(maxsize=_RUNS_AT_HAND)
-def _at_hand(run: Run) -> _Numbers:
+def _at_hand(run: Segment) -> _Numbers:
     """The numbers of a run: a copy of what its summaries say, so of a week few are held."""
     return _Numbers(all_alike(run.bags))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.clock_faults import ClockFault, Dating
     from ros2_memory.index.pace import Pace
-    from ros2_memory.index.segment import Extent, Held, Run, Span, Stated
+    from ros2_memory.index.segment import Extent, HeldMessages, Segment, Span, Stated
 
 __all__ = ["RUN_LIMIT", "Snapshot", "Timeline"]
 
@@ -113,7 +113,7 @@ class Snapshot:
         """The topics of which some bag holds a message, sorted."""
         return tuple(self._timeline.types)
 
-    def holding(self, topic: str, window: TimeWindow | None = None) -> tuple[Held, ...]:
+    def holding(self, topic: str, window: TimeWindow | None = None) -> tuple[HeldMessages, ...]:
         """Every bag that holds messages of the topic, in bag order, one entry for each type.
 
         With a window, only those that may hold some in it: by the topic's own first and last time
@@ -144,7 +144,7 @@ class Snapshot:
         ]
 
     @cached_property
-    def _odd_runs(self) -> list[Run]:
+    def _odd_runs(self) -> list[Segment]:
         return [run for run in self.runs if run.odd]
 
     def types_of(self, topic: str) -> tuple[str, ...]:
@@ -179,11 +179,11 @@ class Snapshot:
         return self._timeline.taken
 
     @property
-    def runs(self) -> Sequence[Run]:
+    def runs(self) -> Sequence[Segment]:
         """The bags, some at a time, in order; what is worked out for a run holds while it stays."""
         return self._timeline.runs
 
-    def run_of(self, bag: BagFile) -> Run:
+    def run_of(self, bag: BagFile) -> Segment:
         """The run in which a bag lies."""
         return self._timeline.run_of(bag)
 

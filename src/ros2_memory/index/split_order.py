@@ -50,7 +50,7 @@ class StepBack(NamedTuple):
     by: Ns
 
 
-class Course(NamedTuple):
+class SplitRange(NamedTuple):
     """A series among some bags: its first and last split by count, and the steps between."""
 
     first: Split
@@ -72,7 +72,7 @@ def is_recording(series: Series) -> bool:
     return prefix == f"{folder.rpartition('/')[2]}_"
 
 
-def courses_of(bags: Iterable[BagFile]) -> dict[Series, Course]:
+def split_ranges_of(bags: Iterable[BagFile]) -> dict[Series, SplitRange]:
     """The course of each series among these bags."""
     series: dict[Series, list[Split]] = {}
     for bag in bags:
@@ -82,7 +82,7 @@ def courses_of(bags: Iterable[BagFile]) -> dict[Series, Course]:
     return {each: _course(each, splits) for each, splits in series.items()}
 
 
-def steps_of(parts: Sequence[Mapping[Series, Course]], bags: Bags) -> list[StepBack]:
+def steps_of(parts: Sequence[Mapping[Series, SplitRange]], bags: Bags) -> list[StepBack]:
     """Where the clock stepped back, from the courses of all parts of a history in order.
 
     `bags` gives all bags of some parts; it is asked only where those of a series do not follow each
@@ -112,7 +112,7 @@ def in_series(series: Series, bags: Iterable[BagFile]) -> list[Split]:
     return sorted(splits, key=_by_count)
 
 
-def neighbours(file: str, parts: Sequence[Mapping[Series, Course]], bags: Bags) -> Neighbours:
+def neighbours(file: str, parts: Sequence[Mapping[Series, SplitRange]], bags: Bags) -> Neighbours:
     """What lies on both sides of a file in its series, as near as there is something.
 
     `bags` gives all bags of some parts; it is asked only for those that the file's count falls in.
@@ -132,10 +132,10 @@ def neighbours(file: str, parts: Sequence[Mapping[Series, Course]], bags: Bags) 
     return Neighbours(before and before.bag.end, after and after.bag.start)
 
 
-def _course(series: Series, splits: list[Split]) -> Course:
+def _course(series: Series, splits: list[Split]) -> SplitRange:
     splits.sort(key=_by_count)
     steps = _steps(splits) if is_recording(series) else []
-    return Course(splits[0], splits[-1], tuple(steps))
+    return SplitRange(splits[0], splits[-1], tuple(steps))
 
 
 def _by_count(split: Split) -> int:

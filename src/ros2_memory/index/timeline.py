@@ -13,7 +13,7 @@ from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.index.pace import Pace
-from ros2_memory.index.segment import Run, Stated, in_time, taken_by, wider
+from ros2_memory.index.segment import Segment, Stated, in_time, taken_by, wider
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.segment import Extent, Held, Span
+    from ros2_memory.index.segment import Extent, HeldMessages, Span
 
 RUN_LIMIT: Final = 256
 """Bags in a run at most: few enough to work out in a millisecond, and 240 runs make a week."""
@@ -30,13 +30,13 @@ RUN_LIMIT: Final = 256
 class Timeline:
     """Bags sorted by (start, end, path), immutable; `changed` gives the next one."""
 
-    def __init__(self, runs: Sequence[Run] = ()) -> None:
+    def __init__(self, runs: Sequence[Segment] = ()) -> None:
         self._runs = tuple(runs)
         self._recordings: dict[str, dict[Path, Span]] = {}
         self._before_last: dict[str, dict[Path, Span]] = {}  # of all runs but the last
 
     @property
-    def runs(self) -> tuple[Run, ...]:
+    def runs(self) -> tuple[Segment, ...]:
         """The bags, some at a time, in order; a run stays the same while its bags do."""
         return self._runs
 
@@ -67,7 +67,7 @@ class Timeline:
             run_for(bag).remove(bag)
         for bag in added:
             run_for(bag).append(bag)
-        runs: list[Run] = []
+        runs: list[Segment] = []
         for at, run in enumerate(self._runs):
             if at in touched:
                 runs.extend(_runs_of(sorted(touched[at], key=in_time)))
@@ -88,13 +88,13 @@ class Timeline:
         """For each run the latest log time in it and all before it: ascending."""
         return list(accumulate((run.latest for run in self._runs), max))
 
-    def _runs_in(self, window: TimeWindow) -> Sequence[Run]:
+    def _runs_in(self, window: TimeWindow) -> Sequence[Segment]:
         """The runs that may hold something of a window, in order."""
         begin = bisect_left(self._reaches, window.start)
         end = bisect_left(self._firsts, window.stop, key=lambda first: first[0])
         return self._runs[begin:end]
 
-    def run_of(self, bag: BagFile) -> Run:
+    def run_of(self, bag: BagFile) -> Segment:
         """The run in which a bag of this timeline lies."""
         return self._runs[max(bisect_right(self._firsts, in_time(bag)) - 1, 0)]
 
@@ -181,7 +181,7 @@ class Timeline:
             if window.overlaps(bag.start, bag.end)
         )
 
-    def holding(self, topic: str, window: TimeWindow | None = None) -> tuple[Held, ...]:
+    def holding(self, topic: str, window: TimeWindow | None = None) -> tuple[HeldMessages, ...]:
         """The bags that hold messages of the topic (in the window), in order.
 
         A bag in which the topic has two types appears once for each.
@@ -194,7 +194,7 @@ class Timeline:
         """As `holding`, but of the summaries only the times of the first and last message."""
         return chain.from_iterable(run.extents(topic, window) for run in self._of(topic, window))
 
-    def _of(self, topic: str, window: TimeWindow | None) -> Iterator[Run]:
+    def _of(self, topic: str, window: TimeWindow | None) -> Iterator[Segment]:
         """The runs that may hold messages of the topic (in the window), in order."""
         if window is not None and window.empty:
             return
@@ -204,12 +204,14 @@ class Timeline:
                 yield run
 
 
-def _runs_of(bags: Sequence[BagFile]) -> list[Run]:
+def _runs_of(bags: Sequence[BagFile]) -> list[Segment]:
     """Sorted bags cut into runs, the first ones full."""
-    return [Run(bags[at : at + RUN_LIMIT]) for at in range(0, len(bags), RUN_LIMIT)]
+    return [Segment(bags[at : at + RUN_LIMIT]) for at in range(0, len(bags), RUN_LIMIT)]
 
 
-def _recordings(runs: Iterable[Run], topic: str, known: Mapping[Path, Span]) -> dict[Path, Span]:
+def _recordings(
+    runs: Iterable[Segment], topic: str, known: Mapping[Path, Span]
+) -> dict[Path, Span]:
     """The recordings that hold the topic in some runs, besides those that are known."""
     spans = dict(known)
     for run in runs:

@@ -13,14 +13,14 @@ import numpy as np
 
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.model import BagFile, BagState
-from ros2_memory.index.file_state import FileNotes, Standing, Verdict
+from ros2_memory.index.file_state import Classification, FileNotes, FileState
 from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.file_state import FormerFile, Scene
+    from ros2_memory.index.file_state import KnownFile, ScanContext
     from ros2_memory.storage.base import BagReader
 
 _KINDS: Final = (".mcap", ".db3")
@@ -28,7 +28,7 @@ _KINDS: Final = (".mcap", ".db3")
 _CLOSED: Final = BagState.CLOSED
 
 
-class Dormant:
+class UnchangedBags:
     """The bags of which nothing but the answers is kept. Not for several threads at once."""
 
     def __init__(self) -> None:
@@ -47,9 +47,9 @@ class Dormant:
     def take(
         self,
         stamps: dict[str, Stamp],
-        known: Mapping[str, FormerFile],
+        known: Mapping[str, KnownFile],
         reader: BagReader,
-        scene: Scene,
+        scene: ScanContext,
     ) -> list[BagFile]:
         """Takes over, and out of `stamps`, the files that look as they are known.
 
@@ -92,7 +92,7 @@ class Dormant:
         bag = self._bags.get(path)
         return None if bag is None else self._stamp(bag)
 
-    def wake(self, path: str, now: Ns) -> tuple[FileNotes, Verdict] | None:
+    def wake(self, path: str, now: Ns) -> tuple[FileNotes, Classification] | None:
         """Gives up a file: what would be known of it, had it been read; None where it is none."""
         bag = self._bags.pop(path, None)
         if bag is None:
@@ -100,7 +100,7 @@ class Dormant:
         notes = FileNotes.first(Path(path), self._stamp(bag), now)
         del self._inodes[path]
         notes.recall(bag.summary)
-        return notes, Verdict(Standing.CLOSED, bag)
+        return notes, Classification(FileState.CLOSED, bag)
 
     def _stamp(self, bag: BagFile) -> Stamp:
         """How the file looked. The ctime counts only where a file could not be read."""

@@ -46,7 +46,7 @@ def begun(recording: str) -> Ns | None:
     return int(moment.timestamp()) * NS_PER_S
 
 
-def whereabouts(
+def unreadable_span(
     recording: str, near: Neighbours, written: Ns | None, now: Ns, *, growing: bool = False
 ) -> TimeWindow | None:
     """The log times between which all messages of a file lie; None where that is unknown.
@@ -77,8 +77,8 @@ def whereabouts(
 def bounds(recording: str, near: Neighbours, written: Ns | None, now: Ns) -> TimeWindow | None:
     """The log times outside of which a closed file can hold no message; None where it may anywhere.
 
-    As `whereabouts`, without the guess how much a file holds. Splits around it of which the clock
-    was set back in between bound nothing.
+    As `unreadable_span`, without the guess how much a file holds. Splits around it of which the
+    clock was set back in between bound nothing.
     """
     start = begun(recording) if near.before is None else near.before
     end = _last_written(written, now) if near.after is None else min(near.after + 1, MAX_NS)

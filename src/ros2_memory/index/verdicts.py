@@ -9,18 +9,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
-from ros2_memory.index.file_state import Standing
+from ros2_memory.index.file_state import FileState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from ros2_memory.bag_dir.hard_links import KeptNames
+    from ros2_memory.bag_dir.hard_links import HardLinks
     from ros2_memory.core.model import BagFile
-    from ros2_memory.index.file_state import FileNotes, Scene, Verdict
-    from ros2_memory.index.unchanged_bags import Dormant
+    from ros2_memory.index.file_state import Classification, FileNotes, ScanContext
+    from ros2_memory.index.unchanged_bags import UnchangedBags
 
 
-class Verdicts:
+class CountedBags:
     """The verdict on each file that is awake, by path. Not for several threads at once.
 
     `files`, `dormant` and `names` are what their owner knows of the same files; they are looked at.
@@ -31,16 +31,18 @@ class Verdicts:
         hidden: the other form answers for these, for the time being.
     """
 
-    def __init__(self, files: Mapping[str, FileNotes], dormant: Dormant, names: KeptNames) -> None:
+    def __init__(
+        self, files: Mapping[str, FileNotes], dormant: UnchangedBags, names: HardLinks
+    ) -> None:
         self._files = files
         self._dormant = dormant
         self._names = names
-        self._verdicts: dict[str, Verdict] = {}
-        self.counted: dict[str, Verdict] = {}
-        self.set_aside: dict[str, Verdict] = {}
+        self._verdicts: dict[str, Classification] = {}
+        self.counted: dict[str, Classification] = {}
+        self.set_aside: dict[str, Classification] = {}
         self.hidden: set[str] = set()
 
-    def give(self, path: str, verdict: Verdict) -> bool:
+    def give(self, path: str, verdict: Classification) -> bool:
         """Takes in a verdict; gives whether it is another one than before."""
         if verdict == self._verdicts.get(path):
             return False
@@ -51,11 +53,13 @@ class Verdicts:
         """Forgets the verdict on a file; gives whether there was one."""
         return self._verdicts.pop(path, None) is not None
 
-    def wake(self, path: str, verdict: Verdict) -> None:
+    def wake(self, path: str, verdict: Classification) -> None:
         """Takes in the verdict on a file that was dormant, and counted."""
         self._verdicts[path] = self.counted[path] = verdict
 
-    def recount(self, changed: Iterable[str], scene: Scene) -> tuple[list[BagFile], list[BagFile]]:
+    def recount(
+        self, changed: Iterable[str], scene: ScanContext
+    ) -> tuple[list[BagFile], list[BagFile]]:
         """Brings what counts up to date; gives the bags that left it and those that came."""
         removed, added = [], []
         forms = {form for each in changed for form in (each, other_form(each))}
@@ -76,7 +80,7 @@ class Verdicts:
                 added.append(after.bag)
         return removed, added
 
-    def _verdict_that_counts(self, path: str, scene: Scene) -> Verdict | None:
+    def _verdict_that_counts(self, path: str, scene: ScanContext) -> Classification | None:
         """The file's verdict; None where it is unknown, or its other form answers for it.
 
         While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Two
@@ -89,10 +93,10 @@ class Verdicts:
         if own is None or other is None or own.standing > other.standing:
             return own
         kept = not self._being_compressed(path, scene)
-        if kept and own.standing is Standing.UNREAD:
+        if kept and own.standing is FileState.UNREAD:
             return own
         if own.standing == other.standing and (
-            (kept and own.standing is Standing.CLOSED) or not path.endswith(COMPRESSED)
+            (kept and own.standing is FileState.CLOSED) or not path.endswith(COMPRESSED)
         ):
             return own
         self.hidden.add(path)
@@ -110,6 +114,6 @@ class Verdicts:
             == (stamp.size, stamp.mtime_ns, stamp.inode)
         )
 
-    def _being_compressed(self, path: str, scene: Scene) -> bool:
+    def _being_compressed(self, path: str, scene: ScanContext) -> bool:
         forms = [self._files[form] for form in (path, other_form(path)) if form in self._files]
         return any(notes.grew_lately(scene) for notes in forms)

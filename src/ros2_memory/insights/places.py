@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.geometry import alike, invert, rotate
 from ros2_memory.core.model import TimeWindow, Transform
-from ros2_memory.core.text import glimpse
+from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
 from ros2_memory.core.wording import Reason
 from ros2_memory.history.transforms import (
@@ -63,7 +63,7 @@ class _Known:
 
 
 @dataclass(slots=True)
-class Placing:
+class MapPlacement:
     """How positions of poses become places.
 
     Attributes:
@@ -178,24 +178,26 @@ class Placing:
             return None
 
 
-def placing(view: View, pose_frame: str, topic: str, frame_id: str | None = None) -> Placing:
+def map_placement(
+    view: View, pose_frame: str, topic: str, frame_id: str | None = None
+) -> MapPlacement:
     """How places are told of the poses of a topic in this frame; in `frame_id` where one is asked.
 
     Raises:
         InvalidArgumentsError: places are not told in that frame.
     """
-    own = Placing(view, pose_frame, pose_frame)
+    own = MapPlacement(view, pose_frame, pose_frame)
     place = own if frame_id == pose_frame else _best(view, topic, own)
     if frame_id not in (None, place.frame_id):
         known = " or ".join(dict.fromkeys((place.frame_id, pose_frame)))
         raise InvalidArgumentsError(
-            f"frame_id was {glimpse(frame_id)}; places are told in {known}, and "
+            f"frame_id was {abbreviate(frame_id)}; places are told in {known}, and "
             "get_transform_at leads from any other frame"
         )
     return place
 
 
-def _best(view: View, topic: str, own: Placing) -> Placing:
+def _best(view: View, topic: str, own: MapPlacement) -> MapPlacement:
     """In the map, where the transforms of some recording lead there from its poses' frame."""
     target, pose_frame = view.memory.limits.map_frame, own.pose_frame
     if not target or target == pose_frame or not connected(view, (target, pose_frame)):
@@ -203,7 +205,7 @@ def _best(view: View, topic: str, own: Placing) -> Placing:
     recordings = view.snapshot.recordings(topic).items()
     lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
     if any(connected(view, (target, pose_frame), among=each) for each in lending):
-        return Placing(view, target, pose_frame)
+        return MapPlacement(view, target, pose_frame)
     return own
 
 

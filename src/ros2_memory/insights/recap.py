@@ -14,28 +14,28 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.accounts import Event, Recap
 from ros2_memory.analysis.intervals import united
 from ros2_memory.analysis.standstills import CREEP_MPS, SHORTEST_NS
-from ros2_memory.analysis.topic_events import tells
+from ros2_memory.analysis.topic_events import has_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.timebase import ns_from_unix, unix_from_ns
 from ros2_memory.core.wording import Reason, counted
 from ros2_memory.history.coverage import resolve_pose_topic
-from ros2_memory.history.driven_path import length_notes, way_driven
+from ros2_memory.history.driven_path import driven_path, length_notes
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.time_arguments import open_span
-from ros2_memory.history.unseen import note_edges, note_unseen
-from ros2_memory.insights.tales import standstills_in, story_in
+from ros2_memory.history.unseen import note_edges, note_unread
+from ros2_memory.insights.tales import events_in, standstills_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.intervals import Presence, Seen
+    from ros2_memory.analysis.intervals import IntervalTable, VisibleInterval
     from ros2_memory.analysis.standstills import Standstill
-    from ros2_memory.analysis.topic_events import Fault, Story
+    from ros2_memory.analysis.topic_events import ReportedError, TopicEvents
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.driven_path import Way
-    from ros2_memory.history.time_arguments import Span
+    from ros2_memory.history.driven_path import DrivenPath
+    from ros2_memory.history.time_arguments import TimeRange
     from ros2_memory.history.view import View
 
 MOST_EVENTS: Final = 25
@@ -59,7 +59,7 @@ _PLURALS: Final = {
 class _Drive:
     """How the robot moved: its way, where there are poses, and its stops, and which go on."""
 
-    way: Way | None
+    way: DrivenPath | None
     stops: tuple[tuple[Standstill, bool], ...]
 
     def stood(self, length: Ns) -> Ns | None:
@@ -80,7 +80,7 @@ class _Drive:
         return None if is_hidden and not way.gaps and ns_from_unix(else_s) > SHORTEST_NS else stood
 
 
-def recap(memory: Memory, call: Call, span: Span) -> Recap:
+def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     """What happened in a window.
 
     Raises:
@@ -92,7 +92,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
     start, end = window.asked()
     drive = _drive(view, window)
     events = [] if drive is None else [*_stops(drive)]
-    seen: list[Seen] = []
+    seen: list[IntervalTable] = []
     throughout: set[str] = set()
     there_still: dict[str, Ns] = {}
     newest = view.snapshot.latest
@@ -118,7 +118,7 @@ def recap(memory: Memory, call: Call, span: Span) -> Recap:
         for each in things.longest(MOST_EVENTS)
     ]
     events += _gaps(view, window)
-    note_unseen(view, window)
+    note_unread(view, window)
     note_edges(view, window)
     counts = Counter(each.kind for each in events)
     if things.size:
@@ -157,7 +157,7 @@ def _drive(view: View, window: TimeWindow) -> _Drive | None:
     """How the robot moved; None, with a note, where that is not known."""
     try:
         topic = resolve_pose_topic(view)
-        way = way_driven(view, topic, window)
+        way = driven_path(view, topic, window)
         note_robots(view, topic, window)
         stops = standstills_in(view, topic, window)
         if way is None:
@@ -168,10 +168,10 @@ def _drive(view: View, window: TimeWindow) -> _Drive | None:
     return None if way is None and not stops else _Drive(way, stops)
 
 
-def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, Story]]:
+def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, TopicEvents]]:
     for topic in view.snapshot.topics():
-        if any(map(tells, view.snapshot.types_of(topic))):
-            story = story_in(view, topic, window)
+        if any(map(has_events, view.snapshot.types_of(topic))):
+            story = events_in(view, topic, window)
             if story is not None and not story.says_nothing:
                 yield topic, story
 
@@ -182,7 +182,7 @@ def _stops(drive: _Drive) -> Iterator[Event]:
         yield Event("stop", start, end, f"stood at x {x:z.2f}, y {y:z.2f}", goes_on)
 
 
-def _flips(topic: str, story: Story) -> Iterator[Event]:
+def _flips(topic: str, story: TopicEvents) -> Iterator[Event]:
     """Each flip, and how long it held; up to the end where it still did."""
     until: dict[str, Ns] = {}
     for flip in reversed(story.flips):
@@ -193,13 +193,13 @@ def _flips(topic: str, story: Story) -> Iterator[Event]:
         until[flip.path] = flip.time
 
 
-def _error(fault: Fault) -> Event:
+def _error(fault: ReportedError) -> Event:
     again = f" ({fault.reports} times)" if fault.reports > 1 else ""
     end = fault.last if fault.reports > 1 else None
     return Event("error", fault.first, end, f"error: {fault.text}{again}")
 
 
-def _thing(presence: Presence, *, goes_on: bool) -> Event:
+def _thing(presence: VisibleInterval, *, goes_on: bool) -> Event:
     text = f"{presence.label} in view"
     return Event("thing", presence.first, presence.last, text, goes_on)
 

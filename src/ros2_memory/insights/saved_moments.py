@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.accounts import KeptMoment, KeptMoments, Remembered
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.bag_dir.moment_file import held_in
-from ros2_memory.bag_dir.request_queue import Slot
+from ros2_memory.bag_dir.moment_file import stored_moments_in
+from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
 from ros2_memory.history.view import View
@@ -38,7 +38,9 @@ def remember_moment(
     _require_recorder(memory)
     start, end = now - ns_from_unix(seconds_before), now + ns_from_unix(seconds_after)
     asked = memory.clock.now()
-    slot = Slot(memory.index.bag_dir, label, max(start, MIN_NS + 1), min(end, MAX_NS - 1), asked)
+    slot = PendingRequest(
+        memory.index.bag_dir, label, max(start, MIN_NS + 1), min(end, MAX_NS - 1), asked
+    )
     try:
         slot.post()
     except OSError as error:
@@ -69,7 +71,7 @@ def list_moments(memory: Memory, call: Call) -> KeptMoments:
         RefusedError: they cannot be listed.
     """
     try:
-        held = [*held_in(memory.index.bag_dir)]
+        held = [*stored_moments_in(memory.index.bag_dir)]
     except OSError as error:
         raise RefusedError(
             f"the moments cannot be listed: {error.strerror or error}; this server must be allowed "
@@ -120,7 +122,7 @@ def _require_recorder(memory: Memory) -> None:
         )
 
 
-def _awaited(slot: Slot, call: Call) -> Outcome | None:
+def _awaited(slot: PendingRequest, call: Call) -> Outcome | None:
     """What the recorder answers; None where it has not begun in time, and so never will."""
     for _ in range(2):
         patience = Deadline.after(PATIENCE_S)

@@ -33,21 +33,21 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.coverage import moment, require_bags
 from ros2_memory.history.reverse_search import Search
-from ros2_memory.history.time_arguments import Span, clamped, ns_argument
+from ros2_memory.history.time_arguments import TimeRange, clamped, ns_argument
 from ros2_memory.history.transforms import own_holdings, transform_at
-from ros2_memory.history.unseen import note_unseen
+from ros2_memory.history.unseen import note_unread
 from ros2_memory.history.view import View
-from ros2_memory.messages.detections import things_of
+from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
-    from ros2_memory.history.candidates import Stretch
+    from ros2_memory.history.candidates import SearchWindow
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import Found
-    from ros2_memory.messages.detections import Thing
+    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.messages.detections import Detection
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
 """An older pose does not tell where the robot was."""
@@ -64,7 +64,7 @@ class _Run:
         begun: it is known what is before them.
     """
 
-    newest: Found
+    newest: StoredMessage
     first: Ns
     reach: Ns
     messages: int = 1
@@ -96,7 +96,7 @@ def find_matches(
         QueryTimeoutError: the call's time is over before anything was found.
     """
     condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
-    span = Span(start_s, end_s, last_s)
+    span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = View(memory, call, min(_window(span, wall).stop, wall))
     require_bags(view)
@@ -106,10 +106,10 @@ def find_matches(
     runs = _Runs(limit, oldest_first=oldest_first)
     _gather(view, topic, condition, window, runs)
     searched = TimeWindow(runs.told[-1].first, window.stop) if runs.cut and runs.told else window
-    view.unsay_before(searched.start)
+    view.retract_notes_before(searched.start)
     pose_topic = memory.limits.pose_topic
     found = tuple(_told(view, condition, run, pose_topic) for run in runs.told)
-    note_unseen(view, searched, nothing=not found, search=True)
+    note_unread(view, searched, nothing=not found, search=True)
     start = window.start if earliest is None else max(window.start, earliest)
     end = window.stop if latest is None else min(window.stop, latest)
     if end < start:  # all of it lies before or behind the memory
@@ -125,7 +125,7 @@ def find_matches(
     )
 
 
-def _window(span: Span, now: Ns) -> TimeWindow:
+def _window(span: TimeRange, now: Ns) -> TimeWindow:
     """The window searched, with the slack of floats of seconds.
 
     Raises:
@@ -223,7 +223,7 @@ class _Runs:
         self.count = 0
         self.cut = False
 
-    def add(self, found: Found) -> None:
+    def add(self, found: StoredMessage) -> None:
         """Takes the next older match; rows that ended in silence before it have been ended."""
         topic = found.record.channel.topic
         run = self._open.get(topic)
@@ -236,7 +236,7 @@ class _Runs:
             run.messages += 1
             self._open.move_to_end(topic)
 
-    def pass_by(self, found: Found) -> None:
+    def pass_by(self, found: StoredMessage) -> None:
         """Takes a message that cannot be decoded: it is no match, and ends no row."""
         topic = found.record.channel.topic
         run = self._open.get(topic)
@@ -280,10 +280,10 @@ class _Runs:
 
 
 def _parts(
-    view: View, topics: Sequence[str], stretches: Iterator[Stretch], window: TimeWindow
+    view: View, topics: Sequence[str], stretches: Iterator[SearchWindow], window: TimeWindow
 ) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
     """The parts of a window in which topics may have matches, and these, newest first."""
-    if view.received_twice(topics):
+    if view.may_be_relatched(topics):
         # What ends a row may be a copy of a message in a bag that is ruled out.
         yield window, topics
         return
@@ -321,7 +321,7 @@ def _told(view: View, condition: Condition, run: _Run, pose_topic: str) -> Sight
     )
 
 
-def _robot(view: View, topic: str, seen: Found) -> Pose | None:
+def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
     """Where the robot was: its newest pose at or before then that can be read.
 
     Where the sighting's own session has poses, it is one of these.
@@ -341,12 +341,14 @@ def _robot(view: View, topic: str, seen: Found) -> Pose | None:
     return pose if pose is not None and all(map(math.isfinite, pose.position)) else None
 
 
-def _spot(view: View, condition: Condition, found: Found, robot: Pose | None) -> Spot | None:
+def _spot(
+    view: View, condition: Condition, found: StoredMessage, robot: Pose | None
+) -> Spot | None:
     """Where the thing that matched was; in the map, the robot's frame, or its message's own."""
     message = view.memory.reader.decode(found.record)
     value = view.memory.extractor.exact(message, found.record.channel.type)
     frame = view.memory.extractor.frame(message)
-    thing = _matching(things_of(value, frame), condition)
+    thing = _matching(detections_of(value, frame), condition)
     if thing is None or thing.place is None:
         return None
     frames = (view.memory.limits.map_frame, "" if robot is None else robot.frame_id)
@@ -366,7 +368,7 @@ def _spot(view: View, condition: Condition, found: Found, robot: Pose | None) ->
     return Spot(thing.label, thing.place, thing.frame_id)
 
 
-def _matching(things: Sequence[Thing], condition: Condition) -> Thing | None:
+def _matching(things: Sequence[Detection], condition: Condition) -> Detection | None:
     """The thing that a condition is about: by name or place, or the only one; placed ones first."""
     test = condition.test
     if isinstance(test, NearPosition):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.sights import Sights
+from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.analysis.standstills import (
     CONTEXT_NS,
     StandstillBuilder,
@@ -17,21 +17,21 @@ from ros2_memory.analysis.standstills import (
 )
 from ros2_memory.analysis.topic_events import (
     MOST_TOLD,
-    QUIET,
-    Story,
-    StoryBuilder,
+    NO_EVENTS,
+    TopicEvents,
+    TopicEventsBuilder,
     state_of,
 )
 from ros2_memory.catalogue.codec import (
+    decode_topic_events,
+    encode_topic_events,
     packed_standstills,
-    packed_story,
     unpacked_standstills,
-    unpacked_story,
 )
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, START_SLACK_NS
 from ros2_memory.history.driven_path import add_poses
-from ros2_memory.history.stored_parts import Kept, Kind, is_whole
+from ros2_memory.history.stored_parts import DigestKind, StoredPart, is_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -39,20 +39,20 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.standstills import Standstill
     from ros2_memory.core.model import Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
-_STANDSTILLS: Final = Kind(
+_STANDSTILLS: Final = DigestKind(
     "standstills",
     ask=lambda notes, topic, among: notes.standstills(topic, among),
     packed=lambda digest: packed_standstills(digest).hex(),
     unpacked=lambda text: unpacked_standstills(bytes.fromhex(text)),
 )
-_STORIES: Final = Kind(
+_STORIES: Final = DigestKind(
     "story",
     ask=lambda notes, topic, among: notes.stories(topic, among),
-    packed=lambda story: "" if story is None else packed_story(story).hex(),
-    unpacked=lambda text: unpacked_story(bytes.fromhex(text)) if text else None,
+    packed=lambda story: "" if story is None else encode_topic_events(story).hex(),
+    unpacked=lambda text: decode_topic_events(bytes.fromhex(text)) if text else None,
 )
 
 
@@ -84,8 +84,8 @@ def standstills_in(
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     window = window.widened(CONTEXT_NS)
     builder = StandstillBuilder()
-    kept: Kept[StandstillDigest] = Kept(view, topic, _STANDSTILLS, window)
-    sights = Sights(view.memory.reader, view.memory.extractor)
+    kept: StoredPart[StandstillDigest] = StoredPart(view, topic, _STANDSTILLS, window)
+    sights = MotionDecoder(view.memory.reader, view.memory.extractor)
     for group in view.groups(topic, window):
         failures: list[UndecodableError] = []
         if not is_whole(group, window):
@@ -111,30 +111,30 @@ def standstills_in(
     )
 
 
-def story_in(view: View, topic: str, window: TimeWindow) -> Story | None:
+def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
     """What the messages of a topic say in a window; None where there is no message."""
-    builder = StoryBuilder()
-    kept: Kept[Story | None] = Kept(view, topic, _STORIES, window)
+    builder = TopicEventsBuilder()
+    kept: StoredPart[TopicEvents | None] = StoredPart(view, topic, _STORIES, window)
     for group in view.groups(topic, window):
         if not is_whole(group, window):
             _hear(view, builder, group.once())
             continue
         known = kept.of(group)
         if known is None:
-            collector = StoryBuilder()
+            collector = TopicEventsBuilder()
             _hear(view, collector, group.once())
             story = collector.story(MOST_TOLD)
             if story is not None:
                 kept.keep(group, story, (story.first, story.last))
         else:
             story, span = known
-            story = Story(*span) if story is QUIET else story
+            story = TopicEvents(*span) if story is NO_EVENTS else story
         if story is not None:
             builder.join(story)
     return builder.story()
 
 
-def _hear(view: View, builder: StoryBuilder, messages: Iterable[Found]) -> None:
+def _hear(view: View, builder: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:
     """Adds what messages say."""
     for found in messages:
         channel = found.record.channel

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.accounts import Visit, Visits
 from ros2_memory.analysis.conditions import Condition, NearPosition
-from ros2_memory.analysis.dwell import Approach, Stays, Unread
+from ros2_memory.analysis.dwell import Approach, DwellBuilder, Unread
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.sights import Sights
+from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     QueryTimeoutError,
@@ -28,7 +28,7 @@ from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
 from ros2_memory.history.bag_groups import groups_of
-from ros2_memory.history.candidates import Candidates
+from ros2_memory.history.candidates import CandidateBags
 from ros2_memory.history.coverage import moment, require_bags, resolve_pose_topic
 from ros2_memory.history.driven_path import (
     POSES,
@@ -38,23 +38,23 @@ from ros2_memory.history.driven_path import (
     stops,
 )
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.stored_parts import Kept, is_whole
-from ros2_memory.history.unseen import note_unseen
+from ros2_memory.history.stored_parts import StoredPart, is_whole
+from ros2_memory.history.unseen import note_unread
 from ros2_memory.history.view import View
-from ros2_memory.insights.odometry_resets import restarts
-from ros2_memory.insights.places import placing
+from ros2_memory.insights.odometry_resets import odometry_resets
+from ros2_memory.insights.places import map_placement
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.dwell import Stay
-    from ros2_memory.analysis.odometry import PoseDigest, Stop
+    from ros2_memory.analysis.dwell import Dwell
+    from ros2_memory.analysis.odometry import PoseDigest, TimedPosition
     from ros2_memory.core.model import Pose, Vector3
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import Found, Holding
-    from ros2_memory.insights.places import Placing
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.insights.places import MapPlacement
 
 _COUNTING_S: Final = 5.0
 """For so long visits are counted that are not shown."""
@@ -93,7 +93,7 @@ def visits(
     view = View(memory, call, wall)
     require_bags(view)
     topic = resolve_pose_topic(view)
-    place = placing(view, _pose_frame(view, topic), topic, frame_id)
+    place = map_placement(view, _pose_frame(view, topic), topic, frame_id)
     looking = _Looking(view, topic, place, (x, y, radius))
     latest, newest = view.snapshot.latest, looking.newest_time
     now = wall if memory.limits.now == "wall" or latest is None else latest
@@ -101,7 +101,7 @@ def visits(
     known = newest is not None and newest >= now - stale
     found, total = looking.newest(limit)
     epochs = () if place.is_map or not found else _restarts(view, topic, found[-1][0].arrived)
-    note_unseen(view, TimeWindow.everything(), nothing=not found)
+    note_unread(view, TimeWindow.everything(), nothing=not found)
     told = tuple(
         Visit(
             arrived=stay.arrived if stay.begun else None,
@@ -139,7 +139,7 @@ def visits(
 def _restarts(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
     """When odometry began anew after a moment; not known where the time is over before."""
     try:
-        return restarts(view, topic, since)
+        return odometry_resets(view, topic, since)
     except QueryTimeoutError:
         view.complete = False
         view.note("the time was over before it was known whether odometry began anew since")
@@ -167,7 +167,7 @@ def _pose_frame(view: View, topic: str) -> str:
         raise
 
 
-def _frame_of(view: View, found: Found) -> str:
+def _frame_of(view: View, found: StoredMessage) -> str:
     message = view.memory.reader.decode(found.record)
     pose = view.memory.extractor.pose(message, found.record.channel.type)
     if pose is None:
@@ -193,14 +193,14 @@ class _Looking:
     """Goes through the poses of a topic from the newest on, but for bags that are ruled out."""
 
     def __init__(
-        self, view: View, topic: str, place: Placing, wanted: tuple[float, float, float]
+        self, view: View, topic: str, place: MapPlacement, wanted: tuple[float, float, float]
     ) -> None:
         self._view = view
         self._topic = topic
         self._place = place
         self._x, self._y, self._radius = wanted
         self._one = place.is_one(topic)
-        self._kept: Kept[PoseDigest] = Kept(view, topic, POSES, TimeWindow.everything())
+        self._kept: StoredPart[PoseDigest] = StoredPart(view, topic, POSES, TimeWindow.everything())
         self._counting: Deadline | None = None
 
     @property
@@ -208,12 +208,12 @@ class _Looking:
         """When the newest pose was recorded."""
         return next((stop.time for stop in self._positions(TimeWindow.everything())), None)
 
-    def newest(self, limit: int) -> tuple[list[tuple[Stay, Approach]], int]:
+    def newest(self, limit: int) -> tuple[list[tuple[Dwell, Approach]], int]:
         """The newest visits, each with its closest approach, and how many there are in all.
 
         Where the time is over before all is gone through, there are as many as were found.
         """
-        stays = Stays(limit)
+        stays = DwellBuilder(limit)
         before = MAX_NS
         try:
             for part in self._parts():
@@ -242,13 +242,13 @@ class _Looking:
         if self._counting is not None and self._counting.expired():
             raise QueryTimeoutError("counting takes too long")
 
-    def _closest(self, stay: Stay) -> Approach:
+    def _closest(self, stay: Dwell) -> Approach:
         """The closest of all poses of a visit, the earliest of equals.
 
         Whole bags within the radius are read only where one of their poses may be closer.
         """
         closest = stay.closest
-        sights = Sights(self._view.memory.reader, self._view.memory.extractor)
+        sights = MotionDecoder(self._view.memory.reader, self._view.memory.extractor)
         for bound, window, here in sorted(stay.unread, key=attrgetter("bound")):
             if closest is not None and closest <= bound:
                 break
@@ -268,7 +268,7 @@ class _Looking:
 
     def _parts(self) -> Iterator[TimeWindow]:
         """The times in which the robot may have been near, newest first."""
-        if self._view.received_twice([self._topic]):
+        if self._view.may_be_relatched([self._topic]):
             # What ends a visit may be a copy of a pose in a bag that is ruled out.
             yield TimeWindow.everything()
             return
@@ -278,10 +278,10 @@ class _Looking:
             near = Condition(NearPosition(0.0, 0.0, None, math.inf))
         else:
             near = Condition(NearPosition(*here, None, self._radius))
-        for stretch in Candidates(self._view, (self._topic,), near, MAX_NS).stretches():
+        for stretch in CandidateBags(self._view, (self._topic,), near, MAX_NS).stretches():
             yield stretch.window
 
-    def _pass_over(self, stays: Stays, gap: TimeWindow) -> None:
+    def _pass_over(self, stays: DwellBuilder, gap: TimeWindow) -> None:
         """Takes the time between two parts: any pose in it is elsewhere."""
         if gap.empty or not stays.under_way:
             return
@@ -289,7 +289,7 @@ class _Looking:
             if not stays.away(stop.time):
                 return
 
-    def _look(self, stays: Stays, part: TimeWindow) -> None:
+    def _look(self, stays: DwellBuilder, part: TimeWindow) -> None:
         groups = groups_of(self._view, self._topic, part)
         alone = len(groups) == 1 and is_whole(groups[0], part) and not self._contested(part)
         here = self._here_in(groups[0].holdings[0]) if alone else None
@@ -308,7 +308,7 @@ class _Looking:
 
     def _sum_up(
         self,
-        stays: Stays,
+        stays: DwellBuilder,
         group: Group,
         digest: PoseDigest,
         span: tuple[Ns, Ns],
@@ -352,7 +352,7 @@ class _Looking:
         wider = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
         return len({each.bag.recording for each in self._view.holdings([self._topic], wider)}) > 1
 
-    def _here_in(self, held: Holding) -> tuple[float, float] | None:
+    def _here_in(self, held: BagSpan) -> tuple[float, float] | None:
         """Where the place is in the poses' frame of a bag; None where that is not one place."""
         return self._place.in_poses(held.bag.recording, held.first, self._x, self._y)
 
@@ -368,7 +368,7 @@ class _Looking:
         messages = self._view.stream([self._topic], part, newest_first=True)
         at: list[Path] = []
 
-        def noted() -> Iterator[Found]:
+        def noted() -> Iterator[StoredMessage]:
             for found in messages:
                 at[:] = [found.bag.recording]
                 yield found
@@ -376,7 +376,7 @@ class _Looking:
         for stop in stops(self._view, noted()):
             yield at[0], *stop
 
-    def _positions(self, part: TimeWindow) -> Iterator[Stop]:
+    def _positions(self, part: TimeWindow) -> Iterator[TimedPosition]:
         """The positions of a part that are places, newest first."""
         return stops(self._view, self._view.stream([self._topic], part, newest_first=True))
 

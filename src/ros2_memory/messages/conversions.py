@@ -23,15 +23,15 @@ from ros2_memory.messages.fields import (
     ABSENT,
     descend,
     field_of,
-    layout_of,
-    layout_of_class,
+    field_table_of,
+    field_table_of_class,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from ros2_memory.core.model import Quaternion, Vector3
-    from ros2_memory.messages.fields import Layout
+    from ros2_memory.messages.fields import FieldTable
 
 ANGLES: Final = ("roll_deg", "pitch_deg", "yaw_deg")
 
@@ -48,7 +48,7 @@ class Degrees(float):
     __slots__ = ()
 
 
-class Kind(Enum):
+class ValueKind(Enum):
     """How the extracted view sees a message."""
 
     PLAIN = auto()  # field by field
@@ -57,39 +57,39 @@ class Kind(Enum):
     TIME = auto()  # as one number of seconds
 
 
-def kind_of(node: object) -> Kind:
+def kind_of(node: object) -> ValueKind:
     """How the extracted view sees a node; PLAIN for what is no message."""
     cls: type = type(node)
     return _kind_of_class(cls)
 
 
 @lru_cache(maxsize=4096)
-def _kind_of_class(cls: type) -> Kind:
-    layout = layout_of_class(cls)
+def _kind_of_class(cls: type) -> ValueKind:
+    layout = field_table_of_class(cls)
     if layout is None:
-        return Kind.PLAIN
-    kind, fields = _KINDS.get(layout.type, (Kind.PLAIN, ""))
+        return ValueKind.PLAIN
+    kind, fields = _KINDS.get(layout.type, (ValueKind.PLAIN, ""))
     # A bag may bring a definition of its own under the name of a standard type.
-    return kind if fields.split() == list(layout.attributes) else Kind.PLAIN
+    return kind if fields.split() == list(layout.attributes) else ValueKind.PLAIN
 
 
 def view(node: object, name: str) -> object:
     """What stands under this name in the extracted view of a message; else ABSENT."""
     kind = kind_of(node)
-    if kind is Kind.TIME:
+    if kind is ValueKind.TIME:
         return ABSENT
-    if kind is Kind.QUATERNION:
+    if kind is ValueKind.QUATERNION:
         angles = euler(node)
         return (None if angles is None else angles[name]) if name in ANGLES else ABSENT
     found = field_of(node, name)
-    if kind is Kind.VECTOR:
+    if kind is ValueKind.VECTOR:
         return Metric(found) if isinstance(found, float) else found
-    layout = None if found is ABSENT else layout_of(node)
+    layout = None if found is ABSENT else field_table_of(node)
     summaries = _NONE if layout is None else summaries_of(layout)
     return summaries[name](node, found) if name in summaries else found
 
 
-def summaries_of(layout: Layout) -> Mapping[str, Callable[[object, object], object]]:
+def summaries_of(layout: FieldTable) -> Mapping[str, Callable[[object, object], object]]:
     """By field of such messages, what makes a summary of the message and what was found there."""
     return _VIEWS.get(layout.type, _NONE)
 
@@ -214,13 +214,13 @@ def _or_null(node: object) -> object:
     return None if node is ABSENT else node
 
 
-_KINDS: Final[Mapping[str, tuple[Kind, str]]] = {
-    "geometry_msgs/msg/Point": (Kind.VECTOR, "x y z"),
-    "geometry_msgs/msg/Point32": (Kind.VECTOR, "x y z"),
-    "geometry_msgs/msg/Vector3": (Kind.VECTOR, "x y z"),
-    "geometry_msgs/msg/Quaternion": (Kind.QUATERNION, "x y z w"),
-    "builtin_interfaces/msg/Time": (Kind.TIME, "sec nanosec"),
-    "builtin_interfaces/msg/Duration": (Kind.TIME, "sec nanosec"),
+_KINDS: Final[Mapping[str, tuple[ValueKind, str]]] = {
+    "geometry_msgs/msg/Point": (ValueKind.VECTOR, "x y z"),
+    "geometry_msgs/msg/Point32": (ValueKind.VECTOR, "x y z"),
+    "geometry_msgs/msg/Vector3": (ValueKind.VECTOR, "x y z"),
+    "geometry_msgs/msg/Quaternion": (ValueKind.QUATERNION, "x y z w"),
+    "builtin_interfaces/msg/Time": (ValueKind.TIME, "sec nanosec"),
+    "builtin_interfaces/msg/Duration": (ValueKind.TIME, "sec nanosec"),
 }
 _NONE: Final[Mapping[str, Callable[[object, object], object]]] = {}
 _VIEWS: Final[Mapping[str, Mapping[str, Callable[[object, object], object]]]] = {

@@ -32,7 +32,7 @@ _LONGEST_JSON: Final = 1 << 16
 _DEEPEST: Final = 4
 
 
-class Thing(NamedTuple):
+class Detection(NamedTuple):
     """Something that was seen: `place` (m) is in `frame_id`, empty where the message names none."""
 
     label: str
@@ -40,7 +40,7 @@ class Thing(NamedTuple):
     frame_id: str = ""
 
 
-def things_of(value: JsonValue, frame_id: str = "") -> tuple[Thing, ...]:
+def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]:
     """The things in an extracted value, in order; `frame_id` is the message's own."""
     return tuple(_things(value, frame_id, _DEEPEST))
 
@@ -60,7 +60,7 @@ def hangs_on_numbers(value: JsonValue) -> bool:
     return False
 
 
-def _things(value: JsonValue, frame_id: str, depth: int) -> Iterator[Thing]:
+def _things(value: JsonValue, frame_id: str, depth: int) -> Iterator[Detection]:
     if depth == 0:
         return
     if isinstance(value, str):
@@ -77,27 +77,27 @@ def _things(value: JsonValue, frame_id: str, depth: int) -> Iterator[Thing]:
             yield from _within(value, frame_id, depth)
 
 
-def _within(value: dict[str, JsonValue], frame_id: str, depth: int) -> Iterator[Thing]:
+def _within(value: dict[str, JsonValue], frame_id: str, depth: int) -> Iterator[Detection]:
     """The things in the fields of an object that is none itself."""
     frame = _frame(value) or frame_id
     for name, inner in value.items():
         if name in LISTS and isinstance(inner, list):
-            yield from (Thing(each) for each in inner if isinstance(each, str) and each)
+            yield from (Detection(each) for each in inner if isinstance(each, str) and each)
         yield from _things(inner, frame, depth - 1)
 
 
-def _thing(value: dict[str, JsonValue], frame_id: str) -> Thing | None:
+def _thing(value: dict[str, JsonValue], frame_id: str) -> Detection | None:
     """The thing that an object is; None where it is none."""
     frame = _frame(value) or frame_id
     label = _label(value)
     if label is not None:
-        return Thing(label, _place(value), frame)
+        return Detection(label, _place(value), frame)
     best = _best_result(value.get("results"))
     if best is None:
         return None
     hypothesis = best.get("hypothesis")
     label = _label(hypothesis if isinstance(hypothesis, dict) else best)
-    return None if label is None else Thing(label, _place(best) or _place(value), frame)
+    return None if label is None else Detection(label, _place(best) or _place(value), frame)
 
 
 def _label(value: dict[str, JsonValue]) -> str | None:

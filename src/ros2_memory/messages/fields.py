@@ -32,30 +32,30 @@ _PATH: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.([A-Za-z][A-Za-z0-9_]*|[0-9]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Layout:
+class FieldTable:
     """The type of one message class and its fields: names in the definition to attributes."""
 
     type: str
     attributes: Mapping[str, str]
 
 
-def layout_of(node: object) -> Layout | None:
+def field_table_of(node: object) -> FieldTable | None:
     """How a message is laid out; None for what is not a message (a number, a list, a mapping)."""
     cls: type = type(node)
-    known = layout_of_class(cls)
+    known = field_table_of_class(cls)
     if known is not None or cls.__module__ in {"builtins", "numpy"}:
         return known
     names = {name: name for name in getattr(node, "__dict__", {}) if not name.startswith("_")}
-    return Layout("", names) if names else None
+    return FieldTable("", names) if names else None
 
 
 @lru_cache(maxsize=4096)
-def layout_of_class(cls: type) -> Layout | None:
+def field_table_of_class(cls: type) -> FieldTable | None:
     """How the messages of a dataclass are laid out; None for another class."""
     if not dataclasses.is_dataclass(cls):
         return None
     attributes = {_ros_name(f.name): f.name for f in dataclasses.fields(cls) if _is_data(f)}
-    return Layout(str(getattr(cls, "__msgtype__", "")), attributes)
+    return FieldTable(str(getattr(cls, "__msgtype__", "")), attributes)
 
 
 def _is_data(field: dataclasses.Field[object]) -> bool:
@@ -79,7 +79,7 @@ def field_of(node: object, name: str) -> object:
     if isinstance(node, dict):
         entry: object = node.get(name, ABSENT)
         return entry
-    layout = layout_of(node)
+    layout = field_table_of(node)
     if layout is None or name not in layout.attributes:
         return ABSENT
     found: object = getattr(node, layout.attributes[name], ABSENT)
@@ -92,7 +92,7 @@ def names_of(node: object) -> tuple[str, ...]:
         node = node[0] if node else None
     if isinstance(node, dict):
         return tuple(str(name) for name in node)
-    layout = layout_of(node)
+    layout = field_table_of(node)
     return () if layout is None else tuple(layout.attributes)
 
 

@@ -16,8 +16,8 @@ from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
 from ros2_memory.messages import rounding
 from ros2_memory.messages.conversions import (
     Degrees,
-    Kind,
     Metric,
+    ValueKind,
     euler,
     kind_of,
     nanoseconds,
@@ -25,7 +25,7 @@ from ros2_memory.messages.conversions import (
     xyz,
 )
 from ros2_memory.messages.downsample import array_note, evenly
-from ros2_memory.messages.fields import ABSENT, layout_of
+from ros2_memory.messages.fields import ABSENT, field_table_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -86,16 +86,16 @@ class Rendering(ABC):
 
     def _message(self, node: object, path: str, depth: int) -> JsonValue:
         kind = kind_of(node)
-        if kind is Kind.QUATERNION:
+        if kind is ValueKind.QUATERNION:
             return self._rotation(node, path)
-        if kind is Kind.TIME:
+        if kind is ValueKind.TIME:
             time = nanoseconds(node)
             return None if time is None else self._seconds(time)
-        vector = xyz(node) if kind is Kind.VECTOR else None
+        vector = xyz(node) if kind is ValueKind.VECTOR else None
         if vector is not None:
             x, y, z = vector
             return {"x": self._metric(x), "y": self._metric(y), "z": self._metric(z)}
-        layout = layout_of(node)
+        layout = field_table_of(node)
         if layout is None:
             return self._text(f"<{type(node).__name__}>", path)
         summaries = summaries_of(layout)
@@ -168,7 +168,7 @@ class Rendering(ABC):
         """Notes a loss at a path; of several of one kind there, the weightiest counts."""
 
 
-class Exact(Rendering):
+class ExactJson(Rendering):
     """Everything as it is."""
 
     def _text(self, text: str, _path: str, /) -> JsonValue:
@@ -208,7 +208,7 @@ class Exact(Rendering):
         """Nothing is lost here that is not said of `exact`."""
 
 
-class Shown(Rendering):
+class ReplyJson(Rendering):
     """What leaves in a reply, and the notes on what does not.
 
     `squeeze` divides what a string may hold and bounds JSON objects too, for messages that would

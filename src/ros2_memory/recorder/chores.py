@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
 
-    from ros2_memory.recorder.event_log import Journal
+    from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.ports import Housekeeper
 
 HOUSE_S: Final = 10.0
@@ -27,7 +27,7 @@ class Chores:
     """
 
     def __init__(
-        self, bag_dir: Path, housekeeper: Housekeeper, journal: Journal, now_s: float
+        self, bag_dir: Path, housekeeper: Housekeeper, journal: EventLog, now_s: float
     ) -> None:
         self._bag_dir = bag_dir
         self._housekeeper = housekeeper

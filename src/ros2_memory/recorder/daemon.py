@@ -20,7 +20,7 @@ from ros2_memory.core.sd_notify import (
     WATCHDOG,
     watchdog_interval_s,
 )
-from ros2_memory.recorder.handover.recovery import settle_all
+from ros2_memory.recorder.handover.recovery import recover_handovers
 from ros2_memory.retention.clear import clear_bags, refuse_homes
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ class Upkeep:
         running = heartbeat.recordings if heartbeat else ()
         # A directory that cannot be listed is the recorder's to report.
         with suppress(OSError):
-            settle_all(self._bag_dir, self._reader, running)
+            recover_handovers(self._bag_dir, self._reader, running)
 
 
 def record_until_told(recorder: Ticking, manager: ServiceManager, upkeep: Upkeep) -> None:
@@ -212,7 +212,7 @@ class EndingSignals:
 def _prepare(bag_dir: Path, reader: BagReader, housekeeper: Housekeeper) -> None:
     tasks: dict[str, Callable[[], None]] = {
         "repair": lambda: housekeeper.repair(bag_dir),
-        "settle": lambda: settle_all(bag_dir, reader),
+        "settle": lambda: recover_handovers(bag_dir, reader),
         "apply": lambda: housekeeper.apply(bag_dir),
     }
     for name, task in tasks.items():

@@ -27,7 +27,7 @@ _ADVICE = {
 }
 
 
-class Journal:
+class EventLog:
     """Log events of the recorder; `last_error` is the sentence of the newest fault."""
 
     def __init__(self) -> None:

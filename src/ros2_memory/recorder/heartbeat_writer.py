@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.timebase import Clock
-    from ros2_memory.recorder.event_log import Journal
-    from ros2_memory.recorder.sessions import Crew
+    from ros2_memory.recorder.event_log import EventLog
+    from ros2_memory.recorder.sessions import RecordingSessions
 
 
-class Pulse:
+class HeartbeatWriter:
     """Writes `recorder.json`; `interval_s` is how often it is asked to.
 
     `expected` gives the topics that are to be recorded by name, `age_held` which bags age leaves.
@@ -29,7 +29,7 @@ class Pulse:
         bag_dir: Path,
         interval_s: float,
         clock: Clock,
-        journal: Journal,
+        journal: EventLog,
         *,
         expected: Callable[[], Sequence[str]] = tuple,
         age_held: Callable[[], str | None] = lambda: None,
@@ -54,17 +54,17 @@ class Pulse:
         """The recording that was announced is one of the crew's, or does not come."""
         self._announced = ()
 
-    def beat(self, state: RecorderState, crew: Crew) -> None:
+    def beat(self, state: RecorderState, crew: RecordingSessions) -> None:
         """Writes a heartbeat. One that cannot be written is reported, and stops nothing."""
         self._write(self._heartbeat(state, crew))
 
-    def beat_if_news(self, state: RecorderState, crew: Crew) -> None:
+    def beat_if_news(self, state: RecorderState, crew: RecordingSessions) -> None:
         """Writes a heartbeat where it would say something new, besides times and amounts."""
         heartbeat = self._heartbeat(state, crew)
         if _news(heartbeat) != self._told:
             self._write(heartbeat)
 
-    def _heartbeat(self, state: RecorderState, crew: Crew) -> Heartbeat:
+    def _heartbeat(self, state: RecorderState, crew: RecordingSessions) -> Heartbeat:
         now = self._clock.now()
         if state is not self._state:
             self._state, self._since = state, now
@@ -88,7 +88,7 @@ class Pulse:
             age_held=self._age_held(),
         )
 
-    def _missing(self, crew: Crew) -> tuple[str, ...]:
+    def _missing(self, crew: RecordingSessions) -> tuple[str, ...]:
         """What no publisher has offered; nothing before the first recorder has looked around."""
         for session in crew.sessions:
             self._offered |= session.subscribed | session.splits.heard

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, has_own_name
@@ -25,13 +25,13 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
 from ros2_memory.core.wording import counted
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
-from ros2_memory.retention.collect import Disposal
+from ros2_memory.retention.collect import GarbageCollector
 from ros2_memory.retention.delete import left_by_repair, remove_emptied
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.retention.recorded_time import RecordedTime
 from ros2_memory.retention.repair import Repairer, open_files
-from ros2_memory.retention.saved_moments import Keeper
+from ros2_memory.retention.saved_moments import MomentKeeper
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.recorder.ports import Housekeeper
-    from ros2_memory.retention.collect import Disposed
+    from ros2_memory.retention.collect import Collected
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
     from ros2_memory.retention.time_sync import TimeSync
@@ -95,7 +95,7 @@ class Housekeeping:
         self._recorded = RecordedTime(bag_dir)
         self._own = own or OwnRecordings(bag_dir)
         self._keeps_foreign = limits.keeps_foreign
-        disposal = Disposal(
+        disposal = GarbageCollector(
             bag_dir,
             limits,
             Carrier(bag_dir, reader, writer, static_topics),
@@ -114,9 +114,9 @@ class Housekeeping:
             split_duration_s=split_duration_s,
             disposal=disposal,
         )
-        self._keeper = Keeper(bag_dir, moments_bytes, clock)
+        self._keeper = MomentKeeper(bag_dir, moments_bytes, clock)
         self._repairer = Repairer(reader, writer, bag_dir)
-        self._names = KeptNames(bag_dir)
+        self._names = HardLinks(bag_dir)
         self._clock = clock
         self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
         self._held = 0
@@ -306,7 +306,7 @@ class Housekeeping:
             )
         return self._repairer.repair(path)
 
-    def _report(self, done: Disposed, begun: int, **values: object) -> None:
+    def _report(self, done: Collected, begun: int, **values: object) -> None:
         tell = _log.info if done.bags else _log.debug
         tell(
             "retention_applied",
@@ -321,7 +321,7 @@ class Housekeeping:
             **values,
         )
 
-    def _tell_held(self, done: Disposed) -> None:
+    def _tell_held(self, done: Collected) -> None:
         """Says once that age is held, and once that it no longer is."""
         before, self._held = self._held, done.held
         if self._held and not before:
@@ -329,7 +329,7 @@ class Housekeeping:
         elif before and not self._held:
             _log.info("age_no_longer_held")
 
-    def _tell_foreign(self, done: Disposed) -> None:
+    def _tell_foreign(self, done: Collected) -> None:
         """Says once that there are bags which no limit counts."""
         if done.foreign_bytes and not self._foreign:
             _log.warning(
@@ -341,7 +341,7 @@ class Housekeeping:
             )
         self._foreign = bool(done.foreign_bytes)
 
-    def _tell_shortage(self, done: Disposed) -> None:
+    def _tell_shortage(self, done: Collected) -> None:
         """Says once that the budget cannot be held."""
         if not done.fits and not self._short:
             _log.error(

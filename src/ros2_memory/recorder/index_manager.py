@@ -20,10 +20,10 @@ import structlog
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import ms_from_ns, ns_from_unix
-from ros2_memory.index.bag_table import Survey
-from ros2_memory.index.file_state import Scene
+from ros2_memory.index.bag_table import BagTable
+from ros2_memory.index.file_state import ScanContext
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.retention.collect import Disposed
+from ros2_memory.retention.collect import Collected
 from ros2_memory.retention.foreign import ForeignBags
 
 if TYPE_CHECKING:
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.timebase import Clock, Ns
-    from ros2_memory.index.bag_table import Change
-    from ros2_memory.index.file_state import FormerFile
-    from ros2_memory.retention.collect import Disposal
+    from ros2_memory.index.bag_table import TableChange
+    from ros2_memory.index.file_state import KnownFile
+    from ros2_memory.retention.collect import GarbageCollector
     from ros2_memory.retention.foreign import Foreign
     from ros2_memory.storage.base import BagReader
 
@@ -71,8 +71,8 @@ class IndexManager:
         *,
         refresh_s: float,
         split_duration_s: float,
-        disposal: Disposal | None = None,
-        known: Callable[[], Mapping[str, FormerFile]] | None = None,
+        disposal: GarbageCollector | None = None,
+        known: Callable[[], Mapping[str, KnownFile]] | None = None,
         include_active: bool = False,
         trusts_mtime: bool = True,
     ) -> None:
@@ -120,14 +120,14 @@ class IndexManager:
 
     def apply_retention(
         self, *, free_bytes: Callable[[], int] | None = None, min_free_bytes: int | None = None
-    ) -> Disposed:
+    ) -> Collected:
         """Scans, and deletes what the limits do not allow to keep; nothing without a `disposal`.
 
         `free_bytes` measures what the disk has left, where that is to count; `min_free_bytes` is
         what it must have, where that is not as the limits say.
         """
         if self._disposal is None:
-            return Disposed()
+            return Collected()
         with self._lock:
             snapshot = self._scan()
             heartbeat = self.heartbeat()
@@ -158,10 +158,10 @@ class IndexManager:
 
     # What follows runs under the lock.
 
-    def _new_survey(self) -> Survey:
+    def _new_survey(self) -> BagTable:
         # Disposal weighs more than bags.
         all_awake = self._disposal is not None
-        return Survey(self.bag_dir, self._reader, known=self._known, all_awake=all_awake)
+        return BagTable(self.bag_dir, self._reader, known=self._known, all_awake=all_awake)
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
         if self.published is not None:
@@ -186,12 +186,12 @@ class IndexManager:
         self._report(before, self.published, change, begun)
         return self.published
 
-    def _scene(self) -> Scene:
+    def _scene(self) -> ScanContext:
         now = self._clock.now()
         heartbeat = self.heartbeat()
         live = heartbeat is not None and heartbeat.is_live(now)
         named = frozenset(heartbeat.recordings) if heartbeat is not None and live else None
-        return Scene(
+        return ScanContext(
             self.bag_dir,
             now,
             self._three_splits,
@@ -200,7 +200,9 @@ class IndexManager:
             self._trusts_mtime,
         )
 
-    def _report(self, before: Snapshot | None, after: Snapshot, change: Change, begun: Ns) -> None:
+    def _report(
+        self, before: Snapshot | None, after: Snapshot, change: TableChange, begun: Ns
+    ) -> None:
         removed, added, _ = change
         known = set() if before is None else set(before.damaged)
         for each in after.damaged:

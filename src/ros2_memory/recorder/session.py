@@ -10,7 +10,7 @@ from ros2_memory.recorder.process.output import Said, parse_line
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.recorder.handover.plan import Moment
+    from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.ports import RecorderProcess
     from ros2_memory.recorder.process.output import Line
     from ros2_memory.recorder.split_watcher import Splits
@@ -21,14 +21,16 @@ _LAST_WORDS: Final = 6
 _TOLD: Final = frozenset(Said) - {Said.REMARK, Said.FLUSHING}
 
 
-class Session:
+class RecordingSession:
     """One recording: its name, its child and its splits.
 
     `subscribed` are the topics that its recorder says it has subscribed to, which does not mean
     that it receives any of them.
     """
 
-    def __init__(self, name: str, child: RecorderProcess, splits: Splits, began: Moment) -> None:
+    def __init__(
+        self, name: str, child: RecorderProcess, splits: Splits, began: ClockReading
+    ) -> None:
         self.name = name
         self.child = child
         self.splits = splits

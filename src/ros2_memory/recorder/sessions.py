@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.handover.plan import READY_TIMEOUT_S, Passage, Step
-from ros2_memory.recorder.handover.transfer import Takeover
+from ros2_memory.recorder.handover.plan import READY_TIMEOUT_S, HandoverPlan, Step
+from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.process.child import end_all
-from ros2_memory.recorder.session import Session
+from ros2_memory.recorder.session import RecordingSession
 from ros2_memory.recorder.split_watcher import Splits
 from ros2_memory.recorder.watchdog import silence_told
 from ros2_memory.retention.clear import remove_if_empty
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.recorder.event_log import Journal
-    from ros2_memory.recorder.handover.plan import Moment
+    from ros2_memory.recorder.event_log import EventLog
+    from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.ports import RecorderProcess
     from ros2_memory.recorder.split_watcher import Changes
     from ros2_memory.storage.base import BagReader
@@ -33,7 +33,7 @@ WHOLE_RECORDING_S: Final = 15.0
 """A recording that lived for less says nothing of topics that brought no message."""
 
 
-class Crew:
+class RecordingSessions:
     """The sessions of one bag directory; `restarts` is how often one had to be begun anew.
 
     Args:
@@ -54,7 +54,7 @@ class Crew:
         start_child: Callable[[str, Path], RecorderProcess],
         announce: Callable[[str], None],
         reader: BagReader,
-        journal: Journal,
+        journal: EventLog,
         *,
         own: OwnRecordings,
         simulated: bool,
@@ -71,15 +71,15 @@ class Crew:
         self._simulated = simulated
         self._subscribe_timeout_s = subscribe_timeout_s
         self._both_s = both_s
-        self.current: Session | None = None
-        self.takeover: Takeover | None = None
-        self._leaving: list[Session] = []
-        self._completed: list[Takeover] = []
+        self.current: RecordingSession | None = None
+        self.takeover: HandoverTransfer | None = None
+        self._leaving: list[RecordingSession] = []
+        self._completed: list[HandoverTransfer] = []
         self._retired_bytes = 0
         self.restarts = 0
 
     @property
-    def sessions(self) -> tuple[Session, ...]:
+    def sessions(self) -> tuple[RecordingSession, ...]:
         """All sessions whose recorders have not ended, the current one first."""
         current = () if self.current is None else (self.current,)
         incoming = () if self.takeover is None else (self.takeover.new,)
@@ -90,7 +90,7 @@ class Crew:
         """By all recordings since the start."""
         return self._retired_bytes + sum(each.splits.bytes_written for each in self.sessions)
 
-    def begin(self, now: Moment) -> None:
+    def begin(self, now: ClockReading) -> None:
         """Starts a recording when there is none.
 
         Raises:
@@ -98,7 +98,7 @@ class Crew:
         """
         self.current = self._launch(recording_name(now.wall, self._bag_dir), now)
 
-    def begin_takeover(self, now: Moment) -> None:
+    def begin_takeover(self, now: ClockReading) -> None:
         """Starts a recording that is to take over from the current one.
 
         Raises:
@@ -108,17 +108,19 @@ class Crew:
         if old is None or self.takeover is not None:
             return
         name = recording_name(now.wall, self._bag_dir)
-        Takeover.announce(old, name)
-        passage = Passage(now, subscribe_timeout_s=self._subscribe_timeout_s, both_s=self._both_s)
+        HandoverTransfer.announce(old, name)
+        passage = HandoverPlan(
+            now, subscribe_timeout_s=self._subscribe_timeout_s, both_s=self._both_s
+        )
         try:
             new = self._launch(name, now)
         except RecorderError:
-            Takeover.withdraw(old)
+            HandoverTransfer.withdraw(old)
             raise
-        self.takeover = Takeover(old, new, passage, self._reader, simulated=self._simulated)
+        self.takeover = HandoverTransfer(old, new, passage, self._reader, simulated=self._simulated)
         self._journal.note("rotation_begun", recording=old.name, next=name)
 
-    def look(self, now: Moment) -> bool:
+    def look(self, now: ClockReading) -> bool:
         """Takes in what the recorders said and wrote; whether a split was closed."""
         closed = False
         for session in self.sessions:
@@ -131,7 +133,7 @@ class Crew:
                 self._has_vanished(session)
         return closed
 
-    def advance_takeover(self, now: Moment) -> Step:
+    def advance_takeover(self, now: ClockReading) -> Step:
         """Takes a handover further; COMPLETE or ABANDON when it is over."""
         takeover = self.takeover
         if takeover is None:
@@ -147,7 +149,7 @@ class Crew:
             self._abandon(takeover)
         return step
 
-    def bury(self, now: Moment) -> list[float]:
+    def handle_exits(self, now: ClockReading) -> list[float]:
         """Deals with recorders that died; for how long each had lived, in seconds.
 
         Where the current one died during a handover the new one is the current one from then on.
@@ -163,7 +165,7 @@ class Crew:
             self._lose_current()
         return lived
 
-    def give_up(self, now: Moment) -> bool:
+    def give_up(self, now: ClockReading) -> bool:
         """Ends a current recorder that does not begin to record; whether there was one."""
         current = self.current
         if current is None or current.ready:
@@ -177,15 +179,15 @@ class Crew:
         self.current = None
         return True
 
-    def reap(self, now: Moment) -> None:
+    def collect_ended(self, now: ClockReading) -> None:
         """Reminds those that are ending, and lets go of those that have ended."""
         for session in tuple(self._leaving):
             if session.child.end() is not None:
                 self._leaving.remove(session)
                 self._retire(session, now)
 
-    def dismiss(self, now: Moment) -> None:
-        """Has all recorders end; `reap` then lets go of them."""
+    def dismiss(self, now: ClockReading) -> None:
+        """Has all recorders end; `collect_ended` then lets go of them."""
         takeover = self.takeover
         if takeover is not None:
             try:
@@ -202,15 +204,15 @@ class Crew:
             self._leave(self.current)
             self.current = None
 
-    def end(self, now: Moment) -> None:
+    def end(self, now: ClockReading) -> None:
         """Has all recorders end, and waits for it, within the patience of the children."""
         self.dismiss(now)
         for child in end_all([session.child for session in self._leaving]):
             self._journal.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
-        self.reap(now)
+        self.collect_ended(now)
         self._leaving.clear()
 
-    def _launch(self, name: str, now: Moment) -> Session:
+    def _launch(self, name: str, now: ClockReading) -> RecordingSession:
         self._own.begin(name)
         self._announce(name)
         directory = self._bag_dir / name
@@ -220,9 +222,9 @@ class Crew:
             raise RecorderError(f"ros2 bag record cannot be started: {error}") from error
         self._unlisted.add(name)
         self._journal.note("recorder_started", recording=name, pid=child.pid)
-        return Session(name, child, Splits(directory, self._reader), now)
+        return RecordingSession(name, child, Splits(directory, self._reader), now)
 
-    def _list(self, session: Session) -> None:
+    def _list(self, session: RecordingSession) -> None:
         """Notes which directory the child has made, as soon as it has; a fault is tried again."""
         if session.name not in self._unlisted:
             return
@@ -234,7 +236,7 @@ class Crew:
         else:
             self._journal.over("recording_not_listed", session.name)
 
-    def _report(self, session: Session, changes: Changes) -> None:
+    def _report(self, session: RecordingSession, changes: Changes) -> None:
         for name in changes.closed:
             self._journal.note("split_closed", recording=session.name, file=name)
         if changes.closed:
@@ -246,7 +248,7 @@ class Crew:
         for fault in changes.faults:
             self._journal.fail_once("unreadable", session.name, fault, recording=session.name)
 
-    def _complete(self, takeover: Takeover, now: Moment) -> None:
+    def _complete(self, takeover: HandoverTransfer, now: ClockReading) -> None:
         if takeover.missing:
             missing = ", ".join(sorted(takeover.missing))
             self._journal.warn(
@@ -258,7 +260,7 @@ class Crew:
         self.current, self.takeover = takeover.new, None
         self._journal.note("rotated", recording=takeover.old.name, next=takeover.new.name)
 
-    def _abandon(self, takeover: Takeover) -> None:
+    def _abandon(self, takeover: HandoverTransfer) -> None:
         """Ends the new recorder; the old one goes on."""
         self.takeover = None
         try:
@@ -279,7 +281,7 @@ class Crew:
         except RecorderError as error:
             self._journal.fail("rotation_failed", str(error), recording=takeover.old.name)
 
-    def _has_vanished(self, session: Session) -> None:
+    def _has_vanished(self, session: RecordingSession) -> None:
         sentence = f"the directory of recording {session.name} has gone; a new one is begun"
         self._journal.fail("recording_vanished", sentence, recording=session.name)
         self.restarts += 1
@@ -289,7 +291,7 @@ class Crew:
             self._leave(session)
             self._lose_current()
 
-    def _has_died(self, session: Session, now: Moment) -> float:
+    def _has_died(self, session: RecordingSession, now: ClockReading) -> float:
         self._journal.tell(session.name, session.hear())
         lived_s = now.monotonic_s - session.began.monotonic_s
         status = session.child.exit_status()
@@ -300,12 +302,12 @@ class Crew:
             self._retire(session, now)
         return lived_s
 
-    def _leave(self, session: Session) -> None:
+    def _leave(self, session: RecordingSession) -> None:
         if session not in self._leaving:
             self._leaving.append(session)
             session.child.end()
 
-    def _retire(self, session: Session, now: Moment) -> None:
+    def _retire(self, session: RecordingSession, now: ClockReading) -> None:
         """The recorder of this session has ended: looks at what it left a last time."""
         self._journal.tell(session.name, session.hear())
         self._report(session, session.splits.look(now.monotonic_s))

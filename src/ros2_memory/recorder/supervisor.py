@@ -15,16 +15,16 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.chores import QUIET_HOUSE_S, Chores
-from ros2_memory.recorder.event_log import Journal
+from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.plan import (
     BOTH_S,
     SUBSCRIBE_TIMEOUT_S,
-    Moment,
+    ClockReading,
     Step,
 )
-from ros2_memory.recorder.heartbeat_writer import Pulse
+from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
 from ros2_memory.recorder.policies import Backoff, SilenceWatch, session_over
-from ros2_memory.recorder.sessions import Crew
+from ros2_memory.recorder.sessions import RecordingSessions
 from ros2_memory.recorder.watchdog import Space, resume_bytes, space, time_was_set_back
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
@@ -94,9 +94,9 @@ class Supervisor:
         self._free_bytes_of = free_bytes_of
         self._home = HomeDisk(orders.bag_dir, device)
         self._away = False
-        self._journal = Journal()
+        self._journal = EventLog()
         self._chores = Chores(orders.bag_dir, housekeeper, self._journal, monotonic())
-        self._pulse = Pulse(
+        self._pulse = HeartbeatWriter(
             orders.bag_dir,
             orders.heartbeat_s,
             clock,
@@ -104,7 +104,7 @@ class Supervisor:
             expected=expected,
             age_held=housekeeper.age_held,
         )
-        self._crew = Crew(
+        self._crew = RecordingSessions(
             orders.bag_dir,
             start_child,
             self._announce,
@@ -176,8 +176,8 @@ class Supervisor:
         self._paused = False
         self._beat(RecorderState.STOPPED)
 
-    def _mind_all(self, now: Moment) -> None:
-        tasks: dict[str, Callable[[Moment], object]] = {
+    def _mind_all(self, now: ClockReading) -> None:
+        tasks: dict[str, Callable[[ClockReading], object]] = {
             "disk": self._mind_disk,
             "look": self._look,
             "deaths": self._mind_deaths,
@@ -185,7 +185,7 @@ class Supervisor:
             "takeover": self._mind_takeover,
             "rotation": self._mind_rotation,
             "restart": self._mind_restart,
-            "reap": self._crew.reap,
+            "reap": self._crew.collect_ended,
             "recorded": self._note_recorded,
             "house": self._keep_house,
             "moments": self._keep_moments,
@@ -198,11 +198,11 @@ class Supervisor:
                 if self._is_due(f"tell {task}", FAULT_S, now):
                     self._journal.fail("supervision_failed", str(error), task=task)
 
-    def _look(self, now: Moment) -> None:
+    def _look(self, now: ClockReading) -> None:
         if self._is_due("look", LOOK_S, now):
             self._chores.splits_closed |= self._crew.look(now)
 
-    def _mind_disk(self, now: Moment) -> None:
+    def _mind_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
         there = [each.name for each in self._crew.sessions if each.splits.exists]
         before, self._away = self._away, self._home.is_away(there)
@@ -218,9 +218,9 @@ class Supervisor:
             self._put_off("restart", self._backoff.failed(0.0), now)
             self._journal.note("disk_back", bag_dir=str(self._bag_dir))
 
-    def _mind_deaths(self, now: Moment) -> None:
+    def _mind_deaths(self, now: ClockReading) -> None:
         before = self._crew.current
-        for lived_s in self._crew.bury(now):
+        for lived_s in self._crew.handle_exits(now):
             self._put_off("rotate", self._rotation_backoff.failed(lived_s), now)
             self._put_off("restart", self._backoff.failed(lived_s), now)
         if self._crew.give_up(now):
@@ -229,7 +229,7 @@ class Supervisor:
         if current is not None and current is not before:
             self._silence.began(now.monotonic_s, SETTLE_S)
 
-    def _mind_space(self, now: Moment) -> None:
+    def _mind_space(self, now: ClockReading) -> None:
         """Deletes more, pauses and resumes, by what the disk has left."""
         if self._away or not self._is_due("space", SPACE_S, now):
             return
@@ -263,7 +263,7 @@ class Supervisor:
             making=self._chores.making_room(),
         )
 
-    def _pause(self, now: Moment, free: int) -> None:
+    def _pause(self, now: ClockReading, free: int) -> None:
         self._paused = True
         self._crew.dismiss(now)
         self._journal.fail(
@@ -274,7 +274,7 @@ class Supervisor:
         )
         self._beat()
 
-    def _mind_takeover(self, now: Moment) -> None:
+    def _mind_takeover(self, now: ClockReading) -> None:
         step = self._crew.advance_takeover(now)
         if step is Step.COMPLETE:
             self._silence.rotated(for_silence=self._rotating_for_silence)
@@ -282,7 +282,7 @@ class Supervisor:
         elif step is Step.ABANDON:
             self._put_off("rotate", self._rotation_backoff.failed(0.0), now)
 
-    def _mind_rotation(self, now: Moment) -> None:
+    def _mind_rotation(self, now: ClockReading) -> None:
         current = self._crew.current
         if current is None:
             return
@@ -307,7 +307,7 @@ class Supervisor:
             self._journal.fail("rotation_failed", str(error), recording=current.name)
             self._put_off("rotate", self._rotation_backoff.failed(0.0), now)
 
-    def _mind_restart(self, now: Moment) -> None:
+    def _mind_restart(self, now: ClockReading) -> None:
         if self._crew.current is not None or self._paused or self._away:
             return
         if not self._is_due("restart", 0.0, now):
@@ -318,7 +318,7 @@ class Supervisor:
             self._journal.fail("recorder_not_started", str(error))
             self._put_off("restart", self._backoff.failed(0.0), now)
 
-    def _begin(self, now: Moment) -> None:
+    def _begin(self, now: ClockReading) -> None:
         self._make_bag_dir()
         self._crew.begin(now)
         self._silence.began(now.monotonic_s, SETTLE_S)
@@ -341,16 +341,16 @@ class Supervisor:
     def _make_room(self) -> None:
         self._chores.make_room(resume_bytes(self._orders.min_free_bytes))
 
-    def _keep_house(self, now: Moment) -> None:
+    def _keep_house(self, now: ClockReading) -> None:
         self._chores.tell()
         if not self._away:
             self._chores.keep_house(now.monotonic_s)
 
-    def _note_recorded(self, now: Moment) -> None:
+    def _note_recorded(self, now: ClockReading) -> None:
         names = () if self._away else tuple(each.name for each in self._crew.sessions if each.ready)
         self._chores.note_recorded(names, self._crew.bytes_written, now.monotonic_s)
 
-    def _keep_moments(self, now: Moment) -> None:
+    def _keep_moments(self, now: ClockReading) -> None:
         if not self._away and self._is_due("moments", MOMENTS_S, now):
             self._chores.keep_moments()
 
@@ -381,18 +381,18 @@ class Supervisor:
         self._journal.over("free_space_unknown", "")
         return free
 
-    def _is_due(self, task: str, every_s: float, now: Moment) -> bool:
+    def _is_due(self, task: str, every_s: float, now: ClockReading) -> bool:
         """Whether a task is due; it then is not for `every_s`."""
         if now.monotonic_s < self._due_s.get(task, 0.0):
             return False
         self._due_s[task] = now.monotonic_s + every_s
         return True
 
-    def _put_off(self, task: str, wait_s: float, now: Moment) -> None:
+    def _put_off(self, task: str, wait_s: float, now: ClockReading) -> None:
         self._due_s[task] = now.monotonic_s + wait_s
 
-    def _now(self) -> Moment:
-        return Moment(self._monotonic(), self._clock.now())
+    def _now(self) -> ClockReading:
+        return ClockReading(self._monotonic(), self._clock.now())
 
     @property
     def _bag_dir(self) -> Path:

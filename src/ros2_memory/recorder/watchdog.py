@@ -11,7 +11,7 @@ from ros2_memory.recorder.handover.plan import set_back
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from ros2_memory.recorder.handover.plan import Moment
+    from ros2_memory.recorder.handover.plan import ClockReading
 
 RESUME_FACTOR: Final = 1.2
 """Recording that was paused resumes when this many times the least free space is free again."""
@@ -60,7 +60,7 @@ def space(
     return Space.WAIT if making and free_bytes >= min_free_bytes // 2 else Space.PAUSE
 
 
-def time_was_set_back(before: Moment, now: Moment) -> bool:
+def time_was_set_back(before: ClockReading, now: ClockReading) -> bool:
     """Whether the wall clock was set back by so much that the open split would not be closed.
 
     A split is closed by the time of a message that comes long enough after its first, so it would

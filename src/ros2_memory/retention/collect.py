@@ -19,17 +19,17 @@ from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
 from ros2_memory.retention.inventory import Inventory
-from ros2_memory.retention.policy import ages, weighed
+from ros2_memory.retention.policy import ages, plan_deletions
 from ros2_memory.retention.recorded_time import relative_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.index.bag_table import Known
+    from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.latched_carry import Carrier
-    from ros2_memory.retention.policy import RetentionLimits, Stock, StoredBag
+    from ros2_memory.retention.policy import RetentionLimits, RetentionStock, StoredBag
     from ros2_memory.retention.recorded_time import RecordedTime
     from ros2_memory.retention.time_sync import TimeSync
 
@@ -40,7 +40,7 @@ _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 @dataclass(slots=True)
-class Disposed:
+class Collected:
     """What one pass did.
 
     `total_bytes` is what the budget counts afterwards, and `fits` whether the limits are kept.
@@ -72,7 +72,7 @@ class _Pass:
     urgent: bool
     synchronised: bool | None = None
     waiting: set[str] = field(default_factory=set)
-    done: Disposed = field(default_factory=Disposed)
+    done: Collected = field(default_factory=Collected)
     gone: set[str] = field(default_factory=set)
     staying: set[str] = field(default_factory=set)
     kept: set[Path] = field(default_factory=set)
@@ -84,7 +84,7 @@ class _Pass:
         self.waiting.clear()
 
 
-class Disposal:
+class GarbageCollector:
     """Keeps one bag directory within its limits. Not for several threads at once.
 
     Args:
@@ -126,12 +126,12 @@ class Disposal:
 
     def apply(
         self,
-        known: Known,
+        known: KnownBags,
         snapshot: Snapshot,
         *,
         free_bytes: Callable[[], int] | None = None,
         min_free_bytes: int | None = None,
-    ) -> Disposed:
+    ) -> Collected:
         """Deletes what is too old, and then what is too much. What cannot be deleted is reported.
 
         Args:
@@ -153,7 +153,7 @@ class Disposal:
             if free_bytes is not None:
                 stock = replace(stock, free_bytes=free_bytes())
             stock = self._with_clocks(stock, limits, under_way)
-            found = weighed(stock, limits)
+            found = plan_deletions(stock, limits)
             under_way.done.foreign_bytes = stock.foreign_bytes
             under_way.done.total_bytes, under_way.done.fits = found.total_bytes, found.fits
             doomed = found.doomed[: MOST_AT_ONCE - len(under_way.gone)]
@@ -167,7 +167,9 @@ class Disposal:
         self._tidy(known, under_way)
         return under_way.done
 
-    def _with_clocks(self, stock: Stock, limits: RetentionLimits, under_way: _Pass) -> Stock:
+    def _with_clocks(
+        self, stock: RetentionStock, limits: RetentionLimits, under_way: _Pass
+    ) -> RetentionStock:
         """The stock, and what the clocks say of it."""
         names = {
             bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in stock.bags
@@ -234,7 +236,7 @@ class Disposal:
         under_way.done.bags += 1
         under_way.done.bytes += size
 
-    def _tidy(self, known: Known, under_way: _Pass) -> None:
+    def _tidy(self, known: KnownBags, under_way: _Pass) -> None:
         """Deletes what is left of recordings without a bag, unless one is being written."""
         named = {self._bag_dir / name for name in known.named}
         self._untidy |= {Path(path).parent for path in under_way.gone}

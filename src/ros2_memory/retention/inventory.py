@@ -28,19 +28,19 @@ from ros2_memory.bag_dir.own_recordings import (
     identity_of,
 )
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.file_state import Standing
+from ros2_memory.index.file_state import FileState
 from ros2_memory.index.pace import Pace, is_rare
 from ros2_memory.index.segment import Stated
 from ros2_memory.retention.delete import beside_bags
-from ros2_memory.retention.policy import Span, Stock, StoredBag, StoredFile
+from ros2_memory.retention.policy import RetentionStock, Span, StoredBag, StoredFile
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
     from ros2_memory.bag_dir.own_recordings import Identity
     from ros2_memory.core.bag_summary import TopicSummary
-    from ros2_memory.index.bag_table import Known
-    from ros2_memory.index.file_state import Verdict
+    from ros2_memory.index.bag_table import KnownBags
+    from ros2_memory.index.file_state import Classification
     from ros2_memory.index.scan import Stamp
 
 OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
@@ -48,10 +48,10 @@ OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
 SETTLED_NS: Final[Ns] = 120 * NS_PER_S
 """A directory that changed longer ago holds what it will hold."""
 _BLOCK: Final = 4096
-_WHOLE: Final = frozenset({Standing.CLOSED, Standing.EMPTY})
+_WHOLE: Final = frozenset({FileState.CLOSED, FileState.EMPTY})
 
 
-class _Fate(Enum):
+class _Deletable(Enum):
     """What may become of a bag."""
 
     MAY_GO = auto()
@@ -65,10 +65,10 @@ class _Fate(Enum):
 class _Entry(NamedTuple):
     """A bag, and what it was made from."""
 
-    verdict: Verdict
+    verdict: Classification
     stamp: Stamp
     bag: StoredBag
-    fate: _Fate
+    fate: _Deletable
 
 
 class _Folder(NamedTuple):
@@ -105,8 +105,8 @@ class Inventory:
         self._folders: dict[str, _Folder] = {}
 
     def stock(
-        self, known: Known, *, gone: Collection[str] = (), staying: Collection[str] = ()
-    ) -> Stock:
+        self, known: KnownBags, *, gone: Collection[str] = (), staying: Collection[str] = ()
+    ) -> RetentionStock:
         """The bags that may be deleted, and the size of everything else.
 
         A bag that is being written may not, nor one that cannot be read: it says nothing of its
@@ -145,15 +145,15 @@ class Inventory:
                 own = owned[bag.recording] = self._is_own(bag.recording, known.now)
             # One that has just been begun is listed with its directory some moments later.
             ours = own or bag.recording in named or is_carried(Path(path))
-            if not ours and fate is not _Fate.KEPT:
+            if not ours and fate is not _Deletable.KEPT:
                 foreign.update(bag.files)
                 continue
-            unnamed = fate is _Fate.MAY_GO_UNNAMED and bag.recording not in named
-            if own and (fate is _Fate.MAY_GO or unnamed) and path not in staying:
+            unnamed = fate is _Deletable.MAY_GO_UNNAMED and bag.recording not in named
+            if own and (fate is _Deletable.MAY_GO or unnamed) and path not in staying:
                 bags.append(bag)
             else:
                 occupied.add(bag.recording)
-                if fate is not _Fate.KEPT and not self._is_from_elsewhere(fate, bag):
+                if fate is not _Deletable.KEPT and not self._is_from_elsewhere(fate, bag):
                     others += sum(file.size for file in bag.files)
         self._forget(known)
         emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
@@ -162,7 +162,7 @@ class Inventory:
         others += sum(self._folder(each, known.now).size for each in occupied - emptied)
         elsewhere = sum({file.inode: file.size for file in foreign}.values())
         kept = self._kept(known)
-        return Stock(bags, known.now, sidecars, others, kept=kept, foreign_bytes=elsewhere)
+        return RetentionStock(bags, known.now, sidecars, others, kept=kept, foreign_bytes=elsewhere)
 
     def _is_own(self, recording: str, now: Ns) -> bool:
         if self._own is None:
@@ -170,18 +170,18 @@ class Inventory:
         name = self._own.name_of(recording)
         return self._own.lists(name, self._folder(recording, now).identity)
 
-    def _is_from_elsewhere(self, fate: _Fate, bag: StoredBag) -> bool:
+    def _is_from_elsewhere(self, fate: _Deletable, bag: StoredBag) -> bool:
         """Whether a bag that stays does not count: where all are weighed, its name has to tell."""
-        if fate is _Fate.DAMAGED:
+        if fate is _Deletable.DAMAGED:
             return self._own is None and not has_own_name(Path(bag.recording).name)
-        return fate is _Fate.FROM_ELSEWHERE
+        return fate is _Deletable.FROM_ELSEWHERE
 
-    def _entered(self, path: str, verdict: Verdict, known: Known) -> _Entry:
+    def _entered(self, path: str, verdict: Classification, known: KnownBags) -> _Entry:
         bag = self._stored(path, verdict, known)
-        fate = _Fate.KEPT if path in known.kept else _fate(verdict, bag)
+        fate = _Deletable.KEPT if path in known.kept else _fate(verdict, bag)
         return _Entry(verdict, known.files[path].stamp, bag, fate)
 
-    def _kept(self, known: Known) -> tuple[StoredFile, ...]:
+    def _kept(self, known: KnownBags) -> tuple[StoredFile, ...]:
         """The files of moments, each once."""
         if not known.kept:
             return ()
@@ -195,7 +195,7 @@ class Inventory:
             for inode, stamp in stamps.items()
         )
 
-    def _stored(self, path: str, verdict: Verdict, known: Known) -> StoredBag:
+    def _stored(self, path: str, verdict: Classification, known: KnownBags) -> StoredBag:
         recording = str(known.files[path].path.parent)
         device = self._folder(recording, known.now).device
         other = other_form(path)
@@ -206,7 +206,7 @@ class Inventory:
         )
         return StoredBag(path, recording, self._span(verdict), stamps[0].mtime_ns, tuple(files))
 
-    def _span(self, verdict: Verdict) -> Span | None:
+    def _span(self, verdict: Classification) -> Span | None:
         if verdict.bag is None:
             return None
         said = [
@@ -245,7 +245,7 @@ class Inventory:
             self._folders[path] = known
         return known
 
-    def _forget(self, known: Known) -> None:
+    def _forget(self, known: KnownBags) -> None:
         if len(self._entries) > len(known.counted):
             for path in self._entries.keys() - known.counted.keys():
                 del self._entries[path]
@@ -269,15 +269,15 @@ class Inventory:
         return size
 
 
-def _fate(verdict: Verdict, bag: StoredBag) -> _Fate:
+def _fate(verdict: Classification, bag: StoredBag) -> _Deletable:
     path = Path(bag.path)
-    if verdict.standing is Standing.INCOMPLETE:
-        return _Fate.MAY_GO_UNNAMED
+    if verdict.standing is FileState.INCOMPLETE:
+        return _Deletable.MAY_GO_UNNAMED
     if verdict.standing in _WHOLE:
-        return _Fate.STAYS if is_carried(path) else _Fate.MAY_GO
-    if verdict.standing is Standing.DAMAGED:
-        return _Fate.DAMAGED
-    return _Fate.FROM_ELSEWHERE if verdict.standing is Standing.UNREAD else _Fate.STAYS
+        return _Deletable.STAYS if is_carried(path) else _Deletable.MAY_GO
+    if verdict.standing is FileState.DAMAGED:
+        return _Deletable.DAMAGED
+    return _Deletable.FROM_ELSEWHERE if verdict.standing is FileState.UNREAD else _Deletable.STAYS
 
 
 def _on_disk(size: int) -> int:

@@ -33,7 +33,7 @@ import structlog
 
 from ros2_memory.bag_dir.carried_origin import Origin, origin_of, with_origin
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -242,7 +242,7 @@ class Carrier:
     def _folder(self, bag: Path) -> str:
         """The folder of a bag's recording, from the bag directory on; also of a moment's bag."""
         bag_dir = self.path.parent.parent
-        return os.path.relpath(KeptNames(bag_dir).recorded_as(str(bag.parent)), bag_dir)
+        return os.path.relpath(HardLinks(bag_dir).recorded_as(str(bag.parent)), bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
         """The messages of these topics.

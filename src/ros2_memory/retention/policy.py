@@ -82,7 +82,7 @@ class StoredBag(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Stock:
+class RetentionStock:
     """All that lies in the bag directory because of this program.
 
     `sidecars` says, for each recording that goes with its last bag, how many bytes go with it.
@@ -120,7 +120,7 @@ class Ages(NamedTuple):
         return self.by_dates - self.too_old(synchronised=synchronised)
 
 
-class Weighed(NamedTuple):
+class DeletionPlan(NamedTuple):
     """What the limits say of a stock.
 
     `doomed` are the bags to delete, oldest first. `total_bytes` is what the budget counted, each
@@ -132,24 +132,24 @@ class Weighed(NamedTuple):
     fits: bool
 
 
-def expired(stock: Stock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
+def expired(stock: RetentionStock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
     """The bags to delete, oldest first: all that are too old, and no more than the budget needs."""
-    return weighed(stock, limits).doomed
+    return plan_deletions(stock, limits).doomed
 
 
-def ages(stock: Stock, limits: RetentionLimits) -> Ages:
+def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
     """The bags that are too old by either clock."""
     return _ages(stock, _eras(stock, limits), limits.max_age_ns)
 
 
-def weighed(stock: Stock, limits: RetentionLimits) -> Weighed:
+def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPlan:
     """The bags to delete, and what came of weighing them."""
     plan = _Plan(stock)
     total = plan.total
     eras = _eras(stock, limits)
     aged = _ages(stock, eras, limits.max_age_ns).too_old(synchronised=stock.synchronised)
     if not aged and plan.fits(limits):
-        return Weighed((), total, fits=True)
+        return DeletionPlan((), total, fits=True)
     order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)
     # What shares a file with the bag that stays would free nothing.
     kept = _inodes(_newest(order, eras))
@@ -164,13 +164,15 @@ def weighed(stock: Stock, limits: RetentionLimits) -> Weighed:
         if bag.path not in aged and kept.isdisjoint(_inodes(bag)) and plan.frees(bag):
             doomed.add(bag.path)
             plan.delete(bag)
-    return Weighed(tuple(bag for bag in order if bag.path in doomed), total, fits=plan.fits(limits))
+    return DeletionPlan(
+        tuple(bag for bag in order if bag.path in doomed), total, fits=plan.fits(limits)
+    )
 
 
 class _Plan:
     """What is left when some bags are deleted."""
 
-    def __init__(self, stock: Stock) -> None:
+    def __init__(self, stock: RetentionStock) -> None:
         files = [each for bag in stock.bags for each in bag.files]
         sizes = {each.inode: each.size for each in files}
         self.shared = len(sizes) < len(files)
@@ -212,7 +214,7 @@ class _Plan:
 _Era: TypeAlias = "list[tuple[Span, StoredBag]]"
 
 
-def _eras(stock: Stock, limits: RetentionLimits) -> list[_Era]:
+def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
     """The dated bags, parted where a pause is too long; the last era is the present one."""
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
     latest = stock.now + FUTURE_NS
@@ -240,7 +242,7 @@ def _eras(stock: Stock, limits: RetentionLimits) -> list[_Era]:
     return eras
 
 
-def _ages(stock: Stock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
+def _ages(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
     old = {name for name, since in stock.recorded_since.items() if since > max_age_ns}
     by_recording = (bag.path for bag in stock.bags if bag.recording in old) if old else ()
     by_dates = _aged(stock.bags, eras, max_age_ns)
@@ -265,7 +267,7 @@ def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> se
 
 
 def _oldest_first(
-    stock: Stock, limits: RetentionLimits, present: _Era, *, shared: bool
+    stock: RetentionStock, limits: RetentionLimits, present: _Era, *, shared: bool
 ) -> list[StoredBag]:
     """All bags, oldest first.
 

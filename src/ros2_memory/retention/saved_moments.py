@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
 from ros2_memory.bag_dir.moment_file import (
     MOST_MOMENTS,
-    Held,
-    Keepsake,
-    held_in,
+    SavedMoment,
+    StoredMoment,
     make_folder,
     moments_of,
-    write_keepsake,
+    stored_moments_in,
+    write_saved_moment,
 )
-from ros2_memory.bag_dir.request_queue import Mailbox, Outcome
+from ros2_memory.bag_dir.request_queue import Outcome, RequestQueue
 from ros2_memory.core import directories
 from ros2_memory.retention.moment_plan import (
     Weight,
@@ -42,7 +42,7 @@ from ros2_memory.retention.moment_plan import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.bag_dir.moment_file import Wish
+    from ros2_memory.bag_dir.moment_file import SaveRequest
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock
     from ros2_memory.index.snapshot import Snapshot
@@ -54,7 +54,7 @@ _OWN_FOLDER: Final = re.compile(r"\d{8}T\d{6}Z-[a-z0-9-]+(_\d+)?")
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-class Keeper:
+class MomentKeeper:
     """The moments of one bag directory. Not for several threads at once, but for `has_work`.
 
     Args:
@@ -67,8 +67,8 @@ class Keeper:
         self._bag_dir = bag_dir
         self._share = share_bytes
         self._clock = clock
-        self._mailbox = Mailbox(bag_dir)
-        self._names = KeptNames(bag_dir)
+        self._mailbox = RequestQueue(bag_dir)
+        self._names = HardLinks(bag_dir)
         self._looked = False
         self._waiting = False
 
@@ -89,7 +89,7 @@ class Keeper:
         if not self._looked:
             self._clean()
         now = self._clock.now()
-        book = {held.folder.name: held for held in held_in(self._bag_dir)}
+        book = {held.folder.name: held for held in stored_moments_in(self._bag_dir)}
         for name, held in book.items():
             if held.keepsake.pending:
                 book[name] = self._advance(held, _all_files(book), snapshot)
@@ -117,7 +117,9 @@ class Keeper:
             except OSError as error:
                 _log.error("moment_not_followed", path=root, reason=str(error))
 
-    def _grant(self, wish: Wish, book: dict[str, Held], snapshot: Snapshot) -> Outcome:
+    def _grant(
+        self, wish: SaveRequest, book: dict[str, StoredMoment], snapshot: Snapshot
+    ) -> Outcome:
         """Begins a moment, which is then in the book, or says why not."""
         need = self._needed(wish, snapshot)
         refused = self._refusal(wish, need, book, snapshot)
@@ -137,7 +139,7 @@ class Keeper:
         return Outcome(refused=refused)
 
     def _refusal(
-        self, wish: Wish, need: Needed, book: dict[str, Held], snapshot: Snapshot
+        self, wish: SaveRequest, need: Needed, book: dict[str, StoredMoment], snapshot: Snapshot
     ) -> str | None:
         if len(book) >= MOST_MOMENTS:
             return (
@@ -154,21 +156,23 @@ class Keeper:
             return no_room(held, sum(new.values()) + expected, self._share)
         return None
 
-    def _begin(self, wish: Wish, need: Needed) -> Held:
+    def _begin(self, wish: SaveRequest, need: Needed) -> StoredMoment:
         folder = make_folder(self._bag_dir, wish)
         try:
-            write_keepsake(folder, Keepsake.of(wish))
+            write_saved_moment(folder, SavedMoment.of(wish))
             missing, files = self._link(folder, need.bags, None)
-            keepsake = replace(Keepsake.of(wish), pending=need.waits, missing=missing)
-            if keepsake != Keepsake.of(wish):
-                write_keepsake(folder, keepsake)
+            keepsake = replace(SavedMoment.of(wish), pending=need.waits, missing=missing)
+            if keepsake != SavedMoment.of(wish):
+                write_saved_moment(folder, keepsake)
         except OSError:
             directories.remove(folder)
             raise
         flush(folder.parent)
-        return Held(folder, keepsake, files)
+        return StoredMoment(folder, keepsake, files)
 
-    def _advance(self, held: Held, files: dict[int, int], snapshot: Snapshot) -> Held:
+    def _advance(
+        self, held: StoredMoment, files: dict[int, int], snapshot: Snapshot
+    ) -> StoredMoment:
         """Goes on with a moment; what of it cannot be kept it says in its file."""
         before = held.keepsake
         need = self._needed(before, snapshot)
@@ -180,23 +184,23 @@ class Keeper:
         after = replace(before, pending=need.waits, missing=said)
         files_now = {**held.files, **linked}
         if after == before:
-            return Held(held.folder, before, files_now)
+            return StoredMoment(held.folder, before, files_now)
         try:
-            write_keepsake(held.folder, after)
+            write_saved_moment(held.folder, after)
         except OSError as error:
             _log.error("moment_not_written", folder=str(held.folder), reason=str(error))
-            return Held(held.folder, before, files_now)
+            return StoredMoment(held.folder, before, files_now)
         if not after.pending:
             _log.info("moment_complete", folder=held.folder.name, missing=list(said))
-        return Held(held.folder, after, files_now)
+        return StoredMoment(held.folder, after, files_now)
 
-    def _needed(self, what: Wish | Keepsake, snapshot: Snapshot) -> Needed:
+    def _needed(self, what: SaveRequest | SavedMoment, snapshot: Snapshot) -> Needed:
         window = window_of(what.start, what.end)
         open_files = [snapshot.places[aside] for aside in snapshot.active]
         bags = snapshot.overlapping(window)
         return needed(window, what.asked, bags, open_files, self._clock.now())
 
-    def _open_bytes(self, wish: Wish, snapshot: Snapshot) -> int:
+    def _open_bytes(self, wish: SaveRequest, snapshot: Snapshot) -> int:
         """What of the moment is being written, as far as it has come."""
         window, size = window_of(wish.start, wish.end), 0
         for aside in snapshot.active:
@@ -267,12 +271,12 @@ def _gone(name: str) -> str:
     return f"{name} has gone, or another file of that name is kept"
 
 
-def _all_files(book: dict[str, Held]) -> dict[int, int]:
+def _all_files(book: dict[str, StoredMoment]) -> dict[int, int]:
     """What all moments hold, each file once."""
     return {inode: size for held in book.values() for inode, size in held.files.items()}
 
 
-def _outcome_of(held: Held) -> Outcome:
+def _outcome_of(held: StoredMoment) -> Outcome:
     keepsake = held.keepsake
     return Outcome(held.folder.name, len(held.files), keepsake.pending)
 

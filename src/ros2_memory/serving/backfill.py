@@ -25,7 +25,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.index.scan import settled
 from ros2_memory.queries import list_recorded_topics, trajectory_summary
 
@@ -69,7 +69,7 @@ class Progress:
         return Progress(self.closed, self.waiting - more, self.refused)
 
 
-class Filler:
+class Backfill:
     """Digests the bags of one memory. Not for several threads at once, but for `progress`."""
 
     def __init__(self, memory: Memory, digester: Digester, bag_dir: Path) -> None:
@@ -155,7 +155,7 @@ class Filler:
             rows = list_recorded_topics(self._memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
         with suppress(EpisodicError):
-            trajectory_summary(self._memory, Call(), Span(start_s=0.0, end_s=LAST_S))
+            trajectory_summary(self._memory, Call(), TimeRange(start_s=0.0, end_s=LAST_S))
 
     def tidy(self) -> None:
         """Drops the entries of files that are gone, and those of older configurations.
@@ -199,7 +199,7 @@ class Filler:
         return BagKey.of(bag, self._bag_dir)
 
 
-async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> None:
+async def keep_backfilled(filler: Backfill, helper: Sequence[str], every_s: float) -> None:
     """Digests what has closed, every `every_s` seconds, until it is cancelled.
 
     `helper` is the command line of the program that digests a backlog (`ros2-memory index`).
@@ -227,7 +227,7 @@ async def keep_filled(filler: Filler, helper: Sequence[str], every_s: float) -> 
         await anyio.sleep(every_s)
 
 
-async def _digest(filler: Filler, bags: Sequence[BagFile]) -> int:
+async def _digest(filler: Backfill, bags: Sequence[BagFile]) -> int:
     """How many of these bags could be digested and kept."""
     done = 0
     for bag in bags:

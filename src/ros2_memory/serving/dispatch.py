@@ -26,11 +26,11 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered
-from ros2_memory.core.text import glimpse
+from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.serving.call_size import too_much_of
-from ros2_memory.serving.fair_queue import Lane
+from ros2_memory.serving.fair_queue import FairQueue
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
@@ -86,8 +86,8 @@ class Dispatcher:
         self._call_timeout_s = call_timeout_s
         self._telemetry = telemetry
         self._log_arguments = log_arguments
-        self.quick = Lane("quick", QUICK_AT_ONCE)
-        self.blocking = Lane("blocking", BLOCKING_AT_ONCE)
+        self.quick = FairQueue("quick", QUICK_AT_ONCE)
+        self.blocking = FairQueue("blocking", BLOCKING_AT_ONCE)
         self._stopping = threading.Event()
 
     def stop(self) -> None:
@@ -148,8 +148,8 @@ class Dispatcher:
         """Of a call that is over: the log, and whoever observes."""
         tool, _log = done.tool, log
         if self._log_arguments:
-            tool = name if tool != UNKNOWN_TOOL else glimpse(name)
-            _log = log.bind(arguments=glimpse(given, _LOGGED_CHARS))
+            tool = name if tool != UNKNOWN_TOOL else abbreviate(name)
+            _log = log.bind(arguments=abbreviate(given, _LOGGED_CHARS))
         _log.info(
             "tool_call",
             tool=tool,
@@ -238,7 +238,7 @@ def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
         return tools[name]
     near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
     hint = f"do you mean {' or '.join(near)}?" if near else f"there are: {', '.join(tools)}"
-    raise InvalidArgumentsError(f"there is no tool {glimpse(name)}; {hint}")
+    raise InvalidArgumentsError(f"there is no tool {abbreviate(name)}; {hint}")
 
 
 def _asked(tool: Tool, given: Mapping[str, object]) -> Question:

@@ -34,7 +34,7 @@ class _Waiting:
     turn: asyncio.Future[None]
 
 
-class Lane:
+class FairQueue:
     """At most `places` questions at once, each in a thread; the others wait, at most so many.
 
     All methods belong to the event loop's thread. A place is taken until the thread is done with

@@ -18,12 +18,12 @@ from ros2_memory.core.timebase import Ns, unix_from_ns, unix_rounded_up
 from ros2_memory.history.bag_access import short_name
 from ros2_memory.insights.status import problems_of
 from ros2_memory.overview import clock_faults, left_open
-from ros2_memory.serving.fair_queue import Lane
+from ros2_memory.serving.fair_queue import FairQueue
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.history.context import Memory
-    from ros2_memory.serving.backfill import Filler
+    from ros2_memory.serving.backfill import Backfill
     from ros2_memory.tools.reply_size import JsonObject
 
 PATIENCE_S: Final = 2.0
@@ -59,13 +59,13 @@ class Health:
         self,
         memory: Memory,
         version: str,
-        filler: Filler | None = None,
+        filler: Backfill | None = None,
         patience_s: float = PATIENCE_S,
     ) -> None:
         self._look = partial(_health, memory, version, filler)
         self._version = version
         self._patience_s = patience_s
-        self._lane = Lane("health", 1)
+        self._lane = FairQueue("health", 1)
 
     def stop(self) -> None:
         """Lets its thread go."""
@@ -82,7 +82,7 @@ class Health:
         return _status(self._version, ["the bag directory is being looked through"], {})
 
 
-def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
+def _health(memory: Memory, version: str, filler: Backfill | None) -> JsonObject:
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
     heartbeat = memory.heartbeat()
@@ -120,7 +120,7 @@ def _health(memory: Memory, version: str, filler: Filler | None) -> JsonObject:
     return _status(version, problems, shown)
 
 
-def _of_catalogue(filler: Filler) -> JsonObject:
+def _of_catalogue(filler: Backfill) -> JsonObject:
     progress, undecodable = filler.progress(), filler.undecodable
     shown: JsonObject = {
         "catalogue": {
@@ -140,7 +140,7 @@ def _of_catalogue(filler: Filler) -> JsonObject:
     return shown
 
 
-def _state(filler: Filler, waiting: int) -> str:
+def _state(filler: Backfill, waiting: int) -> str:
     """`ready`, `filling`, or `failing` where it is not what it should be."""
     if filler.trouble is not None:
         return "failing"

@@ -39,7 +39,7 @@ _TOO_MUCH: Final = "The server is taking in too much at once; ask again.\n"
 _UNREAD: Final = "Replies to this session are not being read; read them, then ask again.\n"
 
 
-class Intake:
+class RequestLimits:
     """Reads requests for an application, and cancels it where nobody waits for its answer."""
 
     def __init__(self, app: ASGIApp) -> None:

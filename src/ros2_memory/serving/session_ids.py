@@ -22,7 +22,7 @@ _BEGINS: Final = b'"initialize"'
 _OK: Final = 200
 
 
-class SessionNames:
+class SessionIds:
     """Adds a name to the answer where a conversation begins and the client has none yet."""
 
     def __init__(self, app: ASGIApp) -> None:

@@ -19,8 +19,8 @@ from starlette.routing import Route
 from ros2_memory.core.logging_setup import Refusals, get_logger
 from ros2_memory.serving.auth import ADMITTED, HEALTH_PATH, TokenGate, admit
 from ros2_memory.serving.page import PAGE_PATH, Page
-from ros2_memory.serving.request_limits import Intake
-from ros2_memory.serving.session_ids import SessionNames
+from ros2_memory.serving.request_limits import RequestLimits
+from ros2_memory.serving.session_ids import SessionIds
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
@@ -91,7 +91,7 @@ def web_app(
     routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
     if metrics is not None:
         routes.append(Route(METRICS_PATH, _showing(metrics), methods=["GET"]))
-    app: ASGIApp = Intake(SessionNames(Starlette(routes=routes, lifespan=lifespan)))
+    app: ASGIApp = RequestLimits(SessionIds(Starlette(routes=routes, lifespan=lifespan)))
     if host.lower() not in _LOOPBACK:
         app = Page(app)
     if api_token is not None:

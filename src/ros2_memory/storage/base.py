@@ -85,7 +85,7 @@ class Record(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class CdrLayout:
     """Where the numbers of a message lie: offsets in its payload, little-endian.
 
     It is of every payload of `size` bytes that is the same outside of these numbers.
@@ -210,7 +210,7 @@ class BagReader(ABC):
             UndecodableError: no definition, a foreign encoding, or bytes that do not fit it.
         """
 
-    def layout(self, record: Record) -> Layout | None:
+    def layout(self, record: Record) -> CdrLayout | None:
         """Where the numbers of this message lie; None where that is not told: then decode it."""
         del record
         return None

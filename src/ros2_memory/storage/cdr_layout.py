@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from rosbags.interfaces import Nodetype
 
-from ros2_memory.storage.base import Layout
+from ros2_memory.storage.base import CdrLayout
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import FieldDesc, Typesdict
@@ -48,7 +48,7 @@ class _NoLayoutError(Exception):
     """The numbers are too many, or something of the payload is not understood here."""
 
 
-def layout_of(definitions: Typesdict, root: str, payload: bytes) -> Layout | None:
+def layout_of(definitions: Typesdict, root: str, payload: bytes) -> CdrLayout | None:
     """The layout of payloads like this one; None where decoding them is the only way."""
     if payload[:2] != _LITTLE_ENDIAN:
         return None
@@ -60,7 +60,7 @@ def layout_of(definitions: Typesdict, root: str, payload: bytes) -> Layout | Non
     # Writers may pad the end to a multiple of 4.
     if not 0 <= len(payload) - walk.position < 4:
         return None
-    return Layout(len(payload), tuple(walk.doubles), tuple(walk.singles), tuple(walk.times))
+    return CdrLayout(len(payload), tuple(walk.doubles), tuple(walk.singles), tuple(walk.times))
 
 
 def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from rosbags.interfaces.typing import Typesdict
 
-    from ros2_memory.storage.base import Channel, Layout, Record
+    from ros2_memory.storage.base import CdrLayout, Channel, Record
 
 _MAX_KNOWN = 10_000
 _MAX_JSON_BYTES = 4 << 20
@@ -64,7 +64,7 @@ class Decoding:
             reason = _why(record, error)
             raise UndecodableError(channel.topic, channel.type, reason) from error
 
-    def layout(self, record: Record) -> Layout | None:
+    def layout(self, record: Record) -> CdrLayout | None:
         """Where the numbers of a message lie; None where only decoding tells."""
         channel = record.channel
         if channel.encoding != "cdr":

@@ -65,7 +65,7 @@ class ContradictionError(LostError):
     """Indexes that contradict the messages: these are read without them, from `first` to `last`."""
 
 
-def whole(path: Path, item: T | LostError) -> T:
+def raise_if_lost(path: Path, item: T | LostError) -> T:
     """The item itself.
 
     Raises:
@@ -114,7 +114,7 @@ class _Reading:
 
 
 @contextmanager
-def damage() -> Iterator[None]:
+def as_unreadable() -> Iterator[None]:
     """Raises `UnreadableError` for whatever damaged bytes raise, where others may be whole.
 
     What the disk or the machine lacks (OSError, MemoryError) passes: whole bytes raise it too.

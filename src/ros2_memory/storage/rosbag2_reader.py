@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.errors import LostError, UnreadableError, reading, whole
+from ros2_memory.storage.errors import LostError, UnreadableError, raise_if_lost, reading
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap.bag_file import McapBags
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagSummary, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Channel, Closing, Layout, Record
+    from ros2_memory.storage.base import CdrLayout, Channel, Closing, Record
 
 _KINDS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 
@@ -113,7 +113,7 @@ class Rosbag2Reader(BagReader):
                 records = opened.room.records
                 yield from records(opened.path, topics, window, newest_first=newest_first)
 
-        return map(partial(whole, path), found())
+        return map(partial(raise_if_lost, path), found())
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """The latest message of the topic inside the window."""
@@ -143,7 +143,7 @@ class Rosbag2Reader(BagReader):
         """The message of a record."""
         return self._decoding.decode(record)
 
-    def layout(self, record: Record) -> Layout | None:
+    def layout(self, record: Record) -> CdrLayout | None:
         """Where the numbers of a record lie, or None."""
         return self._decoding.layout(record)
 

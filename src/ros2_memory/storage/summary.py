@@ -6,7 +6,7 @@ from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.core.bag_summary import BagSummary, Heading, shared_shape
+from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -39,13 +39,13 @@ def bag_summary(
         other = found.get(key)
         found[key] = each if other is None else _together(other, each)
     silent = {channel.topic for channel in declared} - {topic for topic, _ in found}
-    headings: list[Heading] = []
+    headings: list[TopicHeader] = []
     numbers: list[int] = []
     # Past the objects of single topics: an index makes one summary after the other.
     for (topic, type_name), (channel, *stated) in sorted(found.items(), key=itemgetter(0)):
-        headings.append(Heading(topic, type_name, channel.encoding, channel.latched))
+        headings.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
         numbers += stated
-    shape = shared_shape(tuple(headings), tuple(sorted(silent)), complete, notes, set_back)
+    shape = shared_schema(tuple(headings), tuple(sorted(silent)), complete, notes, set_back)
     return BagSummary.packed(shape, shape.layout.pack(*numbers))
 
 

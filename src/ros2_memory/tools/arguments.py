@@ -1,7 +1,7 @@
 """The arguments of the tools, one declaration for each question.
 
 A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) shares one declaration, in
-which a `moment` or a `span` stands for the arguments that differ; a `When` unfolds it.
+which a `moment` or a `span` stands for the arguments that differ; a `TimeArgument` unfolds it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from pydantic import BaseModel, ConfigDict, JsonValue
 
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.tools.argument_types import (
     Before,
     Child,
@@ -54,59 +54,59 @@ class Arguments(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
-class When(Arguments, ABC):
+class TimeArgument(Arguments, ABC):
     """Arguments that unfold a `moment` or a `span`; `stands_for` names which."""
 
     stands_for: ClassVar[str]
 
     @abstractmethod
-    def folded(self) -> Moment | Span:
+    def folded(self) -> AtTime | TimeRange:
         """The moment or span that they mean."""
 
 
-class At(When):
+class At(TimeArgument):
     """A moment in Unix seconds."""
 
     stands_for = "moment"
     timestamp: Timestamp
 
-    def folded(self) -> Moment:
+    def folded(self) -> AtTime:
         """The moment itself."""
-        return Moment(at_s=self.timestamp)
+        return AtTime(at_s=self.timestamp)
 
 
-class Ago(When):
+class Ago(TimeArgument):
     """A moment counted back from now."""
 
     stands_for = "moment"
     seconds_ago: SecondsAgo
 
-    def folded(self) -> Moment:
+    def folded(self) -> AtTime:
         """The moment, relative to now."""
-        return Moment(ago_s=self.seconds_ago)
+        return AtTime(ago_s=self.seconds_ago)
 
 
-class Between(When):
+class Between(TimeArgument):
     """A window in Unix seconds."""
 
     stands_for = "span"
     start: Start
     end: End
 
-    def folded(self) -> Span:
+    def folded(self) -> TimeRange:
         """The window itself."""
-        return Span(start_s=self.start, end_s=self.end)
+        return TimeRange(start_s=self.start, end_s=self.end)
 
 
-class Last(When):
+class Last(TimeArgument):
     """A window that ends now."""
 
     stands_for = "span"
     seconds: Seconds
 
-    def folded(self) -> Span:
+    def folded(self) -> TimeRange:
         """The window, relative to now."""
-        return Span(last_s=self.seconds)
+        return TimeRange(last_s=self.seconds)
 
 
 class Nothing(Arguments):
@@ -123,7 +123,7 @@ class TopicAt(Arguments):
     """One message of a topic."""
 
     topic: Topic
-    moment: Moment
+    moment: AtTime
     tolerance_s: Tolerance | None = None
     fields: Fields = ()
 
@@ -132,7 +132,7 @@ class TopicOver(Arguments):
     """Messages of a topic over a window."""
 
     topic: Topic
-    span: Span
+    span: TimeRange
     max_samples: MaxSamples = 100
     fields: Fields = ()
 
@@ -140,7 +140,7 @@ class TopicOver(Arguments):
 class MotionAt(Arguments):
     """Pose or twist at a moment."""
 
-    moment: Moment
+    moment: AtTime
     topic: PoseTopic | None = None
     tolerance_s: Tolerance | None = None
 
@@ -150,7 +150,7 @@ class TransformAt(Arguments):
 
     parent: Parent
     child: Child
-    moment: Moment
+    moment: AtTime
 
 
 class Search(Arguments):
@@ -179,14 +179,14 @@ class Correlation(Arguments):
 class WayOver(Arguments):
     """The way driven over a window."""
 
-    span: Span
+    span: TimeRange
     topic: PoseTopic | None = None
 
 
 class Window(Arguments):
     """A window."""
 
-    span: Span
+    span: TimeRange
 
 
 class Remember(Arguments):

@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
 from ros2_memory.tools.arguments import Arguments
-from ros2_memory.tools.reply_size import compact
+from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.schema import Signature
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.accounts import Account
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.tools.arguments import When
+    from ros2_memory.tools.arguments import TimeArgument
     from ros2_memory.tools.reply_json import Answer
     from ros2_memory.tools.reply_size import JsonObject
 
@@ -41,7 +41,7 @@ class Tool:
 
 
 @dataclass(frozen=True, slots=True)
-class Variant:
+class ToolName:
     """One name of a question.
 
     `said` takes the place of {when} in the description; `more` is what the reply has besides that
@@ -50,16 +50,16 @@ class Variant:
 
     name: str
     title: str
-    when: type[When] | None = None
+    when: type[TimeArgument] | None = None
     said: str = ""
     more: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Entry(Generic[A]):
+class ToolDeclaration(Generic[A]):
     """A question and all its names."""
 
-    variants: tuple[Variant, ...]
+    variants: tuple[ToolName, ...]
     description: str
     arguments: type[A]
     ask: Callable[[Memory, Call, A], Answer | Account]
@@ -71,7 +71,7 @@ class Entry(Generic[A]):
         for variant in self.variants:
             signature = Signature(self.arguments, variant.when)
             what = self._told(variant, facts)
-            text = f"{what} Example: {compact(signature.example)}"
+            text = f"{what} Example: {to_json_text(signature.example)}"
             if self.blocking:
                 text = f"Blocking, up to {facts['timeout']} s. {text}"
             yield Tool(
@@ -84,7 +84,7 @@ class Entry(Generic[A]):
                 self.writes,
             )
 
-    def _told(self, variant: Variant, facts: Mapping[str, object]) -> str:
+    def _told(self, variant: ToolName, facts: Mapping[str, object]) -> str:
         """What it answers: in full under the first name, and under the others by that."""
         first = self.variants[0]
         if variant is first:

@@ -21,7 +21,7 @@ from ros2_memory.tools.arguments import (
     Window,
     tested,
 )
-from ros2_memory.tools.declaration import Entry, Variant
+from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -45,8 +45,8 @@ def readable(facts: Mapping[str, object]) -> Iterator[Tool]:
     yield from _TYPE.tools(facts)
 
 
-_SIGHTINGS = Entry(
-    (Variant("find_matches", "Sightings"),),
+_SIGHTINGS = ToolDeclaration(
+    (ToolName("find_matches", "Sightings"),),
     "When, where, how often and how long a condition (as in find_last_match) held, newest first; "
     "matches in a row are one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, robot: where it was at last_seen, place: of the thing}}], total}}.",
@@ -66,10 +66,10 @@ _SIGHTINGS = Entry(
     ),
     blocking=True,
 )
-_RECAP = Entry(
+_RECAP = ToolDeclaration(
     (
-        Variant("recap", "What happened", Between, "between two Unix times"),
-        Variant("recap_last", "What happened lately", Last, "in the last seconds"),
+        ToolName("recap", "What happened", Between, "between two Unix times"),
+        ToolName("recap_last", "What happened lately", Last, "in the last seconds"),
     ),
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps. Reply: "
     "{{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], counts}}.",
@@ -77,15 +77,15 @@ _RECAP = Entry(
     lambda memory, call, given: recap(memory, call, given.span),
     blocking=True,
 )
-_STATUS = Entry(
-    (Variant("memory_status", "How far to trust the memory"),),
+_STATUS = ToolDeclaration(
+    (ToolName("memory_status", "How far to trust the memory"),),
     "Whether the recorder is alive, how old the newest data is, which topics fell silent, what is "
     "damaged, and for how long the disk lasts.",
     Nothing,
     lambda memory, call, _: memory_status(memory, call),
 )
-_VISITS = Entry(
-    (Variant("visits", "Visits to a place"),),
+_VISITS = ToolDeclaration(
+    (ToolName("visits", "Visits to a place"),),
     "When, how long and how often the robot was near a place, newest first, in {map_frame} where "
     "transforms lead there, else in the frame of {pose_topic}. Reply: {{frame_id, there_now, "
     "visits: [{{arrived, departed, duration_s, closest_m, ago_s}}], total}}.",
@@ -101,20 +101,20 @@ _VISITS = Entry(
     ),
     blocking=True,
 )
-_TYPE = Entry(
-    (Variant("describe_type", "Fields of a message type"),),
+_TYPE = ToolDeclaration(
+    (ToolName("describe_type", "Fields of a message type"),),
     "The fields that replies show of a message type.",
     OfType,
     lambda memory, call, given: describe_type(memory, call, given.type),
 )
-_MOMENTS = Entry(
-    (Variant("list_moments", "Kept moments"),),
+_MOMENTS = ToolDeclaration(
+    (ToolName("list_moments", "Kept moments"),),
     "Moments kept by remember_moment, newest first.",
     Nothing,
     lambda memory, call, _: list_moments(memory, call),
 )
-_REMEMBER = Entry(
-    (Variant("remember_moment", "Keep a moment"),),
+_REMEMBER = ToolDeclaration(
+    (ToolName("remember_moment", "Keep a moment"),),
     "Keeps what is recorded around now from deletion. Reply: {{moment, bags, pending: the rest is "
     "being written}}.",
     Remember,

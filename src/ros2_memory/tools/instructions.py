@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from ros2_memory.history.context import Limits
+    from ros2_memory.history.context import QuerySettings
 
 _RULES: Final = """\
 What a robot saw and did in the past, from its recordings. For what it sees right now, ask \
@@ -40,7 +40,7 @@ values with fields, or ask for a shorter window.
 """
 
 
-def instructions(limits: Limits, *, additions: bool = True) -> str:
+def instructions(limits: QuerySettings, *, additions: bool = True) -> str:
     """The rules whose neglect makes most wrong calls, with this deployment's defaults.
 
     Clients cut instructions at about 2,000 characters; these stay below. `additions`: whether the

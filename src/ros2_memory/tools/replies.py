@@ -17,7 +17,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.timebase import unix_rounded_up
 from ros2_memory.tools.extra_reply_json import shown
 from ros2_memory.tools.reply_json import file_name, fit_topics
-from ros2_memory.tools.reply_size import compact, fit
+from ros2_memory.tools.reply_size import fit_reply, to_json_text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -52,10 +52,10 @@ class Replies:
         if isinstance(value, dict):
             if from_active:
                 value = {**value, "from_active": True}
-            return Reply(fit(value, self.max_chars))
+            return Reply(fit_reply(value, self.max_chars))
         if isinstance(answer, tuple):
             return Reply(fit_topics(answer, self.max_chars))
-        return Reply(compact(value))
+        return Reply(to_json_text(value))
 
     def error(self, error: EpisodicError) -> Reply:
         """An error of the tree. Having no data is an answer; the others are errors."""
@@ -86,8 +86,8 @@ class Replies:
 
     def _no_data(self, reason: NoDataReason, detail: str, notes: tuple[str, ...] = ()) -> Reply:
         shown: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
-        return Reply(fit({**shown, "notes": [*notes]} if notes else shown, self.max_chars))
+        return Reply(fit_reply({**shown, "notes": [*notes]} if notes else shown, self.max_chars))
 
     def _failure(self, code: str, detail: str, **more: JsonValue) -> Reply:
         shown: JsonObject = {"error": code, **more, "detail": detail}
-        return Reply(fit(shown, self.max_chars), is_error=True)
+        return Reply(fit_reply(shown, self.max_chars), is_error=True)

@@ -24,7 +24,7 @@ from ros2_memory.tools.figures import (
     seconds,
     with_notes,
 )
-from ros2_memory.tools.reply_size import compact, without_constant_zeros
+from ros2_memory.tools.reply_size import to_json_text, without_constant_zeros
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 Answer: TypeAlias = (
     tuple[results.TopicRow, ...]
-    | results.TimeRange
+    | results.DataTimeRange
     | results.TopicValue
     | results.TopicRange
     | results.Position
@@ -81,7 +81,7 @@ def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
     are left out, with their first and last time and the sum of their counts. `max_chars` must be
     at least 500.
     """
-    text = compact([_topic_row(row) for row in rows])
+    text = to_json_text([_topic_row(row) for row in rows])
     if len(text) <= max_chars:
         return text
     spare = max_chars - _LONGEST_REST_CHARS
@@ -89,7 +89,7 @@ def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
     rest: list[results.TopicRow] = []
     for row in sorted(rows, key=lambda row: -row.count):
         one = _topic_row(row)
-        size = len(compact(one)) + 1
+        size = len(to_json_text(one)) + 1
         if size <= spare and not rest:
             told.append(one)
             spare -= size
@@ -102,11 +102,11 @@ def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
         max(row.last for row in rest),
         sum(row.count for row in rest),
     )
-    return compact([*told, _topic_row(others)])
+    return to_json_text([*told, _topic_row(others)])
 
 
-@shown.register(results.TimeRange)
-def _time_range(answer: results.TimeRange, bag_dir: Path) -> JsonObject:
+@shown.register(results.DataTimeRange)
+def _time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
     notes = list(answer.notes)
     gaps: list[JsonValue] = [
         {
@@ -184,7 +184,7 @@ def _topic_value(answer: results.TopicValue, _bag_dir: Path) -> JsonObject:
 @shown.register(results.TopicRange)
 def _topic_range(answer: results.TopicRange, _bag_dir: Path) -> JsonObject:
     reply = _range_of(answer, [sample.value for sample in answer.samples], answer.notes)
-    if len(compact(reply)) <= ZEROS_SHOWN_BELOW_CHARS:
+    if len(to_json_text(reply)) <= ZEROS_SHOWN_BELOW_CHARS:
         return reply
     values, zeros = without_constant_zeros([sample.value for sample in answer.samples])
     if not zeros:

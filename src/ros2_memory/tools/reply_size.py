@@ -33,7 +33,7 @@ _MOST_NAMES: Final = 8
 _CUT: Final = "…"
 
 
-def compact(value: JsonValue) -> str:
+def to_json_text(value: JsonValue) -> str:
     """The shortest JSON text of a value.
 
     What JSON or UTF-8 cannot carry does not leave: NaN and infinities become null, a lone
@@ -42,23 +42,23 @@ def compact(value: JsonValue) -> str:
     return json.dumps(_sound(value), separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
-def fit(reply: JsonObject, max_chars: int) -> str:
+def fit_reply(reply: JsonObject, max_chars: int) -> str:
     """The reply as JSON text of at most `max_chars` characters, always valid.
 
     Where it would be longer, its lists of rows are thinned (along time evenly, first and last
     kept), then the arrays inside, then texts are cut and objects lose keys; `notes` says what was
     left out and how to see it. `max_chars` must be at least 500.
     """
-    text = compact(reply)
+    text = to_json_text(reply)
     if len(text) <= max_chars:
         return text
     bounded = _with_few_notes(reply)
     for attempt in (_fewer_rows, _less_inside):
         bounded = attempt(bounded, max_chars)
-        text = compact(bounded)
+        text = to_json_text(bounded)
         if len(text) <= max_chars:
             return text
-    return compact(_outline(reply, max_chars))
+    return to_json_text(_outline(reply, max_chars))
 
 
 def without_constant_zeros(samples: Sequence[JsonValue]) -> tuple[list[JsonValue], list[str]]:
@@ -155,8 +155,10 @@ def _outline(reply: JsonObject, max_chars: int) -> JsonObject:
     )
     kept: JsonObject = {}
     for key, item in reply.items():
-        is_short = key != "notes" and not isinstance(item, list | dict) and len(compact(item)) < 80
-        if is_short and len(compact({**kept, key: item})) < max_chars // 2:
+        is_short = (
+            key != "notes" and not isinstance(item, list | dict) and len(to_json_text(item)) < 80
+        )
+        if is_short and len(to_json_text({**kept, key: item})) < max_chars // 2:
             kept[key] = item
     return {**kept, "notes": [sentence]}
 
@@ -164,13 +166,13 @@ def _outline(reply: JsonObject, max_chars: int) -> JsonObject:
 def _fewer_rows(reply: JsonObject, max_chars: int) -> JsonObject:
     """Thins the longest lists of the reply's first level until it fits or few rows are left."""
     lists = {key: item for key, item in reply.items() if isinstance(item, list) and key != "notes"}
-    for key in sorted(lists, key=lambda key: len(compact(lists[key])), reverse=True):
+    for key in sorted(lists, key=lambda key: len(to_json_text(lists[key])), reverse=True):
         rows = lists[key]
-        if len(compact(reply)) <= max_chars or len(rows) <= _FEWEST_ROWS:
+        if len(to_json_text(reply)) <= max_chars or len(rows) <= _FEWEST_ROWS:
             continue
-        sizes = [len(compact(row)) + 1 for row in rows]
+        sizes = [len(to_json_text(row)) + 1 for row in rows]
         empty = _noted({**reply, key: []}, _rows_note(key, len(rows), len(rows), max_chars))
-        spare = max_chars - len(compact(empty))
+        spare = max_chars - len(to_json_text(empty))
         kept = _rows_that_fit(key, sizes, spare)
         reply = _noted(
             {**reply, key: [rows[index] for index in kept]},
@@ -205,9 +207,9 @@ def _less_inside(reply: JsonObject, max_chars: int) -> JsonObject:
     note_room = max_chars - _LONGEST_NOTE if max_chars > 3 * _LONGEST_NOTE else max_chars * 2 // 3
 
     def fits(keys: int, arrays: int, text: int) -> bool:
-        return len(compact(_Shorter(keys, arrays, text).reply(reply))) <= note_room
+        return len(to_json_text(_Shorter(keys, arrays, text).reply(reply))) <= note_room
 
-    whole = len(compact(reply))
+    whole = len(to_json_text(reply))
     longest = _largest(_ARRAY_STEPS[0], max_chars, lambda size: fits(whole, size, whole))
     if longest is not None:
         return _shortened(reply, _Shorter(whole, longest, whole), max_chars)

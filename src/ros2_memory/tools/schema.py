@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 from pydantic import ValidationError
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.text import glimpse
+from ros2_memory.core.text import abbreviate
 from ros2_memory.tools.arguments import Arguments
-from ros2_memory.tools.reply_size import compact
+from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.tools.arguments import When
+    from ros2_memory.tools.arguments import TimeArgument
     from ros2_memory.tools.reply_size import JsonObject
 
 A = TypeVar("A", bound=Arguments)
@@ -35,9 +35,9 @@ _KINDS: Final = {
 
 
 class Signature(Generic[A]):
-    """Arguments of type `A`, with a `When` in the place of their moment or span."""
+    """Arguments of type `A`, with a `TimeArgument` in the place of their moment or span."""
 
-    def __init__(self, arguments: type[A], when: type[When] | None = None) -> None:
+    def __init__(self, arguments: type[A], when: type[TimeArgument] | None = None) -> None:
         self._arguments = arguments
         self._when = when
         self._properties: dict[str, JsonObject] = {}
@@ -106,7 +106,7 @@ class Signature(Generic[A]):
             near = get_close_matches(name[:_LONGEST_NAME], self._properties, n=1)
             hint = f"do you mean {near[0]}?" if near else f"there are: {', '.join(self.names)}"
             hint = hint if self.names else "there are none"
-            yield f"there is no argument {glimpse(name)}; {hint}"
+            yield f"there is no argument {abbreviate(name)}; {hint}"
         if more := sum(1 for _ in unknown):
             yield f"and {more} more that there are not"
 
@@ -125,7 +125,7 @@ class Signature(Generic[A]):
             own = fault["msg"].removeprefix("Value error, ")
             why = f", which {own}" if fault["type"] == "value_error" else ""
             expected = _expected(self._properties[name])
-            yield f"{name} was {glimpse(given[name])}{why}; expected {expected}"
+            yield f"{name} was {abbreviate(given[name])}{why}; expected {expected}"
 
 
 def _properties(arguments: type[Arguments]) -> dict[str, JsonObject]:
@@ -159,13 +159,13 @@ def _expected(schema: JsonObject) -> str:
     told = f"{what} of {' and '.join(bounds)}" if bounds else what
     if "description" in schema:
         told += f" ({str(schema['description']).rstrip('.')})"
-    return f"{told}, e.g. {compact(_example(schema))}" if "examples" in schema else told
+    return f"{told}, e.g. {to_json_text(_example(schema))}" if "examples" in schema else told
 
 
 def _kind(schema: JsonObject) -> str:
     allowed, several = schema.get("enum"), schema.get("anyOf")
     if isinstance(allowed, list):
-        return f"one of {', '.join(compact(item) for item in allowed)}"
+        return f"one of {', '.join(to_json_text(item) for item in allowed)}"
     if isinstance(several, list):
         return " or ".join(_kind(kind) for kind in several if isinstance(kind, dict))
     return _KINDS[str(schema.get("type"))]

@@ -1,7 +1,7 @@
 """The specification's 17 tools: names, what the planner reads, and the query behind each.
 
 A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declared once; only the
-`Variant`s differ. The order here is the order in which clients see them.
+`ToolName`s differ. The order here is the order in which clients see them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory import queries, results
 from ros2_memory.core.errors import NoDataError, NoDataReason
-from ros2_memory.core.globs import matching
+from ros2_memory.core.globs import match_topics
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,
@@ -28,20 +28,20 @@ from ros2_memory.tools.arguments import (
     WayOver,
     tested,
 )
-from ros2_memory.tools.declaration import Entry, Variant
+from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
-    from ros2_memory.history.context import Call, Limits, Memory
+    from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.tools.declaration import Tool
 
 
-def readable_tools(limits: Limits) -> tuple[Tool, ...]:
+def readable_tools(limits: QuerySettings) -> tuple[Tool, ...]:
     """What is asked by reading a resource, and no tool."""
     return tuple(extra_tools.readable({"pose_topic": limits.pose_topic}))
 
 
 def build_tools(
-    limits: Limits, call_timeout_s: float, *, additions: bool = True, writing: bool = False
+    limits: QuerySettings, call_timeout_s: float, *, additions: bool = True, writing: bool = False
 ) -> tuple[Tool, ...]:
     """The tools, in order. The descriptions tell this deployment's defaults.
 
@@ -74,7 +74,7 @@ def _list_topics(memory: Memory, call: Call, given: Listing) -> tuple[results.To
     rows = queries.list_recorded_topics(memory, call)
     if given.pattern is None or not rows:
         return rows
-    matched = {*matching([row.topic for row in rows], given.pattern)}
+    matched = {*match_topics([row.topic for row in rows], given.pattern)}
     named = tuple(row for row in rows if row.topic in matched)
     if not named:
         raise NoDataError(
@@ -85,10 +85,10 @@ def _list_topics(memory: Memory, call: Call, given: Listing) -> tuple[results.To
     return named
 
 
-def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[Variant, ...]:
+def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
     return (
-        Variant(f"get_{name}_{at}", f"{title} at a time", At, "at a Unix time"),
-        Variant(
+        ToolName(f"get_{name}_{at}", f"{title} at a time", At, "at a Unix time"),
+        ToolName(
             f"get_{name}_seconds_ago",
             f"{title} some seconds ago",
             Ago,
@@ -98,23 +98,23 @@ def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[Variant, ...]:
     )
 
 
-_LIST = Entry(
-    (Variant("list_recorded_topics", "Recorded topics"),),
+_LIST = ToolDeclaration(
+    (ToolName("list_recorded_topics", "Recorded topics"),),
     "Every recorded topic. Ask this first when a topic's name is not known. "
     "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; the busiest first where "
     "they are too many.",
     Listing,
     _list_topics,
 )
-_RANGE = Entry(
-    (Variant("data_time_range", "Span of the memory"),),
+_RANGE = ToolDeclaration(
+    (ToolName("data_time_range", "Span of the memory"),),
     "What time span the memory covers, with its holes, and what time it is now. "
     "Reply: {{earliest, latest, now, bags, gaps, damaged, clock_faults, ...}}, times in Unix s and "
     "local ISO, null while the memory is empty.",
     Nothing,
     lambda memory, call, _: queries.data_time_range(memory, call),
 )
-_TOPIC_AT = Entry(
+_TOPIC_AT = ToolDeclaration(
     _at_and_ago("topic", "A topic's value", at="at_time"),
     "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
     "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
@@ -129,10 +129,10 @@ _TOPIC_AT = Entry(
         fields=given.fields,
     ),
 )
-_TOPIC_OVER = Entry(
+_TOPIC_OVER = ToolDeclaration(
     (
-        Variant("get_topic_in_range", "A topic over a window", Between, "between two Unix times"),
-        Variant("get_topic_in_last", "A topic over the last seconds", Last, "in the last seconds"),
+        ToolName("get_topic_in_range", "A topic over a window", Between, "between two Unix times"),
+        ToolName("get_topic_in_last", "A topic over the last seconds", Last, "in the last seconds"),
     ),
     "What a topic said {when}: up to max_samples messages, evenly spaced over the window, first "
     "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; with "
@@ -147,7 +147,7 @@ _TOPIC_OVER = Entry(
         fields=given.fields,
     ),
 )
-_POSITION = Entry(
+_POSITION = ToolDeclaration(
     _at_and_ago("position", "Robot position"),
     "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
     "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, longitude "
@@ -157,7 +157,7 @@ _POSITION = Entry(
         memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
     ),
 )
-_VELOCITY = Entry(
+_VELOCITY = ToolDeclaration(
     _at_and_ago("velocity", "Robot velocity"),
     "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
     "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
@@ -167,7 +167,7 @@ _VELOCITY = Entry(
         memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
     ),
 )
-_TRANSFORM = Entry(
+_TRANSFORM = ToolDeclaration(
     _at_and_ago("transform", "Transform"),
     "The pose of frame child in frame parent {when}, through any chain of frames, interpolated. "
     "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock"
@@ -177,8 +177,8 @@ _TRANSFORM = Entry(
         memory, call, given.parent, given.child, given.moment
     ),
 )
-_FRAMES = Entry(
-    (Variant("list_frames", "Frames"),),
+_FRAMES = ToolDeclaration(
+    (ToolName("list_frames", "Frames"),),
     "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, static}}]}}.",
     Nothing,
     lambda memory, call, _: queries.frames(memory, call),
@@ -190,8 +190,8 @@ _CONDITIONS = (
     "above and below (number; field says which), near_position "
     '({{"x": m, "y": m}} within {near} m, in the frame that the topic itself uses)'
 )
-_LAST_MATCH = Entry(
-    (Variant("find_last_match", "Last time something held"),),
+_LAST_MATCH = ToolDeclaration(
+    (ToolName("find_last_match", "Last time something held"),),
     "When a condition last held, in all history. "
     f"Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
     "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
@@ -209,8 +209,8 @@ _LAST_MATCH = Entry(
     ),
     blocking=True,
 )
-_VALUE_WHEN = Entry(
-    (Variant("get_value_when", "A topic when another matched"),),
+_VALUE_WHEN = ToolDeclaration(
+    (ToolName("get_value_when", "A topic when another matched"),),
     "What value_topic held when condition_topic last met a condition (as in find_last_match), "
     "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
     "value_timestamp, condition_topic, value_topic}}, or null as there.",
@@ -228,10 +228,10 @@ _VALUE_WHEN = Entry(
     ),
     blocking=True,
 )
-_TRAJECTORY = Entry(
+_TRAJECTORY = ToolDeclaration(
     (
-        Variant("trajectory_summary", "Way driven", Between, "between two Unix times"),
-        Variant(
+        ToolName("trajectory_summary", "Way driven", Between, "between two Unix times"),
+        ToolName(
             "recent_trajectory_summary",
             "Way driven lately",
             Last,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from ros2_memory.analysis.bulk_decode import mould_of
+from ros2_memory.analysis.bulk_decode import template_for
 from ros2_memory.analysis.conditions import (
     Condition,
     Contains,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.catalogue.digest import Digest
-    from ros2_memory.storage.base import Layout, Record
+    from ros2_memory.storage.base import CdrLayout, Record
 
 S = 10**9
 T0 = 1_700_000_000 * S
@@ -50,7 +50,7 @@ ODD = (math.nan, math.inf, -math.inf, 1e300, 0.0)
 class OneByOne(McapReader):
     """Tells no layout, so that every message is decoded."""
 
-    def layout(self, record: Record) -> Layout | None:
+    def layout(self, record: Record) -> CdrLayout | None:
         return None
 
 
@@ -122,7 +122,7 @@ def test_whole_numbers_that_change_are_seen(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages)
     assert_alike(path)
     [topic] = both(path)[0].topics
-    assert all(Equals(n).may_match(topic.evidence) for n in range(60))
+    assert all(Equals(n).can_match(topic.evidence) for n in range(60))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -144,7 +144,7 @@ def test_what_a_message_of_a_mould_holds_is_never_ruled_out(tmp_path: Path, seed
             for field in (None, "position", "position.x"):
                 condition = Condition(test, field)
                 if condition.matches(value):
-                    assert condition.may_match(topic.evidence)
+                    assert condition.can_match(topic.evidence)
 
 
 def first_record(tmp_path: Path, *messages: Msg) -> tuple[McapReader, Record]:
@@ -155,9 +155,9 @@ def first_record(tmp_path: Path, *messages: Msg) -> tuple[McapReader, Record]:
 
 def test_the_numbers_of_an_odometry_are_found_where_they_lie(tmp_path: Path) -> None:
     reader, record = first_record(tmp_path, odom(T0, 1.5, -2.5, 0.5, vx=0.25))
-    mould = mould_of(reader, extractor(), record)
+    mould = template_for(reader, extractor(), record)
     assert mould is not None
-    _, rows = mould.those_like(record, [record], [0])
+    _, rows = mould.matching(record, [record], [0])
     assert mould.frame_id == "odom"
     [pose] = mould.poses(rows)
     assert pose is not None
@@ -168,18 +168,19 @@ def test_the_numbers_of_an_odometry_are_found_where_they_lie(tmp_path: Path) -> 
 
 def test_messages_that_differ_in_more_than_numbers_are_not_of_one_mould(tmp_path: Path) -> None:
     reader, record = first_record(tmp_path, odom(T0, 1.0, 0.0))
-    mould = mould_of(reader, extractor(), record)
+    mould = template_for(reader, extractor(), record)
     assert mould is not None
     payload = record.payload.replace(b"odom", b"abcd")
     others = [record, record._replace(payload=payload), record._replace(payload=payload[:-8])]
-    chosen, rows = mould.those_like(record, others, [0, 1, 2])
+    chosen, rows = mould.matching(record, others, [0, 1, 2])
     assert (chosen, len(rows)) == ([0], 1)
 
 
 def test_what_cannot_be_walked_has_no_mould(tmp_path: Path) -> None:
     reader, record = first_record(tmp_path, text(T0, "no numbers in it"))
     assert (
-        mould_of(reader, extractor(), record._replace(payload=record.payload + b"12345678")) is None
+        template_for(reader, extractor(), record._replace(payload=record.payload + b"12345678"))
+        is None
     )
     big_endian = record._replace(payload=b"\x00\x00" + record.payload[2:])
     assert reader.layout(big_endian) is None

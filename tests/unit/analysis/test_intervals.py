@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import (
     FLICKER_NS,
     SILENCE_NS,
+    IntervalBuilder,
+    IntervalTable,
     Part,
-    Presence,
-    Seen,
-    Watcher,
+    VisibleInterval,
     joined,
     united,
 )
@@ -42,7 +42,7 @@ def histories(draw: st.DrawFn, begin: int = 0) -> Messages:
 
 
 def watched(messages: Messages, at_most: int = 1000) -> Part:
-    watcher = Watcher(at_most)
+    watcher = IntervalBuilder(at_most)
     for time, labels in messages:
         watcher.add(time, labels)
     part = watcher.part()
@@ -50,9 +50,9 @@ def watched(messages: Messages, at_most: int = 1000) -> Part:
     return part
 
 
-def by_hand(messages: Messages) -> list[Presence]:
+def by_hand(messages: Messages) -> list[VisibleInterval]:
     """From the sentence that says what a presence is."""
-    found: list[Presence] = []
+    found: list[VisibleInterval] = []
     for label in "abc":
         row: list[int] = []  # places of the messages of one presence
         for nth, (time, labels) in enumerate(messages):
@@ -62,11 +62,11 @@ def by_hand(messages: Messages) -> list[Presence]:
                 apart = time - messages[row[-1]][0]
                 follows = row[-1] == nth - 1 and apart <= SILENCE_NS
                 if not (follows or apart <= FLICKER_NS):
-                    found.append(Presence(label, messages[row[0]][0], messages[row[-1]][0]))
+                    found.append(VisibleInterval(label, messages[row[0]][0], messages[row[-1]][0]))
                     row = []
             row.append(nth)
         if row:
-            found.append(Presence(label, messages[row[0]][0], messages[row[-1]][0]))
+            found.append(VisibleInterval(label, messages[row[0]][0], messages[row[-1]][0]))
     return sorted(found, key=lambda each: (each.first, each.label))
 
 
@@ -137,8 +137,8 @@ def test_the_most_lasting_are_kept_in_order_with_the_names_that_they_need() -> N
     kept = seen.most_lasting(2)
     assert kept.labels == ("b", "c")
     assert kept.presences() == (
-        Presence("b", 0, 1),
-        Presence("c", late, late + 1),
+        VisibleInterval("b", 0, 1),
+        VisibleInterval("c", late, late + 1),
     )
     assert [each.label for each in seen.most_lasting(1).presences()] == ["b"]
     assert seen.most_lasting(3) is seen
@@ -146,7 +146,7 @@ def test_the_most_lasting_are_kept_in_order_with_the_names_that_they_need() -> N
 
 def test_presences_without_some_things_are_those_of_the_others() -> None:
     seen = watched([(0, ("a", "b")), (20 * NS_PER_S, ("a",))]).seen
-    assert seen.without({"a", "x"}).presences() == (Presence("b", 0, 0),)
+    assert seen.without({"a", "x"}).presences() == (VisibleInterval("b", 0, 0),)
     assert seen.without({"x"}) is seen
 
 
@@ -206,9 +206,9 @@ def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
 
 def test_nothing_seen_is_joined_to_nothing_seen() -> None:
     nothing = watched([(0, ())])
-    assert joined([nothing, watched([(1, ())])]) == Part(0, 1, Seen())
-    assert united([]) == Seen()
-    assert Seen().longest(3) == ()
+    assert joined([nothing, watched([(1, ())])]) == Part(0, 1, IntervalTable())
+    assert united([]) == IntervalTable()
+    assert IntervalTable().longest(3) == ()
 
 
 def test_times_at_either_end_of_what_can_be_said_are_far_apart() -> None:
@@ -218,7 +218,7 @@ def test_times_at_either_end_of_what_can_be_said_are_far_apart() -> None:
 
 
 def test_presences_are_counted_beyond_what_may_be_held() -> None:
-    watcher = Watcher(2)
+    watcher = IntervalBuilder(2)
     for nth in range(6):
         watcher.add(nth * 20 * NS_PER_S, ["a"])
     assert watcher.left_out == 3
@@ -230,11 +230,11 @@ def test_presences_are_counted_beyond_what_may_be_held() -> None:
 @pytest.mark.parametrize(
     "seen",
     [
-        Seen((), watched([(0, ("a",))]).seen.rows),
-        Seen(("a",), watched([(0, ("a", "b"))]).seen.rows),
-        Seen(("a",), b"rows"),
+        IntervalTable((), watched([(0, ("a",))]).seen.rows),
+        IntervalTable(("a",), watched([(0, ("a", "b"))]).seen.rows),
+        IntervalTable(("a",), b"rows"),
     ],
 )
-def test_rows_without_a_name_are_told_from_sound_ones(seen: Seen) -> None:
+def test_rows_without_a_name_are_told_from_sound_ones(seen: IntervalTable) -> None:
     assert not seen.is_sound
     assert watched([(0, ("a", "b"))]).seen.is_sound

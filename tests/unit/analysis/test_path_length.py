@@ -13,18 +13,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.odometry import Stop, link
+from ros2_memory.analysis.odometry import TimedPosition, link
 from ros2_memory.analysis.trajectory import (
     PoseCollector,
     Trajectory,
     TrajectoryBuilder,
 )
-from ros2_memory.catalogue.codec import packed_poses, unpacked_poses
+from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.geometry import simplify_to
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.tools.replies import Replies
@@ -97,7 +97,7 @@ def summarise(points: Points, hertz: float, cuts: Sequence[int] | None = None) -
         collector = PoseCollector(10.0)
         for time, pose in zip(times[begin:end], poses[begin:end], strict=True):
             collector.add(time, pose)
-        builder.join(unpacked_poses(packed_poses(collector.digest())))
+        builder.join(decode_poses(encode_poses(collector.digest())))
     return builder.result()
 
 
@@ -250,7 +250,7 @@ def test_a_digest_outlives_its_bytes() -> None:
             collector.add(BEGIN + index * S // 50, Pose((float(x), float(y), float(z)), None))
         digest: PoseDigest = collector.digest()
         # As texts, since the vertex between two pieces of a path is no number.
-        assert repr(unpacked_poses(packed_poses(digest))) == repr(digest)
+        assert repr(decode_poses(encode_poses(digest))) == repr(digest)
 
 
 # Speed
@@ -290,7 +290,10 @@ def test_a_burst_of_speed_that_lasts_is_the_highest() -> None:
 def test_what_lies_between_two_poses(
     seconds: float, to: tuple[float, float, float], kind: str
 ) -> None:
-    before, after = Stop(BEGIN, (5.0, 0.0, 0.0)), Stop(BEGIN + round(seconds * S), to)
+    before, after = (
+        TimedPosition(BEGIN, (5.0, 0.0, 0.0)),
+        TimedPosition(BEGIN + round(seconds * S), to),
+    )
     assert link(before, after, S // 20, 10.0) == kind
 
 
@@ -332,7 +335,7 @@ def replies(folder: Path, *, recalls: bool) -> tuple[dict[str, Any], dict[str, A
     memory = memory_of(folder)
     if recalls:
         memory = recalling(replace(memory), folder)
-    span = Span(start_s=BEGIN / S - 1, end_s=BEGIN / S + 1000)
+    span = TimeRange(start_s=BEGIN / S - 1, end_s=BEGIN / S + 1000)
     shown = Replies(folder, 24_000)
     way = json.loads(shown.answer(trajectory_summary(memory, Call(), span)).text)
     told = json.loads(shown.answer(recap(memory, Call(), span)).text)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.analysis.sights import Sight, Sights
+from ros2_memory.analysis.sights import MotionDecoder, MotionSample
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
@@ -33,7 +33,7 @@ class Counting(McapReader):
         return super().decode(record)
 
 
-def alone(reader: McapReader, record: Record) -> Sight | None:
+def alone(reader: McapReader, record: Record) -> MotionSample | None:
     """What a message says, decoded; None where it cannot be."""
     try:
         message = reader.decode(record)
@@ -41,7 +41,7 @@ def alone(reader: McapReader, record: Record) -> Sight | None:
         return None
     twist = extractor().twist(message, record.channel.type)
     speed = None if twist is None else math.hypot(*twist.linear)
-    return Sight(extractor().pose(message, record.channel.type), speed)
+    return MotionSample(extractor().pose(message, record.channel.type), speed)
 
 
 def assert_seen_as_alone(tmp_path: Path, messages: list[Msg]) -> None:
@@ -50,7 +50,7 @@ def assert_seen_as_alone(tmp_path: Path, messages: list[Msg]) -> None:
     topic = messages[0].topic
     records = list(reader.records(path, [topic], TimeWindow.everything()))
     assert len(records) == len(messages)
-    sights = Sights(reader, extractor())
+    sights = MotionDecoder(reader, extractor())
     half = len(records) // 2
     seen = [*sights.of(records[:half]), *sights.of(records[half:])]
     expected = [alone(reader, record) for record in records]
@@ -95,7 +95,7 @@ def test_poses_of_another_type_are_found_by_the_same_paths(tmp_path: Path) -> No
 def test_of_many_alike_few_are_decoded(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "bag.mcap", [odom(T0 + n, n / 9, 1.0) for n in range(500)])
     reader = Counting()
-    sights = Sights(reader, extractor())
+    sights = MotionDecoder(reader, extractor())
     records = list(reader.records(path, ["/odom"], TimeWindow.everything()))
     assert len(sights.of(records)) == 500
     assert reader.decoded < 10

@@ -5,26 +5,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis import topic_events
-from ros2_memory.analysis.intervals import Seen, Watcher
+from ros2_memory.analysis.intervals import IntervalBuilder, IntervalTable
 from ros2_memory.analysis.topic_events import (
     NOTHING,
-    Fault,
-    Flip,
-    Known,
+    KnownFlag,
+    ReportedError,
     State,
-    Story,
-    StoryBuilder,
+    Toggle,
+    TopicEvents,
+    TopicEventsBuilder,
     state_of,
 )
-from ros2_memory.catalogue.codec import packed_story, unpacked_story
+from ros2_memory.catalogue.codec import decode_topic_events, encode_topic_events
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
 
 Messages = list[tuple[int, State]]
 
 
-def told(messages: Messages, at_most: int | None = None) -> Story | None:
-    builder = StoryBuilder()
+def told(messages: Messages, at_most: int | None = None) -> TopicEvents | None:
+    builder = TopicEventsBuilder()
     for time, state in messages:
         builder.add(time, state)
     return builder.story(at_most)
@@ -63,7 +63,7 @@ def histories(draw: st.DrawFn) -> tuple[Messages, list[int]]:
     return messages, sorted(draw(st.sets(st.integers(1, len(messages)), max_size=6)))
 
 
-def _comparable(story: Story | None) -> object:
+def _comparable(story: TopicEvents | None) -> object:
     """Flips of several booleans at one time stand in no order."""
     assert story is not None
     flips = sorted(story.flips, key=lambda flip: (flip.time, flip.path))
@@ -72,8 +72,8 @@ def _comparable(story: Story | None) -> object:
     return (story.first, story.last, seen, known, flips, story.faults, story.left_out)
 
 
-def _glimpse(label: str, at: int) -> Seen:
-    watcher = Watcher(1)
+def _glimpse(label: str, at: int) -> IntervalTable:
+    watcher = IntervalBuilder(1)
     watcher.add(at, [label])
     part = watcher.part()
     assert part is not None
@@ -85,7 +85,7 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
     history: tuple[Messages, list[int]],
 ) -> None:
     messages, cuts = history
-    builder = StoryBuilder()
+    builder = TopicEventsBuilder()
     for begin, end in zip([0, *cuts], [*cuts, len(messages)], strict=True):
         part = told(messages[begin:end])
         if part is not None:
@@ -98,8 +98,8 @@ def test_a_boolean_that_flips_is_told_with_its_new_value() -> None:
     story = told(each_second(*flags))
     assert story is not None
     assert story.flips == (
-        Flip("value", 2 * NS_PER_S, True),
-        Flip("value", 3 * NS_PER_S, False),
+        Toggle("value", 2 * NS_PER_S, True),
+        Toggle("value", 3 * NS_PER_S, False),
     )
 
 
@@ -107,7 +107,7 @@ def test_an_error_that_is_reported_again_is_told_once_with_its_count() -> None:
     hot = State(faults=("motor: hot",))
     story = told(each_second(hot, NOTHING, hot, hot))
     assert story is not None
-    assert story.faults == (Fault("motor: hot", 0, 3 * NS_PER_S, 3),)
+    assert story.faults == (ReportedError("motor: hot", 0, 3 * NS_PER_S, 3),)
 
 
 def test_what_is_beyond_the_limit_is_counted() -> None:
@@ -123,18 +123,18 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
 ) -> None:
     monkeypatch.setattr(topic_events, "MOST_HELD", 10)
     monkeypatch.setattr(topic_events, "MOST_SEEN", 10)
-    builder = StoryBuilder()
+    builder = TopicEventsBuilder()
     for nth in range(15):
         at = nth * 100 * NS_PER_S
-        known = [Known(path, at, first=False, last=True) for path in ("x", "y")]
+        known = [KnownFlag(path, at, first=False, last=True) for path in ("x", "y")]
         builder.join(
-            Story(
+            TopicEvents(
                 at,
                 at + NS_PER_S,
                 seen=_glimpse(f"cup {nth}", at),
                 known=tuple(known),
-                flips=tuple(Flip(each.path, at + 1, True) for each in known),
-                faults=(Fault(f"error {nth}", at, at, 1),),
+                flips=tuple(Toggle(each.path, at + 1, True) for each in known),
+                faults=(ReportedError(f"error {nth}", at, at, 1),),
             )
         )
     story = builder.story()
@@ -180,4 +180,4 @@ def test_a_story_comes_back_from_its_bytes_as_it_was(
     many = State(flags=tuple((f"flag_{nth}", nth % 3 == 0) for nth in range(booleans)), beyond=3)
     story = told([*messages, (at, many), (at + 1, NOTHING)])
     assert story is not None
-    assert unpacked_story(packed_story(story)) == story
+    assert decode_topic_events(encode_topic_events(story)) == story

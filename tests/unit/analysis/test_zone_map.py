@@ -7,13 +7,13 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.zone_map import OPEN, Box, Boxes, Evidence
+from ros2_memory.analysis.zone_map import UNBOUNDED, Box, Boxes, ZoneMap
 
 _axis = st.tuples(st.floats(-50, 50), st.floats(0, 20)).map(lambda pair: (pair[0], sum(pair)))
 _boxes = st.tuples(_axis, _axis, _axis | st.just((math.inf, -math.inf))).map(
     lambda axes: Box(*axes[0], *axes[1], *axes[2])
 )
-_evidence = st.just(OPEN) | st.just(Evidence()) | _boxes.map(lambda box: Evidence(box=box))
+_evidence = st.just(UNBOUNDED) | st.just(ZoneMap()) | _boxes.map(lambda box: ZoneMap(box=box))
 
 
 @given(
@@ -24,15 +24,15 @@ _evidence = st.just(OPEN) | st.just(Evidence()) | _boxes.map(lambda box: Evidenc
     st.floats(0, 30),
 )
 def test_all_boxes_at_once_say_what_each_says_alone(
-    pieces: list[Evidence], x: float, y: float, z: float | None, reach: float
+    pieces: list[ZoneMap], x: float, y: float, z: float | None, reach: float
 ) -> None:
     numbered = dict(enumerate(pieces, start=100))
-    alone = {n for n, each in numbered.items() if each.may_hold_place(x, y, z, reach)}
+    alone = {n for n, each in numbered.items() if each.can_contain_place(x, y, z, reach)}
     assert Boxes(numbered).meeting(x, y, z, reach) == alone
 
 
 def test_a_place_on_the_edge_of_a_box_is_not_ruled_out() -> None:
-    box = Boxes({1: Evidence(box=Box(0.1, 0.3, 0.0, 0.0, 0.0, 0.0)), 2: Evidence()})
+    box = Boxes({1: ZoneMap(box=Box(0.1, 0.3, 0.0, 0.0, 0.0, 0.0)), 2: ZoneMap()})
     assert box.meeting(0.1 - 0.5, 0.0, None, 0.5) == {1}
     assert box.meeting(0.3 + 0.5, 0.0, 0.0, 0.5) == {1}
     assert box.meeting(0.3 + 0.51, 0.0, None, 0.5) == set()

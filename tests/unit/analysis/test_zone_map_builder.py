@@ -16,7 +16,7 @@ from ros2_memory.analysis.conditions import (
     NearPosition,
 )
 from ros2_memory.analysis.zone_map import united
-from ros2_memory.analysis.zone_map_builder import EvidenceCollector
+from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
 from tests.strategies import json_values
 
 if TYPE_CHECKING:
@@ -68,10 +68,10 @@ conditions = st.builds(
 def test_evidence_never_rules_out_what_matches(
     others: list[JsonValue], value: JsonValue, condition: Condition
 ) -> None:
-    collector = EvidenceCollector()
+    collector = ZoneMapBuilder()
     for each in (*others, value):
         collector.add(each)
     evidence = collector.evidence()
     if condition.matches(value):
-        assert condition.may_match(evidence)
-        assert condition.may_match(united([EvidenceCollector().evidence(), evidence]))
+        assert condition.can_match(evidence)
+        assert condition.can_match(united([ZoneMapBuilder().evidence(), evidence]))

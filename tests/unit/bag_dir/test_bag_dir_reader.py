@@ -17,7 +17,7 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.memories import memory_of
@@ -103,7 +103,7 @@ def test_a_sidecar_that_comes_later_is_noticed(tmp_path: Path) -> None:
     assert bumps(memory) == 48
     cut(tmp_path, T0 + 8 * S)
     assert bumps(memory) == 40
-    span = Span(start_s=T0 / 1e9, end_s=T0 / 1e9 + 60)
+    span = TimeRange(start_s=T0 / 1e9, end_s=T0 / 1e9 + 60)
     assert queries.topic_range(memory, Call(), "/bumper", span).total == 40
 
 

@@ -22,8 +22,8 @@ from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.request_queue import Mailbox, Slot
-from ros2_memory.bootstrap import build_filler, build_memory
+from ros2_memory.bag_dir.request_queue import PendingRequest, RequestQueue
+from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.catalogue.file import open_file
 from ros2_memory.cli.recovery import recover
 from ros2_memory.config import load_settings
@@ -32,11 +32,11 @@ from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.endpoint import build_server
-from ros2_memory.history.context import Limits
+from ros2_memory.history.context import QuerySettings
 from ros2_memory.index.file_state import files_in_metadata
 from ros2_memory.index.scan import Tree
 from ros2_memory.recorder import ros2bag
-from ros2_memory.recorder.handover.recovery import settle_all
+from ros2_memory.recorder.handover.recovery import recover_handovers
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -94,7 +94,7 @@ def settings_for(bag_dir: Path, *overrides: str) -> Settings:
 def asking(bag_dir: Path) -> Iterator[EpisodicServer]:
     settings = settings_for(bag_dir)
     memory = build_memory(settings)
-    filler = build_filler(settings, memory)
+    filler = build_backfill(settings, memory)
     for bag in filler.waiting():
         filler.digest(bag)
     server = build_server(settings, memory)
@@ -328,8 +328,8 @@ class TestDeletions:
         before = contents(outside)
         (bags / ".episodic").symlink_to(outside)
         with pytest.raises(OSError, match="symbolic link"):
-            Slot(bags, "label", 0, 1, 2).post()
-        mailbox = Mailbox(bags)
+            PendingRequest(bags, "label", 0, 1, 2).post()
+        mailbox = RequestQueue(bags)
         mailbox.open()
         assert not mailbox.has_mail()
         assert contents(outside) == before
@@ -419,7 +419,7 @@ class TestWhatTheRecorderKeepsBesideBags:
         assert read_handover(outside).problem is None
         before = contents(outside)
         (bags / "rec").symlink_to(outside)
-        settle_all(bags, McapReader())
+        recover_handovers(bags, McapReader())
         assert contents(outside) == before
 
     @pytest.mark.parametrize("name", ["..", ".", "a/b", "/etc", ""])
@@ -438,7 +438,7 @@ def _write_through(link: Path, target: Path) -> None:
 
 
 class TestArguments:
-    TOOLS = build_tools(Limits(), 25.0)
+    TOOLS = build_tools(QuerySettings(), 25.0)
 
     @pytest.mark.parametrize("tool", TOOLS, ids=lambda tool: tool.name)
     def test_no_tool_takes_a_path(self, tool: Any) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.confined import ConfinedReader
-from ros2_memory.bag_dir.hard_links import KeptNames
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.stand_in import StandInReader
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
@@ -30,7 +30,7 @@ class TestNames:
     def test_a_kept_bag_answers_after_where_it_was_recorded_and_after_earlier_moments(
         self, tmp_path: Path
     ) -> None:
-        names = KeptNames(tmp_path)
+        names = HardLinks(tmp_path)
         recorded, first, second = (
             f"{tmp_path}/{name}"
             for name in ("r/r_0.mcap", "moments/a/r/r_0.mcap", "moments/b/r/r_0.mcap")
@@ -49,7 +49,7 @@ class TestNames:
         assert list(names.of(recorded)) == []
 
     def test_what_lies_in_no_moment_is_its_own_name(self, tmp_path: Path) -> None:
-        names = KeptNames(tmp_path)
+        names = HardLinks(tmp_path)
         for path in (f"{tmp_path}/moments/x.mcap", f"{tmp_path}/a/moments/b/x.mcap"):
             assert names.recorded_as(path) == path
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ros2_memory.bag_dir.layered import LayeredReader
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Closing, Layout, Record
+from ros2_memory.storage.base import CdrLayout, Closing, Record
 from tests.bags import odom, text
 from tests.fakes import FakeReader
 
@@ -22,8 +22,8 @@ class Fake(FakeReader):
         self.add(OPEN, [text(10, "open")], closing=Closing.OPEN)
         self.add(FULL, [text(1, "first"), text(2, "last"), odom(3, 0, 0)])
 
-    def layout(self, record: Record) -> Layout:
-        return Layout(len(record.payload), (), (), ())
+    def layout(self, record: Record) -> CdrLayout:
+        return CdrLayout(len(record.payload), (), (), ())
 
 
 class Elsewhere(LayeredReader):

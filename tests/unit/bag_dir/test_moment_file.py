@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE, bag_kind
 from ros2_memory.bag_dir.moment_file import (
-    Keepsake,
-    Wish,
+    SavedMoment,
+    SaveRequest,
     fault_of_label,
     folder_name,
-    held_in,
     make_folder,
-    read_keepsake,
-    write_keepsake,
+    read_saved_moment,
+    stored_moments_in,
+    write_saved_moment,
 )
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ T0 = 1_795_150_800 * S  # 2026-11-20T05:00:00Z
 NUMBER = "0123456789abcdef" * 2
 
 
-def wish(label: str = "charger found", number: str = NUMBER) -> Wish:
-    return Wish(number, label, T0 - 30 * S, T0, T0)
+def wish(label: str = "charger found", number: str = NUMBER) -> SaveRequest:
+    return SaveRequest(number, label, T0 - 30 * S, T0, T0)
 
 
 class TestLabels:
@@ -69,7 +69,7 @@ class TestFolders:
         (tmp_path / "moments").symlink_to(elsewhere)
         with pytest.raises(OSError, match="symbolic link"):
             make_folder(tmp_path, wish())
-        assert list(held_in(tmp_path)) == []
+        assert list(stored_moments_in(tmp_path)) == []
 
 
 class TestMomentFiles:
@@ -82,9 +82,9 @@ class TestMomentFiles:
         self, tmp_path_factory: pytest.TempPathFactory, label: str, pending: bool, said: list[str]
     ) -> None:
         folder = tmp_path_factory.mktemp("moment")
-        keepsake = Keepsake(*wish(label), pending, tuple(said))
-        write_keepsake(folder, keepsake)
-        assert read_keepsake(folder) == keepsake
+        keepsake = SavedMoment(*wish(label), pending, tuple(said))
+        write_saved_moment(folder, keepsake)
+        assert read_saved_moment(folder) == keepsake
         complete = json.loads((folder / MOMENT_FILE).read_text())["complete"]
         assert complete == (not pending and not said)
 
@@ -113,5 +113,5 @@ class TestMomentFiles:
     def test_what_says_something_else_is_no_moment(self, tmp_path: Path, text: str) -> None:
         folder = make_folder(tmp_path, wish())
         (folder / MOMENT_FILE).write_text(text)
-        assert read_keepsake(folder) is None
-        assert list(held_in(tmp_path)) == []
+        assert read_saved_moment(folder) is None
+        assert list(stored_moments_in(tmp_path)) == []

@@ -12,9 +12,9 @@ from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.request_queue import (
     MOST_AT_ONCE,
     STALE_NS,
-    Mailbox,
     Outcome,
-    Slot,
+    PendingRequest,
+    RequestQueue,
 )
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ T0 = 1_795_150_800 * S
 NUMBER = "0123456789abcdef" * 2
 
 
-def asked(bag_dir: Path, label: str = "here", at: int = T0) -> Slot:
-    slot = Slot(bag_dir, label, at - 30 * S, at, at)
+def asked(bag_dir: Path, label: str = "here", at: int = T0) -> PendingRequest:
+    slot = PendingRequest(bag_dir, label, at - 30 * S, at, at)
     slot.post()
     return slot
 
@@ -36,7 +36,7 @@ def names(bag_dir: Path) -> list[str]:
 
 
 def test_a_wish_is_taken_and_answered_and_nothing_is_left(tmp_path: Path) -> None:
-    slot, mailbox = asked(tmp_path), Mailbox(tmp_path)
+    slot, mailbox = asked(tmp_path), RequestQueue(tmp_path)
     assert mailbox.has_mail()
     [wish] = mailbox.take(T0)
     assert wish == slot.wish
@@ -50,14 +50,14 @@ def test_a_wish_is_taken_and_answered_and_nothing_is_left(tmp_path: Path) -> Non
 
 
 def test_a_refusal_is_an_answer(tmp_path: Path) -> None:
-    slot, mailbox = asked(tmp_path), Mailbox(tmp_path)
+    slot, mailbox = asked(tmp_path), RequestQueue(tmp_path)
     [wish] = mailbox.take(T0)
     mailbox.answer(wish, Outcome(refused="there is no room"))
     assert slot.outcome() == Outcome(refused="there is no room")
 
 
 def test_a_wish_can_be_withdrawn_until_it_is_taken(tmp_path: Path) -> None:
-    first, second, mailbox = asked(tmp_path), asked(tmp_path), Mailbox(tmp_path)
+    first, second, mailbox = asked(tmp_path), asked(tmp_path), RequestQueue(tmp_path)
     assert first.withdraw()
     assert [wish.number for wish in mailbox.take(T0)] == [second.wish.number]
     assert not second.withdraw()
@@ -65,22 +65,22 @@ def test_a_wish_can_be_withdrawn_until_it_is_taken(tmp_path: Path) -> None:
 
 def test_a_wish_that_was_taken_and_not_answered_is_taken_again(tmp_path: Path) -> None:
     slot = asked(tmp_path)
-    assert [wish.number for wish in Mailbox(tmp_path).take(T0)] == [slot.wish.number]
-    again = Mailbox(tmp_path)
+    assert [wish.number for wish in RequestQueue(tmp_path).take(T0)] == [slot.wish.number]
+    again = RequestQueue(tmp_path)
     assert again.has_mail()
     assert [wish.number for wish in again.take(T0 + S)] == [slot.wish.number]
 
 
 def test_a_wish_whose_server_died_is_forgotten(tmp_path: Path) -> None:
     asked(tmp_path)
-    assert list(Mailbox(tmp_path).take(T0 + STALE_NS + 1)) == []
+    assert list(RequestQueue(tmp_path).take(T0 + STALE_NS + 1)) == []
     assert names(tmp_path) == []
 
 
 def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
     for _ in range(MOST_AT_ONCE + 2):
         asked(tmp_path)
-    mailbox = Mailbox(tmp_path)
+    mailbox = RequestQueue(tmp_path)
     first = list(mailbox.take(T0))
     assert len(first) == MOST_AT_ONCE
     for wish in first:
@@ -119,7 +119,7 @@ def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_wish_is_told_and_dropped(tmp_path: Path, text: str) -> None:
-    mailbox = Mailbox(tmp_path)
+    mailbox = RequestQueue(tmp_path)
     (tmp_path / REQUESTS_FOLDER).mkdir(parents=True)
     (tmp_path / REQUESTS_FOLDER / f"{NUMBER}.json").write_text(text)
     with structlog.testing.capture_logs() as captured:
@@ -133,7 +133,7 @@ def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path)
     (folder / f"{NUMBER}.json").mkdir(parents=True)
     (folder / f"{'a' * 32}.json").symlink_to("/etc/hostname")
     os.mkfifo(folder / f"{'b' * 32}.json")
-    slot, mailbox = asked(tmp_path), Mailbox(tmp_path)
+    slot, mailbox = asked(tmp_path), RequestQueue(tmp_path)
     with structlog.testing.capture_logs() as captured:
         [wish] = mailbox.take(T0)
         mailbox.answer(wish, Outcome(refused="no"))
@@ -145,7 +145,7 @@ def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path)
 def test_other_files_are_left_alone_and_counted(tmp_path: Path) -> None:
     slot = asked(tmp_path)
     (tmp_path / REQUESTS_FOLDER / "notes.txt").write_text("mine")
-    mailbox = Mailbox(tmp_path)
+    mailbox = RequestQueue(tmp_path)
     with structlog.testing.capture_logs() as captured:
         for wish in mailbox.take(T0):
             mailbox.answer(wish, Outcome(refused="no"))
@@ -157,7 +157,7 @@ def test_other_files_are_left_alone_and_counted(tmp_path: Path) -> None:
 
 def test_answers_that_nobody_fetched_are_swept_away(tmp_path: Path) -> None:
     asked(tmp_path)
-    mailbox = Mailbox(tmp_path)
+    mailbox = RequestQueue(tmp_path)
     [wish] = mailbox.take(T0)
     mailbox.answer(wish, Outcome(refused="no"))
     path = tmp_path / REQUESTS_FOLDER / f"{wish.number}.answer"
@@ -172,7 +172,7 @@ def test_another_user_may_read_a_wish_and_its_answer(tmp_path: Path) -> None:
     before = os.umask(0o077)
     try:
         asked(tmp_path)
-        mailbox = Mailbox(tmp_path)
+        mailbox = RequestQueue(tmp_path)
         [wish] = mailbox.take(T0)
         taken = tmp_path / REQUESTS_FOLDER / f"{wish.number}.taken"
         assert stat.S_IMODE(taken.stat().st_mode) == 0o644
@@ -185,11 +185,11 @@ def test_another_user_may_read_a_wish_and_its_answer(tmp_path: Path) -> None:
 
 def test_no_folder_is_made_where_the_bag_directory_is_away(tmp_path: Path) -> None:
     away = tmp_path / "away"
-    Mailbox(away).open()
+    RequestQueue(away).open()
     with pytest.raises(OSError, match=r"\.episodic"):
         asked(away)
     assert not away.exists()
-    assert not Mailbox(away).has_mail()
+    assert not RequestQueue(away).has_mail()
 
 
 def test_an_answer_that_is_none_is_not_believed(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import anyio
 import pytest
 
-from ros2_memory.bootstrap import build_dispatcher, build_filler, build_memory
+from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
 from ros2_memory.catalogue.file import VERSION
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.config import load_settings
@@ -82,7 +82,7 @@ def replies(settings: Settings, memory: Memory) -> dict[str, Any]:
 
 
 def fill(settings: Settings, memory: Memory) -> int:
-    filler = build_filler(settings, memory)
+    filler = build_backfill(settings, memory)
     return sum(filler.digest(bag) for bag in filler.waiting())
 
 
@@ -152,7 +152,7 @@ def test_the_file_of_another_version_is_never_misread(
     assert replies(settings, memory) == expected
     # Rebuilt, or of the same digests.
     fill(settings, memory)
-    assert build_filler(settings, memory).waiting() == []
+    assert build_backfill(settings, memory).waiting() == []
     assert memory.recall is not None
     assert memory.recall.catalogue.path == file
     assert replies(settings, memory) == expected
@@ -161,7 +161,7 @@ def test_the_file_of_another_version_is_never_misread(
         assert base.execute("PRAGMA user_version").fetchone()[0] == VERSION
     # As it is left it is taken by whoever comes next.
     memory = build_memory(settings)
-    assert build_filler(settings, memory).waiting() == []
+    assert build_backfill(settings, memory).waiting() == []
     assert replies(settings, memory) == expected
     close(memory)
 
@@ -182,7 +182,7 @@ def test_what_another_version_holds_open_is_left_to_it(
         assert path is not None
         assert path.is_relative_to(tmp_path / "cache")
         memory.recall.catalogue.look_after(thorough=True)
-        assert build_filler(settings, memory).waiting() == []
+        assert build_backfill(settings, memory).waiting() == []
         assert theirs.execute("SELECT count(*) FROM bags").fetchone() == before
         assert not file.with_name(f"{FILE}.aside").exists()
     close(memory)

@@ -20,11 +20,11 @@ from ros2_memory.analysis.conditions import (
 from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.analysis.zone_map import MOST_WORDS
 from ros2_memory.catalogue.codec import (
+    decode_poses,
+    decode_schema,
+    encode_poses,
+    encode_schema,
     filled,
-    packed_poses,
-    shape_of_text,
-    shape_text,
-    unpacked_poses,
 )
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.topic_digest import MOST_KEPT
@@ -72,14 +72,14 @@ def topic_of(messages: list[Msg]) -> TopicDigest:
 )
 def test_evidence_rules_out_what_was_never_there(condition_type: str, value: JsonValue) -> None:
     seen = topic_of([detections(T0, ["cup", "Person 2"]), detections(T0 + S, ["chair"])])
-    assert not parse_condition(condition_type, value, 0.5).may_match(seen.evidence)
+    assert not parse_condition(condition_type, value, 0.5).can_match(seen.evidence)
 
 
 def test_evidence_rules_out_a_number_beyond_all_that_were_there() -> None:
     seen = topic_of([detections(T0, ["cup"])])
     for limit, above in ((1e6, True), (-1e6, False)):
-        assert not Beyond(limit, above=above).may_match(seen.evidence)
-        assert Beyond(-limit, above=above).may_match(seen.evidence)
+        assert not Beyond(limit, above=above).can_match(seen.evidence)
+        assert Beyond(-limit, above=above).can_match(seen.evidence)
 
 
 @pytest.mark.parametrize(
@@ -88,13 +88,13 @@ def test_evidence_rules_out_a_number_beyond_all_that_were_there() -> None:
 )
 def test_evidence_lets_through_what_was_there(condition_type: str, value: JsonValue) -> None:
     seen = topic_of([detections(T0, ["cup", "Person 2"])])
-    assert parse_condition(condition_type, value, 0.5).may_match(seen.evidence)
+    assert parse_condition(condition_type, value, 0.5).can_match(seen.evidence)
 
 
 def test_a_topic_of_too_many_words_is_not_ruled_out_by_words_but_still_by_numbers() -> None:
     seen = topic_of([text(T0 + n, f"word{n}") for n in range(MOST_WORDS + 1)])
-    assert Contains("scissors").may_match(seen.evidence)
-    assert not Equals(3).may_match(seen.evidence)
+    assert Contains("scissors").can_match(seen.evidence)
+    assert not Equals(3).can_match(seen.evidence)
 
 
 def test_one_message_that_cannot_be_decoded_leaves_everything_open() -> None:
@@ -132,7 +132,7 @@ def test_digests_of_bags_joined_give_what_all_their_poses_give(
             positions.append((x, y, 0.0))
             whole.add(time, pose, speed)
             collector.add(time, pose, speed)
-        joined.join(unpacked_poses(packed_poses(collector.digest())))
+        joined.join(decode_poses(encode_poses(collector.digest())))
     told, expected = joined.result(), whole.result()
     assert joined.frames == whole.frames
     assert told.distance_m == pytest.approx(expected.distance_m, rel=1e-12, abs=1e-12)
@@ -212,7 +212,7 @@ def test_few_latched_messages_are_kept_whole_and_many_are_not() -> None:
 
 def test_a_summary_is_the_same_after_it_was_packed() -> None:
     summary = digest_of([odom(T0, 0, 0), text(T0 + S, "a"), text(T0 + 2 * S, "b")]).summary
-    assert filled(shape_of_text(shape_text(summary.shape)), summary.numbers) == summary
+    assert filled(decode_schema(encode_schema(summary.shape)), summary.numbers) == summary
 
 
 def test_numbers_of_another_shape_are_refused() -> None:
@@ -223,4 +223,4 @@ def test_numbers_of_another_shape_are_refused() -> None:
 
 def test_bytes_that_are_no_digest_are_refused() -> None:
     with pytest.raises(ValueError, match="not a digest"):
-        unpacked_poses(b"123")
+        decode_poses(b"123")

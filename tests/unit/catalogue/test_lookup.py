@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from tests.bags import odom, write_mcap
 from tests.memories import memory_of
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.history.context import Memory
-    from ros2_memory.index.segment import Run
+    from ros2_memory.index.segment import Segment
 
 T0 = 1_700_000_000 * 10**9
 
 
-def recorded(bag_dir: Path, bags: int = 2) -> tuple[Memory, Run]:
+def recorded(bag_dir: Path, bags: int = 2) -> tuple[Memory, Segment]:
     for n in range(bags):
         write_mcap(bag_dir / "rec" / f"rec_{n}.mcap", [odom(T0 + n, 0.0, 0.0)])
     memory = memory_of(bag_dir)
@@ -74,7 +74,7 @@ def test_what_cannot_be_read_of_what_was_worked_out_is_worked_out_again(
     memory = recalling(memory_of(tmp_path), tmp_path)
 
     def told() -> object:
-        way = trajectory_summary(memory, Call(), Span(start_s=0.0, end_s=9e9))
+        way = trajectory_summary(memory, Call(), TimeRange(start_s=0.0, end_s=9e9))
         return list_recorded_topics(memory, Call()), way
 
     before = told()

@@ -18,8 +18,8 @@ from ros2_memory.bag_dir.bag_dir_reader import CountingReader
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.history.context import Call, Limits
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.history.view import View
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
@@ -82,7 +82,7 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
     yield "range", queries.data_time_range
     yield "frames", queries.frames
     for at in [(each + draw.choice([0, S // 3])) / 1e9 for each in draw.sample(moments, 2)]:
-        moment = Moment(at_s=at)
+        moment = AtTime(at_s=at)
         for topic in ("/odom", "/dock", "/mixed", "/status"):
             yield f"{topic} at {at}", partial(_value, topic, moment)
         yield f"position {at}", partial(_position, moment)
@@ -90,7 +90,7 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
         for child in ("laser", "base_link"):
             yield f"{child} {at}", partial(_transform, child, moment)
     for first, last in (sorted(draw.sample(moments, 2)), (min(moments), max(moments))):
-        span = Span(start_s=first / 1e9, end_s=last / 1e9)
+        span = TimeRange(start_s=first / 1e9, end_s=last / 1e9)
         for topic in ("/odom", "/chatter", "/dock"):
             yield f"{topic} in {span}", partial(_range, topic, span)
             yield f"way of {topic} in {span}", partial(_way, topic, span)
@@ -110,31 +110,31 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
     yield "odom when", partial(_when, "/chatter")
 
 
-def _value(topic: str, moment: Moment, memory: Memory, call: Call) -> object:
+def _value(topic: str, moment: AtTime, memory: Memory, call: Call) -> object:
     return queries.topic_value(memory, call, topic, moment, tolerance_s=2.0)
 
 
-def _position(moment: Moment, memory: Memory, call: Call) -> object:
+def _position(moment: AtTime, memory: Memory, call: Call) -> object:
     return queries.position(memory, call, moment)
 
 
-def _velocity(moment: Moment, memory: Memory, call: Call) -> object:
+def _velocity(moment: AtTime, memory: Memory, call: Call) -> object:
     return queries.velocity(memory, call, moment)
 
 
-def _transform(child: str, moment: Moment, memory: Memory, call: Call) -> object:
+def _transform(child: str, moment: AtTime, memory: Memory, call: Call) -> object:
     return queries.transform(memory, call, "odom", child, moment)
 
 
-def _range(topic: str, span: Span, memory: Memory, call: Call) -> object:
+def _range(topic: str, span: TimeRange, memory: Memory, call: Call) -> object:
     return queries.topic_range(memory, call, topic, span, max_samples=5)
 
 
-def _recap(span: Span, memory: Memory, call: Call) -> object:
+def _recap(span: TimeRange, memory: Memory, call: Call) -> object:
     return recap(memory, call, span)
 
 
-def _way(topic: str, span: Span, memory: Memory, call: Call) -> object:
+def _way(topic: str, span: TimeRange, memory: Memory, call: Call) -> object:
     return queries.trajectory_summary(memory, call, span, topic=topic)
 
 
@@ -191,7 +191,7 @@ def test_every_question_is_answered_as_without_a_catalogue(
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
-        limits = Limits(tf_clock=clock)  # type: ignore[arg-type]
+        limits = QuerySettings(tf_clock=clock)  # type: ignore[arg-type]
         plain = memory_of(bag_dir, reader=CountingReader(McapReader()), limits=limits)
         recalled = recalling(replace(plain), bag_dir, part=part)
         for asked, ask in questions(moments, draw):
@@ -235,8 +235,10 @@ def test_a_latched_message_received_again_is_no_event_with_a_catalogue_either(
     )
     plain = memory_of(tmp_path)
     recalled = recalling(replace(plain), tmp_path)
-    told = [recap(memory, Call(), Span(start_s=590.0, end_s=610.0)) for memory in (plain, recalled)]
+    told = [
+        recap(memory, Call(), TimeRange(start_s=590.0, end_s=610.0)) for memory in (plain, recalled)
+    ]
     assert told[0] == told[1]
     assert told[0].events == ()
-    flipped = recap(recalled, Call(), Span(start_s=0.0, end_s=610.0)).events
+    flipped = recap(recalled, Call(), TimeRange(start_s=0.0, end_s=610.0)).events
     assert [each.start for each in flipped if each.kind == "flip"] == [5 * S]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 import structlog
 
-from ros2_memory.analysis.topic_events import QUIET
+from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.database import RETRY_S
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue, relative
@@ -90,7 +90,7 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
         assert again.poses(held.topic, [number]).get(number) == held.poses
         assert again.standstills(held.topic, [number]).get(number) == held.standstills
         assert again.stories(held.topic, [number]) == {
-            number: QUIET if held.story is not None and held.story.says_nothing else held.story
+            number: NO_EVENTS if held.story is not None and held.story.says_nothing else held.story
         }
         assert again.edges(held.topic, [number]).get(number) == held.edges
         assert again.kept(held.topic, [number]).get(number) == held.kept
@@ -111,7 +111,7 @@ def test_a_topic_that_cannot_be_decoded_has_no_story_and_is_not_taken_for_a_quie
     catalogue.put(KEY, replace(DIGEST, topics=(quiet, replace(unknown, story=None))))
     [number] = catalogue.find([KEY])
     assert number is not None
-    assert catalogue.stories("/tf_static", [number]) == {number: QUIET}
+    assert catalogue.stories("/tf_static", [number]) == {number: NO_EVENTS}
     assert catalogue.stories("/bumper", [number]) == {number: None}
     catalogue.close()
     assert catalogue.stories("/tf_static", [number]) == {}

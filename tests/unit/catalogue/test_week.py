@@ -10,19 +10,19 @@ import pytest
 
 from ros2_memory import queries
 from ros2_memory.catalogue.digest import Digest, Digester
-from ros2_memory.catalogue.lookup import Recall
+from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import BagKey, Catalogue
 from ros2_memory.core.model import BagFile, BagState, BagSummary
 from ros2_memory.core.timebase import NS_PER_S, FixedClock
-from ros2_memory.history.context import Call, Limits, Memory
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.index.snapshot import Snapshot
 from tests.bags import detections, odom, tf, transform
 from tests.fakes import FakeReader
 from tests.memories import extractor
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.odometry import PoseDigest, Stop
+    from ros2_memory.analysis.odometry import PoseDigest, TimedPosition
     from ros2_memory.recorder.index_manager import IndexManager
 
 BAGS = 60_480
@@ -66,7 +66,7 @@ def later(digest: Digest, by: int) -> Digest:
 
 
 def moved(poses: PoseDigest, by: int) -> PoseDigest:
-    def stop(at: Stop | None) -> Stop | None:
+    def stop(at: TimedPosition | None) -> TimedPosition | None:
         if at is None:
             return None
         x, y, z = at.position
@@ -97,8 +97,8 @@ def week() -> tuple[Memory, FakeReader]:
     index = cast("IndexManager", Still(Snapshot(tuple(bags))))
     reader = FakeReader()
     clock = FixedClock(T0 + BAGS * SPLIT)
-    recall = Recall(catalogue, BAG_DIR)
-    return Memory(index, reader, extractor(), clock, Limits(), recall), reader
+    recall = DigestCache(catalogue, BAG_DIR)
+    return Memory(index, reader, extractor(), clock, QuerySettings(), recall), reader
 
 
 def test_what_was_never_seen_is_told_of_a_week_without_reading_a_bag(
@@ -123,7 +123,7 @@ def test_the_way_of_an_hour_is_summed_without_reading_a_bag(
     week: tuple[Memory, FakeReader],
 ) -> None:
     memory, reader = week
-    hour = Span(start_s=float(T0_S + 360 * 100), end_s=float(T0_S + 360 * 100 + 3599))
+    hour = TimeRange(start_s=float(T0_S + 360 * 100), end_s=float(T0_S + 360 * 100 + 3599))
     told = queries.trajectory_summary(memory, Call(), hour)
     assert told.trajectory.poses == 3600
     assert told.trajectory.distance_m == pytest.approx(3599 * 0.1, rel=1e-6)

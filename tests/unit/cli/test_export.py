@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from mcap.writer import Writer as McapFile
 
-    from ros2_memory.history.duplicates import Found
+    from ros2_memory.history.duplicates import StoredMessage
 
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
@@ -307,7 +307,7 @@ class TestMcap:
         assert str(out) in capsys.readouterr().err
 
     def test_an_interrupted_export_leaves_nothing(self, bag_dir: Path, tmp_path: Path) -> None:
-        def interrupted() -> Iterator[Found]:
+        def interrupted() -> Iterator[StoredMessage]:
             view = View(memory_of(bag_dir), Call())
             yield from view.stream(["/odom"], TimeWindow.everything())
             raise KeyboardInterrupt

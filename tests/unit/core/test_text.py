@@ -5,7 +5,7 @@ import math
 import pytest
 from hypothesis import given
 
-from ros2_memory.core.text import glimpse
+from ros2_memory.core.text import abbreviate
 from tests.hostile import DEEP, MEGABYTE, nested, values
 
 
@@ -28,15 +28,15 @@ from tests.hostile import DEEP, MEGABYTE, nested, values
     ],
 )
 def test_a_value_is_shown_in_a_few_words(value: object, shown: str) -> None:
-    assert glimpse(value) == shown
+    assert abbreviate(value) == shown
 
 
 def test_a_long_text_is_cut() -> None:
-    assert glimpse("x" * MEGABYTE, 20) == '"' + "x" * 18 + "…"
+    assert abbreviate("x" * MEGABYTE, 20) == '"' + "x" * 18 + "…"
 
 
 @given(value=values)
 def test_nothing_is_shown_longer_than_asked_or_as_something_that_is_not_text(value: object) -> None:
-    shown = glimpse(value, 60)
+    shown = abbreviate(value, 60)
     assert len(shown) <= 60
     shown.encode()

@@ -12,9 +12,9 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartb
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.model import Transform
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
-from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.coverage import seconds
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import shown
 from tests.bags import boolean, odom, text, tf, transform, write_mcap
@@ -28,8 +28,8 @@ T0_S = 1_784_023_200
 T0 = T0_S * NS_PER_S
 
 
-def after(seconds_later: float) -> Moment:
-    return Moment(at_s=T0_S + seconds_later)
+def after(seconds_later: float) -> AtTime:
+    return AtTime(at_s=T0_S + seconds_later)
 
 
 def frames_that_part(bag_dir: Path) -> None:
@@ -87,7 +87,7 @@ def test_by_header_stamps_a_time_without_any_is_out_of_range_and_no_fault_of_the
     tmp_path: Path,
 ) -> None:
     frames_that_part(tmp_path)
-    memory = memory_of(tmp_path, limits=Limits(tf_clock="stamp"))
+    memory = memory_of(tmp_path, limits=QuerySettings(tf_clock="stamp"))
     with pytest.raises(NoDataError) as caught:
         queries.transform(memory, Call(), "odom", "base_link", after(5000))
     assert caught.value.reason is NoDataReason.OUTSIDE_RANGE
@@ -160,5 +160,5 @@ def test_a_window_that_reaches_into_the_split_being_written_has_no_answer_yet(
     memory = memory_of(tmp_path, clock=clock)
     assert memory.index.snapshot(None).active
     with pytest.raises(NoDataError) as caught:
-        queries.topic_range(memory, Call(), "/bumper", Span(T0_S + 9.5, T0_S + 15))
+        queries.topic_range(memory, Call(), "/bumper", TimeRange(T0_S + 9.5, T0_S + 15))
     assert caught.value.reason is NoDataReason.NOT_CLOSED_YET

@@ -12,9 +12,9 @@ from ros2_memory.core.model import BagFile, BagState, BagSummary
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.duplicates import (
     COPY_HORIZON_NS,
-    Found,
-    once_backward,
-    once_forward,
+    StoredMessage,
+    deduplicate_backward,
+    deduplicate_forward,
 )
 from ros2_memory.storage.base import Channel, Record, Schema
 
@@ -27,13 +27,13 @@ MS = 10**6
 S = 10**9
 
 
-def found(recording: str, time: int, said: bytes = b"x") -> Found:
+def found(recording: str, time: int, said: bytes = b"x") -> StoredMessage:
     bag = BagFile(f"/{recording}/0.mcap", 1, 1, BagState.CLOSED, BagSummary(()), 0, 0)
-    return Found(bag, Record(CHANNEL, time, 0, said))
+    return StoredMessage(bag, Record(CHANNEL, time, 0, said))
 
 
 @st.composite
-def histories(draw: st.DrawFn) -> list[Found]:
+def histories(draw: st.DrawFn) -> list[StoredMessage]:
     """Rows of a few messages that are alike, in two recordings or three, some rows close by."""
     messages = []
     start = 0
@@ -50,40 +50,42 @@ def histories(draw: st.DrawFn) -> list[Found]:
 @given(histories())
 @example([found("a", 0), found("b", 1), found("b", 2)])
 @example([found("a", 0), found("b", 1), found("a", 2)])
-def test_the_same_copies_are_kept_newest_first(messages: list[Found]) -> None:
-    forwards = list(once_forward(messages, EVERYWHERE))
-    backwards = list(once_backward(reversed(messages), EVERYWHERE))
+def test_the_same_copies_are_kept_newest_first(messages: list[StoredMessage]) -> None:
+    forwards = list(deduplicate_forward(messages, EVERYWHERE))
+    backwards = list(deduplicate_backward(reversed(messages), EVERYWHERE))
     assert backwards[::-1] == forwards
 
 
 @given(histories(), st.integers(0, 30 * S), st.integers(0, 30 * S))
 def test_what_lies_outside_of_the_contested_time_is_kept_both_ways(
-    messages: list[Found], one: int, other: int
+    messages: list[StoredMessage], one: int, other: int
 ) -> None:
     spans = [(min(one, other), max(one, other))]
-    forwards = list(once_forward(messages, spans))
-    assert list(once_backward(reversed(messages), spans))[::-1] == forwards
+    forwards = list(deduplicate_forward(messages, spans))
+    assert list(deduplicate_backward(reversed(messages), spans))[::-1] == forwards
     outside = [each for each in messages if not spans[0][0] <= each.time < spans[0][1]]
     assert not Counter(map(id, outside)) - Counter(map(id, forwards))
 
 
 def test_as_many_remain_as_the_recording_holds_that_holds_the_most() -> None:
     messages = [found("a", 0), found("b", 1), found("b", 2), found("b", 3), found("a", 4)]
-    kept = [each.time for each in once_forward(messages, EVERYWHERE)]
+    kept = [each.time for each in deduplicate_forward(messages, EVERYWHERE)]
     assert kept == [0, 2, 3]
-    assert [each.time for each in once_backward(reversed(messages), EVERYWHERE)] == kept[::-1]
+    assert [each.time for each in deduplicate_backward(reversed(messages), EVERYWHERE)] == kept[
+        ::-1
+    ]
 
 
 def test_no_more_is_held_of_messages_that_are_all_alike_than_of_some_seconds() -> None:
     taken = 0
 
-    def endless() -> Iterator[Found]:
+    def endless() -> Iterator[StoredMessage]:
         nonlocal taken
         for number in range(10_000):
             taken += 1
             yield found("ab"[number % 2], (10_000 - number) * 100 * MS)
 
-    kept = once_backward(endless(), EVERYWHERE)
+    kept = deduplicate_backward(endless(), EVERYWHERE)
     next(kept)
     assert taken * 100 * MS < 4 * COPY_HORIZON_NS
     assert 4_900 < 1 + sum(1 for _ in kept) < 5_400

@@ -9,7 +9,7 @@ import pytest
 
 from ros2_memory import queries
 from ros2_memory.core.timebase import FixedClock
-from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.context import Call, QuerySettings
 from tests.asking import asked
 from tests.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
 from tests.mcap_surgery import spoil_chunk
@@ -251,7 +251,7 @@ def test_a_match_from_the_future_has_no_age(tmp_path: Path) -> None:
 def test_now_of_replayed_bags_is_not_the_year_2262(tmp_path: Path) -> None:
     write_splits(tmp_path, 2)
     write_mcap(tmp_path / "max" / "max_0.mcap", [odom(T0, 0, 0), odom(T0, 1, 0, log_time=2**62)])
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR), limits=Limits(now="latest"))
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR), limits=QuerySettings(now="latest"))
     found = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=1)
     assert found["timestamp"] == at(18)
 
@@ -260,7 +260,7 @@ def test_simulated_times_are_no_fault(tmp_path: Path) -> None:
     for number in range(2):
         moments = [number * 10 * S + second * S for second in range(10)]
         write_mcap(tmp_path / "sim" / f"sim_{number}.mcap", [odom(at, 0, 0) for at in moments])
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR), limits=Limits(now="latest"))
+    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR), limits=QuerySettings(now="latest"))
     told = asked(memory, tmp_path, "data_time_range")
     assert (told["earliest"], told["latest"], told["clock_faults"]) == (0.0, 19.0, [])
     found = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=4)

@@ -13,8 +13,8 @@ from ros2_memory.cli.info import usual_rate
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call, Limits
-from ros2_memory.history.time_arguments import Moment
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.time_arguments import AtTime
 from ros2_memory.index.pace import Pace, is_rare
 from ros2_memory.index.segment import Stated
 from ros2_memory.insights.status import memory_status
@@ -74,14 +74,14 @@ def record(folder: Path, messages: list[Msg], layout: McapLayout = TRANSIENT) ->
 
 
 def remembered(root: Path, *, recalls: bool = False, **limits: Any) -> Memory:
-    memory = memory_of(root, limits=Limits(**limits))
+    memory = memory_of(root, limits=QuerySettings(**limits))
     return recalling(replace(memory), root) if recalls else memory
 
 
 def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:
     """The reply to a question for a moment, or the reason why there is none."""
     try:
-        answer = topic_value(memory, Call(), topic, Moment(unix_from_ns(at)))
+        answer = topic_value(memory, Call(), topic, AtTime(unix_from_ns(at)))
     except NoDataError as error:
         return {"error": error.reason}
     shown: dict[str, Any] = json.loads(Replies(memory.index.bag_dir, 24_000).answer(answer).text)
@@ -217,7 +217,7 @@ def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None
 def test_a_pose_that_is_latched_says_so(tmp_path: Path) -> None:
     record(tmp_path / "rec", [odom(T0, 1.0, 2.0), text(T0 + 60 * S, "later", "/words")])
     memory = remembered(tmp_path, latched_topics=("/odom",))
-    found = position(memory, Call(), Moment(unix_from_ns(T0 + 30 * S)))
+    found = position(memory, Call(), AtTime(unix_from_ns(T0 + 30 * S)))
     assert [note for note in found.notes if "/odom is latched" in note and "30" in note]
 
 

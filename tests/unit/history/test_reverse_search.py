@@ -14,7 +14,7 @@ from ros2_memory import queries
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
@@ -147,7 +147,7 @@ def test_what_is_known_of_all_bags_is_told_without_reading_one(bag_dir: Path) ->
     queries.list_recorded_topics(memory, Call())
     queries.data_time_range(memory, Call())
     queries.trajectory_summary(
-        memory, Call(), Span(start_s=T0_S - 1, end_s=T0_S + 100), topic="/odom"
+        memory, Call(), TimeRange(start_s=T0_S - 1, end_s=T0_S + 100), topic="/odom"
     )
     assert reader.read == []
 

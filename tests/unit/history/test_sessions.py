@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.visits import visits
@@ -110,11 +110,11 @@ def test_another_robots_static_transform_places_nothing(tmp_path: Path, recalls:
     memory = remembered(tmp_path, recalls=recalls)
     assert arrivals(memory, 103.0) == [round(-DAY / S + 5.4, 1)]
     with pytest.raises(NoDataError):
-        transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 5 * S)))
+        transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(BEGIN + 5 * S)))
 
 
 def asked(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> float:
-    found = transform(memory, Call(), parent, child, Moment(unix_from_ns(at)))
+    found = transform(memory, Call(), parent, child, AtTime(unix_from_ns(at)))
     return round(found.transform.translation[0], 3)
 
 
@@ -132,7 +132,7 @@ def test_two_robots_of_one_time_are_not_mixed_and_a_note_says_whose_it_is(
 ) -> None:
     two_robots(tmp_path, BEGIN, BEGIN)
     memory = remembered(tmp_path, recalls=recalls)
-    found = transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 4 * S)))
+    found = transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(BEGIN + 4 * S)))
     assert found.transform.translation[0] == pytest.approx(3.0)
     assert [note for note in found.notes if "2 sessions" in note and "boat" in note]
 
@@ -145,7 +145,7 @@ def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(
     for name, x in ((first, 100.0), (second, 500.0)):
         record(tmp_path / name, [static(BEGIN, "map", "odom", x), *drive(BEGIN, 20)])
     memory = remembered(tmp_path, recalls=recalls)
-    found = transform(memory, Call(), "map", "odom", Moment(unix_from_ns(BEGIN + 4 * S)))
+    found = transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(BEGIN + 4 * S)))
     named = {100.0: first, 500.0: second}[found.transform.translation[0]]
     [note] = [note for note in found.notes if "2 sessions" in note]
     assert note.endswith(f"this is that of {named}")
@@ -192,7 +192,7 @@ def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls:
     record(tmp_path / "moving", moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5))
     record(tmp_path / "sensors", drive(BEGIN, 20))
     memory = remembered(tmp_path, recalls=recalls)
-    at = Moment(unix_from_ns(BEGIN + 4 * S))
+    at = AtTime(unix_from_ns(BEGIN + 4 * S))
     joined = transform(memory, Call(), "map", "base_link", at)
     assert joined.transform.translation[0] == pytest.approx(9.0)
     assert [note for note in joined.notes if "fixed and moving are joined" in note]
@@ -319,10 +319,10 @@ def test_two_robots_on_one_topic_are_named(tmp_path: Path, recalls: bool) -> Non
     two_at_once(tmp_path)
     memory = remembered(tmp_path, recalls=recalls)
     begin, end = unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S)
-    at = Moment(unix_from_ns(BEGIN + 5 * S))
+    at = AtTime(unix_from_ns(BEGIN + 5 * S))
     for answer in (
-        trajectory_summary(memory, Call(), Span(begin, end)),
-        recap(memory, Call(), Span(begin, end)),
+        trajectory_summary(memory, Call(), TimeRange(begin, end)),
+        recap(memory, Call(), TimeRange(begin, end)),
         position(memory, Call(), at),
         find_last_match(memory, Call(), "/odom", "near_position", {"x": 50, "y": 0}),
     ):
@@ -345,7 +345,7 @@ def test_copies_and_what_a_handover_joins_are_of_one_robot(
     else:
         record(second, [each for each in drive(BEGIN, 20) if each.log_time >= BEGIN + 10 * S])
     memory = remembered(tmp_path, recalls=recalls)
-    span = Span(unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S))
+    span = TimeRange(unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S))
     answer = trajectory_summary(memory, Call(), span)
     assert not [note for note in answer.notes if "robots" in note]
 

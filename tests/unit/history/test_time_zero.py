@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
-from ros2_memory.history.context import Limits
+from ros2_memory.history.context import QuerySettings
 from tests.asking import asked, replied
 from tests.bags import boolean, detections, odom, write_mcap
 from tests.memories import SettableClock, memory_of
@@ -94,7 +94,7 @@ def bag_dir(tmp_path: Path) -> Path:
 
 
 def memory_at(bag_dir: Path, recalls: bool, now: Now = "wall") -> Memory:
-    memory = memory_of(bag_dir, clock=SettableClock(9 * S), limits=Limits(now=now))
+    memory = memory_of(bag_dir, clock=SettableClock(9 * S), limits=QuerySettings(now=now))
     return recalling(memory, bag_dir) if recalls else memory
 
 
@@ -120,7 +120,7 @@ def test_no_reply_about_public_bags_from_time_zero_does(
     folder: str, storage: str, topic: str, now: Now
 ) -> None:
     [bag_dir] = REAL.glob(f"**/{folder}")
-    memory = memory_of(bag_dir, storage=storage, limits=Limits(now=now))
+    memory = memory_of(bag_dir, storage=storage, limits=QuerySettings(now=now))
     topics = [row["topic"] for row in asked(memory, bag_dir, "list_recorded_topics")]
     hold(memory, bag_dir, topic if topic in topics else topics[0])
 
@@ -159,7 +159,7 @@ def test_a_window_below_zero_is_clamped_at_both_ends(
     messages = [odom((begin_s + 1 + n) * S, n * 0.1, 0.0) for n in range(5)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
     clock = SettableClock((begin_s + 9) * S)
-    memory = memory_of(tmp_path, clock=clock, limits=Limits(now=now))
+    memory = memory_of(tmp_path, clock=clock, limits=QuerySettings(now=now))
     memory = recalling(memory, tmp_path) if recalls else memory
     window = {"start": start, "end": end}
     told = asked(memory, tmp_path, "recap", **window)

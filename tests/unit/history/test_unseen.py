@@ -17,7 +17,7 @@ from ros2_memory.core.model import (
     TopicSummary,
 )
 from ros2_memory.core.wording import counted, listed
-from ros2_memory.history.unseen import unseen
+from ros2_memory.history.unseen import unread_spans
 from ros2_memory.index.snapshot import Snapshot
 
 S = 10**9
@@ -40,7 +40,7 @@ def torn(number: int, written: int | None = T0 + DAY, folder: str = "rec") -> Se
 
 def told(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False) -> list[str]:
     window = TimeWindow(T0 + round(start * S), T0 + round(stop * S))
-    return list(unseen(snapshot, window, nothing=nothing))
+    return list(unread_spans(snapshot, window, nothing=nothing))
 
 
 LOST_SPLIT = Snapshot(bags=(split(0), split(2), split(3)), damaged=(torn(1),), scanned_at=T0 + DAY)

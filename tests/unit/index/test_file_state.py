@@ -11,12 +11,12 @@ from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import BagState
 from ros2_memory.index.file_state import (
     RETRY_NS,
+    Classification,
     FileNotes,
-    Scene,
-    Standing,
-    Verdict,
+    FileState,
+    ScanContext,
+    classify,
     files_in_metadata,
-    judge,
 )
 from ros2_memory.index.scan import Stamp
 from ros2_memory.storage.base import Closing
@@ -46,9 +46,9 @@ class Eye:
         self.root = root
         self.reader = PlainReader(*(kinds or (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")))
         self.notes: FileNotes | None = None
-        self.verdict: Verdict | None = None
+        self.verdict: Classification | None = None
         self.trusts_mtime = True
-        self.scene = Scene(root, NOW, THREE_SPLITS)
+        self.scene = ScanContext(root, NOW, THREE_SPLITS)
 
     def look(
         self,
@@ -57,7 +57,7 @@ class Eye:
         age_s: float | None = None,
         now: int = NOW,
         names: set[str] | None = None,
-    ) -> Standing:
+    ) -> FileState:
         """The standing at `now`, first giving the file an mtime; `names`: a live heartbeat."""
         if age_s is not None:
             mtime_ns = now - round(age_s * S)
@@ -68,8 +68,10 @@ class Eye:
         else:
             self.notes.look(stamp, now)
         recordings = None if names is None else frozenset(names)
-        self.scene = Scene(self.root, now, THREE_SPLITS, recordings, trusts_mtime=self.trusts_mtime)
-        self.verdict = judge(self.notes, self.reader, self.scene)
+        self.scene = ScanContext(
+            self.root, now, THREE_SPLITS, recordings, trusts_mtime=self.trusts_mtime
+        )
+        self.verdict = classify(self.notes, self.reader, self.scene)
         return self.verdict.standing
 
     def reason(self) -> str:
@@ -90,7 +92,7 @@ def eye(tmp_path: Path) -> Eye:
 
 def test_a_closed_bag_is_described_from_inside_and_outside(eye: Eye, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec" / "rec_0.mcap", [30, 10, 20])
-    assert eye.look(path, age_s=100) is Standing.CLOSED
+    assert eye.look(path, age_s=100) is FileState.CLOSED
     assert eye.verdict is not None
     bag = eye.verdict.bag
     assert bag is not None
@@ -102,17 +104,17 @@ def test_a_closed_bag_is_described_from_inside_and_outside(eye: Eye, tmp_path: P
 @pytest.mark.parametrize(
     ("age_s", "standing"),
     [
-        (0, Standing.ACTIVE),
-        (30, Standing.ACTIVE),
-        (30.001, Standing.INCOMPLETE),
-        (3600, Standing.INCOMPLETE),
-        (-1.9, Standing.ACTIVE),
-        (-2, Standing.INCOMPLETE),
-        (-3600, Standing.INCOMPLETE),
+        (0, FileState.ACTIVE),
+        (30, FileState.ACTIVE),
+        (30.001, FileState.INCOMPLETE),
+        (3600, FileState.INCOMPLETE),
+        (-1.9, FileState.ACTIVE),
+        (-2, FileState.INCOMPLETE),
+        (-3600, FileState.INCOMPLETE),
     ],
 )
 def test_without_a_heartbeat_an_open_bag_is_active_while_its_mtime_is_within_three_splits(
-    eye: Eye, tmp_path: Path, age_s: float, standing: Standing
+    eye: Eye, tmp_path: Path, age_s: float, standing: FileState
 ) -> None:
     path = plain(tmp_path / "rec" / "rec_0.mcap", [1, 2], closed=False)
     assert eye.look(path, age_s=age_s) is standing
@@ -124,7 +126,7 @@ def test_an_open_bag_of_a_recording_that_the_heartbeat_names_is_active_however_s
     eye: Eye, tmp_path: Path, age_s: float
 ) -> None:
     path = plain(tmp_path / "day" / "rec_1" / "rec_1_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=age_s, names={"day/rec_1", "rec_2"}) is Standing.ACTIVE
+    assert eye.look(path, age_s=age_s, names={"day/rec_1", "rec_2"}) is FileState.ACTIVE
 
 
 @pytest.mark.parametrize("names", [set(), {"rec_2"}, {"rec_1"}, {"day"}])
@@ -132,14 +134,14 @@ def test_an_open_bag_of_a_recording_that_a_live_heartbeat_does_not_name_is_left_
     eye: Eye, tmp_path: Path, names: set[str]
 ) -> None:
     path = plain(tmp_path / "day" / "rec_1" / "rec_1_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=0, names=names) is Standing.INCOMPLETE
+    assert eye.look(path, age_s=0, names=names) is FileState.INCOMPLETE
 
 
 def test_an_open_bag_in_the_bag_directory_itself_is_named_by_a_dot(
     eye: Eye, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=3600, names={"."}) is Standing.ACTIVE
+    assert eye.look(path, age_s=3600, names={"."}) is FileState.ACTIVE
 
 
 def test_a_bag_left_open_serves_what_is_readable(eye: Eye, tmp_path: Path) -> None:
@@ -153,18 +155,18 @@ def test_a_bag_left_open_serves_what_is_readable(eye: Eye, tmp_path: Path) -> No
 
 def test_a_growth_that_was_seen_counts_whatever_the_mtime_says(eye: Eye, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=-86_400) is Standing.INCOMPLETE
+    assert eye.look(path, age_s=-86_400) is FileState.INCOMPLETE
     grow(path, 2)
-    assert eye.look(path, age_s=-86_400) is Standing.ACTIVE
-    assert eye.look(path, now=NOW + THREE_SPLITS) is Standing.ACTIVE
-    assert eye.look(path, now=NOW + THREE_SPLITS + 1) is Standing.INCOMPLETE
+    assert eye.look(path, age_s=-86_400) is FileState.ACTIVE
+    assert eye.look(path, now=NOW + THREE_SPLITS) is FileState.ACTIVE
+    assert eye.look(path, now=NOW + THREE_SPLITS + 1) is FileState.INCOMPLETE
 
 
 def test_a_larger_file_put_in_its_place_did_not_grow(eye: Eye, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=3600) is Standing.INCOMPLETE
+    assert eye.look(path, age_s=3600) is FileState.INCOMPLETE
     plain(tmp_path / "other", [1, 2, 3], closed=False).rename(path)
-    assert eye.look(path, age_s=3600) is Standing.INCOMPLETE
+    assert eye.look(path, age_s=3600) is FileState.INCOMPLETE
 
 
 def test_the_growth_of_a_file_is_not_that_of_the_one_put_in_its_place(
@@ -173,9 +175,9 @@ def test_the_growth_of_a_file_is_not_that_of_the_one_put_in_its_place(
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
     eye.look(path, age_s=3600)
     grow(path, 2)
-    assert eye.look(path, age_s=3600) is Standing.ACTIVE
+    assert eye.look(path, age_s=3600) is FileState.ACTIVE
     plain(tmp_path / "other", [1, 2, 3], closed=False).rename(path)
-    assert eye.look(path, age_s=3600) is Standing.INCOMPLETE
+    assert eye.look(path, age_s=3600) is FileState.INCOMPLETE
 
 
 def test_after_the_clock_was_set_back_a_growth_counts_for_three_splits_more(
@@ -184,11 +186,11 @@ def test_after_the_clock_was_set_back_a_growth_counts_for_three_splits_more(
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
     eye.look(path, age_s=-86_400)
     grow(path, 2)
-    assert eye.look(path, age_s=-86_400) is Standing.ACTIVE
+    assert eye.look(path, age_s=-86_400) is FileState.ACTIVE
     earlier = NOW - 7200 * S
-    assert eye.look(path, now=earlier) is Standing.ACTIVE
-    assert eye.look(path, now=earlier + THREE_SPLITS) is Standing.ACTIVE
-    assert eye.look(path, now=earlier + THREE_SPLITS + 1) is Standing.INCOMPLETE
+    assert eye.look(path, now=earlier) is FileState.ACTIVE
+    assert eye.look(path, now=earlier + THREE_SPLITS) is FileState.ACTIVE
+    assert eye.look(path, now=earlier + THREE_SPLITS + 1) is FileState.INCOMPLETE
 
 
 def test_an_active_bag_is_not_summarised(eye: Eye, tmp_path: Path) -> None:
@@ -200,9 +202,9 @@ def test_an_active_bag_is_not_summarised(eye: Eye, tmp_path: Path) -> None:
 
 def test_an_active_bag_becomes_a_bag_when_it_is_closed_in_place(eye: Eye, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=0) is Standing.ACTIVE
+    assert eye.look(path, age_s=0) is FileState.ACTIVE
     close(path)
-    assert eye.look(path, age_s=0, names={"."}) is Standing.CLOSED
+    assert eye.look(path, age_s=0, names={"."}) is FileState.CLOSED
 
 
 def test_a_file_of_0_bytes_is_active_while_its_recorder_writes_and_damaged_after(
@@ -210,8 +212,8 @@ def test_a_file_of_0_bytes_is_active_while_its_recorder_writes_and_damaged_after
 ) -> None:
     path = tmp_path / "rec_0.mcap"
     path.touch()
-    assert eye.look(path, age_s=5) is Standing.ACTIVE
-    assert eye.look(path, age_s=31) is Standing.DAMAGED
+    assert eye.look(path, age_s=5) is FileState.ACTIVE
+    assert eye.look(path, age_s=31) is FileState.DAMAGED
     assert eye.reason() == "the file is empty"
     assert eye.is_watched()
 
@@ -219,13 +221,13 @@ def test_a_file_of_0_bytes_is_active_while_its_recorder_writes_and_damaged_after
 def test_a_file_that_is_no_bag_is_damaged_with_the_readers_reason(eye: Eye, tmp_path: Path) -> None:
     path = tmp_path / "rec_0.mcap"
     path.write_text("# Dockerfile", encoding="utf-8")
-    assert eye.look(path, age_s=0) is Standing.DAMAGED
+    assert eye.look(path, age_s=0) is FileState.DAMAGED
     assert eye.reason() == "not a bag"
 
 
 def test_a_bag_left_open_before_its_first_message_is_damaged(eye: Eye, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", silent=["/scan"], closed=False)
-    assert eye.look(path, age_s=3600) is Standing.DAMAGED
+    assert eye.look(path, age_s=3600) is FileState.DAMAGED
     assert "before its first message" in eye.reason()
 
 
@@ -233,8 +235,8 @@ def test_a_closed_bag_without_a_message_is_empty_and_names_its_silent_topics(
     eye: Eye, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", silent=["/scan", "/tf"])
-    assert eye.look(path, age_s=3600) is Standing.EMPTY
-    assert eye.verdict == Verdict(Standing.EMPTY, silent=("/scan", "/tf"))
+    assert eye.look(path, age_s=3600) is FileState.EMPTY
+    assert eye.verdict == Classification(FileState.EMPTY, silent=("/scan", "/tf"))
 
 
 def test_a_file_of_a_kind_that_is_not_read_names_the_storage_that_reads_it(
@@ -242,7 +244,7 @@ def test_a_file_of_a_kind_that_is_not_read_names_the_storage_that_reads_it(
 ) -> None:
     eye = Eye(tmp_path, ".mcap")
     path = plain(tmp_path / "rec_0.db3", [1])
-    assert eye.look(path, age_s=0) is Standing.UNREAD
+    assert eye.look(path, age_s=0) is FileState.UNREAD
     assert (
         eye.reason() == "this storage does not read .db3 files: choose storage=rosbag2, which does"
     )
@@ -252,7 +254,7 @@ def test_a_file_of_a_kind_that_is_not_read_names_the_storage_that_reads_it(
 
 def test_a_name_in_capitals_is_not_read_and_says_what_to_do(eye: Eye, tmp_path: Path) -> None:
     path = plain(tmp_path / "REC_0.MCAP", [1])
-    assert eye.look(path, age_s=0) is Standing.UNREAD
+    assert eye.look(path, age_s=0) is FileState.UNREAD
     assert "must end in .mcap, in lower case: rename it" in eye.reason()
 
 
@@ -304,7 +306,7 @@ def test_a_damaged_file_is_tried_again_when_it_changed_or_after_ten_minutes(
     eye.look(path, now=NOW + RETRY_NS + 1)
     assert eye.reader.summaries.total() == 3
     plain(path, [1])
-    assert eye.look(path, age_s=100) is Standing.CLOSED
+    assert eye.look(path, age_s=100) is FileState.CLOSED
 
 
 def test_a_file_that_cannot_be_opened_is_damaged(eye: Eye, tmp_path: Path) -> None:
@@ -315,7 +317,7 @@ def test_a_file_that_cannot_be_opened_is_damaged(eye: Eye, tmp_path: Path) -> No
     eye.reader = Locked()
     path = plain(tmp_path / "rec_0.mcap", [1])
     for _ in range(2):
-        assert eye.look(path, age_s=0) is Standing.DAMAGED
+        assert eye.look(path, age_s=0) is FileState.DAMAGED
         assert eye.reason() == "cannot be opened: Permission denied"
     assert eye.reader.summaries.total() == 0
 
@@ -329,14 +331,14 @@ def test_a_file_that_vanishes_while_it_is_read_is_no_verdict(eye: Eye, tmp_path:
 
 @pytest.mark.parametrize(
     ("age_s", "standing"),
-    [(0, Standing.ACTIVE), (30, Standing.ACTIVE), (30.001, Standing.CLOSED)],
+    [(0, FileState.ACTIVE), (30, FileState.ACTIVE), (30.001, FileState.CLOSED)],
 )
 def test_a_db3_that_looks_closed_is_active_for_three_splits(
-    eye: Eye, tmp_path: Path, age_s: float, standing: Standing
+    eye: Eye, tmp_path: Path, age_s: float, standing: FileState
 ) -> None:
     path = plain(tmp_path / "rec" / "rec_0.db3", [1])
     assert eye.look(path, age_s=age_s) is standing
-    assert eye.is_watched() is (standing is Standing.ACTIVE)
+    assert eye.is_watched() is (standing is FileState.ACTIVE)
 
 
 @pytest.mark.parametrize("name", ["rec_0.db3", "rec_1.db3", "rec_2.db3"])
@@ -345,29 +347,29 @@ def test_a_db3_that_metadata_mentions_is_closed_at_once(
 ) -> None:
     path = plain(tmp_path / "rec" / name, [1])
     (path.parent / "metadata.yaml").write_text(METADATA, encoding="utf-8")
-    assert eye.look(path, age_s=0) is Standing.CLOSED
+    assert eye.look(path, age_s=0) is FileState.CLOSED
 
 
 @pytest.mark.parametrize("name", ["rec_3.db3", "c_0.db3"])
 def test_a_db3_that_metadata_does_not_mention_is_not(eye: Eye, tmp_path: Path, name: str) -> None:
     path = plain(tmp_path / "rec" / name, [1])
     (path.parent / "metadata.yaml").write_text(METADATA, encoding="utf-8")
-    assert eye.look(path, age_s=0) is Standing.ACTIVE
+    assert eye.look(path, age_s=0) is FileState.ACTIVE
 
 
 def test_a_young_db3_is_active_only_where_no_heartbeat_names_other_recordings(
     eye: Eye, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec" / "rec_0.db3", [1])
-    assert eye.look(path, age_s=5, names={"rec"}) is Standing.ACTIVE
-    assert eye.look(path, age_s=5, names={"rec_2"}) is Standing.CLOSED
+    assert eye.look(path, age_s=5, names={"rec"}) is FileState.ACTIVE
+    assert eye.look(path, age_s=5, names={"rec_2"}) is FileState.CLOSED
     assert eye.is_watched()
-    assert eye.look(path, age_s=5) is Standing.ACTIVE
+    assert eye.look(path, age_s=5) is FileState.ACTIVE
 
 
 def test_a_finished_split_of_a_db3_recording_under_way_is_closed(eye: Eye, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec" / "rec_0.db3", [1])
-    assert eye.look(path, age_s=31, names={"rec"}) is Standing.CLOSED
+    assert eye.look(path, age_s=31, names={"rec"}) is FileState.CLOSED
 
 
 @pytest.mark.parametrize("kind", [".mcap.zstd", ".db3.zstd"])
@@ -375,9 +377,9 @@ def test_a_compressed_bag_is_closed_as_soon_as_its_frame_is_whole(
     eye: Eye, tmp_path: Path, kind: str
 ) -> None:
     path = plain(tmp_path / f"rec_0{kind}", [1], closed=False)
-    assert eye.look(path, age_s=0) is Standing.ACTIVE
+    assert eye.look(path, age_s=0) is FileState.ACTIVE
     close(path)
-    assert eye.look(path, age_s=0) is Standing.CLOSED
+    assert eye.look(path, age_s=0) is FileState.CLOSED
 
 
 def test_metadata_that_is_missing_or_no_file_mentions_nothing(tmp_path: Path) -> None:
@@ -397,7 +399,7 @@ def test_metadata_of_any_bytes_is_read_for_the_lines_that_name_bags(tmp_path: Pa
 class TestWhereNothingIsRecorded:
     """A young mtime may be that of a copy."""
 
-    def look(self, path: Path, kind: str, *ages_s: float) -> list[Standing]:
+    def look(self, path: Path, kind: str, *ages_s: float) -> list[FileState]:
         eye = Eye(path.parent, kind)
         eye.trusts_mtime = False
         return [eye.look(path, age_s=age_s) for age_s in ages_s]
@@ -405,10 +407,10 @@ class TestWhereNothingIsRecorded:
     @pytest.mark.parametrize("old_s", [31, 3600, -3600, 1.8e9])
     @pytest.mark.parametrize(
         ("kind", "closed", "standing"),
-        [(".mcap", False, Standing.INCOMPLETE), (".db3", True, Standing.CLOSED)],
+        [(".mcap", False, FileState.INCOMPLETE), (".db3", True, FileState.CLOSED)],
     )
     def test_a_copy_of_other_times_is_not_being_written(
-        self, tmp_path: Path, old_s: float, kind: str, closed: bool, standing: Standing
+        self, tmp_path: Path, old_s: float, kind: str, closed: bool, standing: FileState
     ) -> None:
         path = plain(tmp_path / f"bag{kind}", [NOW - round(old_s * S)], closed=closed)
         assert self.look(path, kind, 0) == [standing]
@@ -418,18 +420,18 @@ class TestWhereNothingIsRecorded:
         self, tmp_path: Path, kind: str, closed: bool
     ) -> None:
         path = plain(tmp_path / f"bag{kind}", [NOW - 3600 * S, NOW - 5 * S], closed=closed)
-        assert self.look(path, kind, 0) == [Standing.ACTIVE]
+        assert self.look(path, kind, 0) == [FileState.ACTIVE]
 
     def test_so_is_one_without_a_message_yet(self, tmp_path: Path) -> None:
         (tmp_path / "bag.mcap").touch()
-        assert self.look(tmp_path / "bag.mcap", ".mcap", 0) == [Standing.ACTIVE]
+        assert self.look(tmp_path / "bag.mcap", ".mcap", 0) == [FileState.ACTIVE]
         begun = plain(tmp_path / "begun.mcap", closed=False)
-        assert self.look(begun, ".mcap", 0) == [Standing.ACTIVE]
+        assert self.look(begun, ".mcap", 0) == [FileState.ACTIVE]
 
     def test_so_is_one_that_was_seen_to_grow(self, tmp_path: Path) -> None:
         path = plain(tmp_path / "bag.mcap", [1], closed=False)
         eye = Eye(tmp_path)
         eye.trusts_mtime = False
-        assert eye.look(path, age_s=0) is Standing.INCOMPLETE
+        assert eye.look(path, age_s=0) is FileState.INCOMPLETE
         grow(path, 2)
-        assert eye.look(path, age_s=0) is Standing.ACTIVE
+        assert eye.look(path, age_s=0) is FileState.ACTIVE

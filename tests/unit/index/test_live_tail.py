@@ -26,7 +26,7 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.storage.mcap_reader import McapReader
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 S = 10**9
 T0 = 1_784_023_200 * S
 TENTH = S // 10
-LIVE = Limits(include_active=True)
+LIVE = QuerySettings(include_active=True)
 LAYOUTS = (
     McapLayout(chunk_size=4096, compression=CompressionType.ZSTD),
     McapLayout(chunk_size=4096),
@@ -423,6 +423,6 @@ def test_lists_have_no_place_for_it_and_stay_lists(tail: Tail) -> None:
 def test_the_instructions_tell_what_this_deployment_can_answer() -> None:
     assert "not_closed_yet" in instructions(LIVE)
     assert "3 s" in instructions(LIVE)
-    assert "newest 10 s" in instructions(Limits())
+    assert "newest 10 s" in instructions(QuerySettings())
     assert "newest 10 s" not in instructions(LIVE)
     assert len(instructions(LIVE)) < 2_000

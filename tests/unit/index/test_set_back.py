@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import IndexType
 
-from ros2_memory.catalogue.codec import shape_of_text, shape_text
+from ros2_memory.catalogue.codec import decode_schema, encode_schema
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.overview import data_time_range
 from ros2_memory.queries import topic_range
 from ros2_memory.storage.mcap_reader import McapReader
@@ -90,7 +90,7 @@ def test_it_is_listed_and_told_where_it_matters_and_changes_no_span(tmp_path: Pa
     [fault] = data_time_range(memory, Call()).clock_faults
     assert "set back by 28 s or more while it was being written" in fault.reason
     assert data_time_range(memory, Call()).earliest == T0 - 10 * S
-    told = topic_range(memory, Call(), way[0].topic, Span(start_s=T0 / S, end_s=T0 / S + 10))
+    told = topic_range(memory, Call(), way[0].topic, TimeRange(start_s=T0 / S, end_s=T0 / S + 10))
     assert any("set back" in note for note in told.notes)
 
 
@@ -99,4 +99,4 @@ def test_the_catalogue_keeps_it(tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", way, LAYOUTS["indexed"])
     shape = McapReader().summarize(tmp_path / "a.mcap").shape
     assert shape.set_back
-    assert shape_of_text(shape_text(shape)) == shape
+    assert decode_schema(encode_schema(shape)) == shape

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from ros2_memory.core.model import BagFile, BagState, BagSummary, TopicSummary
 from ros2_memory.index.split_order import (
     Neighbours,
-    courses_of,
     is_recording,
     neighbours,
     place_of,
+    split_ranges_of,
     steps_of,
 )
 
@@ -39,7 +39,7 @@ def in_parts(bags: list[BagFile], size: int) -> list[list[BagFile]]:
 def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
     parts = in_parts(bags, size)
     found = steps_of(
-        [courses_of(part) for part in parts], lambda at: [bag for n in at for bag in parts[n]]
+        [split_ranges_of(part) for part in parts], lambda at: [bag for n in at for bag in parts[n]]
     )
     return [(step.before.path.name, step.after.path.name, step.by) for step in found]
 
@@ -48,7 +48,7 @@ def near(name: str, bags: list[BagFile], size: int = 256) -> Neighbours:
     parts = in_parts(bags, size)
     return neighbours(
         f"/bags/rec/{name}",
-        [courses_of(part) for part in parts],
+        [split_ranges_of(part) for part in parts],
         lambda at: [bag for n in at for bag in parts[n]],
     )
 

@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.core.timebase import FixedClock
-from ros2_memory.index.file_state import FormerFile
+from ros2_memory.index.file_state import KnownFile
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.plain_bags import PlainReader, plain
 
@@ -28,7 +28,7 @@ class Start:
 
     def __init__(self, bag_dir: Path) -> None:
         self.bag_dir = bag_dir
-        self.known: dict[str, FormerFile] = {}
+        self.known: dict[str, KnownFile] = {}
         for split in range(6):
             plain(bag_dir / "rec" / f"rec_{split}.mcap", [split * 10, split * 10 + 9])
         self.age()
@@ -42,7 +42,7 @@ class Start:
         """Knows from then on all bags as they are."""
         index, _ = self.index(knowing=False)
         self.known = {
-            bag.file: FormerFile(
+            bag.file: KnownFile(
                 bag.size, bag.mtime_ns, bag.sidecar_ns, bag.summary, bag.start, bag.end
             )
             for bag in index.refresh().bags

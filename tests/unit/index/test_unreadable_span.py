@@ -12,7 +12,7 @@ from ros2_memory.index.unreadable_span import (
     LONGEST_NS,
     begun,
     bounds,
-    whereabouts,
+    unreadable_span,
 )
 
 S = 10**9
@@ -23,47 +23,47 @@ OWN = "rec_20260921T130000Z"
 
 
 def test_between_two_splits_it_holds_what_lies_between_them() -> None:
-    found = whereabouts("rec", Neighbours(100 * S, 200 * S), NOW, NOW)
+    found = unreadable_span("rec", Neighbours(100 * S, 200 * S), NOW, NOW)
     assert found == TimeWindow(100 * S, 200 * S + 1)
 
 
 def test_behind_the_last_split_it_ends_when_its_file_was_last_written() -> None:
-    found = whereabouts("rec", Neighbours(NOW - 600 * S), NOW - 500 * S, NOW)
+    found = unreadable_span("rec", Neighbours(NOW - 600 * S), NOW - 500 * S, NOW)
     assert found == TimeWindow(NOW - 600 * S, NOW - 440 * S)
 
 
 def test_a_file_that_was_copied_here_later_is_taken_to_hold_a_day() -> None:
-    found = whereabouts("rec", Neighbours(NOW - 1000 * HOUR), NOW, NOW)
+    found = unreadable_span("rec", Neighbours(NOW - 1000 * HOUR), NOW, NOW)
     assert found == TimeWindow(NOW - 1000 * HOUR, NOW - 976 * HOUR)
 
 
 def test_before_the_first_split_it_begins_with_its_recording() -> None:
     begin = begun(OWN)
     assert begin is not None
-    found = whereabouts(OWN, Neighbours(after=begin + 20 * S), NOW, NOW)
+    found = unreadable_span(OWN, Neighbours(after=begin + 20 * S), NOW, NOW)
     assert found == TimeWindow(begin, begin + 20 * S + 1)
 
 
 def test_alone_in_a_folder_it_ends_when_it_was_written_and_holds_a_day() -> None:
-    found = whereabouts("someones", Neighbours(), NOW - HOUR, NOW)
+    found = unreadable_span("someones", Neighbours(), NOW - HOUR, NOW)
     assert found == TimeWindow(NOW - 25 * HOUR + 60 * S, NOW - HOUR + 60 * S)
 
 
 def test_where_nothing_is_known_around_it_its_time_is_unknown() -> None:
-    assert whereabouts("someones", Neighbours(), None, NOW) is None
-    assert whereabouts("someones", Neighbours(), 5 * S, NOW) is None
-    assert whereabouts("someones", Neighbours(), NOW + HOUR, NOW) is None
+    assert unreadable_span("someones", Neighbours(), None, NOW) is None
+    assert unreadable_span("someones", Neighbours(), 5 * S, NOW) is None
+    assert unreadable_span("someones", Neighbours(), NOW + HOUR, NOW) is None
 
 
 def test_a_file_that_is_still_being_written_has_no_end() -> None:
-    found = whereabouts("rec", Neighbours(NOW - 10 * S), NOW, NOW, growing=True)
+    found = unreadable_span("rec", Neighbours(NOW - 10 * S), NOW, NOW, growing=True)
     assert found == TimeWindow(NOW - 10 * S, MAX_NS)
-    found = whereabouts("someones", Neighbours(), NOW, NOW, growing=True)
+    found = unreadable_span("someones", Neighbours(), NOW, NOW, growing=True)
     assert found == TimeWindow(NOW - 24 * HOUR, MAX_NS)
 
 
 def test_simulated_times_and_a_file_of_today_hold_a_day_from_the_split_before() -> None:
-    found = whereabouts("sim", Neighbours(before=30 * S), 20 * S, NOW)
+    found = unreadable_span("sim", Neighbours(before=30 * S), 20 * S, NOW)
     assert found == TimeWindow(30 * S, 30 * S + LONGEST_NS)
 
 
@@ -93,7 +93,7 @@ def test_a_window_that_is_found_holds_the_neighbouring_ends_and_fits_64_bits(
     now: int,
     growing: bool,
 ) -> None:
-    found = whereabouts(recording, Neighbours(before, after), written, now, growing=growing)
+    found = unreadable_span(recording, Neighbours(before, after), written, now, growing=growing)
     if found is None:
         assert before is after is None
         return
@@ -138,7 +138,7 @@ def test_what_may_be_there_includes_all_that_is_likely_up_to_the_last_write(
     recording: str, before: int | None, after: int | None, written: int | None, now: int
 ) -> None:
     near = Neighbours(before, after)
-    likely = whereabouts(recording, near, written, now)
+    likely = unreadable_span(recording, near, written, now)
     possible = bounds(recording, near, written, now)
     if possible is not None:
         assert likely is not None

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.insights import field_extremes
 from ros2_memory.results import Extremes
 from ros2_memory.tools.replies import Replies
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
-WHOLE = Span(start_s=BEGIN / S, end_s=BEGIN / S + 100)
+WHOLE = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 100)
 
 
 def asked(folder: Path, messages: list[Msg], *fields: str, most: int = 2) -> TopicRange:

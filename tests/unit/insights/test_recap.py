@@ -22,7 +22,7 @@ from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.insights.recap import MOST_EVENTS, recap
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.storage.mcap_reader import McapReader
@@ -45,7 +45,7 @@ each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "cata
 
 def over(memory: Memory, begin: float, end: float) -> Recap:
     """Of so many seconds after BEGIN."""
-    return recap(memory, Call(), Span(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
+    return recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
 
 
 def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
@@ -61,7 +61,7 @@ def test_a_recorded_session_is_told_as_it_happened(tmp_path: Path, recalls: bool
     memory = memory_of(tmp_path)
     if recalls:
         memory = recalling(replace(memory), tmp_path)
-    told = recap(memory, Call(), Span(start_s=session.at(2.0), end_s=session.at(60.0)))
+    told = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
     assert told.distance_m == pytest.approx(58 * SPEED, rel=0.002)
     assert told.stood == 0
     assert told.throughout == ("table",)
@@ -335,7 +335,9 @@ def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
     assert "30 poses left out: the coordinates are no place (NaN or beyond)" in some.notes
     assert any("1 gap without a valid pose" in note for note in some.notes)
     assert not any("nothing was recorded" in note for note in some.notes)
-    summary = trajectory_summary(memory, Call(), Span(start_s=BEGIN / S + 10, end_s=BEGIN / S + 30))
+    summary = trajectory_summary(
+        memory, Call(), TimeRange(start_s=BEGIN / S + 10, end_s=BEGIN / S + 30)
+    )
     shown = json.loads(Replies(tmp_path, 24_000).answer(summary).text)["notes"]
     assert {note for note in some.notes if "pose" in note} <= set(shown)
 
@@ -549,11 +551,11 @@ def test_a_recap_is_the_same_whatever_the_catalogue_knows(seed: int, part: float
         memory = recalling(replace(plain), bag_dir, part=part)
         for _ in range(3):
             first, last = sorted(draw.choices(moments, k=2))
-            span = Span(start_s=first / S, end_s=last / S)
+            span = TimeRange(start_s=first / S, end_s=last / S)
             assert _answer(memory, span) == _answer(plain, span)
 
 
-def _answer(memory: Memory, span: Span) -> str:
+def _answer(memory: Memory, span: TimeRange) -> str:
     try:
         return repr(recap(memory, Call(), span))
     except EpisodicError as error:

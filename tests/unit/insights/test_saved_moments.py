@@ -11,17 +11,17 @@ import pytest
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
-    Keepsake,
-    Wish,
+    SavedMoment,
+    SaveRequest,
     make_folder,
-    write_keepsake,
+    write_saved_moment,
 )
-from ros2_memory.bag_dir.request_queue import Slot
+from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.endpoint import build_server
-from ros2_memory.history.context import Call, Limits, Memory
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights import saved_moments
 from ros2_memory.insights.saved_moments import (
     MOST_LISTED,
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 S = 10**9
 T0 = 1_790_000_000 * S
 NOW = T0 + 60 * S
-RECORDS = Limits(kept=RetentionLimits(10**12, 10**18))
+RECORDS = QuerySettings(kept=RetentionLimits(10**12, 10**18))
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +50,7 @@ def _much_patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(saved_moments, "PATIENCE_S", 60.0)
 
 
-def remembering(bag_dir: Path, limits: Limits = RECORDS) -> Memory:
+def remembering(bag_dir: Path, limits: QuerySettings = RECORDS) -> Memory:
     for n in range(6):
         times = [T0 + (n * 10 + second) * S for second in range(10)]
         write_mcap(bag_dir / f"rec/rec_{n}.mcap", [odom(at, 1.0, 2.0) for at in times])
@@ -124,7 +124,7 @@ def test_what_the_recorder_refuses_is_told_with_its_reason(tmp_path: Path) -> No
 
 
 def test_where_nothing_is_recorded_nothing_can_be_kept(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, Limits())
+    memory = remembering(tmp_path, QuerySettings())
     beating(tmp_path)
     assert "recorder=none" in refusal(memory)
     assert requests(tmp_path) == []
@@ -167,14 +167,14 @@ def test_a_wish_that_was_begun_just_in_time_is_waited_for(
     memory = remembering(tmp_path)
     beating(tmp_path)
     house = keeper_of(tmp_path, clock=SettableClock(NOW))
-    withdraw = Slot.withdraw
+    withdraw = PendingRequest.withdraw
 
-    def too_late(slot: Slot) -> bool:
+    def too_late(slot: PendingRequest) -> bool:
         house.keep_moments(tmp_path)
         return withdraw(slot)
 
     monkeypatch.setattr(saved_moments, "PATIENCE_S", 0.0)
-    monkeypatch.setattr(Slot, "withdraw", too_late)
+    monkeypatch.setattr(PendingRequest, "withdraw", too_late)
     assert remember(memory).bags == 3
 
 
@@ -197,8 +197,8 @@ def test_with_simulated_time_now_is_the_newest_recorded_moment(tmp_path: Path) -
 class TestTheList:
     def keep(self, bag_dir: Path, number: int, **more: Any) -> None:
         end = T0 + number * S
-        wish = Wish(f"{number:032x}", f"number {number}", end - S, end, NOW)
-        write_keepsake(make_folder(bag_dir, wish), replace(Keepsake.of(wish), **more))
+        wish = SaveRequest(f"{number:032x}", f"number {number}", end - S, end, NOW)
+        write_saved_moment(make_folder(bag_dir, wish), replace(SavedMoment.of(wish), **more))
 
     def test_it_has_the_newest_first_and_counts_the_others(self, tmp_path: Path) -> None:
         for number in range(MOST_LISTED + 3):
@@ -239,11 +239,11 @@ class TestTheTool:
         assert load_settings((), {"MEMORY_DEPLOYMENT": preset}).server.write_tools is offered
 
     def test_it_is_offered_only_where_writing_is_allowed(self) -> None:
-        reading = {tool.name for tool in build_tools(Limits(), 25.0)}
-        writing = {tool.name: tool for tool in build_tools(Limits(), 25.0, writing=True)}
+        reading = {tool.name for tool in build_tools(QuerySettings(), 25.0)}
+        writing = {tool.name: tool for tool in build_tools(QuerySettings(), 25.0, writing=True)}
         assert writing.keys() - reading == {"remember_moment"}
         assert [name for name, tool in writing.items() if tool.writes] == ["remember_moment"]
-        spec = build_tools(Limits(), 25.0, additions=False, writing=True)
+        spec = build_tools(QuerySettings(), 25.0, additions=False, writing=True)
         assert not [tool for tool in spec if tool.writes]
 
     @pytest.mark.parametrize(
@@ -259,6 +259,6 @@ class TestTheTool:
         ],
     )
     def test_its_arguments_are_bounded(self, given: dict[str, Any], said: str) -> None:
-        [tool] = [tool for tool in build_tools(Limits(), 25.0, writing=True) if tool.writes]
+        [tool] = [tool for tool in build_tools(QuerySettings(), 25.0, writing=True) if tool.writes]
         with pytest.raises(Exception, match=said):
             tool.question(given)

@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import Deadline, FixedClock, unix_from_ns
-from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.reverse_search import Search
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
@@ -153,7 +153,7 @@ def test_the_last_seconds_count_from_now(tmp_path: Path) -> None:
     spoken(tmp_path, *((float(t), "cup" if t % 2 else "") for t in range(20)))
     memory = memory_of(tmp_path, clock=FixedClock(BEGIN + 25 * S))
     assert seconds(memory, "cup", topic, last_s=10.0) == [(19, 19), (17, 17), (15, 15)]
-    newest = memory_of(tmp_path, limits=Limits(now="latest"))
+    newest = memory_of(tmp_path, limits=QuerySettings(now="latest"))
     assert seconds(newest, "cup", topic, last_s=3.0) == [(19, 19), (17, 17)]
     with pytest.raises(InvalidArgumentsError, match="seconds counts from now"):
         find_matches(memory, Call(), topic, "contains", "cup", last_s=5.0, end_s=4.0)
@@ -296,7 +296,7 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         write_history(bag_dir, draw)
-        plain = memory_of(bag_dir, reader=CountingReader(McapReader()), limits=Limits())
+        plain = memory_of(bag_dir, reader=CountingReader(McapReader()), limits=QuerySettings())
         memory = recalling(replace(plain), bag_dir, part=part)
         for topic, kind, value in ASKED:
             try:

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 
 from ros2_memory.core.model import JsonValue
-from ros2_memory.messages.detections import Thing, things_of
+from ros2_memory.messages.detections import Detection, detections_of
 from tests.strategies import json_values
 
 
@@ -15,9 +15,9 @@ def test_detections_with_a_label_and_a_point_are_things_in_the_frame_of_the_mess
             {"label": "table", "bbox": [0, 1, 2, 3]},
         ]
     }
-    assert things_of(value, "base_link") == (
-        Thing("cup", (1.0, -2.0, 0.5), "base_link"),
-        Thing("table", None, "base_link"),
+    assert detections_of(value, "base_link") == (
+        Detection("cup", (1.0, -2.0, 0.5), "base_link"),
+        Detection("table", None, "base_link"),
     )
 
 
@@ -38,7 +38,7 @@ def test_a_detection_of_vision_msgs_is_its_best_hypothesis() -> None:
             }
         ],
     }
-    assert things_of(value) == (Thing("cup", (1.0, 2.0, 3.0), "camera"),)
+    assert detections_of(value) == (Detection("cup", (1.0, 2.0, 3.0), "camera"),)
 
 
 def test_the_centre_of_a_box_in_an_image_is_no_place() -> None:
@@ -50,21 +50,21 @@ def test_the_centre_of_a_box_in_an_image_is_no_place() -> None:
             }
         ]
     }
-    assert things_of(value) == (Thing("cup"),)
+    assert detections_of(value) == (Detection("cup"),)
 
 
 def test_a_point_that_nobody_filled_in_is_no_place() -> None:
     value: JsonValue = [{"label": "cup", "point": {"x": 0.0, "y": 0.0, "z": 0.0}}]
-    assert things_of(value) == (Thing("cup"),)
+    assert detections_of(value) == (Detection("cup"),)
 
 
 def test_a_text_that_is_json_is_looked_into() -> None:
     value: JsonValue = {"value": '[{"label": "cup", "point": [1, 2, 3]}]'}
-    assert things_of(value, "odom") == (Thing("cup", (1.0, 2.0, 3.0), "odom"),)
+    assert detections_of(value, "odom") == (Detection("cup", (1.0, 2.0, 3.0), "odom"),)
 
 
 def test_a_list_of_names_is_a_list_of_things() -> None:
-    assert things_of({"labels": ["cup", "", "fork"]}) == (Thing("cup"), Thing("fork"))
+    assert detections_of({"labels": ["cup", "", "fork"]}) == (Detection("cup"), Detection("fork"))
 
 
 @pytest.mark.parametrize(
@@ -81,13 +81,13 @@ def test_a_list_of_names_is_a_list_of_things() -> None:
     ids=str,
 )
 def test_other_messages_tell_of_no_things(value: JsonValue) -> None:
-    assert things_of(value) == ()
+    assert detections_of(value) == ()
 
 
 def test_all_things_of_a_message_are_looked_at() -> None:
-    assert len(things_of([{"label": str(nth)} for nth in range(1000)])) == 1000
+    assert len(detections_of([{"label": str(nth)} for nth in range(1000)])) == 1000
 
 
 @given(json_values)
 def test_no_value_is_too_odd(value: JsonValue) -> None:
-    assert all(thing.label.strip() for thing in things_of(value))
+    assert all(thing.label.strip() for thing in detections_of(value))

@@ -13,7 +13,7 @@ from ros2_memory.messages.fields import (
     Route,
     descend,
     field_of,
-    layout_of,
+    field_table_of,
     names_of,
     parse_path,
 )
@@ -69,7 +69,7 @@ def test_an_object_of_another_decoder_is_walked_by_its_attributes() -> None:
     node = SimpleNamespace(pose=SimpleNamespace(x=1.0))
     assert names_of(node) == ("pose",)
     assert descend(node, ("pose", "x")) == 1.0
-    assert layout_of(object()) is None
+    assert field_table_of(object()) is None
 
 
 @pytest.mark.parametrize(

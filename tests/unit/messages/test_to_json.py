@@ -14,8 +14,8 @@ from ros2_memory.messages.to_json import (
     MAX_DEPTH,
     MAX_NOTES,
     MAX_TEXT,
-    Exact,
-    Shown,
+    ExactJson,
+    ReplyJson,
 )
 from tests import bags
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 
 def shown(node: object, limit: int = 50, path: str = "") -> tuple[JsonValue, tuple[str, ...]]:
-    rendering = Shown(limit)
+    rendering = ReplyJson(limit)
     return rendering.value(node, path), rendering.notes
 
 
 def exact(node: object, limit: int = 50) -> JsonValue:
-    return Exact(limit).value(node, "")
+    return ExactJson(limit).value(node, "")
 
 
 def test_a_long_array_is_thinned_evenly_and_the_note_says_so() -> None:
@@ -180,7 +180,7 @@ def test_many_notes_are_counted_rather_than_told() -> None:
 
 
 def test_squeezed_long_objects_lose_their_last_entries_with_a_note() -> None:
-    rendering = Shown(2, squeeze=2)
+    rendering = ReplyJson(2, squeeze=2)
     assert rendering.value({"a": {"b": 1, "c": 2, "d": 3}}, "") == {"a": {"b": 1, "c": 2}}
     assert rendering.notes == ("a: the first 2 of 3 entries",)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Limits
+from ros2_memory.history.context import QuerySettings
 from ros2_memory.observability.gauges import Measuring
 from ros2_memory.retention.policy import RetentionLimits
 from tests.bags import text, write_mcap
@@ -59,7 +59,7 @@ def test_they_tell_how_much_is_kept_and_how_old_the_newest_is(tmp_path: Path) ->
     write_mcap(path, [text(T0, "x"), text(T0 + NS_PER_S, "y")])
     clock = SettableClock(time.time_ns() + 3600 * NS_PER_S)
     kept = RetentionLimits(max_total_bytes=5000, max_age_ns=NS_PER_S, min_free_bytes=0)
-    memory = memory_of(tmp_path, clock=clock, limits=Limits(kept=kept))
+    memory = memory_of(tmp_path, clock=clock, limits=QuerySettings(kept=kept))
     memory.index.refresh()
     scanned, clock.at = clock.at, clock.at + 4 * NS_PER_S
     found = Measuring(memory)()

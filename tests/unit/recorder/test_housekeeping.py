@@ -12,8 +12,8 @@ import zstandard
 from ros2_memory import queries
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call, Limits, Memory
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.recorder.housekeeping import InBackground
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.ports import Housekeeper, NoHousekeeping
@@ -444,7 +444,7 @@ class TestQuestionsMeanwhile:
     ) -> None:
         paths = recording(tmp_path, "a", 0)
         memory = stale_memory(tmp_path)
-        span = Span(start_s=T0 / S, end_s=T0 / S + 24.5)
+        span = TimeRange(start_s=T0 / S, end_s=T0 / S + 24.5)
         assert queries.topic_range(memory, Call(), "/odom", span).total == 59
         for path in paths[: 3 - kept]:
             path.unlink()
@@ -467,7 +467,7 @@ def stale_memory(bag_dir: Path) -> Memory:
     clock, reader = later(), McapReader()
     index = IndexManager(bag_dir, reader, clock, refresh_s=10**6, split_duration_s=10.0)
     index.refresh()
-    return Memory(index, reader, extractor(), clock, Limits(now="latest"))
+    return Memory(index, reader, extractor(), clock, QuerySettings(now="latest"))
 
 
 class TestRemoval:

@@ -12,7 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.recorder.handover.recovery import settle_all
+from ros2_memory.recorder.handover.recovery import recover_handovers
 from ros2_memory.storage.base import Closing
 from tests.recorder_world import World
 from tests.supervision import Housekeeping, assert_each_counts_once, events
@@ -128,7 +128,7 @@ class TestDeath:
         world.run(after_s)
         for recorder in world.running:
             recorder.die()
-        settle_all(tmp_path, world.reader)
+        recover_handovers(tmp_path, world.reader)
         stands, counts = world.published(counting=False), world.published(counting=True)
         assert counts == dict.fromkeys(stands, 1)
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.handover.plan import Moment
+from ros2_memory.recorder.handover.plan import ClockReading
 from ros2_memory.recorder.watchdog import (
     Space,
     resume_bytes,
@@ -66,8 +66,8 @@ class TestSpace:
 def test_only_a_clock_set_back_by_minutes_calls_for_a_new_recording(
     wall_s: float, expected: bool
 ) -> None:
-    before = Moment(10.0, 10**18)
-    now = Moment(10.2, 10**18 + round(wall_s * NS_PER_S))
+    before = ClockReading(10.0, 10**18)
+    now = ClockReading(10.2, 10**18 + round(wall_s * NS_PER_S))
     assert time_was_set_back(before, now) is expected
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from tests.bags import odom, tf, transform, write_mcap
 from tests.keeping import PLENTY, size_of
 from tests.kept_moments import NOW, T0, A, B, S, bag, house_of, in_moments, kept, recording
@@ -32,9 +32,9 @@ class TestRetention:
         house = house_of(tmp_path, max_age_h=1)
         memory = memory_of(tmp_path, clock=SettableClock(NOW))
         questions: list[Callable[[], object]] = [
-            lambda: queries.position(memory, Call(), Moment(at_s=T0 / S + 17)),
+            lambda: queries.position(memory, Call(), AtTime(at_s=T0 / S + 17)),
             lambda: queries.topic_range(
-                memory, Call(), "/odom", Span(start_s=T0 / S + 10, end_s=T0 / S + 29)
+                memory, Call(), "/odom", TimeRange(start_s=T0 / S + 10, end_s=T0 / S + 29)
             ),
         ]
         before = [ask() for ask in questions]
@@ -126,7 +126,7 @@ class TestRetention:
         memory = memory_of(tmp_path, clock=SettableClock(NOW))
 
         def mounted() -> Sample:
-            moment = Moment(at_s=T0 / S + 17)
+            moment = AtTime(at_s=T0 / S + 17)
             return queries.topic_value(memory, Call(), "/tf_static", moment).sample
 
         before = mounted()

@@ -11,7 +11,7 @@ from ros2_memory.core.errors import BagError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.time_arguments import Moment
+from ros2_memory.history.time_arguments import AtTime
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
@@ -64,8 +64,8 @@ def keep_only(bag_dir: Path, *kept: str) -> None:
     assert sorted(path.relative_to(bag_dir).as_posix() for path in left) == sorted(kept)
 
 
-def at(moment: int) -> Moment:
-    return Moment(at_s=unix_from_ns(moment))
+def at(moment: int) -> AtTime:
+    return AtTime(at_s=unix_from_ns(moment))
 
 
 def held(memory: Memory, topic: str, moment: int) -> tuple[int, object] | str:

@@ -66,4 +66,4 @@ def during(moment: int) -> Callable[[int, int], bool]:
 
 
 def test_what_may_have_been_received_before_is_what_questions_take_for_it() -> None:
-    assert latched_carry.RECEIVED_AGAIN_NS <= merged_stream.RECEIVED_AGAIN_NS
+    assert latched_carry.RECEIVED_AGAIN_NS <= merged_stream.RELATCHED_NS

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from ros2_memory.retention.policy import (
     RetentionLimits,
+    RetentionStock,
     Span,
-    Stock,
     StoredBag,
     StoredFile,
     expired,
-    weighed,
+    plan_deletions,
 )
 
 if TYPE_CHECKING:
@@ -53,8 +53,8 @@ def stock(
     sidecars: dict[str, int] | None = None,
     other_bytes: int = 0,
     free_bytes: int | None = None,
-) -> Stock:
-    return Stock(bags, now, sidecars or {}, other_bytes, free_bytes, synchronised=True)
+) -> RetentionStock:
+    return RetentionStock(bags, now, sidecars or {}, other_bytes, free_bytes, synchronised=True)
 
 
 def names(bags: Iterable[StoredBag]) -> list[str]:
@@ -179,7 +179,7 @@ class TestBudget:
     def test_the_last_bag_of_a_recording_takes_its_sidecars_along(self) -> None:
         bags = [bag("a", NOW - 2 * HOUR, recording="old"), *hourly(2)]
         held = stock(*bags, sidecars={"old": 20, "rec": 5})
-        assert weighed(held, LIMITS).total_bytes == 55
+        assert plan_deletions(held, LIMITS).total_bytes == 55
         assert names(expired(held, budget(25))) == ["a"]
         assert names(expired(held, budget(54))) == ["a"]
 
@@ -193,7 +193,7 @@ class TestBudget:
 class TestSharedFiles:
     def test_two_names_of_one_file_count_once(self) -> None:
         held = stock(bag("a", NOW - HOUR, inode=7), bag("b", NOW - HOUR, inode=7), bag("new", NOW))
-        assert weighed(held, LIMITS).total_bytes == 20
+        assert plan_deletions(held, LIMITS).total_bytes == 20
         assert expired(held, budget(20)) == ()
 
     def test_deleting_one_name_frees_nothing_so_both_go_or_none(self) -> None:
@@ -223,7 +223,7 @@ moments = st.one_of(
 
 
 @st.composite
-def stocks(draw: st.DrawFn) -> Stock:
+def stocks(draw: st.DrawFn) -> RetentionStock:
     """Bags by good and bad clocks, in several recordings, some of them names of one file."""
     bags: dict[str, StoredBag] = {}
     for number in range(draw(st.integers(0, 12))):
@@ -238,7 +238,7 @@ def stocks(draw: st.DrawFn) -> Stock:
         if bags and draw(st.integers(0, 9)) == 0:
             made = made._replace(files=draw(st.sampled_from(sorted(bags.values()))).files)
         bags[made.path] = made
-    return Stock(
+    return RetentionStock(
         tuple(draw(st.permutations(list(bags.values())))),
         draw(st.sampled_from([NOW, 5 * HOUR, NOW + 900 * DAY])),
         sidecars=draw(st.dictionaries(st.sampled_from("ABC"), st.integers(0, 20))),
@@ -259,7 +259,7 @@ all_limits = st.builds(
 )
 
 
-def without(held: Stock, doomed: Iterable[StoredBag]) -> Stock:
+def without(held: RetentionStock, doomed: Iterable[StoredBag]) -> RetentionStock:
     """What lies there after these bags, and the sidecars of emptied recordings, are deleted."""
     gone = {each.path for each in doomed}
     bags = [each for each in held.bags if each.path not in gone]
@@ -279,31 +279,33 @@ def without(held: Stock, doomed: Iterable[StoredBag]) -> Stock:
     return replace(held, bags=bags, sidecars=sidecars, free_bytes=free)
 
 
-def fits(held: Stock, limits: RetentionLimits) -> bool:
+def fits(held: RetentionStock, limits: RetentionLimits) -> bool:
     enough = held.free_bytes is None or held.free_bytes >= limits.min_free_bytes
-    return enough and weighed(held, limits).total_bytes <= limits.max_total_bytes
+    return enough and plan_deletions(held, limits).total_bytes <= limits.max_total_bytes
 
 
 class TestAlways:
     @given(stocks(), all_limits)
     def test_the_budget_is_held_unless_the_newest_alone_is_too_large(
-        self, held: Stock, limits: RetentionLimits
+        self, held: RetentionStock, limits: RetentionLimits
     ) -> None:
         left = without(held, expired(held, limits))
         files = {each.files for each in left.bags}
         assert fits(left, limits) or len(files) <= 1
-        assert weighed(held, limits).fits == fits(left, limits)
+        assert plan_deletions(held, limits).fits == fits(left, limits)
 
     @given(stocks(), all_limits)
     def test_something_is_left_where_there_was_something(
-        self, held: Stock, limits: RetentionLimits
+        self, held: RetentionStock, limits: RetentionLimits
     ) -> None:
         left = without(held, expired(held, limits)).bags
         assert bool(left) == bool(held.bags)
         assert any(each.span for each in left) == any(each.span for each in held.bags)
 
     @given(stocks(), all_limits)
-    def test_no_more_is_deleted_than_needed(self, held: Stock, limits: RetentionLimits) -> None:
+    def test_no_more_is_deleted_than_needed(
+        self, held: RetentionStock, limits: RetentionLimits
+    ) -> None:
         aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
         doomed = [each for each in expired(held, limits) if each not in aged]
         if doomed:
@@ -312,27 +314,27 @@ class TestAlways:
 
     @given(stocks(), all_limits)
     def test_the_order_of_what_is_known_does_not_matter(
-        self, held: Stock, limits: RetentionLimits
+        self, held: RetentionStock, limits: RetentionLimits
     ) -> None:
         turned = replace(held, bags=tuple(reversed(held.bags)))
         assert expired(turned, limits) == expired(held, limits)
 
     @given(stocks(), all_limits)
     def test_after_it_is_applied_nothing_more_is_to_delete(
-        self, held: Stock, limits: RetentionLimits
+        self, held: RetentionStock, limits: RetentionLimits
     ) -> None:
         assert expired(without(held, expired(held, limits)), limits) == ()
 
     @given(stocks(), all_limits, st.integers(0, 400))
     def test_a_larger_budget_deletes_nothing_that_a_smaller_one_keeps(
-        self, held: Stock, limits: RetentionLimits, more: int
+        self, held: RetentionStock, limits: RetentionLimits, more: int
     ) -> None:
         larger = replace(limits, max_total_bytes=limits.max_total_bytes + more)
         assert set(expired(held, larger)) <= set(expired(held, limits))
 
     @given(stocks(), st.lists(moments, min_size=1, max_size=5))
     def test_bags_of_bad_clocks_change_nothing_in_the_age_of_others(
-        self, held: Stock, ends: list[int]
+        self, held: RetentionStock, ends: list[int]
     ) -> None:
         odd = [
             bag(f"odd{number}", end, written=end, recording="ODD")
@@ -353,26 +355,26 @@ class TestMoments:
         bags = hourly(4)
         kept = tuple(each.files[0] for each in bags[2:])
         limits = replace(LIMITS, max_total_bytes=39)
-        found = weighed(replace(stock(*bags), kept=kept), limits)
+        found = plan_deletions(replace(stock(*bags), kept=kept), limits)
         # The two oldest would free nothing.
         assert (names(found.doomed), found.total_bytes, found.fits) == (["h1"], 40, True)
 
     def test_what_lies_in_moments_alone_counts_too(self) -> None:
         kept = (StoredFile((1, 5), 15, 15),)
         limits = replace(LIMITS, max_total_bytes=30)
-        found = weighed(replace(stock(*hourly(2)), kept=kept), limits)
+        found = plan_deletions(replace(stock(*hourly(2)), kept=kept), limits)
         assert (names(found.doomed), found.total_bytes, found.fits) == (["h1"], 35, True)
 
     def test_what_is_too_old_goes_from_where_it_was_recorded(self) -> None:
         bags = hourly(170)
-        found = weighed(replace(stock(*bags), kept=bags[-1].files), LIMITS)
+        found = plan_deletions(replace(stock(*bags), kept=bags[-1].files), LIMITS)
         assert names(found.doomed) == ["h169"]
         assert found.total_bytes == 1700
 
     def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
         bags = hourly(3)
         limits = replace(LIMITS, min_free_bytes=10)
-        found = weighed(replace(stock(*bags, free_bytes=0), kept=bags[-1].files), limits)
+        found = plan_deletions(replace(stock(*bags, free_bytes=0), kept=bags[-1].files), limits)
         assert (names(found.doomed), found.fits) == (["h1"], True)
 
     @given(
@@ -392,7 +394,7 @@ class TestMoments:
         ]
         limits = replace(LIMITS, max_total_bytes=most)
         files = tuple(file(inode) for inode in kept)
-        found = weighed(replace(stock(*bags), kept=files), limits)
+        found = plan_deletions(replace(stock(*bags), kept=files), limits)
 
         def shown(left: list[StoredBag]) -> int:
             return sum({each.inode: each.size for each in (*files, *_files(left))}.values())

@@ -13,13 +13,13 @@ from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.retention.policy import (
     SHORTEST_PAUSE_NS,
     RetentionLimits,
+    RetentionStock,
     Span,
-    Stock,
     StoredBag,
     StoredFile,
     ages,
     expired,
-    weighed,
+    plan_deletions,
 )
 from ros2_memory.retention.recorded_time import RecordedTime
 
@@ -48,13 +48,13 @@ class TestAForwardStep:
 
     WEEK = RetentionLimits(PLENTY, 168 * HOUR)
 
-    def stock(self, *, synchronised: bool, recorded_h: int = 0) -> Stock:
+    def stock(self, *, synchronised: bool, recorded_h: int = 0) -> RetentionStock:
         before = hourly(160, until=T0)[::2]
         after = bag("new", 999, Span(T0 + 150 * HOUR, T0 + 150 * HOUR + S))
         since = {each.recording: recorded_h * HOUR for each in before}
         now = T0 + 150 * HOUR + 2 * S
         bags = (*before, after)
-        return Stock(bags, now, recorded_since=since, synchronised=synchronised)
+        return RetentionStock(bags, now, recorded_since=since, synchronised=synchronised)
 
     def test_it_deletes_nothing_while_the_clock_is_not_known_to_be_right(self) -> None:
         held = self.stock(synchronised=False)
@@ -74,7 +74,7 @@ class TestAForwardStep:
 
     def test_the_budget_deletes_all_the_same(self) -> None:
         held = self.stock(synchronised=False)
-        found = weighed(held, RetentionLimits(500, 168 * HOUR))
+        found = plan_deletions(held, RetentionLimits(500, 168 * HOUR))
         assert (len(found.doomed), found.fits) == (31, True)
 
 
@@ -152,9 +152,11 @@ class Life:
             self.bags.append(made)
             self.ended_s[made.path] = self.lived_s
 
-    def stock(self, *, synchronised: bool) -> Stock:
+    def stock(self, *, synchronised: bool) -> RetentionStock:
         since = self.recorded.since({bag.recording for bag in self.bags})
-        return Stock(tuple(self.bags), self.wall, recorded_since=since, synchronised=synchronised)
+        return RetentionStock(
+            tuple(self.bags), self.wall, recorded_since=since, synchronised=synchronised
+        )
 
     def recorded_after(self, bag: StoredBag) -> int:
         return round((self.lived_s - self.ended_s[bag.path]) * S)
@@ -216,4 +218,4 @@ def test_over_any_life_age_deletes_by_a_right_clock_alone_and_the_budget_holds(
                 assert len(old - aged) <= 1, "the newest alone stays"
             life.delete(expired(held, limits))
             left = life.stock(synchronised=synchronised)
-            assert weighed(left, limits).total_bytes <= size or len(life.bags) == 1
+            assert plan_deletions(left, limits).total_bytes <= size or len(life.bags) == 1

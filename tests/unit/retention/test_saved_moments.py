@@ -11,16 +11,16 @@ import structlog
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
-    Keepsake,
-    Wish,
-    held_in,
+    SavedMoment,
+    SaveRequest,
     make_folder,
-    write_keepsake,
+    stored_moments_in,
+    write_saved_moment,
 )
 from ros2_memory.cli.recovery import recover
 from ros2_memory.retention import saved_moments
 from ros2_memory.retention.clear import clear_bags
-from ros2_memory.retention.saved_moments import Keeper
+from ros2_memory.retention.saved_moments import MomentKeeper
 from tests.bags import McapLayout
 from tests.keeping import PLENTY, files_in, recording_now
 from tests.kept_moments import (
@@ -111,7 +111,7 @@ class TestKeeping:
         refused = kept(house, tmp_path, 25, 35).refused
         assert refused is not None
         assert "retention.max_moments_gb" in refused
-        assert len(list(held_in(tmp_path))) == 2
+        assert len(list(stored_moments_in(tmp_path))) == 2
 
     def test_where_links_cannot_be_made_it_is_refused_and_nothing_is_left(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -139,7 +139,7 @@ class TestKeeping:
         request.with_suffix(".taken").write_text(text)
         house_of(tmp_path).keep_moments(tmp_path)
         assert slot.outcome() == first
-        assert len(list(held_in(tmp_path))) == 1
+        assert len(list(stored_moments_in(tmp_path))) == 1
 
     def test_a_moment_in_a_moment_is_kept_under_the_name_that_it_was_recorded_by(
         self, tmp_path: Path
@@ -240,7 +240,7 @@ class TestCrashes:
         recording(tmp_path, A, 0)
         slot = asked(tmp_path, 15, 25)
         folder = make_folder(tmp_path, slot.wish)
-        write_keepsake(folder, Keepsake.of(slot.wish))
+        write_saved_moment(folder, SavedMoment.of(slot.wish))
         house_of(tmp_path).keep_moments(tmp_path)
         outcome = slot.outcome()
         assert outcome is not None
@@ -273,12 +273,12 @@ class TestCrashes:
         told = told_of(tmp_path)
         assert (told["pending"], told["missing"]) == (False, [])
         assert outcome.bags == len(in_moments(tmp_path)) >= 2
-        assert len(list(held_in(tmp_path))) == 1
+        assert len(list(stored_moments_in(tmp_path))) == 1
 
     def test_a_folder_that_is_no_moment_yet_is_removed_and_nothing_else(
         self, tmp_path: Path
     ) -> None:
-        wish = Wish("0" * 32, "here", T0, T0, NOW)
+        wish = SaveRequest("0" * 32, "here", T0, T0, NOW)
         begun = make_folder(tmp_path, wish)
         (begun / f".{MOMENT_FILE}.tmp").write_text("{")
         mine = tmp_path / "moments/mine"
@@ -337,7 +337,7 @@ class TestOthers:
 
     def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
-        looking = Keeper(tmp_path, PLENTY, SettableClock(NOW))
+        looking = MomentKeeper(tmp_path, PLENTY, SettableClock(NOW))
         assert looking.has_work()
         looking.keep(memory_of(tmp_path).index.snapshot())
         assert not looking.has_work()

@@ -19,14 +19,14 @@ import structlog
 from ros2_memory import queries
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.catalogue.digest import Digester
-from ros2_memory.catalogue.lookup import Recall
+from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.cli import main
 from ros2_memory.cli.index import Bar, fill, line
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
-from ros2_memory.serving.backfill import BACKLOG, Filler, Progress, keep_filled
+from ros2_memory.serving.backfill import BACKLOG, Backfill, Progress, keep_backfilled
 from ros2_memory.serving.health import Health
 from tests.bags import McapLayout, odom, text, write_mcap
 from tests.keeping import recorded_before
@@ -49,13 +49,13 @@ def bag(bag_dir: Path, number: int, *, finish: bool = True) -> Path:
 
 
 def recalling(bag_dir: Path, clock: SettableClock | None = None) -> Memory:
-    recall = Recall(Catalogue([bag_dir / FOLDER / FILE], "test"), bag_dir)
+    recall = DigestCache(Catalogue([bag_dir / FOLDER / FILE], "test"), bag_dir)
     return replace(memory_of(bag_dir, clock=clock), recall=recall)
 
 
-def filler_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -> Filler:
+def filler_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -> Backfill:
     made = digester or Digester(memory.reader, memory.extractor, 10.0)
-    return Filler(memory, made, bag_dir)
+    return Backfill(memory, made, bag_dir)
 
 
 def never() -> bool:
@@ -149,7 +149,7 @@ def test_entries_of_bags_that_are_gone_are_dropped(tmp_path: Path) -> None:
 def test_a_bag_directory_that_is_gone_for_a_while_keeps_its_entries(tmp_path: Path) -> None:
     bag_dir, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
     bag(bag_dir, 0)
-    recall = Recall(Catalogue([tmp_path / FILE], "test"), bag_dir)
+    recall = DigestCache(Catalogue([tmp_path / FILE], "test"), bag_dir)
     memory = replace(memory_of(bag_dir), recall=recall)
     fill(filler_of(memory, bag_dir), None, never)
     bag_dir.rename(elsewhere)
@@ -162,7 +162,7 @@ async def test_in_the_background_what_closes_is_digested(tmp_path: Path) -> None
     filler = filler_of(recalling(tmp_path), tmp_path)
     with anyio.fail_after(30):
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_filled, filler, ["/no/such/program"], 0.001)
+            tasks.start_soon(keep_backfilled, filler, ["/no/such/program"], 0.001)
             while filler.progress().waiting:
                 await anyio.lowlevel.checkpoint()
             bag(tmp_path, 1)
@@ -180,7 +180,7 @@ async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
     filler = filler_of(recalling(tmp_path), tmp_path)
     with anyio.fail_after(60):
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_filled, filler, helper, 0.001)
+            tasks.start_soon(keep_backfilled, filler, helper, 0.001)
             while filler.progress().waiting:
                 await anyio.lowlevel.checkpoint()
             tasks.cancel_scope.cancel()

@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.bag_dir.stand_in import StandInReader
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.spec_tools import build_tools
 from tests.bags import detections, odom, tf, transform, write_mcap
@@ -30,7 +30,7 @@ MESSAGES: Final = 1500
 AT_MOST: Final = 2 * MESSAGES
 """Messages that may still be read: those of a bag that is gone through at once."""
 TOOLS: Final = {
-    tool.name: tool for tool in build_tools(Limits(), 25.0, additions=True, writing=False)
+    tool.name: tool for tool in build_tools(QuerySettings(), 25.0, additions=True, writing=False)
 }
 SPAN: Final = {"start": BEGIN_S, "end": BEGIN_S + 4000}
 LONG: Final[tuple[tuple[str, dict[str, Any]], ...]] = (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.errors import BusyError
-from ros2_memory.serving.fair_queue import Lane
+from ros2_memory.serving.fair_queue import FairQueue
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,12 +44,12 @@ async def until(what: Callable[[], bool]) -> None:
             await asyncio.sleep(0.001)
 
 
-def started(lane: Lane, gates: Gates, client: str, count: int) -> list[asyncio.Task[str]]:
+def started(lane: FairQueue, gates: Gates, client: str, count: int) -> list[asyncio.Task[str]]:
     return [asyncio.create_task(lane.run(client, gates.ask(f"{client}{n}"))) for n in range(count)]
 
 
 async def test_so_many_run_at_once_and_the_others_wait() -> None:
-    lane, gates = Lane("test", 2), Gates()
+    lane, gates = FairQueue("test", 2), Gates()
     tasks = started(lane, gates, "a", 5)
     await until(lambda: len(gates.begun) == 2)
     assert (lane.running, lane.waiting) == (2, 3)
@@ -59,7 +59,7 @@ async def test_so_many_run_at_once_and_the_others_wait() -> None:
 
 
 async def test_a_client_that_floods_the_queue_does_not_hold_up_another() -> None:
-    lane, gates = Lane("test", 2), Gates()
+    lane, gates = FairQueue("test", 2), Gates()
     flood = started(lane, gates, "flood", 64)
     await until(lambda: len(gates.begun) == 2)
     [other] = started(lane, gates, "other", 1)
@@ -72,7 +72,7 @@ async def test_a_client_that_floods_the_queue_does_not_hold_up_another() -> None
 
 
 async def test_clients_take_turns_and_each_keeps_its_own_order() -> None:
-    lane, gates = Lane("test", 1), Gates()
+    lane, gates = FairQueue("test", 1), Gates()
     tasks = [
         *started(lane, gates, "a", 4),
         *started(lane, gates, "b", 2),
@@ -85,7 +85,7 @@ async def test_clients_take_turns_and_each_keeps_its_own_order() -> None:
 
 
 async def test_the_next_place_goes_to_whoever_has_the_fewest() -> None:
-    lane, gates = Lane("test", 3), Gates()
+    lane, gates = FairQueue("test", 3), Gates()
     tasks = [*started(lane, gates, "a", 4), *started(lane, gates, "b", 3)]
     await until(lambda: len(gates.begun) == 3)
     gates.release("a0")  # a has two left running, b has none
@@ -98,7 +98,7 @@ async def test_the_next_place_goes_to_whoever_has_the_fewest() -> None:
 
 
 async def test_a_question_whose_caller_leaves_gives_its_place_in_the_queue_back() -> None:
-    lane, gates = Lane("test", 1), Gates()
+    lane, gates = FairQueue("test", 1), Gates()
     tasks = started(lane, gates, "a", 3)
     await until(lambda: lane.waiting == 2)
     tasks[1].cancel()
@@ -109,7 +109,7 @@ async def test_a_question_whose_caller_leaves_gives_its_place_in_the_queue_back(
 
 
 async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -> None:
-    lane, gates = Lane("test", 1), Gates()
+    lane, gates = FairQueue("test", 1), Gates()
     stuck, following = started(lane, gates, "a", 2)
     await until(lambda: gates.begun == ["a0"])
     stuck.cancel()
@@ -122,7 +122,7 @@ async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -
 
 @pytest.mark.parametrize("has_turn", [True, False])
 async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn: bool) -> None:
-    lane, gates = Lane("test", 1), Gates()
+    lane, gates = FairQueue("test", 1), Gates()
     first, leaving, last = started(lane, gates, "a", 3)
     await until(lambda: lane.waiting == 2)
     gates.release("a0")
@@ -139,7 +139,7 @@ async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn:
 
 
 async def test_a_full_queue_refuses_the_newest_of_whoever_fills_it() -> None:
-    lane, gates = Lane("test", 1, most_waiting=4), Gates()
+    lane, gates = FairQueue("test", 1, most_waiting=4), Gates()
     flood = started(lane, gates, "flood", 6)
     await until(lambda: lane.waiting == 4)
     with pytest.raises(BusyError, match="4 questions wait already"):
@@ -154,7 +154,7 @@ async def test_a_full_queue_refuses_the_newest_of_whoever_fills_it() -> None:
 
 
 async def test_what_a_question_raises_reaches_its_caller_and_frees_the_place() -> None:
-    lane = Lane("test", 1)
+    lane = FairQueue("test", 1)
 
     def ask() -> None:
         raise KeyError("inside")
@@ -166,7 +166,7 @@ async def test_what_a_question_raises_reaches_its_caller_and_frees_the_place() -
 
 
 async def test_a_stopped_lane_takes_no_more_and_lets_its_threads_go() -> None:
-    lane, gates = Lane("stopping", 2), Gates()
+    lane, gates = FairQueue("stopping", 2), Gates()
     [running] = started(lane, gates, "a", 1)
     await until(lambda: gates.begun == ["a0"])
     lane.stop()

@@ -7,7 +7,7 @@ import anyio
 import pytest
 
 from ros2_memory.serving import request_limits
-from ros2_memory.serving.request_limits import MOST_BODY_BYTES, MOST_UNREAD, Intake
+from ros2_memory.serving.request_limits import MOST_BODY_BYTES, MOST_UNREAD, RequestLimits
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -89,12 +89,12 @@ async def asked(app: Any, client: Client) -> Client:
     "parts", [[b""], [b"12345"], [b"12", b"", b"345"], [b"x" * (MIB // 4)] * 4]
 )
 async def test_a_body_is_passed_on_whole(parts: list[bytes]) -> None:
-    client = await asked(Intake(echo), Client(*parts))
+    client = await asked(RequestLimits(echo), Client(*parts))
     assert (client.status, client.told) == (200, str(sum(map(len, parts))))
 
 
 async def test_a_body_too_large_is_refused_by_what_is_counted() -> None:
-    client = await asked(Intake(echo), Client(*[b"x" * MIB] * 1000, content_length="5"))
+    client = await asked(RequestLimits(echo), Client(*[b"x" * MIB] * 1000, content_length="5"))
     assert client.status == 413
     assert client.told == f"The request is larger than {MOST_BODY_BYTES} bytes.\n"
     assert client.taken == MOST_BODY_BYTES // MIB + 1
@@ -104,7 +104,7 @@ async def test_a_body_too_large_is_refused_by_what_is_counted() -> None:
 async def test_a_body_too_large_is_refused_by_its_stated_length_before_it_is_read(
     length: str,
 ) -> None:
-    client = await asked(Intake(echo), Client(b"x", content_length=length))
+    client = await asked(RequestLimits(echo), Client(b"x", content_length=length))
     assert (client.status, client.taken) == (413, 0)
 
 
@@ -118,7 +118,7 @@ async def test_all_bodies_together_are_bounded_and_given_back(
         await answering.wait()
         await echo(scope, receive, send)
 
-    app = Intake(slow)
+    app = RequestLimits(slow)
     first = Client(b"x" * MIB)
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(asked, app, first)
@@ -143,7 +143,7 @@ async def test_a_call_whose_client_leaves_is_ended() -> None:
 
     client = Client(b"{}")
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(asked, Intake(stuck), client)
+        tasks.start_soon(asked, RequestLimits(stuck), client)
         await anyio.wait_all_tasks_blocked()
         assert not ended.is_set()
         client.leaves.set()
@@ -158,7 +158,7 @@ async def test_a_client_that_leaves_before_its_body_is_whole_reaches_no_applicat
     client = Client(b"half", b"rest")
     client._messages.pop()
     client.leaves.set()
-    await asked(Intake(never), client)
+    await asked(RequestLimits(never), client)
     assert client.sent == []
 
 
@@ -172,7 +172,7 @@ async def test_what_an_application_does_after_its_answer_is_not_cut_off() -> Non
             await anyio.lowlevel.checkpoint()
         done.append("handed over")
 
-    client = await asked(Intake(accepting), Client(b"{}"))
+    client = await asked(RequestLimits(accepting), Client(b"{}"))
     assert (client.status, done) == (202, ["handed over"])
 
 
@@ -185,7 +185,7 @@ async def test_a_session_that_ends_before_an_accepted_message_is_handed_over_is_
         await respond(send, "Accepted", 202)
         raise error
 
-    assert (await asked(Intake(accepting), Client(b"{}"))).status == 202
+    assert (await asked(RequestLimits(accepting), Client(b"{}"))).status == 202
 
 
 async def test_a_fault_of_the_application_is_not_hidden() -> None:
@@ -193,10 +193,10 @@ async def test_a_fault_of_the_application_is_not_hidden() -> None:
         raise anyio.BrokenResourceError
 
     with pytest.RaisesGroup(anyio.BrokenResourceError):
-        await asked(Intake(broken), Client(b"{}"))
+        await asked(RequestLimits(broken), Client(b"{}"))
 
 
-def stream_and_messages() -> tuple[Intake, anyio.abc.ObjectSendStream[bytes]]:
+def stream_and_messages() -> tuple[RequestLimits, anyio.abc.ObjectSendStream[bytes]]:
     """An application of one event stream, which is sent what the test puts in."""
     events, to_send = anyio.create_memory_object_stream[bytes](100)
 
@@ -213,7 +213,7 @@ def stream_and_messages() -> tuple[Intake, anyio.abc.ObjectSendStream[bytes]]:
                 await send({"type": "http.response.body", "body": event, "more_body": True})
         await send({"type": "http.response.body", "body": b""})
 
-    return Intake(app), events
+    return RequestLimits(app), events
 
 
 def message(query: str = f"session_id={SESSION}") -> Client:
@@ -279,7 +279,7 @@ async def test_messages_are_bounded_however_their_session_is_spelt(query: str) -
 
 async def test_a_message_for_what_is_no_session_is_left_to_the_application() -> None:
     for query in ("", "session_id=", "session_id=none"):
-        assert (await asked(Intake(echo), message(query))).told == "2"
+        assert (await asked(RequestLimits(echo), message(query))).told == "2"
 
 
 async def test_other_scopes_and_requests_without_a_body_are_left_alone() -> None:
@@ -289,6 +289,6 @@ async def test_other_scopes_and_requests_without_a_body_are_left_alone() -> None
         seen.append(scope["type"])
 
     nothing: Any = None
-    await Intake(inner)({"type": "lifespan"}, nothing, nothing)
-    await asked(Intake(inner), Client(method="GET", path="/health"))
+    await RequestLimits(inner)({"type": "lifespan"}, nothing, nothing)
+    await asked(RequestLimits(inner), Client(method="GET", path="/health"))
     assert seen == ["lifespan", "http"]

@@ -14,8 +14,8 @@ import pytest
 from ros2_memory import queries
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call, Limits
-from ros2_memory.history.time_arguments import Moment, Span
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from tests.memories import memory_of
 from tests.shared_bags import REAL, needs_real
 
@@ -44,7 +44,7 @@ def expected() -> dict[str, Any]:
     return {name: entry["expected"] for name, entry in json.loads(text).items()}
 
 
-def memory(name: str, limits: Limits | None = None) -> Memory:
+def memory(name: str, limits: QuerySettings | None = None) -> Memory:
     return memory_of(REAL / name, storage="rosbag2", limits=limits)
 
 
@@ -99,7 +99,7 @@ def test_only_what_has_no_definition_cannot_be_decoded(name: str) -> None:
                 memory(name),
                 Call(),
                 row.topic,
-                Moment(at_s=unix_from_ns(row.last) + 1e-6),
+                AtTime(at_s=unix_from_ns(row.last) + 1e-6),
                 tolerance_s=1.0,
             )
         assert caught.value.reason is NoDataReason.UNDECODABLE
@@ -113,7 +113,7 @@ def test_every_decodable_topic_gives_its_last_message(name: str) -> None:
     for row in rows:
         try:
             answer = queries.topic_value(
-                asked, Call(), row.topic, Moment(at_s=unix_from_ns(row.last)), tolerance_s=0.001
+                asked, Call(), row.topic, AtTime(at_s=unix_from_ns(row.last)), tolerance_s=0.001
             )
         except NoDataError as error:
             unreadable += error.reason is NoDataReason.UNDECODABLE
@@ -142,8 +142,8 @@ NOISY = [("cougars_auv_mcap", "/coug2/depth_data")]
 @pytest.mark.parametrize(("name", "topic"), trajectories())
 def test_path_lengths_equal_those_of_independent_tools(name: str, topic: str) -> None:
     truth = expected()[name]["trajectories"][topic]
-    span = Span(start_s=0.0, end_s=4e9)
-    limits = Limits(max_plausible_speed_mps=1e9)
+    span = TimeRange(start_s=0.0, end_s=4e9)
+    limits = QuerySettings(max_plausible_speed_mps=1e9)
     answer = queries.trajectory_summary(memory(name, limits), Call(), span, topic=topic)
     assert answer.trajectory.poses == truth["n"]
     assert answer.trajectory.path_sum_m == pytest.approx(
@@ -165,7 +165,7 @@ def test_positions_are_those_of_the_last_message_before(name: str, topic: str) -
     for each in expected()[name]["trajectories"][topic].get("position_at", []):
         if each["time_base"] != "log":
             continue
-        moment = Moment(at_s=each["t_ns"] / 1e9)
+        moment = AtTime(at_s=each["t_ns"] / 1e9)
         answer = queries.position(memory(name), Call(), moment, topic=topic, tolerance_s=10.0)
         assert answer.time == each["last_before"]["t_ns"]
         assert math.dist(answer.pose.position, each["last_before"]["position"]) < 2e-6
@@ -186,8 +186,8 @@ def test_transforms_equal_those_of_independent_tools_at_header_stamps(
     name: str, number: int
 ) -> None:
     truth = expected()[name]["tf_lookup"][number]
-    asked = memory(name, Limits(tf_clock="stamp"))
-    moment = Moment(at_s=truth["stamp_ns"] / 1e9)
+    asked = memory(name, QuerySettings(tf_clock="stamp"))
+    moment = AtTime(at_s=truth["stamp_ns"] / 1e9)
     if "error" in truth:
         with pytest.raises(NoDataError):
             queries.transform(asked, Call(), truth["target"], truth["source"], moment)
@@ -200,22 +200,22 @@ def test_transforms_equal_those_of_independent_tools_at_header_stamps(
 
 def test_stamps_days_off_are_recognised_and_log_time_counts_instead() -> None:
     asked = memory("cougars_auv_mcap")
-    moment = Moment(at_s=1744320608.0)
+    moment = AtTime(at_s=1744320608.0)
     answer = queries.transform(asked, Call(), "enu", "coug2.robot", moment)
     assert answer.clock == "log"
     with pytest.raises(NoDataError):
-        queries.transform(asked, Call(), "enu", "coug2.robot", Moment(at_s=1743805390.0))
+        queries.transform(asked, Call(), "enu", "coug2.robot", AtTime(at_s=1743805390.0))
 
 
 def test_positions_that_are_not_numbers_are_said_to_be_so() -> None:
     asked = memory("cougars_auv_mcap")
     answer = queries.position(
-        asked, Call(), Moment(at_s=1744320618.5), topic="/coug2/odom", tolerance_s=60.0
+        asked, Call(), AtTime(at_s=1744320618.5), topic="/coug2/odom", tolerance_s=60.0
     )
     assert all(math.isnan(each) for each in answer.pose.position)
     assert "not a number" in answer.notes[0]
     summary = queries.trajectory_summary(
-        asked, Call(), Span(start_s=0.0, end_s=4e9), topic="/coug2/odom"
+        asked, Call(), TimeRange(start_s=0.0, end_s=4e9), topic="/coug2/odom"
     )
     assert (summary.trajectory.invalid, summary.trajectory.distance_m) == (3, 0.0)
 

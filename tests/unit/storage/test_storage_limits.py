@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import zstandard
 
-from ros2_memory.analysis.sights import Sights
+from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import Span
+from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.messages.to_json import MAX_EXACT_NUMBERS
 from ros2_memory.queries import topic_range
 from ros2_memory.storage.base import Channel, Record, Schema
@@ -179,7 +179,9 @@ class TestTies:
         same = [message(1, 5, text(0, f"{n}").payload) for n in range(1000)]
         bag(tmp_path, chunk_of(bytes_of([*STRINGS, *same]), span=(5, 5)))
         memory = memory_of(tmp_path)
-        answer = topic_range(memory, Call(), "/chatter", Span(start_s=0, end_s=1), max_samples=4)
+        answer = topic_range(
+            memory, Call(), "/chatter", TimeRange(start_s=0, end_s=1), max_samples=4
+        )
         assert answer.total == 1000
         values = [each.value for each in answer.samples]
         assert values == [{"value": f"{n}"} for n in (0, 333, 666, 999)]
@@ -213,7 +215,7 @@ class TestMessages:
         known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
         reader = McapReader()
         record = Record(known, 1, 1, b"\0\1\0\0" + bytes([255] * 20))
-        [error] = Sights(reader, extractor()).of([record])
+        [error] = MotionDecoder(reader, extractor()).of([record])
         assert isinstance(error, UndecodableError)
         assert error.__traceback__ is None
         assert error.__cause__ is None

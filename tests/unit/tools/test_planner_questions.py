@@ -13,14 +13,14 @@ import pytest
 from mcp import Client
 from mcp.types import TextContent
 
-from ros2_memory.bootstrap import limits_of
+from ros2_memory.bootstrap import query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import FixedClock, ns_from_unix
 from ros2_memory.demo.answer_checks import Asked, WrongAnswerError
 from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.endpoint import build_server
-from ros2_memory.tools.reply_size import compact
+from ros2_memory.tools.reply_size import to_json_text
 from tests.memories import memory_of
 from tests.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S
 from tests.planner_questions import QUESTIONS, Planned
@@ -133,7 +133,7 @@ def asking(world: World, request: pytest.FixtureRequest) -> Asking:
     """Every question asked through a client, with and without a catalogue."""
     settings = load_settings((), {"MEMORY_BAG_DIR": str(world.folder)})
     clock = FixedClock(world.asked.after)
-    memory = memory_of(world.folder, clock=clock, limits=limits_of(settings))
+    memory = memory_of(world.folder, clock=clock, limits=query_settings_of(settings))
     if request.param == "catalogue":
         memory = recalling(memory, world.folder)
     server = build_server(settings, memory)
@@ -187,7 +187,7 @@ def test_the_forty_longest_alone_pass_the_bar(asking: Asking) -> None:
 
 
 def test_what_is_listed_of_all_tools_is_short(asking: Asking) -> None:
-    assert len(compact(json.loads(asking.tools))) < MOST_CHARS_OF_TOOLS
+    assert len(to_json_text(json.loads(asking.tools))) < MOST_CHARS_OF_TOOLS
 
 
 def test_what_a_planner_reads_of_the_writing_tool_is_short_too(world: World) -> None:
@@ -197,7 +197,7 @@ def test_what_a_planner_reads_of_the_writing_tool_is_short_too(world: World) -> 
     told: JsonValue = [
         tool.model_dump(mode="json", by_alias=True, exclude_none=True) for tool in listed
     ]
-    assert len(compact(told)) < MOST_CHARS_OF_TOOLS
+    assert len(to_json_text(told)) < MOST_CHARS_OF_TOOLS
 
 
 def leaves(value: JsonValue, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:

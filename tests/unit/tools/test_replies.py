@@ -175,7 +175,7 @@ def test_a_topic_value_has_no_age_and_no_notes_unless_there_are_some() -> None:
 
 
 def test_an_empty_memory_has_nulls_for_its_span() -> None:
-    empty = results.TimeRange(None, None, T0, 0, (), (), (), (), (), 0, ("there is nothing",))
+    empty = results.DataTimeRange(None, None, T0, 0, (), (), (), (), (), 0, ("there is nothing",))
     told = said(empty)
     assert [told[key] for key in ("earliest", "latest", "earliest_local", "latest_local")] == [
         None
@@ -187,7 +187,7 @@ def test_an_empty_memory_has_nulls_for_its_span() -> None:
 
 def test_the_span_lists_gaps_and_files_below_the_bag_directory() -> None:
     told = said(
-        results.TimeRange(
+        results.DataTimeRange(
             T0,
             T0 + 90 * NS_PER_S,
             T0 + 100 * NS_PER_S,
@@ -213,7 +213,7 @@ def test_the_span_lists_gaps_and_files_below_the_bag_directory() -> None:
 
 def test_long_lists_of_files_show_the_last_ones_and_their_number() -> None:
     damaged = tuple(SetAside(BAGS / f"{n:03}.mcap", "torn") for n in range(50))
-    told = said(results.TimeRange(T0, T0, T0, 1, (), (), (), damaged, (), 0))
+    told = said(results.DataTimeRange(T0, T0, T0, 1, (), (), (), damaged, (), 0))
     assert [each["file"] for each in told["damaged"]] == [f"{n:03}.mcap" for n in range(30, 50)]
     assert told["damaged_count"] == 50
     assert told["notes"] == ["damaged: the last 20 of 50 are listed"]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.tools.reply_size import compact, fit, without_constant_zeros
+from ros2_memory.tools.reply_size import fit_reply, to_json_text, without_constant_zeros
 
 FLOATS = st.floats(allow_nan=True, allow_infinity=True)
 SCALARS = st.none() | st.booleans() | st.integers() | FLOATS | st.text(max_size=60)
@@ -43,7 +43,7 @@ def samples(count: int, value: Any = None) -> dict[str, Any]:
 
 @given(VALUES)
 def test_any_value_becomes_valid_json_without_spaces(value: Any) -> None:
-    text = compact(value)
+    text = to_json_text(value)
     strict(text)
     assert text.encode("utf-8").decode("utf-8") == text
     assert text == json.dumps(strict(text), separators=(",", ":"), ensure_ascii=False)
@@ -51,26 +51,26 @@ def test_any_value_becomes_valid_json_without_spaces(value: Any) -> None:
 
 def test_what_json_cannot_carry_does_not_leave() -> None:
     value: Any = {"a": [math.nan, math.inf, -math.inf, -0.0], "b": "\ud800 ä", "\udfff": 1}
-    assert compact(value) == '{"a":[null,null,null,0.0],"b":"? ä","?":1}'
+    assert to_json_text(value) == '{"a":[null,null,null,0.0],"b":"? ä","?":1}'
 
 
 def test_a_reply_that_fits_is_left_as_it_is() -> None:
     reply = samples(3)
-    assert fit(reply, len(compact(reply))) == compact(reply)
+    assert fit_reply(reply, len(to_json_text(reply))) == to_json_text(reply)
 
 
 @given(REPLIES, NOTES, st.integers(500, 5000))
 def test_a_reply_never_passes_the_cap_and_is_always_valid(
     reply: dict[str, Any], notes: list[Any], cap: int
 ) -> None:
-    text = fit({**reply, "notes": notes}, cap)
+    text = fit_reply({**reply, "notes": notes}, cap)
     assert len(text) <= cap
     assert isinstance(strict(text), dict)
 
 
 @given(st.integers(2, 3000), st.integers(1000, 30_000))
 def test_a_thinned_range_keeps_its_ends_and_stays_in_order(count: int, cap: int) -> None:
-    kept = strict(fit(samples(count), cap))["samples"]
+    kept = strict(fit_reply(samples(count), cap))["samples"]
     times = [row["timestamp"] for row in kept]
     assert times[0] == 1.5
     assert times[-1] == 0.5 + count
@@ -80,16 +80,16 @@ def test_a_thinned_range_keeps_its_ends_and_stays_in_order(count: int, cap: int)
 @given(st.integers(40, 3000), st.integers(1500, 30_000))
 def test_a_thinned_range_is_evenly_spaced_and_uses_the_room(count: int, cap: int) -> None:
     reply = samples(count)
-    shown = strict(fit(reply, cap))
+    shown = strict(fit_reply(reply, cap))
     kept = [row["timestamp"] for row in shown["samples"]]
     gaps = [after - before for before, after in pairwise(kept)]
     assert max(gaps) - min(gaps) <= 1
     if len(kept) < count:
-        assert len(compact(shown)) > cap - 800
+        assert len(to_json_text(shown)) > cap - 800
 
 
 def test_a_thinned_range_says_how_many_are_left_and_how_to_see_more() -> None:
-    shown = strict(fit({**samples(1000), "notes": ["first"]}, 2000))
+    shown = strict(fit_reply({**samples(1000), "notes": ["first"]}, 2000))
     thinned = (
         f"samples: {len(shown['samples'])} of 1000 kept, evenly spaced, to keep the reply under "
         "2000 characters; ask for a shorter window or for fewer fields to see more"
@@ -99,14 +99,14 @@ def test_a_thinned_range_says_how_many_are_left_and_how_to_see_more() -> None:
 
 
 def test_lists_that_are_not_along_time_keep_their_beginning() -> None:
-    shown = strict(fit({"frames": [f"frame_{n:03}" for n in range(500)]}, 1000))
+    shown = strict(fit_reply({"frames": [f"frame_{n:03}" for n in range(500)]}, 1000))
     kept = shown["frames"]
     assert kept == [f"frame_{n:03}" for n in range(len(kept))]
     assert shown["notes"][0].startswith(f"frames: {len(kept)} of 500 kept, from the beginning")
 
 
 def test_a_single_huge_array_is_thinned_evenly_with_a_note() -> None:
-    shown = strict(fit({"topic": "/scan", "value": {"ranges": list(range(20_000))}}, 2000))
+    shown = strict(fit_reply({"topic": "/scan", "value": {"ranges": list(range(20_000))}}, 2000))
     ranges = shown["value"]["ranges"]
     assert (ranges[0], ranges[-1]) == (0, 19_999)
     assert len(ranges) > 100
@@ -114,7 +114,7 @@ def test_a_single_huge_array_is_thinned_evenly_with_a_note() -> None:
 
 
 def test_a_single_huge_text_is_cut_with_a_note_and_fills_the_room() -> None:
-    shown = strict(fit({"topic": "/log", "value": {"msg": "ab" * 50_000}}, 2000))
+    shown = strict(fit_reply({"topic": "/log", "value": {"msg": "ab" * 50_000}}, 2000))
     assert shown["topic"] == "/log"
     assert shown["value"]["msg"].startswith("abab")
     assert shown["value"]["msg"].endswith("…")
@@ -123,7 +123,7 @@ def test_a_single_huge_text_is_cut_with_a_note_and_fills_the_room() -> None:
 
 
 def test_a_wide_object_loses_keys_with_a_note() -> None:
-    shown = strict(fit({"value": {f"key_{n:05}": n for n in range(9000)}}, 2000))
+    shown = strict(fit_reply({"value": {f"key_{n:05}": n for n in range(9000)}}, 2000))
     assert "key_00000" in shown["value"]
     assert "value (keys left out: 50 of 9000 kept)" in shown["notes"][0]
 
@@ -132,14 +132,14 @@ def test_what_cannot_be_shortened_leaves_what_it_is_about() -> None:
     tree: Any = 1
     for _ in range(7):
         tree = {f"branch_{n}": tree for n in range(5)}
-    shown = strict(fit({"topic": "/tree", "timestamp": 1.5, "value": tree}, 1000))
+    shown = strict(fit_reply({"topic": "/tree", "timestamp": 1.5, "value": tree}, 1000))
     assert (shown["topic"], shown["timestamp"]) == ("/tree", 1.5)
     assert "value" not in shown
     assert "does not fit into 1000 characters" in shown["notes"][0]
 
 
 def test_a_long_note_does_not_drive_out_the_answer() -> None:
-    shown = strict(fit({"value": 1, "notes": ["n" * 3000] * 50}, 24_000))
+    shown = strict(fit_reply({"value": 1, "notes": ["n" * 3000] * 50}, 24_000))
     assert shown["value"] == 1
     assert shown["notes"][-1] == "and 38 more notes"
 

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from ros2_memory import queries
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.history.context import Call, Limits
+from ros2_memory.history.context import Call, QuerySettings
 from tests.asking import asked
 from tests.bags import McapLayout, Msg, boolean, detections, make, stamp, write_db3, write_mcap
 from tests.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
@@ -164,7 +164,7 @@ def test_a_robot_that_records_is_answered_null_where_every_closed_bag_was_search
     memory = memory_of(
         bag_dir,
         clock=SettableClock(T0 + 35 * S),
-        limits=Limits(include_active=include_active),
+        limits=QuerySettings(include_active=include_active),
         include_active=include_active,
     )
     assert memory.index.snapshot().active

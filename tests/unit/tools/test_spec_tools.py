@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.history.context import Limits
-from ros2_memory.history.time_arguments import Moment
+from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.time_arguments import AtTime
 from ros2_memory.tools.arguments import At, Search
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.instructions import instructions
@@ -18,7 +18,7 @@ from ros2_memory.tools.schema import Signature
 from ros2_memory.tools.spec_tools import build_tools
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"
-TOOLS = {tool.name: tool for tool in build_tools(Limits(), 25.0, writing=True)}
+TOOLS = {tool.name: tool for tool in build_tools(QuerySettings(), 25.0, writing=True)}
 SPECIFIED = [
     "list_recorded_topics",
     "data_time_range",
@@ -122,8 +122,8 @@ def test_a_description_names_the_age_that_the_reply_tells(name: str) -> None:
 
 
 def test_additions_and_what_writes_can_be_left_out() -> None:
-    assert [tool.name for tool in build_tools(Limits(), 25.0)] == [*SPECIFIED, *ADDED]
-    alone = build_tools(Limits(), 25.0, additions=False, writing=True)
+    assert [tool.name for tool in build_tools(QuerySettings(), 25.0)] == [*SPECIFIED, *ADDED]
+    alone = build_tools(QuerySettings(), 25.0, additions=False, writing=True)
     assert [tool.name for tool in alone] == SPECIFIED
 
 
@@ -176,7 +176,7 @@ def test_a_pair_differs_in_its_times_alone(absolute: str, relative: str) -> None
 
 
 def test_descriptions_tell_the_defaults_of_this_deployment() -> None:
-    limits = Limits(pose_topic="/amcl_pose", time_tolerance_s=0.25, position_tolerance_m=2.0)
+    limits = QuerySettings(pose_topic="/amcl_pose", time_tolerance_s=0.25, position_tolerance_m=2.0)
     tools = {tool.name: tool.description for tool in build_tools(limits, 8.0)}
     assert "/amcl_pose" in tools["get_position_at"]
     assert "default 0.25" in tools["get_topic_at_time"]
@@ -186,7 +186,7 @@ def test_descriptions_tell_the_defaults_of_this_deployment() -> None:
 
 
 def test_the_instructions_are_short_enough_for_clients_that_cut_them() -> None:
-    assert 500 < len(instructions(Limits())) < 2_000
+    assert 500 < len(instructions(QuerySettings())) < 2_000
 
 
 def test_a_missing_argument_is_named_with_what_is_expected() -> None:
@@ -274,4 +274,4 @@ def test_a_whole_number_may_be_written_with_a_point() -> None:
 
 
 def test_a_when_is_folded_into_its_moment() -> None:
-    assert At(timestamp=5.0).folded() == Moment(at_s=5.0)
+    assert At(timestamp=5.0).folded() == AtTime(at_s=5.0)

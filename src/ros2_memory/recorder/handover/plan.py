@@ -35,14 +35,14 @@ LAST_WORDS_NS: Final[Ns] = 30 * NS_PER_S
 """How long the old recorder may still receive after it was told to end."""
 
 
-class Moment(NamedTuple):
+class ClockReading(NamedTuple):
     """One moment by the two clocks: seconds that never step, and the wall clock."""
 
     monotonic_s: float
     wall: Ns
 
 
-def set_back(earlier: Moment, later: Moment, by_ns: Ns = STEP_NS) -> bool:
+def set_back(earlier: ClockReading, later: ClockReading, by_ns: Ns = STEP_NS) -> bool:
     """Whether the wall clock was set back by more between two moments that lie close together.
 
     A clock that is set forward does no harm: what was published before and after it still falls on
@@ -72,12 +72,12 @@ class Bounds:
     ended: Ns
 
 
-class Passage:
+class HandoverPlan:
     """A handover under way, from the moment before the new recorder was started."""
 
     def __init__(
         self,
-        began: Moment,
+        began: ClockReading,
         *,
         subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S,
         both_s: float = BOTH_S,
@@ -85,7 +85,7 @@ class Passage:
         self.began = began
         self._timeout_s = subscribe_timeout_s
         self._both_s = both_s
-        self._both: Moment | None = None
+        self._both: ClockReading | None = None
         self._last = began
 
     @property
@@ -93,7 +93,7 @@ class Passage:
         """Whether the new recorder receives all that the old one does."""
         return self._both is not None
 
-    def advance(self, now: Moment, *, ready: bool, missing: Collection[str]) -> Step:
+    def advance(self, now: ClockReading, *, ready: bool, missing: Collection[str]) -> Step:
         """What is due. To be asked several times a second.
 
         Args:
@@ -116,7 +116,7 @@ class Passage:
         over = now.monotonic_s - self._both.monotonic_s >= self._both_s
         return Step.COMPLETE if over else Step.WAIT
 
-    def bounds(self, now: Moment) -> Bounds | None:
+    def bounds(self, now: ClockReading) -> Bounds | None:
         """The times of the handover if it is completed now; None while the two do not overlap."""
         if self._both is None:
             return None
@@ -151,7 +151,7 @@ def withdrawn(old: Handover) -> Handover:
     return replace(old, next=None, counts_until=None, end=None)
 
 
-def handed_over(
+def complete_sidecars(
     old: Handover,
     old_name: str,
     new_name: str,

@@ -43,7 +43,7 @@ SAMPLE: Final = 2000
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-def settle_all(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) -> None:
+def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) -> None:
     """Brings every handover below the bag directory to its end. Reports what it cannot settle.
 
     `running` are recordings that are being written: those may yet come to the end of theirs.
@@ -56,7 +56,7 @@ def settle_all(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) 
         if new_name is None:
             continue
         try:
-            settle(directory, bag_dir / new_name, reader)
+            recover_handover(directory, bag_dir / new_name, reader)
         except RecorderError as error:
             _log.error("handover_not_settled", recording=directory.name, reason=str(error))
 
@@ -72,7 +72,7 @@ def unsettled(recording: Path) -> str | None:
     return handover.next if handover.counts_until is None else None
 
 
-def settle(old: Path, new: Path, reader: BagReader) -> None:
+def recover_handover(old: Path, new: Path, reader: BagReader) -> None:
     """Writes down which of two overlapping recordings has what, after both have ended.
 
     Raises:

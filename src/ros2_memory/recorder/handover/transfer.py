@@ -2,7 +2,7 @@
 
 Each is written before what it speaks of can matter: the old recording names the new one before
 that is started, the new one counts for nothing as soon as it exists, and when the cut is made it is
-written to the new one first. So a crash leaves a pair that `settle` can bring to its end.
+written to the new one first. So a crash leaves a pair that `recover_handover` can bring to its end.
 """
 
 from __future__ import annotations
@@ -19,30 +19,36 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.handover.plan import (
-    handed_over,
+    complete_sidecars,
     intended,
     pending,
     void,
     withdrawn,
 )
-from ros2_memory.recorder.handover.recovery import cut_clock, settle
+from ros2_memory.recorder.handover.recovery import cut_clock, recover_handover
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.recorder.handover.plan import Moment, Passage, Step
-    from ros2_memory.recorder.session import Session
+    from ros2_memory.recorder.handover.plan import ClockReading, HandoverPlan, Step
+    from ros2_memory.recorder.session import RecordingSession
     from ros2_memory.storage.base import BagReader
 
 
-class Takeover:
+class HandoverTransfer:
     """A handover from one running session to another.
 
     `simulated`: log times come from a simulated clock.
     """
 
     def __init__(
-        self, old: Session, new: Session, passage: Passage, reader: BagReader, *, simulated: bool
+        self,
+        old: RecordingSession,
+        new: RecordingSession,
+        passage: HandoverPlan,
+        reader: BagReader,
+        *,
+        simulated: bool,
     ) -> None:
         self.old = old
         self.new = new
@@ -53,7 +59,7 @@ class Takeover:
         self._closed_before = old.splits.closed_names
 
     @staticmethod
-    def announce(old: Session, new_name: str) -> None:
+    def announce(old: RecordingSession, new_name: str) -> None:
         """Has the old recording name the new one, which is about to be started.
 
         Raises:
@@ -63,7 +69,7 @@ class Takeover:
         write_handover(directory, intended(standing_handover(directory), new_name))
 
     @staticmethod
-    def withdraw(old: Session) -> None:
+    def withdraw(old: RecordingSession) -> None:
         """Has the old recording name no next one, if it is still there.
 
         Raises:
@@ -78,7 +84,7 @@ class Takeover:
         """Topics that the old recorder has subscribed to, and the new one not yet."""
         return frozenset(self.old.subscribed - self.new.subscribed)
 
-    def advance(self, now: Moment) -> Step:
+    def advance(self, now: ClockReading) -> Step:
         """What is due at this moment.
 
         Raises:
@@ -90,7 +96,7 @@ class Takeover:
         ready = self._marked and self.new.ready
         return self._passage.advance(now, ready=ready, missing=self.missing)
 
-    def complete(self, now: Moment) -> bool:
+    def complete(self, now: ClockReading) -> bool:
         """Makes the cut, when both recorders receive; False where they do not overlap yet.
 
         Raises:
@@ -99,7 +105,7 @@ class Takeover:
         bounds = self._passage.bounds(now)
         if bounds is None:
             return False
-        sidecars = handed_over(
+        sidecars = complete_sidecars(
             standing_handover(self.old.splits.directory),
             self.old.name,
             self.new.name,
@@ -146,7 +152,7 @@ class Takeover:
             RecorderError: a sidecar cannot be written.
         """
         if _is_there(self.old.splits.directory):
-            settle(self.old.splits.directory, self.new.splits.directory, self._reader)
+            recover_handover(self.old.splits.directory, self.new.splits.directory, self._reader)
         elif _is_there(self.new.splits.directory):
             write_handover(self.new.splits.directory, Handover())
 

@@ -25,7 +25,7 @@ from ros2_memory.storage.errors import (
     LostError,
     UnreachableError,
     UnreadableError,
-    damage,
+    as_unreadable,
     reason_of,
 )
 from ros2_memory.storage.file_io import OpenFile
@@ -48,7 +48,7 @@ from ros2_memory.storage.mcap.index import (
     require_channels,
     require_declared,
 )
-from ros2_memory.storage.mcap.merge import Rows, Run, merged
+from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
 from ros2_memory.storage.mcap.records import MESSAGE, RECORD
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.mcap.summary import Chunk, DoubtError
@@ -240,16 +240,16 @@ class McapBags:
         window: TimeWindow,
         *,
         newest_first: bool,
-    ) -> Iterator[Run[Record | LostError]]:
+    ) -> Iterator[SortedRun[Record | LostError]]:
         wanted = _wanted(index, topics)
 
         large: dict[int, bytes] = {}
 
-        def chunk_run(chunk: Chunk) -> Run[Record | LostError]:
+        def chunk_run(chunk: Chunk) -> SortedRun[Record | LostError]:
             def rows() -> Rows[Record | LostError]:
                 # Of a chunk that cannot be read, only what its index says was wanted is lost.
                 try:
-                    with damage():
+                    with as_unreadable():
                         data = self._chunk_data(file, chunk)
                 except UnreachableError:
                     raise
@@ -263,7 +263,7 @@ class McapBags:
                 fetch = self._fetching(file, chunk, data, wanted, large)
                 return _rows(column, fetch, newest_first=newest_first)
 
-            return Run(chunk.start, chunk.end, chunk.offset, rows)
+            return SortedRun(chunk.start, chunk.end, chunk.offset, rows)
 
         for chunk in self._holding(file, index, wanted, window):
             yield chunk_run(chunk)
@@ -272,7 +272,7 @@ class McapBags:
         if column.times.size:
             fetch = _from_file(file, wanted, self._max_chunk_bytes)
             rows = _rows(column, fetch, newest_first=newest_first)
-            yield Run(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
+            yield SortedRun(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
 
     def _fetching(
         self,
@@ -326,7 +326,7 @@ class McapBags:
     ) -> LostError | None:
         """What is lost of the window with a chunk that cannot be read; None where nothing is."""
         try:
-            with damage():
+            with as_unreadable():
                 columns = self._chunk_columns(file, chunk, wanted, None)
         except UnreachableError:
             raise
@@ -404,7 +404,7 @@ class McapBags:
     def _data_if_whole(self, file: OpenFile, chunk: Chunk) -> bytes | None:
         """The records of a chunk; None where they cannot be read."""
         try:
-            with damage():
+            with as_unreadable():
                 return self._chunk_data(file, chunk)
         except UnreachableError:
             raise
@@ -496,7 +496,7 @@ def _require_declared(index: McapIndex, data: bytes, columns: Sequence[Column]) 
     if index.declared is None:
         return
     try:
-        with damage():
+        with as_unreadable():
             require_declared(index.declared, data, columns)
     except UnreadableError as error:
         raise _ContradictedError(reason_of(error)) from error

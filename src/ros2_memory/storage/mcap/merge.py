@@ -25,7 +25,7 @@ class Rows(NamedTuple, Generic[T]):
     fetch: Callable[[int, Ns], T]
 
 
-class Run(NamedTuple, Generic[T]):
+class SortedRun(NamedTuple, Generic[T]):
     """A stretch of a file: no message in it lies outside `first` to `last` (inclusive).
 
     `rank` is its place in the file; `rows` reads it, and is called only when its turn comes.
@@ -37,7 +37,7 @@ class Run(NamedTuple, Generic[T]):
     rows: Callable[[], Rows[T]]
 
 
-def merged(runs: Iterable[Run[T]], *, newest_first: bool) -> Iterator[T]:
+def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
     """The messages of all runs by log time, ties in file order; or exactly the reverse.
 
     A run is read only when it can hold the next message, and let go at its end: what is held

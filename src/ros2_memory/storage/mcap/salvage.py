@@ -16,7 +16,7 @@ from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.errors import UnreadableError, damage
+from ros2_memory.storage.errors import UnreadableError, as_unreadable
 from ros2_memory.storage.limits import MAX_SECTION_BYTES, most_unpacked
 from ros2_memory.storage.mcap.chunk import (
     packed_chunk,
@@ -98,7 +98,7 @@ class Salvage:
 
     def _chunk(self, start: int, end: int) -> Iterator[tuple[int, bytes]]:
         try:
-            with damage():
+            with as_unreadable():
                 head, packed = packed_chunk(self._file, start, end - start, self._max_chunk_bytes)
                 data = unpacked(head, packed, self._max_chunk_bytes)
                 usable = self._usable(data)
@@ -120,7 +120,7 @@ class Salvage:
         """The chunk inside which the file ends."""
         held = self._file.size - start
         try:
-            with damage():
+            with as_unreadable():
                 head, packed = packed_chunk(self._file, start, held, self._max_chunk_bytes)
                 data = unpacked_in_part(head, packed, self._max_chunk_bytes)
                 usable = self._usable(data)
@@ -149,7 +149,7 @@ def parsed(records: Iterable[tuple[int, bytes]]) -> Iterator[mcap_records.McapRe
             yield mcap_records.Message(channel, log_time, data, publish_time, sequence)
             continue
         try:
-            with damage():
+            with as_unreadable():
                 record = _READERS[opcode](ReadDataStream(BytesIO(body)))
         except UnreadableError:
             continue

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import Closing
-from ros2_memory.storage.errors import UnreadableError, damage
+from ros2_memory.storage.errors import UnreadableError, as_unreadable
 from ros2_memory.storage.limits import (
     MAX_CHUNKS,
     MAX_SECTION_BYTES,
@@ -142,7 +142,7 @@ class _Scan:
             self.damaged.append(str(error))
 
     def _declare(self, opcode: int, body: bytes, among: Declarations) -> None:
-        with damage():
+        with as_unreadable():
             if opcode == Opcode.STATISTICS:
                 self.stated = statistics(body)
                 return
@@ -157,7 +157,7 @@ class _Scan:
 
     def _whole_chunk(self, end: int) -> None:
         self._require_harmless()
-        with damage():
+        with as_unreadable():
             data = unpacked(*self._packed(end), self.max_chunk_bytes)
         self.unpacked += len(data)
         walked = walk(data)
@@ -171,7 +171,7 @@ class _Scan:
         try:
             self._require_harmless()
             head, packed = self._packed(size)
-            with damage():
+            with as_unreadable():
                 walked = walk(unpacked_in_part(head, packed, self.max_chunk_bytes))
         except UnreadableError:
             return

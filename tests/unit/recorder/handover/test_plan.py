@@ -12,11 +12,11 @@ from ros2_memory.bag_dir.handover_file import Counting, CutClock, Handover, Over
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
 from ros2_memory.recorder.handover.plan import (
     Bounds,
-    Moment,
-    Passage,
+    ClockReading,
+    HandoverPlan,
     Sidecars,
     Step,
-    handed_over,
+    complete_sidecars,
     intended,
     pending,
     set_back,
@@ -28,11 +28,13 @@ T0 = 1_795_150_000 * NS_PER_S
 S = NS_PER_S
 
 
-def at(seconds: float, *, stepped_s: float = 0.0) -> Moment:
-    return Moment(500.0 + seconds, T0 + round((seconds + stepped_s) * S))
+def at(seconds: float, *, stepped_s: float = 0.0) -> ClockReading:
+    return ClockReading(500.0 + seconds, T0 + round((seconds + stepped_s) * S))
 
 
-def waited(passage: Passage, *seconds: float, ready: bool, missing: tuple[str, ...] = ()) -> Step:
+def waited(
+    passage: HandoverPlan, *seconds: float, ready: bool, missing: tuple[str, ...] = ()
+) -> Step:
     steps = [passage.advance(at(each), ready=ready, missing=missing) for each in seconds]
     assert set(steps[:-1]) <= {Step.WAIT}
     return steps[-1]
@@ -40,7 +42,7 @@ def waited(passage: Passage, *seconds: float, ready: bool, missing: tuple[str, .
 
 class TestSteps:
     def test_two_seconds_after_everything_is_subscribed_the_handover_is_complete(self) -> None:
-        passage = Passage(at(0))
+        passage = HandoverPlan(at(0))
         assert waited(passage, 0.2, 1.0, ready=True, missing=("/odom",)) is Step.WAIT
         assert passage.bounds(at(1)) is None
         assert waited(passage, 3.0, 4.9, ready=True) is Step.WAIT
@@ -48,19 +50,19 @@ class TestSteps:
         assert waited(passage, 5.0, ready=True) is Step.COMPLETE
 
     def test_a_recorder_that_is_not_ready_is_waited_for(self) -> None:
-        passage = Passage(at(0))
+        passage = HandoverPlan(at(0))
         assert waited(passage, 1.0, 10.0, 100.0, ready=False) is Step.WAIT
         assert not passage.overlapping
 
     def test_a_topic_that_nobody_publishes_any_more_is_waited_for_until_the_timeout(self) -> None:
-        passage = Passage(at(0), subscribe_timeout_s=20)
+        passage = HandoverPlan(at(0), subscribe_timeout_s=20)
         assert waited(passage, 19.9, ready=True, missing=("/gone",)) is Step.WAIT
         assert not passage.overlapping
         assert waited(passage, 20.0, 21.9, ready=True, missing=("/gone",)) is Step.WAIT
         assert waited(passage, 22.0, ready=True, missing=("/gone",)) is Step.COMPLETE
 
     def test_a_publisher_that_appears_while_both_record_is_waited_for_anew(self) -> None:
-        passage = Passage(at(0), subscribe_timeout_s=20)
+        passage = HandoverPlan(at(0), subscribe_timeout_s=20)
         assert waited(passage, 1.0, 2.5, ready=True) is Step.WAIT
         assert waited(passage, 2.7, 3.9, ready=True, missing=("/late",)) is Step.WAIT
         assert not passage.overlapping
@@ -68,31 +70,31 @@ class TestSteps:
         assert waited(passage, 6.0, ready=True) is Step.COMPLETE
 
     def test_one_that_appears_after_the_timeout_is_not(self) -> None:
-        passage = Passage(at(0), subscribe_timeout_s=20)
+        passage = HandoverPlan(at(0), subscribe_timeout_s=20)
         assert waited(passage, 19.0, ready=True) is Step.WAIT
         assert waited(passage, 20.5, ready=True, missing=("/late",)) is Step.WAIT
         assert waited(passage, 21.0, ready=True, missing=("/late",)) is Step.COMPLETE
 
     def test_the_clock_set_back_abandons_it(self) -> None:
-        passage = Passage(at(0))
+        passage = HandoverPlan(at(0))
         waited(passage, 0.2, ready=True)
         step = passage.advance(at(0.4, stepped_s=-0.15), ready=True, missing=())
         assert step is Step.ABANDON
 
     def test_the_clock_set_forward_does_not(self) -> None:
-        passage = Passage(at(0))
+        passage = HandoverPlan(at(0))
         waited(passage, 0.2, ready=True)
         assert passage.advance(at(0.4, stepped_s=3600), ready=True, missing=()) is Step.WAIT
         assert passage.advance(at(2.3, stepped_s=3600), ready=True, missing=()) is Step.COMPLETE
 
     def test_a_clock_that_is_slewed_does_not(self) -> None:
-        passage = Passage(at(0))
+        passage = HandoverPlan(at(0))
         moments = [at(t / 5, stepped_s=-t / 5 * 0.08) for t in range(1, 12)]
         steps = [passage.advance(moment, ready=True, missing=()) for moment in moments]
         assert steps == [*[Step.WAIT] * 10, Step.COMPLETE]
 
     def test_the_cut_lies_in_the_middle_of_the_time_that_both_recorded(self) -> None:
-        passage = Passage(at(0))
+        passage = HandoverPlan(at(0))
         assert passage.bounds(at(1)) is None
         waited(passage, 3.0, 5.0, ready=True)
         assert passage.bounds(at(5)) == Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
@@ -102,7 +104,7 @@ class TestSteps:
     ("wall_s", "expected"), [(1.0, False), (0.95, False), (0.85, True), (-5.0, True), (9.0, False)]
 )
 def test_only_a_clock_that_falls_behind_at_once_was_set_back(wall_s: float, expected: bool) -> None:
-    assert set_back(Moment(10.0, T0), Moment(11.0, T0 + round(wall_s * S))) is expected
+    assert set_back(ClockReading(10.0, T0), ClockReading(11.0, T0 + round(wall_s * S))) is expected
 
 
 class TestSidecars:
@@ -115,7 +117,7 @@ class TestSidecars:
         }
         old = Handover(previous="z", counts_from=5, begin=Overlap(1, 9, ("a_0.mcap",)))
         bounds = Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
-        return handed_over(old, "a", "b", bounds, **(arguments | changes))  # type: ignore[arg-type]
+        return complete_sidecars(old, "a", "b", bounds, **(arguments | changes))  # type: ignore[arg-type]
 
     def test_both_name_each_other_and_the_cut(self) -> None:
         old, new = self.make()
@@ -185,7 +187,7 @@ def test_every_message_counts_exactly_once_whatever_the_publisher_and_the_delays
         T0, T0 + round(subscribed_s * S), T0 + round((subscribed_s + 1) * S),
         T0 + round((subscribed_s + 2) * S),
     )  # fmt: skip
-    old, new = handed_over(
+    old, new = complete_sidecars(
         Handover(),
         "a",
         "b",
@@ -218,7 +220,7 @@ def test_every_message_counts_exactly_once_whatever_the_publisher_and_the_delays
 
 def test_after_the_clock_is_set_back_nothing_is_lost_outside_the_files_of_the_overlap() -> None:
     bounds = Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
-    _, new = handed_over(
+    _, new = complete_sidecars(
         Handover(),
         "a",
         "b",

@@ -25,7 +25,7 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.daemon import Upkeep
 from ros2_memory.recorder.handover.plan import intended, pending, void
-from ros2_memory.recorder.handover.recovery import cut_clock, settle_all, unsettled
+from ros2_memory.recorder.handover.recovery import cut_clock, recover_handovers, unsettled
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.bags import McapLayout, Msg, boolean, tf, transform, write_mcap
 
@@ -76,7 +76,7 @@ def test_whatever_either_holds_counts_exactly_once(
     new = recording(bag_dir, "b", new_start, new_start + new_lasts, delay=delays[1])
     write_handover(old, intended(Handover(), "b"))
     write_handover(new, pending("a"))
-    settle_all(bag_dir, READER)
+    recover_handovers(bag_dir, READER)
     expected = {round(n) for n in range(round(old_stop * 10))} | set(
         range(round(new_start * 10), round((new_start + new_lasts) * 10))
     )
@@ -88,14 +88,14 @@ def test_a_new_one_that_left_no_sidecar_is_settled_too(tmp_path: Path) -> None:
     old = recording(tmp_path, "a", 0, 10, delay=5)
     recording(tmp_path, "b", 8, 12, delay=9)
     write_handover(old, intended(Handover(), "b"))
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(120)), 1)
 
 
 def test_a_new_one_that_was_never_begun_is_forgotten(tmp_path: Path) -> None:
     old = recording(tmp_path, "a", 0, 10, delay=5)
     write_handover(old, intended(Handover(previous="z"), "b"))
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert read_handover(old).handover == Handover(previous="z")
 
 
@@ -104,7 +104,7 @@ def test_a_handover_that_had_failed_stays_failed(tmp_path: Path) -> None:
     new = recording(tmp_path, "b", 8, 9, delay=9)
     write_handover(old, intended(Handover(), "b"))
     write_handover(new, void("a"))
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert read_handover(old).handover.next is None
     assert read_handover(new).handover.state is Counting.VOID
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(100)), 1)
@@ -117,7 +117,7 @@ def test_a_crash_between_the_two_sidecars_is_brought_to_its_end(tmp_path: Path) 
     write_handover(old, intended(Handover(), "b"))
     begin = Overlap(T0 + 6 * S, T0 + 10 * S, ("b_0.mcap",))
     write_handover(new, Handover(previous="a", counts_from=cut, begin=begin))
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert read_handover(old).handover.counts_until == cut
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(150)), 1)
 
@@ -129,7 +129,7 @@ def test_an_old_one_that_holds_nothing_leaves_everything_to_the_new(tmp_path: Pa
     new = recording(tmp_path, "b", 0, 5, delay=0)
     write_handover(old, intended(Handover(), "b"))
     write_handover(new, pending("a"))
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert not read_handover(new).handover.hides_all
     assert len(counted(tmp_path)) == 50
 
@@ -141,7 +141,7 @@ def test_latched_messages_do_not_say_how_far_a_recording_reaches(tmp_path: Path)
     new = recording(tmp_path, "b", 0, 50, delay=9)
     write_handover(directory, intended(Handover(), "b"))
     write_handover(new, pending("a"))
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(500)), 1)
 
 
@@ -151,7 +151,7 @@ def test_after_a_clock_that_was_set_back_no_more_than_a_minute_is_in_doubt(tmp_p
     new = recording(tmp_path, "b", 0, 300, delay=0)
     write_handover(old, intended(Handover(), "b"))
     write_handover(new, pending("a"))
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert len(counted(tmp_path)) >= 20 + 2400
 
 
@@ -160,7 +160,7 @@ def test_recordings_that_are_settled_are_left_alone(tmp_path: Path) -> None:
     write_handover(old, Handover(next="b", counts_until=7, end=Overlap(None, None, ())))
     recording(tmp_path, "b", 0, 1, delay=0)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
 
@@ -170,7 +170,7 @@ def test_what_cannot_be_settled_is_told_and_the_rest_is_settled(tmp_path: Path) 
         write_handover(old, intended(Handover(), name + "2"))
     (tmp_path / "a" / ".handover.json.tmp").mkdir()
     with capture_logs() as logs:
-        settle_all(tmp_path, READER)
+        recover_handovers(tmp_path, READER)
     assert [each["recording"] for each in logs if each["log_level"] == "error"] == ["a"]
     assert unsettled(tmp_path / "c") is None
 
@@ -203,7 +203,7 @@ def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: 
     write_handover(second, handed_over)
     begin = Overlap(T0 + 17 * S, T0 + 21 * S, ("c_0.mcap",))
     write_handover(third, Handover(previous="b", counts_from=T0 + 19 * S, begin=begin))
-    settle_all(tmp_path, READER)
+    recover_handovers(tmp_path, READER)
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(250)), 1)
 
 

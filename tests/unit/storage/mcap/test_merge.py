@@ -5,7 +5,7 @@ from functools import partial
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.storage.mcap.merge import Rows, Run, merged
+from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
 
 Item = tuple[int, int]
 """Log time and place in the file."""
@@ -15,7 +15,9 @@ def fetch(place: int, time: int) -> Item:
     return (time, place)
 
 
-def runs_of(chunks: list[list[int]], opened: list[int], *, newest_first: bool) -> list[Run[Item]]:
+def runs_of(
+    chunks: list[list[int]], opened: list[int], *, newest_first: bool
+) -> list[SortedRun[Item]]:
     """A run for each chunk of log times; `opened` takes note of those that are read."""
 
     def rows(rank: int, items: list[Item]) -> Rows[Item]:
@@ -28,7 +30,7 @@ def runs_of(chunks: list[list[int]], opened: list[int], *, newest_first: bool) -
     for rank, times in enumerate(chunks):
         items = [(time, place + offset) for offset, time in enumerate(times)]
         place += len(times)
-        runs.append(Run(min(times), max(times), rank, partial(rows, rank, items)))
+        runs.append(SortedRun(min(times), max(times), rank, partial(rows, rank, items)))
     return runs
 
 
