@@ -13,7 +13,7 @@ from coverage import Coverage
 from hypothesis import settings
 from xdist.remote import Producer
 
-from tests.workers import Groups, give_way, place, workers_for
+from tests.support.workers import Groups, give_way, place, workers_for
 
 # A loaded machine is slow, not wrong.
 settings.register_profile("steady", deadline=None)
@@ -86,13 +86,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Workers for many tests, see `tests/workers.py`; a few files are run without."""
+    """Workers for many tests, see `tests/support/workers.py`; a few files are run without."""
     return workers_for(config.args)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Groups:
-    """Tests that share a worker, see `tests/workers.py`."""
+    """Tests that share a worker, see `tests/support/workers.py`."""
     return Groups(config, log)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.integration.test_server_process import Served, serving
-from tests.questions import write_run
+from tests.support.robot_run import write_run
 
 HERE: Final = Path(__file__).parent
 HOME: Final = HERE.parents[1] / "build" / "conformance"

@@ -28,8 +28,8 @@ from ros2_memory.serving.backfill import (
     keep_backfilled,
 )
 from tests.faults.world import NOW, fill_up, plainly, served, told, write_bag, write_bags
-from tests.memories import SettableClock
-from tests.waiting import PATIENCE_S
+from tests.support.memories import SettableClock
+from tests.support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -20,9 +20,9 @@ from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.visits import visits
-from tests.bags import McapLayout, detections, odom, tf, transform, write_mcap
-from tests.keeping import recorded_before
-from tests.memories import memory_of
+from tests.support.bags import McapLayout, detections, odom, tf, transform, write_mcap
+from tests.support.housekeepers import recorded_before
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

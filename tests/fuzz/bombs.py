@@ -14,7 +14,6 @@ import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.bags import Msg, definition, write_db3
 from tests.fuzz.good import BASE_S, goods
 from tests.fuzz.mutant import Mutant, mutant_file, mutant_of
 from tests.fuzz.records import (
@@ -27,6 +26,7 @@ from tests.fuzz.records import (
     schema,
     without_summary,
 )
+from tests.support.bags import Msg, definition, write_db3
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -16,7 +16,6 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
-from tests.bags import Msg, definition, write_db3, write_mcap
 from tests.fuzz.good import BASE_S, mcaps, run_of, sqlites
 from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import (
@@ -31,7 +30,8 @@ from tests.fuzz.records import (
     schema,
     without_summary,
 )
-from tests.shelves import LAYOUTS
+from tests.support.bags import Msg, definition, write_db3, write_mcap
+from tests.support.reader_cases import LAYOUTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.bags import Msg
 from tests.fuzz.content import db3_with
 from tests.fuzz.good import BASE_S
 from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import channel, header, message, schema, without_summary
+from tests.support.bags import Msg
 
 if TYPE_CHECKING:
     from random import Random

@@ -15,7 +15,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.bags import (
+from tests.support.bags import (
     McapLayout,
     Msg,
     boolean,
@@ -29,8 +29,8 @@ from tests.bags import (
     write_db3,
     write_mcap,
 )
-from tests.shared_bags import REAL, RECORDED
-from tests.shelves import LAYOUTS
+from tests.support.reader_cases import LAYOUTS
+from tests.support.shared_bags import REAL, RECORDED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
-from tests.bags import typestore
 from tests.fuzz.asking import ask
 from tests.fuzz.oracle import readable_db3, readable_mcap
+from tests.support.bags import typestore
 
 if TYPE_CHECKING:
     from random import Random

@@ -23,10 +23,10 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.moment_file import stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, identity_of
 from ros2_memory.bag_dir.request_queue import PendingRequest
-from tests.bags import odom, write_mcap
-from tests.keeping import size_of
-from tests.memories import ROOT
-from tests.waiting import until
+from tests.support.bags import odom, write_mcap
+from tests.support.housekeepers import size_of
+from tests.support.memories import ROOT
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.request_queue import Outcome
@@ -95,7 +95,14 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
     stop = tmp_path / "stop"
     budget = size_of(robot.bag_dir / "rec_20260101T000000Z") // 2
     house = subprocess.Popen(
-        [sys.executable, "-m", "tests.racing_house", robot.bag_dir, str(budget), stop],
+        [
+            sys.executable,
+            "-m",
+            "tests.support.rival_housekeeper",
+            robot.bag_dir,
+            str(budget),
+            stop,
+        ],
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

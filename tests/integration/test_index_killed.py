@@ -20,10 +20,10 @@ from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S, FixedClock
 from ros2_memory.history.context import Call
-from tests.bags import detections, odom, tf, transform, write_mcap
-from tests.keeping import recorded_before
-from tests.memories import memory_of
-from tests.waiting import until
+from tests.support.bags import detections, odom, tf, transform, write_mcap
+from tests.support.housekeepers import recorded_before
+from tests.support.memories import memory_of
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

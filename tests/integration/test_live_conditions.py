@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
-from tests.live_recorder import (
+from tests.support.live_recorder import (
     NS_PER_S,
     LiveRecorder,
     Machine,
@@ -25,8 +25,14 @@ from tests.live_recorder import (
     moment_of,
     ticks,
 )
-from tests.ros_live import Robot, needs_ros, publishing_robot, ros_environment, wait_for
-from tests.stalls import in_time
+from tests.support.ros_processes import (
+    Robot,
+    needs_ros,
+    publishing_robot,
+    ros_environment,
+    wait_for,
+)
+from tests.timing.stalls import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.live_faults import KINDS, Campaign, Terms, place_is_right, run_campaign
-from tests.ros_live import needs_ros
-from tests.stalls import Watch, driven
+from tests.support.kill_campaign import KINDS, Campaign, Terms, place_is_right, run_campaign
+from tests.support.ros_processes import needs_ros
+from tests.timing.stalls import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path

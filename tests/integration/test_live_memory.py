@@ -15,8 +15,8 @@ import pytest
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.closed_form import position
-from tests.live_recorder import (
+from tests.support.closed_form import position
+from tests.support.live_recorder import (
     NS_PER_S,
     RECORDED_TOPICS,
     Answer,
@@ -31,14 +31,14 @@ from tests.live_recorder import (
     stamp_of,
     ticks,
 )
-from tests.ros_live import Robot, needs_ros, publishing_robot, ros_environment
-from tests.stalls import Watch, driven
+from tests.support.ros_processes import Robot, needs_ros, publishing_robot, ros_environment
+from tests.timing.stalls import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.integration.test_server_process import Served
-    from tests.live_recorder import Machine
+    from tests.support.live_recorder import Machine
 
 pytestmark = needs_ros
 

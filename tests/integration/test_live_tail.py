@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from ros2_memory.core.timebase import unix_rounded_up
-from tests.closed_form import position
-from tests.live_recorder import (
+from tests.support.closed_form import position
+from tests.support.live_recorder import (
     NS_PER_S,
     Answer,
     LiveRecorder,
@@ -28,8 +28,8 @@ from tests.live_recorder import (
     machine,
     ticks,
 )
-from tests.ros_live import needs_ros, publishing_robot, ros_environment
-from tests.stalls import Watch, driven
+from tests.support.ros_processes import needs_ros, publishing_robot, ros_environment
+from tests.timing.stalls import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,12 +16,12 @@ from mcp import Client
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.catalogue.store import FILE, FOLDER
-from tests.bags import McapLayout, odom, write_db3, write_mcap
 from tests.integration.test_retention_process import state
 from tests.integration.test_server_process import serving
-from tests.keeping import recorded_before
-from tests.questions import T0, ask_everything, write_run
-from tests.waiting import PATIENCE_S, until
+from tests.support.bags import McapLayout, odom, write_db3, write_mcap
+from tests.support.housekeepers import recorded_before
+from tests.support.robot_run import T0, ask_everything, write_run
+from tests.support.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,11 +10,11 @@ import pytest
 
 from ros2_memory.bag_dir.heartbeat import write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
-from tests.bags import boolean, detections, odom, text, write_mcap
-from tests.browser import ENTER, TAB, Browser, browsing, needs_chromium
-from tests.documented import heartbeat
 from tests.integration.test_server_process import serving
-from tests.questions import T0, T0_S
+from tests.support.bags import boolean, detections, odom, text, write_mcap
+from tests.support.browser import ENTER, TAB, Browser, browsing, needs_chromium
+from tests.support.documented_history import heartbeat
+from tests.support.robot_run import T0, T0_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.integration.test_server_process import serving
-from tests.memories import ROOT
-from tests.questions import write_run
-from tests.waiting import until
+from tests.support.memories import ROOT
+from tests.support.robot_run import write_run
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,8 +13,8 @@ from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.recorder.null import NullRecorder
 from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader
-from tests import stub_ros2
-from tests.waiting import until
+from tests.support import stub_ros2
+from tests.support.waiting import until
 
 if TYPE_CHECKING:
     from ros2_memory.recorder.base import Recorder

@@ -1,4 +1,4 @@
-"""The recorder's program, run whole over a stand-in for `ros2` (see `tests/stub_ros2.py`)."""
+"""The recorder's program, run whole over a stand-in for `ros2`: `tests/support/stub_ros2.py`."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
-from tests import stub_ros2
-from tests.bags import odom, write_mcap
-from tests.stalls import in_time
-from tests.waiting import PATIENCE_S, until
+from tests.support import stub_ros2
+from tests.support.bags import odom, write_mcap
+from tests.support.waiting import PATIENCE_S, until
+from tests.timing.stalls import in_time
 
 PERIOD_NS = 10_000_000
 
@@ -157,7 +157,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
 
 
 def at_a_site(folder: Path, test: Callable[[Site], None]) -> None:
-    """Runs what a test does by the clock, on a site of its own (see `tests/stalls.py`)."""
+    """Runs what a test does by the clock, on a site of its own (see `tests/timing/stalls.py`)."""
 
     def once() -> None:
         with sited(Path(mkdtemp(dir=folder))) as site:

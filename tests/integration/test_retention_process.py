@@ -27,17 +27,17 @@ from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, odom, write_mcap
 from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving
-from tests.keeping import keeper_of, size_of
-from tests.live_recorder import answer
-from tests.memories import memory_of
-from tests.owned import own_all
-from tests.questions import ask_everything, write_run
-from tests.split_writer import DOCK
+from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.housekeepers import keeper_of, size_of
+from tests.support.live_recorder import answer
+from tests.support.memories import memory_of
+from tests.support.own_recordings import own_all
+from tests.support.robot_run import ask_everything, write_run
+from tests.support.split_writer import DOCK
+from tests.support.waiting import PATIENCE_S, until
 from tests.unit.core.test_deep_directories import DEEP, within
-from tests.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -127,7 +127,7 @@ class Asker:
 @contextmanager
 def writer(bag_dir: Path, begin: int) -> Iterator[Callable[[], dict[str, Any]]]:
     """A process that records; each call takes it a split further."""
-    command = [sys.executable, "-m", "tests.split_writer", str(bag_dir), f"--begin={begin}"]
+    command = [sys.executable, "-m", "tests.support.split_writer", str(bag_dir), f"--begin={begin}"]
     with subprocess.Popen(
         command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:

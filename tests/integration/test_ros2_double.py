@@ -16,8 +16,8 @@ from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema, Summ
 from mcap.stream_reader import breakup_chunk
 from rosbags.highlevel import AnyReader
 
-from tests.ros_live import needs_ros, publishing_robot, ros_environment, wait_for
-from tests.ros_recordings import (
+from tests.support.ros_processes import needs_ros, publishing_robot, ros_environment, wait_for
+from tests.support.ros_recordings import (
     Recording,
     embedded,
     in_file,
@@ -27,8 +27,8 @@ from tests.ros_recordings import (
     records,
     summary_of,
 )
-from tests.shared_bags import RECORDED, needs_recorded
-from tests.stalls import in_time
+from tests.support.shared_bags import RECORDED, needs_recorded
+from tests.timing.stalls import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

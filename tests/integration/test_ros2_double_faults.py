@@ -14,8 +14,14 @@ from typing import TYPE_CHECKING
 import pytest
 from rosbags.highlevel import AnyReader
 
-from tests.ros_live import SHARED_MEMORY, needs_ros, publishing_robot, ros_environment, wait_for
-from tests.ros_recordings import (
+from tests.support.ros_processes import (
+    SHARED_MEMORY,
+    needs_ros,
+    publishing_robot,
+    ros_environment,
+    wait_for,
+)
+from tests.support.ros_recordings import (
     Recording,
     embedded,
     in_file,
@@ -25,9 +31,9 @@ from tests.ros_recordings import (
     records,
     summary_of,
 )
-from tests.shared_bags import RECORDED, needs_recorded
-from tests.stalls import in_time
-from tests.waiting import PATIENCE_S, until
+from tests.support.shared_bags import RECORDED, needs_recorded
+from tests.support.waiting import PATIENCE_S, until
+from tests.timing.stalls import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

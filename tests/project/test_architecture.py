@@ -6,7 +6,7 @@ import re
 from typing import Final
 
 import ros2_memory
-from tests.memories import ROOT
+from tests.support.memories import ROOT
 
 SOURCE: Final = ROOT / "src" / "ros2_memory"
 PAGE: Final = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")

@@ -8,7 +8,7 @@ import re
 import pytest
 
 from tests.conformance import __main__ as conformance
-from tests.memories import ROOT
+from tests.support.memories import ROOT
 
 HERE = ROOT / "tests" / "conformance"
 

@@ -14,7 +14,7 @@ from ros2_memory.history.context import QuerySettings
 from ros2_memory.settings import Ros2BagNode, Settings
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.spec_tools import build_tools
-from tests.memories import ROOT
+from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -24,8 +24,8 @@ from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from ros2_memory.config import load_settings
 from ros2_memory.serving.web_app import STREAM_PATH
-from tests.documented import START_S, write_history
-from tests.memories import ROOT
+from tests.support.documented_history import START_S, write_history
+from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -19,7 +19,7 @@ from ros2_memory.observability.gauges import (
     Measures,
     RecorderMeasures,
 )
-from tests.memories import ROOT
+from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,9 +15,9 @@ from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.tools.resources import SCHEMA, STATUS, TOPICS
 from ros2_memory.tools.spec_tools import build_tools
-from tests import reference
-from tests.documented import CALLS, MISTAKES, replies, shown_files, write_history
-from tests.memories import ROOT
+from tests.support import reference_tables as reference
+from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
+from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

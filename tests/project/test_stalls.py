@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.stalls import DRIVES, LATE_S, WAITED, WITNESS, Watch, driven, in_time, watching
-from tests.waiting import until
-from tests.witness import Witness
+from tests.support.waiting import until
+from tests.timing.stalls import DRIVES, LATE_S, WAITED, WITNESS, Watch, driven, in_time, watching
+from tests.timing.witness import Witness
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from tests.workers import GROUPS, TESTS, WORKERS, group_of, place, workers_for
+from tests.support.workers import GROUPS, TESTS, WORKERS, group_of, place, workers_for
 
 HERE = "tests/project/test_workers.py"
 LIVE = "tests/integration/test_live_memory.py"
@@ -85,7 +85,7 @@ def test_folders_are_run_by_several_workers_and_files_by_none(
 def test_a_worker_gives_way_once_it_is_done_with_what_waits_for_real_time() -> None:
     program = (
         "import os\n"
-        "from tests.workers import give_way\n"
+        "from tests.support.workers import give_way\n"
         "first = os.nice(0)\n"
         f"for file in ({LIVE!r}, {HERE!r}, {HERE!r}):\n"
         "    give_way(f'{file}::test_x')\n"

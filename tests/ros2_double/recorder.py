@@ -17,7 +17,7 @@ from tests.ros2_double.bag import Bag, Writing
 from tests.ros2_double.definitions import package_is_known, type_hash
 from tests.ros2_double.metadata import Topic, qos_text
 from tests.ros2_double.qos import adapted, offered, overrides, refused
-from tests.ros_types import subscription
+from tests.support.ros_types import subscription
 
 if TYPE_CHECKING:
     from tests.ros2_double.arguments import Options

@@ -10,9 +10,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from tests.questions import write_run
 from tests.soak.rounds import soaked
 from tests.soak.server import serving
+from tests.support.robot_run import write_run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

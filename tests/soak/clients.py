@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from mcp import Client
 from mcp.client.sse import sse_client
 
-from tests.questions import ANSWERED, T0_S, ask
 from tests.soak.wire import BOUND_S, answer, asked, call, connected, head, posted
+from tests.support.robot_run import ANSWERED, T0_S, ask
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator

@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from tests.questions import write_run
 from tests.soak.clients import slow_loris
 from tests.soak.rounds import SHORT, soaked
 from tests.soak.server import serving
-from tests.stalls import in_time
+from tests.support.robot_run import write_run
+from tests.timing.stalls import in_time
 
 if TYPE_CHECKING:
     from pathlib import Path

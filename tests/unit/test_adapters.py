@@ -10,8 +10,8 @@ from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.recorder.housekeeping import InBackground
 from ros2_memory.upkeep import build_housekeeper, build_repairer
-from tests.bags import McapLayout, odom, write_mcap
-from tests.keeping import files_in
+from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.housekeepers import files_in
 
 if TYPE_CHECKING:
     from pathlib import Path

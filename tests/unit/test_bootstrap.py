@@ -16,7 +16,7 @@ from ros2_memory.endpoint import build_server
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.reply_size import to_json_text
-from tests.questions import ANSWERED, ask, ask_everything, write_run
+from tests.support.robot_run import ANSWERED, ask, ask_everything, write_run
 
 if TYPE_CHECKING:
     from ros2_memory.settings import Settings

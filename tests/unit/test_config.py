@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.config import load_settings
 from ros2_memory.settings import NullRecorderNode
-from tests.configs import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, refusal
+from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, refusal
 
 PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
     codec="utf-8", exclude_characters="\0"

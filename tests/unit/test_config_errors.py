@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.config import exit_on_config_error, load_settings
-from tests.configs import copied, edit, refusal
+from tests.support.config_folders import copied, edit, refusal
 
 
 @pytest.fixture

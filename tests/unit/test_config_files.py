@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.config import config_dir, load_message_schemas, load_settings
 from ros2_memory.core.errors import ConfigError
-from tests.configs import ROOT, copied, edit, refusal
+from tests.support.config_folders import ROOT, copied, edit, refusal
 
 if TYPE_CHECKING:
     from collections.abc import Callable

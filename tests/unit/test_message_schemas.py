@@ -9,8 +9,8 @@ import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
 
-from tests import bags
-from tests.schemas import shipped_schemas
+from tests.support import bags
+from tests.support.schemas import shipped_schemas
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import FieldDesc, Typesdict

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from ros2_memory.history.context import QuerySettings
-from tests.asking import asked
-from tests.bags import (
+from tests.support.bags import (
     Msg,
     boolean,
     header,
@@ -22,8 +21,9 @@ from tests.bags import (
     transform,
     write_mcap,
 )
-from tests.memories import memory_of
-from tests.recalled import recalling
+from tests.support.memories import memory_of
+from tests.support.tool_calls import asked
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

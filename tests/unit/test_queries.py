@@ -19,7 +19,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.history.view import View
 from ros2_memory.recorder.index_manager import IndexManager
-from tests.bags import (
+from tests.support.bags import (
     McapLayout,
     Msg,
     boolean,
@@ -30,7 +30,7 @@ from tests.bags import (
     transform,
     write_mcap,
 )
-from tests.memories import SettableClock, memory_of
+from tests.support.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,8 +14,8 @@ from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.time_arguments import AtTime, TimeRange
-from tests.bags import typestore
-from tests.closed_form import (
+from tests.support.bags import typestore
+from tests.support.closed_form import (
     CAMERA,
     LASER,
     SESSIONS,
@@ -27,8 +27,8 @@ from tests.closed_form import (
     position,
     yaw_deg,
 )
-from tests.memories import memory_of
-from tests.shared_bags import RECORDED, needs_recorded
+from tests.support.memories import memory_of
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

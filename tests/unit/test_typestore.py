@@ -18,12 +18,12 @@ from ros2_memory.typestore import (
     MessageType,
     Typestores,
 )
-from tests.bags import VISION_DEFINITIONS, definition, detections, odom, text, typestore
+from tests.support.bags import VISION_DEFINITIONS, definition, detections, odom, text, typestore
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.bags import Msg
+    from tests.support.bags import Msg
 
 RULE = "=" * 80
 CDR = b"\x00\x01\x00\x00"

@@ -20,7 +20,7 @@ from ros2_memory.analysis.conditions import (
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import (
+from tests.support.bags import (
     Msg,
     detections,
     header,
@@ -33,7 +33,7 @@ from tests.bags import (
     twist,
     write_mcap,
 )
-from tests.memories import extractor
+from tests.support.memories import extractor
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,7 +19,7 @@ from ros2_memory.analysis.conditions import (
     positions,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
-from tests.strategies import json_values, scalars
+from tests.support.strategies import json_values, scalars
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Scalar

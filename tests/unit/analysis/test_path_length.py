@@ -28,9 +28,9 @@ from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.tools.replies import Replies
-from tests.bags import Msg, odom, write_mcap
-from tests.memories import memory_of
-from tests.recalled import recalling
+from tests.support.bags import Msg, odom, write_mcap
+from tests.support.memories import memory_of
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,8 +12,8 @@ from ros2_memory.analysis.sights import MotionDecoder, MotionSample
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import Msg, header, make, odom, quaternion, text, write_mcap
-from tests.memories import extractor
+from tests.support.bags import Msg, header, make, odom, quaternion, text, write_mcap
+from tests.support.memories import extractor
 
 if TYPE_CHECKING:
     from pathlib import Path

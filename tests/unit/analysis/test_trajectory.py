@@ -19,9 +19,9 @@ from ros2_memory.analysis.trajectory import (
 )
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
-from tests.real_messages import messages
-from tests.shared_bags import REAL, needs_real
-from tests.strategies import points
+from tests.support.rosbags_oracle import messages
+from tests.support.shared_bags import REAL, needs_real
+from tests.support.strategies import points
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -17,7 +17,7 @@ from ros2_memory.analysis.conditions import (
 )
 from ros2_memory.analysis.zone_map import united
 from ros2_memory.analysis.zone_map_builder import ZoneMapBuilder
-from tests.strategies import json_values
+from tests.support.strategies import json_values
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue

@@ -19,8 +19,8 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, Msg, boolean, text, write_mcap
-from tests.memories import memory_of
+from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

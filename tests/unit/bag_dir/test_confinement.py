@@ -44,9 +44,9 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.spec_tools import build_tools
 from ros2_memory.upkeep import build_repairer
-from tests.bags import boolean, text, write_db3, write_mcap
-from tests.keeping import keeper_of
-from tests.questions import ANSWERED, T0, T0_S, write_run
+from tests.support.bags import boolean, text, write_db3, write_mcap
+from tests.support.housekeepers import keeper_of
+from tests.support.robot_run import ANSWERED, T0, T0_S, write_run
 
 if TYPE_CHECKING:
     from ros2_memory.serving.mcp_server import EpisodicServer

@@ -16,8 +16,8 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.overview import list_recorded_topics
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import odom, write_mcap
-from tests.memories import memory_of
+from tests.support.bags import odom, write_mcap
+from tests.support.memories import memory_of
 from tests.unit.index.test_unchanged_bags import Start
 
 if TYPE_CHECKING:

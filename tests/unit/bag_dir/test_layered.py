@@ -7,8 +7,8 @@ from pathlib import Path
 from ros2_memory.bag_dir.layered import LayeredReader
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import CdrLayout, Closing, Record
-from tests.bags import odom, text
-from tests.fakes import FakeReader
+from tests.support.bags import odom, text
+from tests.support.fakes import FakeReader
 
 ASKED, OPEN, FULL = (Path(f"rec/rec_{n}.mcap") for n in range(3))
 EVER = TimeWindow.everything()

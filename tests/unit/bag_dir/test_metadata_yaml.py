@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory.bag_dir.metadata_yaml import take_out, without
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.shared_bags import RECORDED, needs_recorded
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,7 +17,7 @@ from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
 from ros2_memory.catalogue.file import VERSION
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.config import load_settings
-from tests.memories import ROOT
+from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -29,9 +29,9 @@ from ros2_memory.catalogue.codec import (
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.topic_digest import MOST_KEPT
 from ros2_memory.core.model import Pose
-from tests.bags import Msg, boolean, detections, odom, text, tf, transform
-from tests.fakes import FakeReader
-from tests.memories import extractor
+from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform
+from tests.support.fakes import FakeReader
+from tests.support.memories import extractor
 
 if TYPE_CHECKING:
     from ros2_memory.catalogue.digest import Digest

@@ -24,10 +24,10 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, boolean, odom, write_mcap
-from tests.histories import S, write_history
-from tests.memories import memory_of
-from tests.recalled import recalling
+from tests.support.bags import McapLayout, boolean, odom, write_mcap
+from tests.support.memories import memory_of
+from tests.support.random_histories import S, write_history
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

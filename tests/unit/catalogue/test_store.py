@@ -16,14 +16,14 @@ from ros2_memory.analysis.topic_events import NO_EVENTS
 from ros2_memory.catalogue.database import RETRY_S
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue, relative
-from tests.bags import boolean, detections, odom, tf, transform
-from tests.fakes import FakeReader
-from tests.memories import extractor
+from tests.support.bags import boolean, detections, odom, tf, transform
+from tests.support.fakes import FakeReader
+from tests.support.memories import extractor
 
 if TYPE_CHECKING:
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.topic_digest import TopicDigest
-    from tests.bags import Msg
+    from tests.support.bags import Msg
 
 S = 10**9
 T0 = 1_700_000_000 * S

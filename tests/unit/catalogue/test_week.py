@@ -17,9 +17,9 @@ from ros2_memory.core.timebase import NS_PER_S, FixedClock
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.index.snapshot import Snapshot
-from tests.bags import detections, odom, tf, transform
-from tests.fakes import FakeReader
-from tests.memories import extractor
+from tests.support.bags import detections, odom, tf, transform
+from tests.support.fakes import FakeReader
+from tests.support.memories import extractor
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.odometry import PoseDigest, TimedPosition

@@ -20,7 +20,7 @@ from ros2_memory.cli.exits import epilog
 from ros2_memory.cli.output import cell, plain
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
-from tests.bags import odom, text, write_mcap
+from tests.support.bags import odom, text, write_mcap
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,8 +17,8 @@ from mcap.writer import Writer
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
-from tests import stub_ros2
-from tests.bags import McapLayout, Msg, odom, write_mcap
+from tests.support import stub_ros2
+from tests.support.bags import McapLayout, Msg, odom, write_mcap
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -26,7 +26,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.bags import (
+from tests.support.bags import (
     McapLayout,
     Msg,
     boolean,
@@ -38,9 +38,9 @@ from tests.bags import (
     write_db3,
     write_mcap,
 )
-from tests.mcap_surgery import raw_mcap
-from tests.memories import memory_of
-from tests.shared_bags import REAL, RECORDED, needs_real, needs_recorded
+from tests.support.mcap_surgery import raw_mcap
+from tests.support.memories import memory_of
+from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

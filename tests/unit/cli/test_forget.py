@@ -20,8 +20,8 @@ from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.owned import OURS, embedding, own_all
+from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
+from tests.support.own_recordings import OURS, embedding, own_all
 
 if TYPE_CHECKING:
     from pathlib import Path

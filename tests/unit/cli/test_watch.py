@@ -16,7 +16,7 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartb
 from ros2_memory.cli.output import span
 from ros2_memory.cli.watch import AS_USUAL, Course
 from ros2_memory.core.timebase import NS_PER_S
-from tests.bags import boolean, odom, text, write_mcap
+from tests.support.bags import boolean, odom, text, write_mcap
 
 if TYPE_CHECKING:
     from pathlib import Path

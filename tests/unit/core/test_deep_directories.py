@@ -15,8 +15,8 @@ from ros2_memory.cli.recovery import recover
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from ros2_memory.retention.clear import clear_bags
-from tests.bags import odom, write_mcap
-from tests.keeping import keeper_of
+from tests.support.bags import odom, write_mcap
+from tests.support.housekeepers import keeper_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

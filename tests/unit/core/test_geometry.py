@@ -28,7 +28,7 @@ from ros2_memory.core.geometry import (
     yaw,
 )
 from ros2_memory.core.model import Quaternion, Transform, Vector3
-from tests.strategies import angles, points, quaternions, ratios, transforms
+from tests.support.strategies import angles, points, quaternions, ratios, transforms
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -23,7 +23,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
     unix_rounded_up,
 )
-from tests.strategies import moments
+from tests.support.strategies import moments
 
 small = st.integers(-20, 20)
 windows = st.builds(TimeWindow, small, small)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 
 from ros2_memory.core.text import abbreviate
-from tests.hostile import DEEP, MEGABYTE, nested, values
+from tests.support.hostile_arguments import DEEP, MEGABYTE, nested, values
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
     unix_rounded_up,
 )
-from tests.strategies import moments
+from tests.support.strategies import moments
 
 
 @given(moments)

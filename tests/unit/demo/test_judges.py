@@ -19,7 +19,7 @@ from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
-from tests.memories import memory_of
+from tests.support.memories import memory_of
 
 BY_WORDS = {question.words: question for question in QUESTIONS}
 PATHS_THAT_COUNT = {

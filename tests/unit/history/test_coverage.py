@@ -17,9 +17,9 @@ from ros2_memory.history.coverage import seconds
 from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import shown
-from tests.bags import boolean, odom, text, tf, transform, write_mcap
-from tests.memories import SettableClock, memory_of
-from tests.recalled import recalling
+from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
+from tests.support.memories import SettableClock, memory_of
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,11 +10,11 @@ import pytest
 from ros2_memory import queries
 from ros2_memory.core.timebase import FixedClock
 from ros2_memory.history.context import Call, QuerySettings
-from tests.asking import asked
-from tests.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
-from tests.mcap_surgery import spoil_chunk
-from tests.memories import memory_of
-from tests.recalled import recalling
+from tests.support.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
+from tests.support.mcap_surgery import spoil_chunk
+from tests.support.memories import memory_of
+from tests.support.tool_calls import asked
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -21,10 +21,21 @@ from ros2_memory.insights.status import memory_status
 from ros2_memory.queries import position, topic_value, value_when
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.bags import McapLayout, Msg, boolean, make, odom, stamp, text, tf, transform, write_mcap
-from tests.keeping import keeper_of
-from tests.memories import memory_of
-from tests.recalled import recalling
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    make,
+    odom,
+    stamp,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
+from tests.support.housekeepers import keeper_of
+from tests.support.memories import memory_of
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

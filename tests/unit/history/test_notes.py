@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from ros2_memory.core.wording import Reason
-from tests.asking import asked
-from tests.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
-from tests.mcap_surgery import spoil_chunk
-from tests.memories import memory_of
-from tests.recalled import recalling
+from tests.support.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
+from tests.support.mcap_surgery import spoil_chunk
+from tests.support.memories import memory_of
+from tests.support.tool_calls import asked
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -23,10 +23,10 @@ from ros2_memory.queries import (
     transform,
     value_when,
 )
-from tests.bags import Msg, detections, make, odom, tf, write_mcap
-from tests.bags import transform as stamped
-from tests.memories import memory_of
-from tests.recalled import recalling
+from tests.support.bags import Msg, detections, make, odom, tf, write_mcap
+from tests.support.bags import transform as stamped
+from tests.support.memories import memory_of
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

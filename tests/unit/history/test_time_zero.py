@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 
 from ros2_memory.history.context import QuerySettings
-from tests.asking import asked, replied
-from tests.bags import boolean, detections, odom, write_mcap
-from tests.memories import SettableClock, memory_of
-from tests.recalled import recalling
-from tests.shared_bags import REAL, needs_real
+from tests.support.bags import boolean, detections, odom, write_mcap
+from tests.support.memories import SettableClock, memory_of
+from tests.support.shared_bags import REAL, needs_real
+from tests.support.tool_calls import asked, replied
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,8 +17,8 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.messages.downsample import evenly
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, Msg, boolean, odom, text, write_mcap
-from tests.memories import memory_of
+from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator

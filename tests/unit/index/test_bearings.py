@@ -18,8 +18,8 @@ from ros2_memory.core.model import (
 from ros2_memory.index.snapshot import RUN_LIMIT, Snapshot
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, text, write_mcap
-from tests.memories import SettableClock
+from tests.support.bags import McapLayout, text, write_mcap
+from tests.support.memories import SettableClock
 
 S = 10**9
 T0 = 1_784_023_200 * S

@@ -20,7 +20,7 @@ from ros2_memory.index.file_state import (
 )
 from ros2_memory.index.scan import Stamp
 from ros2_memory.storage.base import Closing
-from tests.plain_bags import PlainReader, close, grow, plain
+from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 S = 10**9
 NOW = 1_800_000_000 * S

@@ -22,7 +22,7 @@ from ros2_memory.bag_dir.heartbeat import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Clock
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
-from tests.plain_bags import PlainReader, close, grow, plain
+from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 if TYPE_CHECKING:
     from collections.abc import Callable

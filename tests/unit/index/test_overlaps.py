@@ -11,8 +11,8 @@ from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index.overlaps import Together, named, overlapping_recordings
 from ros2_memory.index.snapshot import Snapshot
-from tests.bags import odom, write_mcap
-from tests.memories import memory_of
+from tests.support.bags import odom, write_mcap
+from tests.support.memories import memory_of
 
 T0 = 1_700_000_000
 

@@ -17,8 +17,8 @@ from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.overview import data_time_range
 from ros2_memory.queries import topic_range
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, Msg, boolean, text, write_mcap
-from tests.memories import memory_of
+from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.memories import memory_of
 
 S: Final = 10**9
 T0: Final = 1_784_000_000 * S

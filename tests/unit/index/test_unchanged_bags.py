@@ -12,7 +12,7 @@ from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.core.timebase import FixedClock
 from ros2_memory.index.file_state import KnownFile
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
-from tests.plain_bags import PlainReader, plain
+from tests.support.plain_text_bags import PlainReader, plain
 
 if TYPE_CHECKING:
     from pathlib import Path

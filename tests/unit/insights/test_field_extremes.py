@@ -15,8 +15,8 @@ from ros2_memory.insights import field_extremes
 from ros2_memory.results import Extremes
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_json import shown
-from tests.bags import Msg, boolean, detections, odom, text, write_mcap
-from tests.memories import memory_of
+from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue

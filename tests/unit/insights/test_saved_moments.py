@@ -31,9 +31,9 @@ from ros2_memory.insights.saved_moments import (
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
-from tests.bags import odom, write_mcap
-from tests.keeping import keeper_of, recorder_at_work
-from tests.memories import SettableClock, memory_of
+from tests.support.bags import odom, write_mcap
+from tests.support.housekeepers import keeper_of, recorder_at_work
+from tests.support.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

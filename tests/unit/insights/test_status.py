@@ -14,8 +14,8 @@ from ros2_memory.index.listed_splits import absent_splits
 from ros2_memory.insights.status import memory_status
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
-from tests.bags import Msg, boolean, odom, text, tf, transform, write_mcap
-from tests.memories import SettableClock, memory_of
+from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
+from tests.support.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -28,12 +28,12 @@ from ros2_memory.history.context import Call
 from ros2_memory.insights.visits import visits
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.bags import Msg, odom, tf, transform, write_mcap
-from tests.closed_form import SESSIONS
-from tests.histories import write_history
-from tests.memories import SettableClock, memory_of
-from tests.recalled import recalling
-from tests.shared_bags import needs_recorded
+from tests.support.bags import Msg, odom, tf, transform, write_mcap
+from tests.support.closed_form import SESSIONS
+from tests.support.memories import SettableClock, memory_of
+from tests.support.random_histories import write_history
+from tests.support.shared_bags import needs_recorded
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

@@ -15,7 +15,7 @@ from ros2_memory.messages.conversions import (
     xyzw,
 )
 from ros2_memory.messages.fields import ABSENT
-from tests import bags
+from tests.support import bags
 
 NAN = math.nan
 

@@ -5,7 +5,7 @@ from hypothesis import given
 
 from ros2_memory.core.model import JsonValue
 from ros2_memory.messages.detections import Detection, detections_of
-from tests.strategies import json_values
+from tests.support.strategies import json_values
 
 
 def test_detections_with_a_label_and_a_point_are_things_in_the_frame_of_the_message() -> None:

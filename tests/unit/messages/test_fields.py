@@ -17,7 +17,7 @@ from ros2_memory.messages.fields import (
     names_of,
     parse_path,
 )
-from tests import bags
+from tests.support import bags
 
 if TYPE_CHECKING:
     from collections.abc import Callable

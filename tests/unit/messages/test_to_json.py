@@ -17,7 +17,7 @@ from ros2_memory.messages.to_json import (
     ExactJson,
     ReplyJson,
 )
-from tests import bags
+from tests.support import bags
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue

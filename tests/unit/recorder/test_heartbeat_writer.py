@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.recorder_world import World
+from tests.support.simulated_recorders import World
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,8 +19,8 @@ from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.ports import Housekeeper, NoHousekeeping
 from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, odom, write_db3, write_mcap
-from tests.keeping import (
+from tests.support.bags import McapLayout, odom, write_db3, write_mcap
+from tests.support.housekeepers import (
     PLENTY,
     FakeTimeSync,
     files_in,
@@ -30,7 +30,7 @@ from tests.keeping import (
     recording_now,
     size_of,
 )
-from tests.memories import extractor
+from tests.support.memories import extractor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, MutableMapping

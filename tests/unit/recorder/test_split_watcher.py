@@ -9,7 +9,7 @@ import pytest
 
 from ros2_memory.recorder.split_watcher import EMPTY_GRACE_S, Changes, Splits
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, boolean, write_mcap
+from tests.support.bags import McapLayout, boolean, write_mcap
 
 T0 = 1_795_150_800 * 10**9
 OPEN = McapLayout(chunk_size=None, finish=False)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from structlog.testing import capture_logs
 
-from tests.recorder_world import World
-from tests.supervision import Housekeeping, assert_each_counts_once, events
+from tests.support.simulated_recorders import World
+from tests.support.supervisor_checks import Housekeeping, assert_each_counts_once, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 

@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.recorder.time_sync import SystemTimeSync, kernel_error
 from ros2_memory.retention import time_sync
 from ros2_memory.retention.time_sync import TimeSync
-from tests.keeping import FakeTimeSync
+from tests.support.housekeepers import FakeTimeSync
 
 DISCIPLINED, UNDISCIPLINED = 4_000, 16_000_000
 

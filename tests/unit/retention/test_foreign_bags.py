@@ -23,11 +23,11 @@ from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
 from ros2_memory.upkeep import claim
-from tests.bags import McapLayout, boolean, odom, write_mcap
-from tests.keeping import PLENTY, files_in, keeper_of, recording_now, size_of
-from tests.kept_moments import NOW, A, B, house_of, in_moments, kept, recording
-from tests.memories import SettableClock, memory_of
-from tests.owned import embedding, lines, own_all
+from tests.support.bags import McapLayout, boolean, odom, write_mcap
+from tests.support.housekeepers import PLENTY, files_in, keeper_of, recording_now, size_of
+from tests.support.memories import SettableClock, memory_of
+from tests.support.own_recordings import embedding, lines, own_all
+from tests.support.saved_moments import NOW, A, B, house_of, in_moments, kept, recording
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,7 +17,7 @@ from ros2_memory.retention.moment_plan import (
     no_room,
     window_of,
 )
-from tests.memories import LAST_WRITTEN
+from tests.support.memories import LAST_WRITTEN
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import BagSummary

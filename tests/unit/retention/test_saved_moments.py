@@ -21,9 +21,10 @@ from ros2_memory.cli.recovery import recover
 from ros2_memory.retention import saved_moments
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.saved_moments import MomentKeeper
-from tests.bags import McapLayout
-from tests.keeping import PLENTY, files_in, recording_now
-from tests.kept_moments import (
+from tests.support.bags import McapLayout
+from tests.support.housekeepers import PLENTY, files_in, recording_now
+from tests.support.memories import SettableClock, memory_of
+from tests.support.saved_moments import (
     NOW,
     T0,
     A,
@@ -37,7 +38,6 @@ from tests.kept_moments import (
     recording,
     told_of,
 )
-from tests.memories import SettableClock, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,8 +13,8 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.spec_tools import build_tools
-from tests.bags import detections, odom, tf, transform, write_mcap
-from tests.memories import memory_of
+from tests.support.bags import detections, odom, tf, transform, write_mcap
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

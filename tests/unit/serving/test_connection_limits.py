@@ -17,8 +17,8 @@ from structlog.testing import capture_logs
 from ros2_memory.core.logging_setup import Refusals
 from ros2_memory.serving import connection_limits
 from ros2_memory.serving.auth import admit
+from tests.support.webserver import BOUND_S, listening
 from tests.unit.serving.test_web_app import GOOD, MCP_HEADERS, SHOWN, app, call_tool
-from tests.webserver import BOUND_S, listening
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

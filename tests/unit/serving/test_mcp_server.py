@@ -13,7 +13,7 @@ from mcp.types import INVALID_PARAMS, TextContent, TextResourceContents
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
 from ros2_memory.endpoint import build_server
-from tests.questions import write_run
+from tests.support.robot_run import write_run
 
 if TYPE_CHECKING:
     from pathlib import Path

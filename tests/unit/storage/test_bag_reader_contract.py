@@ -20,8 +20,8 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Channel, Closing, Record, Schema
-from tests.bags import Msg, boolean, detections, odom, text, tf, transform, typestore
-from tests.shelves import ALL, FILES, Shelf
+from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, typestore
+from tests.support.reader_cases import ALL, FILES, Shelf
 
 if TYPE_CHECKING:
     from collections.abc import Collection

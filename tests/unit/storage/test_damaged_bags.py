@@ -10,9 +10,9 @@ import pytest
 from ros2_memory.core.errors import BagError, EpisodicError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.errors import UnreadableError, reading
-from tests.bags import Msg, detections, odom, text, tf, transform
-from tests.damage import damaged
-from tests.shelves import FILES, Shelf
+from tests.support.bags import Msg, detections, odom, text, tf, transform
+from tests.support.damage import damaged
+from tests.support.reader_cases import FILES, Shelf
 
 if TYPE_CHECKING:
     from collections.abc import Collection

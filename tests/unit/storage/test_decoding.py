@@ -7,10 +7,10 @@ import pytest
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.decoding import Decoding
-from tests.bags import definition, odom, text
+from tests.support.bags import definition, odom, text
 
 if TYPE_CHECKING:
-    from tests.bags import Msg
+    from tests.support.bags import Msg
 
 
 CDR = b"\x00\x01\x00\x00"

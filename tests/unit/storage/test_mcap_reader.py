@@ -18,8 +18,8 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
-from tests.mcap_surgery import (
+from tests.support.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
+from tests.support.mcap_surgery import (
     FOOTER,
     RECORD,
     SMALL,

@@ -19,7 +19,16 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.bags import McapLayout, Msg, boolean, detections, odom, text, write_db3, write_mcap
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    detections,
+    odom,
+    text,
+    write_db3,
+    write_mcap,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

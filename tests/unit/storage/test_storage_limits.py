@@ -36,7 +36,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.sqlite_guard import guard
 from ros2_memory.storage.zstd import unpacked_zstd
-from tests.bags import Msg, make, text, write_db3, write_mcap
 from tests.fuzz.bombs import rle_frame
 from tests.fuzz.records import (
     MAGIC,
@@ -48,7 +47,8 @@ from tests.fuzz.records import (
     schema,
     without_summary,
 )
-from tests.memories import extractor, memory_of
+from tests.support.bags import Msg, make, text, write_db3, write_mcap
+from tests.support.memories import extractor, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

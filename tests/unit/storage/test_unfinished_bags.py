@@ -12,8 +12,8 @@ from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, Msg, text, write_mcap
-from tests.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
+from tests.support.bags import McapLayout, Msg, text, write_mcap
+from tests.support.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,9 +15,9 @@ from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.schema import Signature
 from ros2_memory.tools.spec_tools import build_tools
-from tests.hostile import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested
-from tests.memories import memory_of
-from tests.questions import ANSWERED, write_run
+from tests.support.hostile_arguments import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested
+from tests.support.memories import memory_of
+from tests.support.robot_run import ANSWERED, write_run
 
 if TYPE_CHECKING:
     from ros2_memory.tools.replies import Reply

@@ -21,10 +21,10 @@ from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.endpoint import build_server
 from ros2_memory.tools.reply_size import to_json_text
-from tests.memories import memory_of
-from tests.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S
-from tests.planner_questions import QUESTIONS, Planned
-from tests.recalled import recalling
+from tests.support.memories import memory_of
+from tests.support.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S
+from tests.support.planner_questions import QUESTIONS, Planned
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -16,12 +16,21 @@ from ros2_memory import queries
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
-from tests.asking import asked
-from tests.bags import McapLayout, Msg, boolean, detections, make, stamp, write_db3, write_mcap
-from tests.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
-from tests.memories import SettableClock, memory_of
-from tests.recalled import recalling
-from tests.shared_bags import REAL, needs_real
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    detections,
+    make,
+    stamp,
+    write_db3,
+    write_mcap,
+)
+from tests.support.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
+from tests.support.memories import SettableClock, memory_of
+from tests.support.shared_bags import REAL, needs_real
+from tests.support.tool_calls import asked
+from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -27,7 +27,7 @@ from ros2_memory.recorder.daemon import Upkeep
 from ros2_memory.recorder.handover.plan import intended, pending, void
 from ros2_memory.recorder.handover.recovery import cut_clock, recover_handovers, unsettled
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.bags import McapLayout, Msg, boolean, tf, transform, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, tf, transform, write_mcap
 
 S = 10**9
 T0 = 1_795_150_800 * S

@@ -1,0 +1,112 @@
+"""MCAP files in layouts and with faults that no writer makes on request."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, Final
+
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.writer import IndexType, Writer
+
+from tests.support.bags import McapLayout, Msg, text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from mcap.records import ChunkIndex
+
+SMALL: Final = McapLayout(chunk_size=400)
+RECORD: Final = struct.Struct("<BQ")
+FOOTER: Final = struct.Struct("<BQQQI")
+
+
+def chatter(count: int, size: int = 100, start: int = 0) -> list[Msg]:
+    """Messages of one topic, at 0, 1, 2 ... ns unless said, each with a text of `size`."""
+    return [text(time, f"{time:0{size}d}") for time in range(start, start + count)]
+
+
+def raw_mcap(path: Path, fill: Callable[[Writer], None], *, profile: str = "", **how: Any) -> Path:
+    """A bag that `fill` writes with the writer itself."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        writer = Writer(stream, **how)
+        writer.start(profile=profile, library="test")
+        fill(writer)
+        writer.finish()
+    return path
+
+
+def chunks_of(path: Path) -> list[ChunkIndex]:
+    """The chunk indexes of a file, as its summary states them."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        return summary.chunk_indexes
+
+
+def spoil_chunk(path: Path, number: int) -> None:
+    """Flips a bit in the middle of a chunk's data."""
+    chunk = chunks_of(path)[number]
+    data = bytearray(path.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size // 2] ^= 1
+    path.write_bytes(data)
+
+
+def change_index(path: Path, chunk: ChunkIndex, at: int, value: int, nth: int = 0) -> None:
+    """Overwrites a number of the first message index of a chunk.
+
+    `at` is 0 for a log time and 8 for a place, `nth` of which message.
+    """
+    data = bytearray(path.read_bytes())
+    index_at = min(chunk.message_index_offsets.values())
+    struct.pack_into("<Q", data, index_at + 15 + 16 * nth + at, value)
+    path.write_bytes(data)
+
+
+def edit_summary(path: Path, opcode: Opcode, edit: Callable[[bytearray], None]) -> None:
+    """Changes the bodies of the summary's records of one kind, checksum kept right."""
+
+    def edited(found: int, body: bytes) -> bytes:
+        changed = bytearray(body)
+        if found == opcode:
+            edit(changed)
+        return bytes(changed)
+
+    rewrite_summary(path, edited)
+
+
+def rewrite_summary(path: Path, change: Callable[[int, bytes], bytes | None]) -> None:
+    """Writes the bodies of the summary's records anew, None for none, checksum kept right."""
+    data = path.read_bytes()
+    footer_at = len(data) - 8 - FOOTER.size
+    kind, length, start, offsets, _ = FOOTER.unpack_from(data, footer_at)
+    section = bytearray()
+    position = start
+    while position < footer_at:
+        opcode, size = RECORD.unpack_from(data, position)
+        position += RECORD.size
+        body = change(opcode, data[position : position + size])
+        if body is not None:
+            section += RECORD.pack(opcode, len(body)) + body
+        position += size
+    footer = FOOTER.pack(kind, length, start, offsets, 0)[:-4]
+    crc = zlib.crc32(footer, zlib.crc32(section))
+    path.write_bytes(data[:start] + section + footer + struct.pack("<I", crc) + data[-8:])
+
+
+def one_chunk(compression: str, data: bytes) -> bytes:
+    """An MCAP file with one chunk that states 2^60 bytes of content, and no summary."""
+    out = BytesIO()
+    writer = Writer(out, index_types=IndexType.NONE, use_statistics=False, use_chunking=False)
+    writer.start()
+    start = out.tell()
+    writer.finish()
+    name = compression.encode()
+    body = struct.pack("<QQQII", 1, 2, 1 << 60, 0, len(name)) + name
+    body += struct.pack("<Q", len(data)) + data
+    whole = out.getvalue()
+    return whole[:start] + RECORD.pack(Opcode.CHUNK, len(body)) + body + whole[start:]

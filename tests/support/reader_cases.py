@@ -1,0 +1,164 @@
+"""Every reader over every kind of file that it reads, for tests that hold for all of them."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+import zstandard
+from mcap.writer import CompressionType, IndexType
+
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.bags import McapLayout, Msg, write_db3, write_mcap
+from tests.support.fakes import FakeReader
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable
+    from pathlib import Path
+
+    from ros2_memory.storage.base import BagReader
+
+NO_CHUNK_INDEX: Final = IndexType.ATTACHMENT | IndexType.MESSAGE | IndexType.METADATA
+NO_MESSAGE_INDEX: Final = IndexType.ATTACHMENT | IndexType.CHUNK | IndexType.METADATA
+
+LAYOUTS: Final = {
+    "default": McapLayout(),
+    "small chunks": McapLayout(chunk_size=200),
+    "zstd": McapLayout(chunk_size=200, compression=CompressionType.ZSTD),
+    "lz4": McapLayout(chunk_size=200, compression=CompressionType.LZ4),
+    "unchunked": McapLayout(chunk_size=None),
+    "no summary offsets": McapLayout(chunk_size=200, use_summary_offsets=False),
+    "no chunk index": McapLayout(chunk_size=200, index_types=NO_CHUNK_INDEX),
+    "no message index": McapLayout(chunk_size=200, index_types=NO_MESSAGE_INDEX),
+    "no repeated channels": McapLayout(chunk_size=200, repeat_channels=False),
+    "no statistics": McapLayout(chunk_size=200, use_statistics=False),
+    "no summary": McapLayout(
+        chunk_size=200,
+        index_types=IndexType.NONE,
+        repeat_channels=False,
+        use_statistics=False,
+        use_summary_offsets=False,
+    ),
+    "other profile": McapLayout(profile="px4"),
+}
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """A reader, and how a bag comes to lie before it."""
+
+    name: str
+    make_reader: Callable[[], BagReader]
+    write: Callable[[Path, Iterable[Msg], Collection[tuple[str, str]]], Path]
+    suffix: str = ".mcap"
+    keeps_publish_time: bool = True
+    writes_silent_topics: bool = True  # a chunk without messages is not written
+
+    def __str__(self) -> str:
+        return self.name
+
+    def stocked(
+        self,
+        folder: Path,
+        messages: Iterable[Msg] = (),
+        *,
+        declared: Collection[tuple[str, str]] = (),
+    ) -> Stocked:
+        """A reader, and one bag that it reads."""
+        reader = self.make_reader()
+        path = folder / f"bag{self.suffix}"
+        if isinstance(reader, FakeReader):
+            reader.add(path, messages, declared=declared)
+        else:
+            self.write(path, messages, declared)
+        return Stocked(reader, path)
+
+
+@dataclass
+class Stocked:
+    reader: BagReader
+    path: Path
+
+    def remove(self) -> None:
+        if isinstance(self.reader, FakeReader):
+            self.reader.remove(self.path)
+        else:
+            self.path.unlink()
+
+    def spoil(self, content: bytes) -> None:
+        """Puts something in its place that is not a bag."""
+        if isinstance(self.reader, FakeReader):
+            self.reader.add_damaged(self.path)
+        else:
+            self.path.write_bytes(content)
+
+
+def _mcap(
+    layout: McapLayout, path: Path, messages: Iterable[Msg], declared: Collection[tuple[str, str]]
+) -> Path:
+    return write_mcap(path, messages, layout, declared=declared)
+
+
+def _db3(path: Path, messages: Iterable[Msg], declared: Collection[tuple[str, str]]) -> Path:
+    write_db3(path, messages)
+    with closing(sqlite3.connect(path)) as base:
+        for topic, type_name in declared:
+            base.execute(
+                "INSERT INTO topics(name,type,serialization_format,offered_qos_profiles,"
+                "type_description_hash) VALUES (?,?,'cdr','','')",
+                (topic, type_name),
+            )
+        base.commit()
+    return path
+
+
+def _compressed(
+    write: Callable[[Path, Iterable[Msg], Collection[tuple[str, str]]], Path],
+    path: Path,
+    messages: Iterable[Msg],
+    declared: Collection[tuple[str, str]],
+) -> Path:
+    plain = write(path.with_suffix(""), messages, declared)
+    path.write_bytes(zstandard.compress(plain.read_bytes()))
+    plain.unlink()
+    return path
+
+
+def _mcap_shelf(name: str, layout: McapLayout) -> Shelf:
+    silent = layout.repeat_channels or layout.chunk_size is None
+    write = partial(_mcap, layout)
+    return Shelf(f"mcap: {name}", McapReader, write, writes_silent_topics=silent)
+
+
+MCAP: Final = [_mcap_shelf(name, layout) for name, layout in LAYOUTS.items()]
+ROSBAG2: Final = [
+    Shelf("rosbag2: mcap", Rosbag2Reader, partial(_mcap, McapLayout())),
+    Shelf("rosbag2: db3", Rosbag2Reader, _db3, ".db3", keeps_publish_time=False),
+    Shelf(
+        "rosbag2: mcap.zstd",
+        Rosbag2Reader,
+        partial(_compressed, partial(_mcap, McapLayout())),
+        ".mcap.zstd",
+    ),
+    Shelf(
+        "rosbag2: db3.zstd",
+        Rosbag2Reader,
+        partial(_compressed, _db3),
+        ".db3.zstd",
+        keeps_publish_time=False,
+    ),
+]
+COUNTING: Final = [
+    Shelf(
+        "counting: mcap",
+        lambda: CountingReader(McapReader()),
+        partial(_mcap, McapLayout(chunk_size=200)),
+    )
+]
+FILES: Final = MCAP + ROSBAG2 + COUNTING
+ALL: Final = [Shelf("fake", FakeReader, partial(_mcap, McapLayout())), *FILES]

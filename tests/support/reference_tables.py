@@ -1,0 +1,284 @@
+"""The tables of docs/reference that are made of code: tools, configuration, log events.
+
+Each stands in its page between `<!-- begin: NAME -->` and `<!-- end: NAME -->`; what people wrote
+around it, and the last column of the log events, is theirs.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import textwrap
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import yaml
+from pydantic import TypeAdapter
+
+from ros2_memory.cli.app import COMMANDS
+from ros2_memory.cli.exits import EVERYWHERE, EXITS
+from ros2_memory.recorder import event_log
+from ros2_memory.recorder.process.output import Said
+from ros2_memory.settings import Ros2BagNode, Rosbag2Node, Settings
+from tests.support.documented_history import CALLS
+from tests.support.memories import ROOT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from ros2_memory.tools.declaration import Tool
+
+SOURCE: Final = ROOT / "src" / "ros2_memory"
+LEVELS: Final = {
+    "debug": "debug",
+    "info": "info",
+    "note": "info",
+    "warning": "warning",
+    "warn": "warning",
+    "error": "error",
+    "exception": "error",
+    "fail": "error",
+    "fail_once": "error",
+}
+VARIES: Final = {"used_gb", "size_gb", "growth_gb_per_day", "full_in_days", "keeps_days"}
+"""Sizes depend on the compressor's version by some bytes, so they are shown and not compared."""
+
+
+def section(page: str, name: str) -> str:
+    """What stands between a page's marks."""
+    found = re.search(rf"<!-- begin: {name} -->\n\n(.*?)\n\n<!-- end: {name} -->", page, re.DOTALL)
+    assert found, f"the page has no marks of {name}"
+    return found[1]
+
+
+def with_section(page: str, name: str, text: str) -> str:
+    """The page with `text` between its marks."""
+    before, begin, rest = page.partition(f"<!-- begin: {name} -->")
+    _, end, after = rest.partition(f"<!-- end: {name} -->")
+    return f"{before}{begin}\n\n{text}\n\n{end}{after}"
+
+
+def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A Markdown table."""
+    named = [*columns]
+    lines = [named, ["---"] * len(named), *rows]
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+    )
+
+
+def told_exits() -> str:
+    """Each command, what it is for, and what its exit codes say."""
+    common = "; ".join(f"{code}: {why}" for code, why in EVERYWHERE.items())
+    rows = [
+        (f"`{name}`", purpose, "; ".join(f"{code}: {why}" for code, why in EXITS[name].items()))
+        for name, (_, purpose) in COMMANDS.items()
+    ]
+    columns = ("command", "what it is for", "exit code")
+    return f"{table(columns, rows)}\n\nWhere nothing else is said, {common}."
+
+
+def told_tools(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
+    """Each tool: what it answers, its arguments, a call and the reply."""
+    return "\n\n".join(_tool(tool, replies[tool.name]) for tool in tools)
+
+
+def shown(reply: str) -> str:
+    """A reply as a page shows it: whole, in lines of a readable length."""
+    value = json.loads(reply)
+    return f"```json\n{_laid_out(value)}\n```"
+
+
+def without_sizes(text: str) -> str:
+    """A page's text without the numbers that vary."""
+    return re.sub(rf'"({"|".join(sorted(VARIES))})": [\d.e+-]+', r'"\1": 0', text)
+
+
+def _laid_out(value: Any, indent: int = 0) -> str:
+    """JSON of which whatever fits stands in one line."""
+    flat = json.dumps(value, ensure_ascii=False)
+    if len(flat) + indent <= 92 or not isinstance(value, dict | list) or not value:
+        return flat
+    inner = " " * (indent + 2)
+    if isinstance(value, dict):
+        items = [f"{json.dumps(k)}: {_laid_out(v, indent + 2)}" for k, v in value.items()]
+    else:
+        items = [_laid_out(each, indent + 2) for each in value]
+    opening, closing = ("{", "}") if isinstance(value, dict) else ("[", "]")
+    joined = f",\n{inner}".join(items)
+    return f"{opening}\n{inner}{joined}\n{' ' * indent}{closing}"
+
+
+def _tool(tool: Tool, reply: str) -> str:
+    what = tool.description.partition(" Example: ")[0]
+    properties: Any = tool.schema["properties"]
+    required: Any = tool.schema.get("required", [])
+    rows = [
+        [f"`{name}`", _kind(schema), _need(name, schema, required), schema.get("description", "")]
+        for name, schema in properties.items()
+    ]
+    arguments = (
+        table(("argument", "type", "default", "meaning"), rows)
+        if rows
+        else "It takes no arguments."
+    )
+    call = json.dumps(CALLS[tool.name], ensure_ascii=False)
+    return "\n\n".join(
+        (
+            f"### `{tool.name}`",
+            "\n".join(textwrap.wrap(what, 100, break_long_words=False, break_on_hyphens=False)),
+            arguments,
+            f"```json\n{call}\n```",
+            shown(reply),
+        )
+    )
+
+
+def _need(name: str, schema: Mapping[str, Any], required: Iterable[str]) -> str:
+    if name in required:
+        return "required"
+    return f"`{json.dumps(schema['default'])}`" if "default" in schema else "none"
+
+
+def _kind(schema: Mapping[str, Any]) -> str:
+    """What an argument or a key may hold."""
+    if "enum" in schema:
+        return ", ".join(f"`{each}`" for each in schema["enum"])
+    if "$ref" in schema:
+        return "mapping"
+    if "anyOf" in schema:
+        return " or ".join(dict.fromkeys(_kind(each) for each in schema["anyOf"]))
+    kind = {
+        "array": "list",
+        "boolean": "`true`, `false`",
+        "integer": "whole number",
+        "null": "`null`",
+        "string": "path" if schema.get("format") == "path" else "text",
+    }.get(schema.get("type", ""), schema.get("type", ""))
+    bounds = [
+        f"{word} {schema[key]:g}"
+        for key, word in (
+            ("exclusiveMinimum", "above"),
+            ("minimum", "at least"),
+            ("maximum", "at most"),
+            ("exclusiveMaximum", "below"),
+        )
+        if key in schema
+    ]
+    return " ".join([kind, ", ".join(bounds)]).strip()
+
+
+def told_configuration() -> str:
+    """Every key: what it may hold, its default and what its file says of it."""
+    folder = ROOT / "config"
+    rows = []
+    for key, default, meaning in (
+        *_keys(folder / "config.yaml", ""),
+        *_keys(folder / "recorder" / "ros2bag.yaml", "recorder."),
+        *_keys(folder / "storage" / "rosbag2.yaml", "storage."),
+    ):
+        told = meaning.replace(" | ", ", ")
+        rows.append([f"`{key}`", _kind(_schema_of(key)), f"`{default}`", told])
+    return table(("key", "holds", "default", "meaning"), rows)
+
+
+def _keys(path: Path, prefix: str) -> Iterator[tuple[str, str, str]]:
+    """Key, default and meaning of each line that has one; links to other keys are passed over."""
+    group = ""
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if found := re.fullmatch(r"(\w+):", line):
+            group = f"{found[1]}."
+        elif found := re.fullmatch(r"\s*(\w+): (\S.*?)\s+# (.*)", line):
+            yield f"{prefix}{group}{found[1]}", found[2], found[3]
+
+
+def _schema_of(key: str) -> Mapping[str, Any]:
+    section_name, _, name = key.partition(".")
+    model = {"recorder": Ros2BagNode, "storage": Rosbag2Node}.get(section_name, Settings)
+    schema: Any = TypeAdapter(model).json_schema()
+    if model is Settings:
+        schema = schema["$defs"][schema["properties"][section_name]["$ref"].rpartition("/")[2]]
+    found: Mapping[str, Any] = schema["properties"][name]
+    return found
+
+
+def configured_keys() -> set[str]:
+    """Every key of the shipped files that holds a value of its own."""
+    whole = yaml.safe_load((ROOT / "config" / "config.yaml").read_text(encoding="utf-8"))
+    keys = {
+        f"{group}.{name}"
+        for group, members in whole.items()
+        if isinstance(members, dict)
+        for name in members
+    }
+    for group, file in (("recorder", "ros2bag"), ("storage", "rosbag2")):
+        text = (ROOT / "config" / group / f"{file}.yaml").read_text(encoding="utf-8")
+        own = yaml.safe_load(text)
+        keys |= {
+            f"{group}.{name}"
+            for name, value in own.items()
+            if name != "_target_" and not str(value).startswith("${")
+        }
+    return keys
+
+
+@dataclass(frozen=True, order=True)
+class Event:
+    """One log event as one place in the code writes it."""
+
+    name: str
+    level: str
+    fields: tuple[str, ...]
+
+
+def events() -> list[Event]:
+    """Every log event in the code."""
+    found = {
+        each
+        for path in sorted(SOURCE.rglob("*.py"))
+        for each in _events_of(ast.parse(path.read_text(encoding="utf-8")))
+    }
+    found |= {
+        Event(name, "info", ("recording", *(("topic",) if said is Said.SUBSCRIBED else ())))
+        for said, name in event_log._INFORM.items()
+    }
+    found |= {Event(said.value, "warning", ("reason", "recording")) for said in event_log._ADVICE}
+    return sorted(found)
+
+
+def _events_of(tree: ast.AST) -> Iterator[Event]:
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call) or not node.args:
+            continue
+        first = node.args[0]
+        if not (isinstance(first, ast.Constant) and isinstance(first.value, str)):
+            continue
+        choices = [each for each in ast.walk(node.func) if isinstance(each, ast.Attribute)]
+        loggers = [each for each in choices if each.attr in LEVELS and _is_log(each.value)]
+        for method in loggers:
+            own = [word.arg for word in node.keywords if word.arg]
+            given = ["reason"] if method.attr in {"warn", "fail", "fail_once"} else []
+            traced = ["exception"] if method.attr == "exception" else []
+            yield Event(first.value, LEVELS[method.attr], (*given, *own, *traced))
+
+
+def _is_log(node: ast.AST) -> bool:
+    name = node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+    is_own_journal = name == "self"  # of Journal.tell
+    return name in {"log", "_log", "_journal", "journal"} or is_own_journal
+
+
+def told_events(page: str) -> str:
+    """The table of log events; their meaning is what the page says already."""
+    written = dict(re.findall(r"^\| `(\w+)` \|.*\| ([^|]+) \|$", page, re.MULTILINE))
+    every = events()
+    rows = []
+    for name in dict.fromkeys(each.name for each in every):
+        same = [each for each in every if each.name == name]
+        levels = ", ".join(dict.fromkeys(each.level for each in same))
+        named = dict.fromkeys(field for each in same for field in each.fields)
+        fields = ", ".join(f"`{field}`" for field in named)
+        rows.append([f"`{name}`", levels, fields or "none", written.get(name, "?")])
+    return table(("event", "level", "fields", "means"), rows)

@@ -1,0 +1,299 @@
+"""A robot's publishers: real rclpy and DDS, values in closed form of the time t since its start.
+
+With T0 the clock's time (whole milliseconds) at the start and tick k at t = k / hz:
+
+- It drives a circle of radius 2 m at 0.5 m/s from (0, 0), facing +x, turning left: `pose(t)`.
+- `/odom` (nav_msgs/Odometry, odom -> base_link) and `/tf` (tf2_msgs/TFMessage, the same) each tick;
+  header stamps are T0 + t exactly.
+- `/tf_static` once, latched: laser and camera in base_link.
+- `/cmd_vel` (geometry_msgs/Twist) every second tick.
+- `/bumper` (std_msgs/Bool) twice a second, true while 25 <= t < 26.
+- `/battery_state` (sensor_msgs/BatteryState) once a second: percentage 0.8 - 0.001 t.
+- `/vision/scene/scene_objects` (ros2_vision_interfaces/VisionDetectionArray) once a second:
+  "table" always, "cup" for 5 <= t < 30, "scissors" for 12 <= t < 18.
+
+- `/clock` (rosgraph_msgs/Clock) each tick, t itself; only where it is asked for.
+
+Below 2 Hz every topic comes with every tick. Run as a program, it first waits for its subscribers,
+then writes T0 to the truth file, and at the end how many messages were published on each topic.
+While it drives it adds when the number of subscribers that its first topic reaches has changed: one
+that says it has subscribed may be reached some seconds later. It also tells how late it was at
+worst, in seconds, in having published a tick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import rclpy
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+from tests.support.bags import typestore
+from tests.support.ros_types import publisher
+
+RADIUS: Final = 2.0  # m
+TURN_RATE: Final = 0.25  # rad/s
+SEEN: Final = {"table": (0.0, math.inf), "cup": (5.0, 30.0), "scissors": (12.0, 18.0)}
+TYPES: Final = {
+    "/clock": "rosgraph_msgs/msg/Clock",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/cmd_vel": "geometry_msgs/msg/Twist",
+    "/bumper": "std_msgs/msg/Bool",
+    "/battery_state": "sensor_msgs/msg/BatteryState",
+    "/vision/scene/scene_objects": "ros2_vision_interfaces/msg/VisionDetectionArray",
+}
+# What a subscriber on a busy machine has not taken yet: seconds of the quickest topic.
+DEPTH: Final = 1000
+_PER_SECOND: Final = {"/bumper": 2.0, "/battery_state": 1.0, "/vision/scene/scene_objects": 1.0}
+WORTH_TELLING_S: Final = 0.05
+ACKED_WITHIN_S: Final = 60  # of a subscriber that lives; one that was killed is given up before
+_SENSORS: Final = {"laser": (0.10, 0.0, 0.20), "camera": (0.15, 0.0, 0.30)}
+
+
+def pose(t: float) -> tuple[float, float, float]:
+    """x and y (m) and yaw (rad, not wrapped) in odom, t seconds after T0."""
+    angle = TURN_RATE * t
+    return RADIUS * math.sin(angle), RADIUS * (1.0 - math.cos(angle)), angle
+
+
+def seen(t: float) -> list[str]:
+    """What the camera sees t seconds after T0."""
+    return [name for name, (begin, end) in SEEN.items() if begin <= t < end]
+
+
+def is_due(topic: str, tick: int, hz: float) -> bool:
+    """Whether a message of this topic is published at this tick."""
+    if topic == "/tf_static":
+        return tick == 0
+    period = 2.0 if topic == "/cmd_vel" else hz / _PER_SECOND.get(topic, hz)
+    return tick % max(1, round(period if hz >= 2.0 else 1.0)) == 0
+
+
+class Messages:
+    """The messages of one robot, serialized."""
+
+    def __init__(self, t0: int) -> None:
+        self._t0 = t0
+
+    def payload(self, topic: str, t: float) -> bytes:
+        """The message published on `topic` t seconds after T0, as CDR."""
+        bodies = {
+            "/clock": lambda t: _of("rosgraph_msgs/msg/Clock", clock=_time(round(t * 1e9))),
+            "/odom": self._odometry,
+            "/tf": self._transform,
+            "/tf_static": self._sensors,
+            "/cmd_vel": self._command,
+            "/bumper": lambda t: _of("std_msgs/msg/Bool", data=25.0 <= t < 26.0),
+            "/battery_state": self._battery,
+            "/vision/scene/scene_objects": self._detections,
+        }
+        return bytes(typestore().serialize_cdr(bodies[topic](t), TYPES[topic]))
+
+    def _header(self, t: float, frame: str) -> Any:
+        stamp = _time(self._t0 + round(t * 1e9))
+        return _of("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def _odometry(self, t: float) -> Any:
+        x, y, yaw = pose(t)
+        place = _of("geometry_msgs/msg/Pose", position=_point(x, y, 0.0), orientation=_turned(yaw))
+        covariance = typestore().types["geometry_msgs/msg/PoseWithCovariance"]
+        motion = typestore().types["geometry_msgs/msg/TwistWithCovariance"]
+        zeros = np.zeros(36)
+        return _of(
+            "nav_msgs/msg/Odometry",
+            header=self._header(t, "odom"),
+            child_frame_id="base_link",
+            pose=covariance(pose=place, covariance=zeros),
+            twist=motion(twist=self._command(t), covariance=zeros),
+        )
+
+    def _stamped(self, t: float, frames: tuple[str, str], at: tuple[float, ...], yaw: float) -> Any:
+        move = _of("geometry_msgs/msg/Vector3", x=at[0], y=at[1], z=at[2])
+        transform = _of("geometry_msgs/msg/Transform", translation=move, rotation=_turned(yaw))
+        return _of(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(t, frames[0]),
+            child_frame_id=frames[1],
+            transform=transform,
+        )
+
+    def _transform(self, t: float) -> Any:
+        x, y, yaw = pose(t)
+        return _of(
+            "tf2_msgs/msg/TFMessage",
+            transforms=[self._stamped(t, ("odom", "base_link"), (x, y, 0.0), yaw)],
+        )
+
+    def _sensors(self, t: float) -> Any:
+        transforms = [
+            self._stamped(t, ("base_link", name), at, 0.0) for name, at in _SENSORS.items()
+        ]
+        return _of("tf2_msgs/msg/TFMessage", transforms=transforms)
+
+    def _command(self, t: float) -> Any:
+        forward = _of("geometry_msgs/msg/Vector3", x=RADIUS * TURN_RATE, y=0.0, z=0.0)
+        turning = _of("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=TURN_RATE)
+        return _of("geometry_msgs/msg/Twist", linear=forward, angular=turning)
+
+    def _battery(self, t: float) -> Any:
+        return _of(
+            "sensor_msgs/msg/BatteryState",
+            header=self._header(t, ""),
+            voltage=12.0,
+            temperature=math.nan,
+            current=math.nan,
+            charge=math.nan,
+            capacity=math.nan,
+            design_capacity=math.nan,
+            percentage=0.8 - 0.001 * t,
+            power_supply_status=0,
+            power_supply_health=0,
+            power_supply_technology=0,
+            present=True,
+            cell_voltage=np.zeros(0, np.float32),
+            cell_temperature=np.zeros(0, np.float32),
+            location="",
+            serial_number="",
+        )
+
+    def _detections(self, t: float) -> Any:
+        detection = typestore().types["ros2_vision_interfaces/msg/VisionDetection"]
+        return _of(
+            TYPES["/vision/scene/scene_objects"],
+            header=self._header(t, "base_link"),
+            skill="scene",
+            detections=[
+                detection(
+                    label=name,
+                    score=0.9 - 0.1 * place,
+                    point=_point(1.0 + place, 0.0, 0.5),
+                    bbox=np.zeros(4, np.int32),
+                )
+                for place, name in enumerate(seen(t))
+            ],
+        )
+
+
+def _of(name: str, **fields: Any) -> Any:
+    return typestore().types[name](**fields)
+
+
+def _time(nanoseconds: int) -> Any:
+    seconds, rest = divmod(nanoseconds, 10**9)
+    return _of("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+
+
+def _point(x: float, y: float, z: float) -> Any:
+    return _of("geometry_msgs/msg/Point", x=x, y=y, z=z)
+
+
+def _turned(yaw: float) -> Any:
+    return _of(
+        "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)
+    )
+
+
+class Robot:
+    """The node with its publishers."""
+
+    def __init__(self, topics: list[str], best_effort: bool, truth: Path) -> None:
+        self._node = rclpy.create_node("robot", enable_rosout=False, start_parameter_services=False)
+        self._truth = truth
+        self._stop = False
+        self._matched = [(0, 0)]
+        self._late_s = 0.0
+        reliability = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+        self._publishers = {}
+        for topic in topics:
+            durability = (
+                DurabilityPolicy.TRANSIENT_LOCAL
+                if topic == "/tf_static"
+                else DurabilityPolicy.VOLATILE
+            )
+            profile = QoSProfile(depth=DEPTH, reliability=reliability, durability=durability)
+            kind = (TYPES[topic], typestore().hash_rihs01(TYPES[topic]))
+            self._publishers[topic] = publisher(self._node, topic, kind, profile)
+
+    def stop(self, *_: object) -> None:
+        self._stop = True
+
+    def await_subscribers(self, count: int) -> None:
+        """Returns when every topic but the latched one has so many, or at a signal."""
+        waiting = [p for topic, p in self._publishers.items() if topic != "/tf_static"]
+        while not self._stop and any(p.get_subscription_count() < count for p in waiting):
+            time.sleep(0.02)
+
+    def drive(self, hz: float, duration_s: float) -> None:
+        """Publishes for `duration_s` of the robot's time, or until a signal, and leaves."""
+        for topic in self._publishers:
+            # The first of its type is slow to make.
+            Messages(0).payload(topic, 0.0)
+        t0 = time.time_ns() // 10**6 * 10**6
+        begin = time.monotonic()
+        messages, published = Messages(t0), Counter[str]()
+        self._tell(t0, published, 0)
+        tick = 0
+        first = next(iter(self._publishers.values()))
+        while tick / hz < duration_s and not self._stop:
+            time.sleep(max(0.0, begin + tick / hz - time.monotonic()))
+            if first.get_subscription_count() != self._matched[-1][1]:
+                self._matched.append((time.time_ns(), first.get_subscription_count()))
+                self._tell(t0, published, tick)
+            for topic, out in self._publishers.items():
+                if is_due(topic, tick, hz):
+                    out.publish(messages.payload(topic, tick / hz))
+                    published[topic] += 1
+            self._note(time.monotonic() - begin - tick / hz, t0, published, tick)
+            tick += 1
+        for out in self._publishers.values():
+            out.wait_for_all_acked(Duration(seconds=ACKED_WITHIN_S))
+        self._tell(t0, published, tick)
+        self._node.destroy_node()
+
+    def _note(self, late_s: float, t0: int, published: Counter[str], ticks: int) -> None:
+        """Whoever kills it is to know how late it was."""
+        told_s, self._late_s = self._late_s, max(late_s, self._late_s)
+        if self._late_s > max(1.2 * told_s, WORTH_TELLING_S):
+            self._tell(t0, published, ticks)
+
+    def _tell(self, t0: int, published: Counter[str], ticks: int) -> None:
+        fresh = self._truth.with_suffix(".new")
+        told = {"t0_ns": t0, "ticks": ticks, "published": published, "matched": self._matched}
+        told["late_s"] = self._late_s
+        fresh.write_text(json.dumps(told))
+        fresh.replace(self._truth)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--duration", type=float, default=math.inf, help="s")
+    parser.add_argument("--hz", type=float, default=20.0, help="ticks a second")
+    default = [topic for topic in TYPES if topic != "/clock"]
+    parser.add_argument("--topics", nargs="+", default=default, choices=list(TYPES))
+    parser.add_argument("--best-effort", action="store_true")
+    parser.add_argument("--subscribers", type=int, default=0, help="to wait for, on each topic")
+    parser.add_argument("--truth", type=Path, required=True, help="JSON file to write")
+    given = parser.parse_args()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    robot = Robot(given.topics, given.best_effort, given.truth)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, robot.stop)
+    robot.await_subscribers(given.subscribers)
+    robot.drive(given.hz, given.duration)
+    rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()

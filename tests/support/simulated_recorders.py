@@ -1,0 +1,221 @@
+"""A world without processes for the recorder's supervision: time is moved, recorders are played.
+
+The recorders write real MCAP files. On each topic one message is published at every quarter of a
+second; all recorders that have subscribed receive it, each a little later.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S, Clock
+from ros2_memory.recorder.ports import NoHousekeeping
+from ros2_memory.recorder.supervisor import Orders, Supervisor
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import McapLayout, boolean, write_mcap
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from ros2_memory.recorder.ports import Housekeeper
+    from tests.support.bags import Msg
+
+T0 = 1_795_150_800 * NS_PER_S
+PERIOD = NS_PER_S // 4
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+TOPICS = ("/bumper", "/door")
+
+
+@dataclass
+class PlayedRecorder:
+    """A `ros2 bag record` as far as its supervision sees it."""
+
+    pid: int
+    world: World
+    directory: Path
+    ready_s: float = 0.5
+    subscribe_s: float = 1.0
+    obeys_after: int = 1
+    topics: tuple[str, ...] = TOPICS
+    heard: tuple[str, ...] = TOPICS
+    status: int | None = None
+    lines: list[str] = field(default_factory=list)
+    asked_to_end: int = 0
+    splits: int = 0
+    patience_s: float = 15.0
+    _age_s: float = 0.0
+    _subscribed: bool = False
+    _held: list[Msg] = field(default_factory=list)
+
+    def take_lines(self) -> list[str]:
+        taken, self.lines = self.lines, []
+        return taken
+
+    def exit_status(self) -> int | None:
+        return self.status
+
+    def end(self) -> int | None:
+        self.asked_to_end += 1
+        if self.status is None and self.asked_to_end > self.obeys_after:
+            if self.directory.is_dir():
+                self._write(finish=True)
+                (self.directory / "metadata.yaml").write_text("{}")
+            self.status = 0
+        return self.status
+
+    def die(self, status: int = -9) -> None:
+        """Ends at once, and leaves its last split open."""
+        self._write(finish=False)
+        self.status = status
+
+    def live(self, seconds: float) -> None:
+        if self.status is not None:
+            return
+        before, self._age_s = self._age_s, self._age_s + seconds
+        if before == 0.0:
+            self.directory.mkdir(parents=True)
+            (self.directory / self._file).touch()
+        if before < self.ready_s <= self._age_s:
+            self.lines.append("[INFO] [1.0] [rosbag2_recorder]: Recording...")
+        if before < self.subscribe_s <= self._age_s:
+            self._subscribed = True
+            self.lines += [
+                f"[INFO] [1.0] [rosbag2_recorder]: Subscribed to topic '{topic}'"
+                for topic in self.topics
+            ]
+
+    def receive(self, published: int) -> None:
+        if self.status is not None or not self._subscribed:
+            return
+        logged = published + 20_000 + self.pid * 1_000
+        if (
+            self._held
+            and logged - self._held[0].log_time > self.world.orders.split_duration_s * 1e9
+        ):
+            self._write(finish=True)
+            self.splits += 1
+            self._held = []
+        for topic in self.heard:
+            message = boolean(published, True, topic)
+            self._held.append(replace(message, log_time=logged, publish_time=published))
+        if self.directory.is_dir():
+            # An open file that grows; what is in it matters when its recorder dies.
+            size = 0 if self.world.disk_full else 50 * len(self._held)
+            (self.directory / self._file).write_bytes(MCAP_MAGIC[: size and 8] + bytes(size))
+
+    @property
+    def _file(self) -> str:
+        return f"{self.directory.name}_{self.splits}.mcap"
+
+    def _write(self, *, finish: bool) -> None:
+        if not self.directory.is_dir():
+            return
+        if self.world.disk_full:
+            (self.directory / self._file).write_bytes(b"")
+            return
+        layout = McapLayout(chunk_size=None, finish=finish)
+        write_mcap(self.directory / self._file, self._held, layout)
+
+
+class WorldClock(Clock):
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def now(self) -> int:
+        return self._world.wall
+
+
+class World:
+    """Time, a bag directory, and the recorders that were started in it."""
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        *,
+        housekeeper: Housekeeper | None = None,
+        expected: Sequence[str] = (),
+        **orders: object,
+    ) -> None:
+        self.bag_dir = bag_dir
+        self.mono = 1_000.0
+        self.wall = T0
+        self.silent = False
+        self.disk_full = False
+        self.free = 10**12
+        self.device = 1
+        self.refuse = ""
+        self.recorders: list[PlayedRecorder] = []
+        self.named_at_start: list[list[str]] = []
+        self.defaults: dict[str, object] = {}
+        plan: dict[str, object] = {
+            "bag_dir": bag_dir,
+            "split_duration_s": 5,
+            "session_duration_s": 1000,
+            "min_free_bytes": 1000,
+        }
+        self.orders = Orders(**(plan | orders))  # type: ignore[arg-type]
+        self.reader = McapReader()
+        self.supervisor = Supervisor(
+            self.orders,
+            self._start,
+            self.reader,
+            housekeeper or NoHousekeeping(),
+            WorldClock(self),
+            monotonic=lambda: self.mono,
+            free_bytes_of=lambda _directory: self.free,
+            device=lambda _directory: self.device,
+            expected=lambda: expected,
+        )
+
+    def _start(self, name: str, directory: Path) -> PlayedRecorder:
+        self.named_at_start.append(self.heartbeat()["recordings"])
+        if self.refuse:
+            raise RecorderError(self.refuse)
+        recorder = PlayedRecorder(100 + len(self.recorders), self, directory)
+        for key, value in self.defaults.items():
+            setattr(recorder, key, value)
+        self.recorders.append(recorder)
+        return recorder
+
+    def run(self, seconds: float) -> None:
+        """Lets time pass in steps of a quarter of a second."""
+        for _ in range(round(seconds * 4)):
+            self.mono += 0.25
+            self.wall += PERIOD
+            for recorder in self.recorders:
+                recorder.live(0.25)
+            published = self.wall - self.wall % PERIOD
+            if not self.silent:
+                for recorder in self.recorders:
+                    recorder.receive(published)
+            self.supervisor.tick()
+
+    def set_clock(self, seconds: float) -> None:
+        """Steps the wall clock."""
+        self.wall += round(seconds * NS_PER_S)
+
+    @property
+    def running(self) -> list[PlayedRecorder]:
+        return [recorder for recorder in self.recorders if recorder.status is None]
+
+    def heartbeat(self) -> dict[str, Any]:
+        content: dict[str, Any] = json.loads((self.bag_dir / HEARTBEAT_FILE).read_text())
+        return content
+
+    def published(self, *, counting: bool) -> Counter[int]:
+        """How often each publish time of `/bumper` stands in the bags, or counts in them."""
+        reader = CountingReader(self.reader) if counting else self.reader
+        found: Counter[int] = Counter()
+        for path in sorted(self.bag_dir.glob("*/*.mcap")):
+            if path.stat().st_size:
+                records = reader.records(path, ["/bumper"], TimeWindow.everything())
+                found.update(record.publish_time for record in records)
+        return found

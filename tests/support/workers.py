@@ -1,0 +1,103 @@
+"""Which tests share a worker: they run one after another, and their fixtures are made once.
+
+All other tests run on whichever worker is free. Node ids stay as they are, for pytest-xdist's own
+`--dist=loadgroup` goes by what it adds to them, which pytest 9.2 no longer takes up.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from xdist.scheduler import LoadScopeScheduling
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+TESTS: Final = Path(__file__).parents[1]
+GROUPS: Final[Mapping[str, Sequence[str]]] = {
+    "live": ("integration/test_live_*.py",),
+    "recorder": (
+        "integration/test_recorder_*.py",
+        "integration/test_retention_*.py",
+        "integration/test_ros2_double*.py",
+    ),
+    "heavy": ("fuzz/*.py", "soak/*.py", "faults/*.py"),
+}
+"""Groups of files, which begin before all else, in this order.
+
+The first two mostly wait for real time, and take longest. "heavy" burns processor time: one such
+test at a time leaves some to those that wait.
+"""
+
+WORKERS: Final = 3
+"""On two cores: most of a whole run is waiting, and two of them do little else."""
+
+PUNCTUAL: Final = ("live", "recorder")
+"""Groups whose programs are to run when their time has come, whatever else there is to do."""
+
+_MARK: Final = re.compile(r'xdist_group\("(\w+)"\)')
+_LASTING: Final = re.compile(r'scope="(module|session)"')
+
+
+def workers_for(args: Sequence[str]) -> int:
+    """How many workers run what pytest was asked for; 0: none, for a few files they begin too late.
+
+    Args:
+        args: folders, files and node ids, as pytest takes them.
+    """
+    return WORKERS if any(Path(arg).is_dir() for arg in args) else 0
+
+
+@cache
+def group_of(path: str) -> str | None:
+    """The group of a file of tests, by its path under the root; None: they run anywhere.
+
+    By its place, else as the file says, `pytestmark = pytest.mark.xdist_group("heavy")`. A file
+    with a fixture that outlives a test is a group of its own.
+    """
+    file = TESTS.parent / path
+    for group, patterns in GROUPS.items():
+        if any(file.relative_to(TESTS).match(pattern) for pattern in patterns):
+            return group
+    text = file.read_text()
+    marked = _MARK.search(text)
+    if marked:
+        return marked[1]
+    return path if _LASTING.search(text) else None
+
+
+def place(nodeid: str) -> int:
+    """When a test begins: a smaller number earlier."""
+    group, order = group_of(_file(nodeid)), list(GROUPS)
+    if group in order:
+        return order.index(group)
+    return len(order) + (group is None)
+
+
+def give_way(nodeid: str) -> None:
+    """Puts this worker behind those of the punctual groups, once a test of another one begins.
+
+    It stays there, for priority is not given back; the punctual groups are over by then.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ and group_of(_file(nodeid)) not in PUNCTUAL:
+        _be_nice()
+
+
+@cache
+def _be_nice() -> None:
+    os.nice(10)
+
+
+class Groups(LoadScopeScheduling):
+    """Gives each group to one worker."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return group_of(_file(nodeid)) or nodeid
+
+
+def _file(nodeid: str) -> str:
+    return nodeid.partition("::")[0]
