@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.topic_digest import TopicDigest
+    from ros2_memory.config import Settings
     from ros2_memory.core.model import BagSummary
     from ros2_memory.history.context import Memory
-    from ros2_memory.settings import Settings
 
 _MAX_MS = 10.0
 

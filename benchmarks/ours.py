@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from mcp.types import TextContent
 
     from benchmarks.bags import Split
+    from ros2_memory.config import Settings
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Memory
-    from ros2_memory.settings import Settings
 
 
 def settings_for(bag_dir: Path) -> Settings:

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from benchmarks.bags import History, Split
     from benchmarks.timing import Ask, Side
+    from ros2_memory.config import Settings
     from ros2_memory.history.context import Memory
-    from ros2_memory.settings import Settings
 
 _SAMPLES: Final = 100
 _POINTS: Final = 20

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
     from benchmarks.timing import Ask
     from ros2_memory.catalogue.digest import Digest
     from ros2_memory.catalogue.store import Catalogue
+    from ros2_memory.config import Settings
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Memory
-    from ros2_memory.settings import Settings
 
 RECORDINGS: Final = WEEK // HOUR
 _BATCH: Final = 1_000

@@ -18,7 +18,7 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
-    from ros2_memory.settings import AdapterNode, Settings
+    from ros2_memory.config import AdapterNode, Settings
 
 GB: Final = 10**9
 

@@ -18,7 +18,7 @@ from ros2_memory.bag_dir.stand_in import StandInReader
 from ros2_memory.catalogue.digest import DIGEST_VERSION, Digester
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
-from ros2_memory.config import load_message_schemas
+from ros2_memory.config import NullRecorderNode, load_message_schemas
 from ros2_memory.core import directories
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.release import PACKAGE, package_version
@@ -30,15 +30,14 @@ from ros2_memory.observability.gauges import Measuring
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.backfill import Backfill
 from ros2_memory.serving.dispatch import Dispatcher
-from ros2_memory.settings import NullRecorderNode
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools, readable_tools
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from ros2_memory.config import Settings
     from ros2_memory.core.telemetry import Observer
-    from ros2_memory.settings import Settings
 
 
 def build_memory(settings: Settings) -> Memory:

@@ -1,84 +1,302 @@
-"""Loads the configuration: Hydra composes it, Pydantic validates it, once, at start.
+"""The configuration: its models, and how it is loaded, once, at start.
 
-Later wins: `config.yaml`, a deployment preset (`MEMORY_DEPLOYMENT`), the named environment
-variables, `MEMORY_CONFIG_OVERRIDES`, the command line's overrides. An empty variable counts as
-unset. `.env` is never read here: the shell, Docker and systemd do that. Whatever is wrong becomes
-one `ConfigError` with a line for each fault: the key, the value, what is allowed, who set it.
+Hydra composes it and Pydantic validates it. Later wins: `config.yaml`, a deployment preset
+(`MEMORY_DEPLOYMENT`), the named environment variables, `MEMORY_CONFIG_OVERRIDES`, the overrides of
+the command line. An empty variable counts as unset. `.env` is never read here: the shell, Docker
+and systemd do that. Every fault becomes a line of one `ConfigError`: the key, the value, what is
+allowed, and who set it.
+
+The models are plain frozen data. Values are strict: `true` is not a number and `"10"` is not a
+duration. Sizes in `_gb` are 10^9 bytes, in `_mb` 2^20 bytes. Defaults are in `config/config.yaml`
+alone.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import shlex
 import sys
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias, get_args, get_type_hints
 
 from hydra import compose, initialize_config_dir
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import OverrideType, Quote, QuotedString
-from hydra.errors import HydraException
 from omegaconf import ListConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
+from pydantic.dataclasses import dataclass
 
-from ros2_memory.config_errors import validated
-from ros2_memory.config_sources import GROUPS, Asked, Sources
+from ros2_memory.config_errors import foreign_errors_as_config_error, validated
+from ros2_memory.config_sources import (
+    INTERFACES_VARIABLE,
+    Sources,
+    expand_home,
+    given_variables,
+    parse_overrides,
+)
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.settings import MessageSchemas, Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from omegaconf import DictConfig
 
 EXIT_CODE: Final = 2
-_INTERFACES: Final = "ROS_VISION_INTERFACES_PATH"
-_LAST_ROS_DOMAIN: Final = 232  # the highest whose DDS ports stay below 65536
-_FOREIGN: Final = (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError)
 
 
-def quoted(value: str) -> str:
-    """The text as a value in Hydra's grammar, whatever is in it."""
-    return str(QuotedString(text=value, quote=Quote.single).with_quotes())
-
-
-def _whole(value: str) -> str:
-    """An int as Hydra reads it; what is none stays text, and the key's own check refuses it."""
+def _home_expanded(path: Path) -> Path:
+    if path == Path():
+        raise ValueError("must name a path")
     try:
-        return str(int(value))
-    except ValueError:
-        return quoted(value)
+        return path.expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"must be a path that can be found: {error}") from error
 
 
-_VARIABLES: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
-    "MEMORY_BAG_DIR": ("recording.bag_dir", quoted),
-    "MCP_TRANSPORT": ("server.transport", quoted),
-    "MCP_HOST": ("server.host", quoted),
-    "MCP_PORT": ("server.port", _whole),
+def _existing_folder(path: Path) -> Path:
+    if not path.is_dir():
+        raise ValueError("must be an existing folder")
+    return path
+
+
+def _in_config_dir(path: Path, info: ValidationInfo[Path]) -> Path:
+    """Resolves `config/x` against the configuration directory in use."""
+    if path.parts[0] != "config":
+        return path
+    return info.context.joinpath(*path.parts[1:])
+
+
+def _message_type(name: str) -> str:
+    if not re.fullmatch(r"\w+/msg/\w+", name):
+        raise ValueError("must be a message type such as nav_msgs/msg/Odometry")
+    return name
+
+
+def _dot_path(path: str) -> str:
+    if not re.fullmatch(r"\w+(\.\w+)*", path):
+        raise ValueError("must be a dot-path such as pose.pose.position")
+    return path
+
+
+Text: TypeAlias = Annotated[str, Field(strict=True, min_length=1)]
+Flag: TypeAlias = Annotated[bool, Field(strict=True)]
+Count: TypeAlias = Annotated[int, Field(strict=True, gt=0)]
+Mebibytes: TypeAlias = Annotated[int, Field(strict=True, gt=0, le=1024)]
+Port: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=65535)]
+Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+Tolerance: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+AnyPath: TypeAlias = Annotated[Path, AfterValidator(_home_expanded)]
+Folder: TypeAlias = Annotated[AnyPath, AfterValidator(_existing_folder)]
+ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
+MessageType: TypeAlias = Annotated[Text, AfterValidator(_message_type)]
+DotPath: TypeAlias = Annotated[Text, AfterValidator(_dot_path)]
+
+_REFUSE_UNKNOWN: Final = ConfigDict(extra="forbid")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class RecordingSettings:
+    """What is recorded, and where to.
+
+    `split_duration_s` is an integer because `ros2 bag record` takes whole seconds.
+    """
+
+    bag_dir: AnyPath
+    split_duration_s: Count
+    session_duration_s: Positive
+    use_sim_time: Flag
+    clear_on_startup: Flag
+    topics_file: ConfigFile
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class LatchedTopics:
+    """Names or globs of topics that count as latched whatever QoS is offered, or never do."""
+
+    include: tuple[Text, ...]
+    exclude: tuple[Text, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class DataSettings:
+    """How recorded data is interpreted.
+
+    Positions are given in `map_frame` where transforms lead there. "Ago" is relative to `now`: the
+    wall clock, or the newest message. `tf_clock` is the time that orders transforms: header stamps,
+    log time, or stamps where the two agree.
+    """
+
+    max_array_length: Count
+    position_tolerance_m: Tolerance
+    time_tolerance_s: Tolerance
+    pose_topic: Text
+    map_frame: Text | None
+    tf_topics: tuple[Text, ...]
+    tf_static_topics: tuple[Text, ...]
+    now: Literal["wall", "latest"]
+    tf_clock: Literal["auto", "stamp", "log"]
+    max_plausible_speed_mps: Positive
+    latched_topics: LatchedTopics
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class ReaderSettings:
+    """How bags are found and decoded.
+
+    `include_active`: complete chunks of the split that is being written are read, too.
+    """
+
+    index_refresh_s: Positive
+    include_active: Flag
+    custom_msg_paths: tuple[Folder, ...]
+    chunk_cache_mb: Count
+    max_chunk_mb: Mebibytes
+    schemas_file: ConfigFile
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class RetentionSettings:
+    """How much history is kept.
+
+    `max_moments_gb` is the part of the total that saved moments may take, at most half of it.
+    `foreign`: whether bags of other programs are left alone, or counted and deleted as its own.
+    """
+
+    max_total_gb: Positive
+    max_age_h: Positive
+    min_free_gb: Tolerance
+    max_moments_gb: Tolerance
+    foreign: Literal["keep", "delete"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class ServerSettings:
+    """How the query server is reached, and what it offers. Port 0 is any free port.
+
+    `tools`: all, or those of the specification; `write_tools`: also those that write. `metrics` and
+    `traces` need the extra `observability`.
+    """
+
+    name: Text
+    transport: Literal["stdio", "sse"]
+    host: Text
+    port: Port
+    call_timeout_s: Positive
+    max_reply_chars: Annotated[int, Field(strict=True, ge=1000)]
+    tools: Literal["all", "spec"]
+    write_tools: Flag
+    metrics: Flag
+    traces: Flag
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class LoggingSettings:
+    """What is logged, and in which format."""
+
+    level: Literal["debug", "info", "warning", "error"]
+    format: Literal["json", "pretty"]
+    arguments: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class AdapterNode:
+    """An adapter's class, and the plain values for its constructor.
+
+    Each adapter that may be built has a subclass. They are the allow-list, since Hydra would build
+    whatever a `_target_` names.
+    """
+
+    target: Text = Field(alias="_target_")
+
+    @property
+    def arguments(self) -> dict[str, object]:
+        """Returns the constructor's keyword arguments."""
+        names = (field.name for field in fields(self) if field.name != "target")
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class McapNode(AdapterNode):
+    """`storage=mcap`: single MCAP files."""
+
+    target: Literal["ros2_memory.storage.mcap_reader.McapReader"] = Field(alias="_target_")
+    custom_msg_paths: tuple[Folder, ...]
+    cache_mb: Count
+    max_chunk_mb: Mebibytes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class Rosbag2Node(AdapterNode):
+    """`storage=rosbag2`: recordings of either plugin; `unpack_max_mb` bounds temporary files."""
+
+    target: Literal["ros2_memory.storage.rosbag2_reader.Rosbag2Reader"] = Field(alias="_target_")
+    custom_msg_paths: tuple[Folder, ...]
+    cache_mb: Count
+    max_chunk_mb: Mebibytes
+    unpack_max_mb: Count
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class Ros2BagNode(AdapterNode):
+    """`recorder=ros2bag`: a supervised `ros2 bag record`."""
+
+    target: Literal["ros2_memory.recorder.ros2bag.Ros2BagRecorder"] = Field(alias="_target_")
+    bag_dir: AnyPath
+    topics_file: ConfigFile
+    split_duration_s: Count
+    session_duration_s: Positive
+    use_sim_time: Flag
+    min_free_gb: Tolerance
+    setup_files: tuple[AnyPath, ...]
+    latched_topics: tuple[Text, ...]
+    repeat_latched: tuple[Text, ...]
+    chunk_bytes: Annotated[int, Field(strict=True, ge=1024)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class NullRecorderNode(AdapterNode):
+    """`recorder=none`: nothing is recorded."""
+
+    target: Literal["ros2_memory.recorder.null.NullRecorder"] = Field(alias="_target_")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class MessageSchemas:
+    """The schema map: for each message type, field name to dot-path in the message."""
+
+    schemas: dict[MessageType, dict[Text, DotPath]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class Settings:
+    """The whole configuration, validated."""
+
+    recording: RecordingSettings
+    data: DataSettings
+    reader: ReaderSettings
+    retention: RetentionSettings
+    server: ServerSettings
+    logging: LoggingSettings
+    storage: Annotated[McapNode | Rosbag2Node, Field(discriminator="target")]
+    recorder: Annotated[Ros2BagNode | NullRecorderNode, Field(discriminator="target")]
+
+
+_NODES: Final = {
+    get_args(get_type_hints(node)["target"])[0]: node
+    for node in (McapNode, Rosbag2Node, Ros2BagNode, NullRecorderNode)
 }
-
-
-@dataclass(frozen=True, slots=True)
-class _Assignment:
-    """One override in Hydra's grammar; `source` completes the phrase "set ..."."""
-
-    text: str
-    source: str
+"""The class of an adapter's section by its `_target_`."""
 
 
 def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None = None) -> Settings:
-    """The validated configuration.
+    """Returns the validated configuration.
 
     Args:
         overrides: assignments in Hydra's grammar (`server.port=9300`, `recorder=none`).
         env: the environment; the process's own where None.
 
     Raises:
-        ConfigError: the files, the environment or the overrides hold something that is refused.
+        ConfigError: a file, a variable or an override is refused.
     """
     return load_explained(overrides, env)[0]
 
@@ -86,38 +304,35 @@ def load_settings(overrides: Sequence[str] = (), env: Mapping[str, str] | None =
 def load_explained(
     overrides: Sequence[str] = (), env: Mapping[str, str] | None = None
 ) -> tuple[Settings, Sources]:
-    """As `load_settings`, and what tells of a key, such as `server.port`, who set it.
+    """Returns the configuration as `load_settings` does, and the source of each of its keys.
 
     Raises:
         ConfigError: as `load_settings`.
     """
-    given = _given(os.environ if env is None else env)
+    given = given_variables(os.environ if env is None else env)
     folder = config_dir(given)
-    assignments = [
-        *_named_variables(given),
-        *(_Assignment(text, "by MEMORY_CONFIG_OVERRIDES") for text in _split_overrides(given)),
-        *(_Assignment(text, "on the command line") for text in overrides),
-    ]
-    groups = {
-        group: sorted(option.stem for option in (folder / group).glob("*.yaml")) for group in GROUPS
-    }
-    asked = [_parsed(assignment, groups) for assignment in assignments]
-
-    joined = {"reader.custom_msg_paths": _INTERFACES} if _INTERFACES in given else {}
-    source = Sources(folder, asked, joined)
-    with _foreign_errors_as_config_error(str(folder), source):
+    appended = {"reader.custom_msg_paths": INTERFACES_VARIABLE}
+    sources = Sources(
+        folder,
+        parse_overrides(overrides, given, folder),
+        appended if INTERFACES_VARIABLE in given else {},
+    )
+    with foreign_errors_as_config_error(str(folder), sources):
         with initialize_config_dir(version_base="1.3", config_dir=str(folder)):
-            composed = compose("config", overrides=[one.text for one in asked])
-        _add_interface_folder(composed, given)
+            composed = compose("config", overrides=[each.text for each in sources.overrides])
+        _append_interface_folder(composed, given)
         data = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         raw = OmegaConf.to_container(composed, resolve=False)
-    return validated(Settings, data, config_dir=folder, source=source, raw=raw), source
+    settings = validated(
+        Settings, data, config_dir=folder, source=sources, raw=raw, adapters=_NODES
+    )
+    return settings, sources
 
 
 def config_dir(env: Mapping[str, str]) -> Path:
-    """The folder that holds `config.yaml` and its groups, absolute.
+    """Returns the absolute path of the folder that holds `config.yaml` and its groups.
 
-    `MEMORY_CONFIG_DIR`, else the copy inside an installed package, else the checkout's `config/`.
+    It is `MEMORY_CONFIG_DIR`, else the copy in an installed package, else the checkout's `config/`.
 
     Raises:
         ConfigError: there is no `config.yaml` in it.
@@ -125,7 +340,7 @@ def config_dir(env: Mapping[str, str]) -> Path:
     package = Path(__file__).resolve().parent
     chosen = env.get("MEMORY_CONFIG_DIR")
     if chosen:
-        folder = _expanded(chosen).absolute()
+        folder = expand_home(chosen).absolute()
     elif (package / "_config").is_dir():
         folder = package / "_config"
     else:
@@ -139,24 +354,24 @@ def config_dir(env: Mapping[str, str]) -> Path:
 
 
 def load_message_schemas(settings: Settings) -> Mapping[str, Mapping[str, str]]:
-    """The schema map of `reader.schemas_file`: message type to {field name: dot-path}.
+    """Returns the schema map of `reader.schemas_file`: message type to {field name: dot-path}.
 
     Raises:
-        ConfigError: the file is missing, is not YAML, or holds something that is refused.
+        ConfigError: the file is missing, is not YAML, or its content is refused.
     """
     path = settings.reader.schemas_file
 
     def source(_key: str) -> str:
         return f"in {path}, which reader.schemas_file names"
 
-    with _foreign_errors_as_config_error(f"reader.schemas_file: {path}", source):
+    with foreign_errors_as_config_error(f"reader.schemas_file: {path}", source):
         data = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
     return validated(MessageSchemas, data, config_dir=path.parent, source=source).schemas
 
 
 @contextmanager
 def exit_on_config_error(program: str) -> Iterator[None]:
-    """Around a program's start: a refused configuration is explained on stderr, exit code 2."""
+    """Ends the program with exit code 2 and an explanation on stderr on a `ConfigError`."""
     try:
         yield
     except ConfigError as error:
@@ -164,123 +379,19 @@ def exit_on_config_error(program: str) -> Iterator[None]:
         raise SystemExit(EXIT_CODE) from None
 
 
-def _given(env: Mapping[str, str]) -> dict[str, str]:
-    """The variables that are set, checked as far as they say what is wrong by themselves."""
-    given = {name: text for name, text in env.items() if text}
-    for name in ("MEMORY_CONFIG_DIR", _INTERFACES, *_VARIABLES):
-        # Environment files, unlike shells, leave this as it stands; Hydra would read it as its own.
-        if "${" in given.get(name, ""):
-            raise ConfigError(
-                f"{name}: {given[name]!r} is not allowed; write the value itself, "
-                "since ${...} is not expanded here"
-            )
-    domain = given.get("ROS_DOMAIN_ID", "0")
-    if not domain.isdecimal() or int(domain) > _LAST_ROS_DOMAIN:
-        raise ConfigError(
-            f"ROS_DOMAIN_ID: {domain!r} is not allowed; "
-            f"must be a whole number from 0 to {_LAST_ROS_DOMAIN}"
-        )
-    return given
+def _append_interface_folder(composed: DictConfig, given: Mapping[str, str]) -> None:
+    """Appends `ROS_VISION_INTERFACES_PATH` to the folders of message definitions.
 
-
-def _expanded(text: str) -> Path:
-    """The path with `~` expanded, where that names a home."""
-    with suppress(RuntimeError):
-        return Path(text).expanduser()
-    return Path(text)
-
-
-def _named_variables(given: Mapping[str, str]) -> list[_Assignment]:
-    preset = given.get("MEMORY_DEPLOYMENT")
-    presets = (
-        [_Assignment(f"deployment={quoted(preset)}", "by MEMORY_DEPLOYMENT")] if preset else []
-    )
-    return presets + [
-        _Assignment(f"{key}={written(given[name])}", f"by {name}")
-        for name, (key, written) in _VARIABLES.items()
-        if name in given
-    ]
-
-
-def _split_overrides(given: Mapping[str, str]) -> list[str]:
-    text = given.get("MEMORY_CONFIG_OVERRIDES", "")
-    try:
-        return shlex.split(text)
-    except ValueError as error:
-        shown = "what it holds" if _names_a_token(text) else repr(text)
-        raise ConfigError(
-            f"MEMORY_CONFIG_OVERRIDES: {shown} is not allowed ({error}); "
-            "write assignments as for a shell, separated by spaces"
-        ) from (None if _names_a_token(text) else error)
-
-
-def _names_a_token(text: str) -> bool:
-    """Whether somebody took a secret for a setting: what is wrong with it must not be shown."""
-    return re.search(r"token\w*\s*=", text, re.IGNORECASE) is not None
-
-
-def _parsed(assignment: _Assignment, groups: Mapping[str, Sequence[str]]) -> Asked:
-    text, source = assignment.text, assignment.source
-    if _names_a_token(text):
-        raise ConfigError(
-            f"a token has no place among the settings (set {source}), where others can read it; "
-            "give the one that clients must show as MEMORY_API_TOKEN"
-        )
-    try:
-        override = OverridesParser.create().parse_override(text)
-    except HydraException as error:
-        raise ConfigError(
-            f"{text!r} is no override ({_reason(error)}; set {source}); write key=value, such as "
-            "server.port=9300, and key='value' where special characters are in it"
-        ) from error
-    key = override.key_or_group
-    is_group = key in groups
-    if not key or override.is_sweep_override():
-        raise ConfigError(
-            f"{text!r} is not one value for one key (set {source}); a list is written key=[a,b]"
-        )
-    changes = override.type is OverrideType.CHANGE
-    if is_group and changes and override.value() not in groups[key]:
-        raise ConfigError(
-            f"{key}: {override.value()!r} is not allowed; use one of: {', '.join(groups[key])} "
-            f"(set {source})"
-        )
-    # Added by force, an unknown key reaches the validation, which names the known ones.
-    option = str(override.value()) if is_group and changes else None
-    return Asked(key, f"++{text}" if changes and not is_group else text, source, is_group, option)
-
-
-def _add_interface_folder(composed: DictConfig, given: Mapping[str, str]) -> None:
-    """Appends `ROS_VISION_INTERFACES_PATH`, unless what it would join is no list and is refused."""
-    folder = given.get(_INTERFACES)
+    Where the key does not hold a list, validation refuses it afterwards.
+    """
+    folder = given.get(INTERFACES_VARIABLE)
     if not folder:
         return
-    if not _expanded(folder).is_dir():
+    if not expand_home(folder).is_dir():
         raise ConfigError(
-            f"ROS_VISION_INTERFACES_PATH: {folder!r} is not allowed; must be an existing folder "
+            f"{INTERFACES_VARIABLE}: {folder!r} is not allowed; must be an existing folder "
             "of message packages (or one package, with msg/*.msg)"
         )
     paths = OmegaConf.select(composed, "reader.custom_msg_paths")
     if isinstance(paths, ListConfig):
         paths.append(folder)
-
-
-@contextmanager
-def _foreign_errors_as_config_error(where: str, source: Callable[[str], str]) -> Iterator[None]:
-    """Translates what Hydra, OmegaConf, YAML and the file system raise."""
-    try:
-        yield
-    except _FOREIGN as error:
-        key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
-        reason = _reason(error)
-        sentence = f"{key}: {reason} (set {source(key)})" if key else f"{where}: {reason}"
-        raise ConfigError(sentence) from error
-
-
-def _reason(error: Exception) -> str:
-    """The reason alone: without search paths, links to manuals and dumps of objects."""
-    text = (error.strerror if isinstance(error, OSError) else None) or str(error)
-    if text in {"", "None"} and error.__cause__ is not None:
-        text = str(error.__cause__)
-    reason = re.split(r"\n *(?:full_key:|Config search path:|See https:)", text)[0]
-    return " ".join(reason.split())

@@ -1,28 +1,33 @@
-"""Checks composed data against `settings.py`, and says what is wrong with it in plain sentences."""
+"""What is wrong with the configuration, as plain sentences.
+
+Faults that Pydantic finds get a line each, with the key and who set it. What Hydra, OmegaConf, YAML
+and the file system raise is translated in one place.
+"""
 
 from __future__ import annotations
 
 import re
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Final, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Final, TypeVar, get_type_hints
 
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
+from yaml import YAMLError
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.settings import McapNode, NullRecorderNode, Ros2BagNode, Rosbag2Node
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from pydantic_core import ErrorDetails
 
 _T = TypeVar("_T")
 
-_NODES: Final = {
-    get_args(get_type_hints(node)["target"])[0]: node
-    for node in (McapNode, Rosbag2Node, Ros2BagNode, NullRecorderNode)
-}
+_LONGEST_VALUE: Final = 80
+_FOREIGN: Final = (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError)
 _RULES: Final = {
     "tuple_type": "must be a list",
     "path_type": "must be a path",
@@ -37,41 +42,68 @@ def validated(
     config_dir: Path,
     source: Callable[[str], str],
     raw: object = None,
+    adapters: Mapping[str, type] | None = None,
 ) -> _T:
-    """`data` as a `model`.
+    """Returns `data` as an instance of `model`.
 
     Args:
-        model: `Settings` or `MessageSchemas`.
+        model: a class of the configuration.
         data: the composed configuration, interpolations resolved.
-        config_dir: what a path that begins with `config/` counts from.
-        source: for a key's dot-path, who set it: what completes the phrase "set ...".
-        raw: the same as `data` with its interpolations left as they stand. A key that only repeats
-            another key's refused value is not reported beside it.
+        config_dir: the folder that paths which begin with `config/` are relative to.
+        source: returns who set the key of a dot-path, as a phrase that follows "set".
+        raw: `data` with its interpolations unresolved. A key that only repeats another key's
+            refused value is not reported again.
+        adapters: the classes of sections that are chosen by their `_target_`.
 
     Raises:
         ConfigError: one line for each fault.
     """
+    nodes = adapters or {}
     try:
         return TypeAdapter(model).validate_python(data, context=config_dir)
     except ValidationError as error:
-        faults = [(_dotted(fault), fault) for fault in error.errors(include_url=False)]
+        faults = [(_dot_path(fault, nodes), fault) for fault in error.errors(include_url=False)]
     refused = {key for key, _fault in faults}
     lines = [
-        f"{_sentence(model, key, fault)} (set {source(key)})"
+        f"{_sentence(model, key, fault, nodes)} (set {source(key)})"
         for key, fault in faults
-        if _repeats(raw, key) not in refused
+        if _interpolated_key(raw, key) not in refused
     ]
     raise ConfigError("\n".join(lines))
 
 
-def _dotted(fault: ErrorDetails) -> str:
-    """A fault's dot-path, without what Pydantic adds for a union's member and a mapping's key."""
-    key = ".".join(str(part) for part in fault["loc"] if part not in {*_NODES, "[key]"})
+@contextmanager
+def foreign_errors_as_config_error(where: str, source: Callable[[str], str]) -> Iterator[None]:
+    """Translates what Hydra, OmegaConf, YAML and the file system raise into `ConfigError`.
+
+    `where` names what was read, for an error that names no key.
+    """
+    try:
+        yield
+    except _FOREIGN as error:
+        key = getattr(error, "full_key", None) or getattr(error.__cause__, "full_key", None)
+        reason = reason_of(error)
+        sentence = f"{key}: {reason} (set {source(key)})" if key else f"{where}: {reason}"
+        raise ConfigError(sentence) from error
+
+
+def reason_of(error: Exception) -> str:
+    """Returns an error's reason alone, without search paths, links to manuals and dumps."""
+    text = (error.strerror if isinstance(error, OSError) else None) or str(error)
+    if text in {"", "None"} and error.__cause__ is not None:
+        text = str(error.__cause__)
+    reason = re.split(r"\n *(?:full_key:|Config search path:|See https:)", text)[0]
+    return " ".join(reason.split())
+
+
+def _dot_path(fault: ErrorDetails, nodes: Mapping[str, type]) -> str:
+    """Returns a fault's dot-path, without Pydantic's marks for union members and mapping keys."""
+    key = ".".join(str(part) for part in fault["loc"] if part not in {*nodes, "[key]"})
     return f"{key}._target_" if fault["type"].startswith("union_tag") else key
 
 
-def _repeats(raw: object, key: str) -> str | None:
-    """The key that this one takes its value from (`${reader.chunk_cache_mb}`), if it does."""
+def _interpolated_key(raw: object, key: str) -> str | None:
+    """Returns the key that this one takes its value from (`${reader.chunk_cache_mb}`), if any."""
     parts = key.split(".")
     for depth, part in enumerate(parts, start=1):
         raw = raw.get(part) if isinstance(raw, dict) else None
@@ -81,11 +113,12 @@ def _repeats(raw: object, key: str) -> str | None:
     return None
 
 
-def _sentence(model: type, key: str, fault: ErrorDetails) -> str:
-    """What is wrong, and what is allowed instead."""
+def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, type]) -> str:
+    """Returns what is wrong, and what is allowed instead."""
     kind, context = fault["type"], fault.get("ctx", {})
     if kind == "unexpected_keyword_argument":
-        return f"{key}: there is no such key; use one of: {', '.join(_keys_beside(model, fault))}"
+        known = ", ".join(_known_keys(model, fault, nodes))
+        return f"{key}: there is no such key; use one of: {known}"
     if kind in {"missing", "union_tag_not_found"}:
         return f"{key}: missing; give it a value"
     if kind in {"dataclass_type", "model_attributes_type", "dict_type"}:
@@ -100,15 +133,15 @@ def _sentence(model: type, key: str, fault: ErrorDetails) -> str:
     return f"{key}: {_shown(fault['input'])} is not allowed; {rule}"
 
 
-def _keys_beside(model: type, fault: ErrorDetails) -> list[str]:
-    """The keys that exist where the fault's unknown key stands."""
+def _known_keys(model: type, fault: ErrorDetails, nodes: Mapping[str, type]) -> list[str]:
+    """Returns the keys that exist in the section of a fault's unknown key."""
     *sections, _unknown = fault["loc"]
     for section in sections:
-        model = _NODES.get(str(section)) or get_type_hints(model)[str(section)]
+        model = nodes.get(str(section)) or get_type_hints(model)[str(section)]
     names = (field.name for field in fields(model) if is_dataclass(model))
     return ["_target_" if name == "target" else name for name in names]
 
 
 def _shown(value: object) -> str:
     text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."

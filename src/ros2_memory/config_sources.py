@@ -1,29 +1,49 @@
-"""Who set a key: a variable, an override, or one of the files of the configuration directory."""
+"""Where the values of the configuration come from: variables, overrides, and files.
+
+Variables and overrides become assignments in Hydra's grammar. `Sources` finds out which of them, or
+which file of the configuration directory, set a key.
+"""
 
 from __future__ import annotations
 
 import re
+import shlex
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import OverrideType, Quote, QuotedString
+from hydra.errors import HydraException
+
+from ros2_memory.config_errors import reason_of
+from ros2_memory.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
 GROUPS: Final = ("deployment", "storage", "recorder")
-"""The groups of files of which one each is chosen."""
-_NODES: Final = ("storage", "recorder")
-"""Those whose files hold the section of that name; a preset's holds any."""
+"""The config groups: folders of files of which one each is chosen."""
+INTERFACES_VARIABLE: Final = "ROS_VISION_INTERFACES_PATH"
+
+_ADAPTERS: Final = ("storage", "recorder")
+"""Groups whose files hold the section of the same name; a preset may hold any."""
 _OVERRIDE: Final = "override /"
+_LAST_ROS_DOMAIN: Final = 232  # the highest whose DDS ports are below 65536
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """A parsed override that Hydra is to apply.
+class Override:
+    """An assignment for Hydra.
 
-    `source` completes the phrase "set ..."; `option` is what is chosen of a group.
+    Attributes:
+        key: the key or group that it sets.
+        text: the assignment in Hydra's grammar.
+        source: who gave it, as a phrase that follows "set".
+        is_group: whether it chooses a file of a group.
+        option: the file that it chooses.
     """
 
     key: str
@@ -35,51 +55,50 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """Tells of a key, such as `server.port`, who set it: what completes the phrase "set ...".
+    """Returns, called with a key such as `server.port`, who set it: a phrase that follows "set".
 
     Args:
-        folder: holds `config.yaml` and the groups.
-        asked: what variables and overrides set; later wins.
-        joined: by key, the variable that adds to what is set otherwise.
+        folder: the configuration directory.
+        overrides: the assignments of variables and overrides; later wins.
+        appended: by key, the variable that appends to what is set otherwise.
     """
 
     folder: Path
-    asked: Sequence[Asked]
-    joined: Mapping[str, str]
+    overrides: Sequence[Override]
+    appended: Mapping[str, str]
 
     def __call__(self, key: str) -> str:
-        """Who set a key; of files the exact one, with the key whose value it takes over."""
-        for one in reversed(self.asked):
-            mine, its = f"{key}.", f"{one.key}."
-            if not one.is_group and (mine.startswith(its) or its.startswith(mine)):
-                return one.source
-        variable = self.joined.get(key)
+        """Returns who set a key; for a file also the key that it takes its value from."""
+        for override in reversed(self.overrides):
+            own, other = f"{key}.", f"{override.key}."
+            if not override.is_group and (own.startswith(other) or other.startswith(own)):
+                return override.source
+        variable = self.appended.get(key)
         return f"{self._file(key)}{f', and by {variable}' if variable else ''}"
 
     def choice(self, group: str) -> tuple[str | None, str]:
-        """The option of a group, and who chose it."""
-        for one in reversed(self.asked):
-            if one.is_group and one.key == group:
-                return one.option, one.source
-        if group != "deployment":
-            for path in self._presets():
-                for default in _defaults(path):
-                    if group in default:
-                        return default[group], f"in {path}"
+        """Returns the option of a group, and who chose it."""
+        for override in reversed(self.overrides):
+            if override.is_group and override.key == group:
+                return override.option, override.source
         config = self.folder / "config.yaml"
-        chosen = next((each[group] for each in _defaults(config) if group in each), None)
-        return chosen, f"in {config}"
+        presets = () if group == "deployment" else self._presets()
+        for path in (*presets, config):
+            for default in _defaults(path):
+                if group in default:
+                    return default[group], f"in {path}"
+        return None, f"in {config}"
 
     def _file(self, key: str) -> str:
         for path in self._files(key.partition(".")[0]):
-            found, value = _held(_content(path), key)
+            found, value = _lookup(_content(path), key)
             if found:
                 link = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
                 return f"in {path}{f', as {link[1]}' if link else ''}"
         return f"in {self.folder}"
 
     def _files(self, section: str) -> Iterator[Path]:
-        """The files that may hold a section's keys, the strongest first."""
+        """Yields the files that may hold a section's keys, the strongest first."""
         yield from self._presets()
         yield self.folder / "config.yaml"
         option = self.choice(section)[0] if section in GROUPS else None
@@ -87,7 +106,7 @@ class Sources:
             yield self.folder / section / f"{option}.yaml"
 
     def _presets(self) -> Iterator[Path]:
-        """The preset that was chosen, and those that it builds on, the strongest first."""
+        """Yields the chosen preset and those that it builds on, the strongest first."""
         names, seen = [self.choice("deployment")[0]], set[str]()
         while names:
             name = names.pop()
@@ -99,8 +118,136 @@ class Sources:
             names += [each for default in _defaults(path) for each in default.get("", "").split()]
 
 
+def quoted(value: str) -> str:
+    """Returns a text as a value in Hydra's grammar, whatever characters it has."""
+    return str(QuotedString(text=value, quote=Quote.single).with_quotes())
+
+
+def _whole(value: str) -> str:
+    """Returns an int as Hydra reads it. Other text is quoted, and validation refuses it."""
+    try:
+        return str(int(value))
+    except ValueError:
+        return quoted(value)
+
+
+_VARIABLES: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
+    "MEMORY_BAG_DIR": ("recording.bag_dir", quoted),
+    "MCP_TRANSPORT": ("server.transport", quoted),
+    "MCP_HOST": ("server.host", quoted),
+    "MCP_PORT": ("server.port", _whole),
+}
+
+
+def given_variables(env: Mapping[str, str]) -> dict[str, str]:
+    """Returns the variables that are not empty.
+
+    Raises:
+        ConfigError: one of them is refused whatever the configuration holds.
+    """
+    given = {name: text for name, text in env.items() if text}
+    for name in ("MEMORY_CONFIG_DIR", INTERFACES_VARIABLE, *_VARIABLES):
+        # Environment files, unlike shells, do not expand it, and Hydra would take it for its own.
+        if "${" in given.get(name, ""):
+            raise ConfigError(
+                f"{name}: {given[name]!r} is not allowed; write the value itself, "
+                "since ${...} is not expanded here"
+            )
+    domain = given.get("ROS_DOMAIN_ID", "0")
+    if not domain.isdecimal() or int(domain) > _LAST_ROS_DOMAIN:
+        raise ConfigError(
+            f"ROS_DOMAIN_ID: {domain!r} is not allowed; "
+            f"must be a whole number from 0 to {_LAST_ROS_DOMAIN}"
+        )
+    return given
+
+
+def expand_home(text: str) -> Path:
+    """Returns the path with `~` expanded, where that names a home."""
+    with suppress(RuntimeError):
+        return Path(text).expanduser()
+    return Path(text)
+
+
+def parse_overrides(
+    command_line: Sequence[str], given: Mapping[str, str], folder: Path
+) -> list[Override]:
+    """Returns the assignments of variables and of the command line; later wins.
+
+    Args:
+        command_line: assignments in Hydra's grammar.
+        given: the environment, without empty variables.
+        folder: the configuration directory.
+
+    Raises:
+        ConfigError: one of them is not an assignment, holds a token, or names no option of a group.
+    """
+    options = {
+        group: sorted(option.stem for option in (folder / group).glob("*.yaml")) for group in GROUPS
+    }
+    preset = given.get("MEMORY_DEPLOYMENT")
+    assignments = [(f"deployment={quoted(preset)}", "by MEMORY_DEPLOYMENT")] if preset else []
+    assignments += [
+        (f"{key}={written(given[name])}", f"by {name}")
+        for name, (key, written) in _VARIABLES.items()
+        if name in given
+    ]
+    assignments += [(text, "by MEMORY_CONFIG_OVERRIDES") for text in _split_variable(given)]
+    assignments += [(text, "on the command line") for text in command_line]
+    return [_parsed(text, source, options) for text, source in assignments]
+
+
+def _split_variable(given: Mapping[str, str]) -> list[str]:
+    text = given.get("MEMORY_CONFIG_OVERRIDES", "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        shown = "what it holds" if _names_token(text) else repr(text)
+        raise ConfigError(
+            f"MEMORY_CONFIG_OVERRIDES: {shown} is not allowed ({error}); "
+            "write assignments as for a shell, separated by spaces"
+        ) from (None if _names_token(text) else error)
+
+
+def _names_token(text: str) -> bool:
+    """Whether somebody took a secret for a setting; the text must not be shown then."""
+    return re.search(r"token\w*\s*=", text, re.IGNORECASE) is not None
+
+
+def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Override:
+    if _names_token(text):
+        raise ConfigError(
+            f"a token has no place among the settings (set {source}), where others can read it; "
+            "give the one that clients must show as MEMORY_API_TOKEN"
+        )
+    try:
+        override = OverridesParser.create().parse_override(text)
+    except HydraException as error:
+        raise ConfigError(
+            f"{text!r} is no override ({reason_of(error)}; set {source}); write key=value, such as "
+            "server.port=9300, and key='value' where special characters are in it"
+        ) from error
+    key = override.key_or_group
+    is_group = key in options
+    if not key or override.is_sweep_override():
+        raise ConfigError(
+            f"{text!r} is not one value for one key (set {source}); a list is written key=[a,b]"
+        )
+    changes = override.type is OverrideType.CHANGE
+    if is_group and changes and override.value() not in options[key]:
+        raise ConfigError(
+            f"{key}: {override.value()!r} is not allowed; use one of: {', '.join(options[key])} "
+            f"(set {source})"
+        )
+    # Added by force, an unknown key reaches the validation, which names the known ones.
+    option = str(override.value()) if is_group and changes else None
+    return Override(
+        key, f"++{text}" if changes and not is_group else text, source, is_group, option
+    )
+
+
 def _defaults(path: Path) -> Iterator[dict[str, str]]:
-    """The choices in a file's defaults list; under "" the presets that it builds on."""
+    """Yields the choices in a file's defaults list; under "" the presets that it builds on."""
     content = _content(path)
     listed = content.get("defaults") if isinstance(content, dict) else None
     for each in listed if isinstance(listed, list) else []:
@@ -114,8 +261,8 @@ def _defaults(path: Path) -> Iterator[dict[str, str]]:
             yield {"": each}
 
 
-def _held(content: object, key: str) -> tuple[bool, object]:
-    """Whether a file sets a key, and to what."""
+def _lookup(content: object, key: str) -> tuple[bool, object]:
+    """Returns whether a file sets a key, and to what."""
     for part in key.split("."):
         if not isinstance(content, dict) or part not in content:
             return False, None
@@ -124,10 +271,10 @@ def _held(content: object, key: str) -> tuple[bool, object]:
 
 
 def _content(path: Path) -> object:
-    """What a file holds, from the root of the configuration on; None where it cannot be read."""
+    """Returns what a file sets, from the root of the configuration; None if it is unreadable."""
     try:
         content: object = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError):
         return None
     group = path.parent.name
-    return {group: content} if path.name != "config.yaml" and group in _NODES else content
+    return {group: content} if path.name != "config.yaml" and group in _ADAPTERS else content

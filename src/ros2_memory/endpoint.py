@@ -14,9 +14,9 @@ from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.tools.instructions import instructions
 
 if TYPE_CHECKING:
+    from ros2_memory.config import Settings
     from ros2_memory.core.telemetry import Telemetry
     from ros2_memory.history.context import Memory
-    from ros2_memory.settings import Settings
 
 
 def build_server(

@@ -44,12 +44,12 @@ if TYPE_CHECKING:
 
     from pydantic import SecretStr
 
+    from ros2_memory.config import ServerSettings
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.listen import Address
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.serving.web_app import Background, WebApp
-    from ros2_memory.settings import ServerSettings
 
 PROGRAM: Final = "ros2-memory-server"
 CANNOT_LISTEN: Final = 1

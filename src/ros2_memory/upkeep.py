@@ -18,8 +18,8 @@ from ros2_memory.storage.mcap_reader import McapReader
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.config import Settings
     from ros2_memory.recorder.ports import Housekeeper
-    from ros2_memory.settings import Settings
     from ros2_memory.storage.base import BagReader
 
 

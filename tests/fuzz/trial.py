@@ -32,9 +32,9 @@ from tests.fuzz.traps import sprung
 if TYPE_CHECKING:
     from collections.abc import Mapping, MutableMapping
 
+    from ros2_memory.config import Settings
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.mcp_server import EpisodicServer
-    from ros2_memory.settings import Settings
     from tests.fuzz.classes import Job
     from tests.fuzz.good import Good
     from tests.fuzz.mutant import Mutant

@@ -12,9 +12,8 @@ import pytest
 import yaml
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
-from ros2_memory.config import load_settings
+from ros2_memory.config import Ros2BagNode, load_settings
 from ros2_memory.serving.api_token import CREDENTIAL
-from ros2_memory.settings import Ros2BagNode
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 RECORDER = DEPLOY / "ros2-memory-recorder.service"

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, get_type_hints
 
 import pytest
 
+from ros2_memory.config import Ros2BagNode, Settings
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.settings import Ros2BagNode, Settings
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.memories import ROOT

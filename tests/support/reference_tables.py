@@ -18,9 +18,9 @@ from pydantic import TypeAdapter
 
 from ros2_memory.cli.app import COMMANDS
 from ros2_memory.cli.exits import EVERYWHERE, EXITS
+from ros2_memory.config import Ros2BagNode, Rosbag2Node, Settings
 from ros2_memory.recorder import event_log
 from ros2_memory.recorder.process.output import Said
-from ros2_memory.settings import Ros2BagNode, Rosbag2Node, Settings
 from tests.support.documented_history import CALLS
 from tests.support.memories import ROOT
 

@@ -19,7 +19,7 @@ from ros2_memory.tools.reply_size import to_json_text
 from tests.support.robot_run import ANSWERED, ask, ask_everything, write_run
 
 if TYPE_CHECKING:
-    from ros2_memory.settings import Settings
+    from ros2_memory.config import Settings
 
 
 def settings(bag_dir: Path, *overrides: str) -> Settings:

@@ -11,8 +11,7 @@ from hydra.utils import instantiate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.config import load_settings
-from ros2_memory.settings import NullRecorderNode
+from ros2_memory.config import NullRecorderNode, load_settings
 from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, refusal
 
 PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(

@@ -21,13 +21,13 @@ from ros2_memory.bag_dir.own_recordings import (
 )
 from ros2_memory.cli.running import NOT_SO, BagDir, Sets, reporting, say
 from ros2_memory.cli.settling import settings_for
+from ros2_memory.config import NullRecorderNode
 from ros2_memory.core.errors import (
     ConfigError,
     InvalidArgumentsError,
     RecorderError,
 )
 from ros2_memory.core.wording import counted
-from ros2_memory.settings import NullRecorderNode
 from ros2_memory.upkeep import claim
 
 _MB = 1_000_000

@@ -14,9 +14,9 @@ from ros2_memory.cli.exits import epilog
 from ros2_memory.cli.output import plain
 from ros2_memory.cli.running import BagDir, Overrides, reporting, say
 from ros2_memory.cli.settling import explained_for
+from ros2_memory.config import AdapterNode, Settings
 from ros2_memory.config_sources import GROUPS, Sources
 from ros2_memory.core.model import JsonValue
-from ros2_memory.settings import AdapterNode, Settings
 
 MASK: Final = "********"
 _SECRET: Final = ("token", "password", "secret", "credential")

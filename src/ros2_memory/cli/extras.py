@@ -10,7 +10,7 @@ from ros2_memory.cli.findings import Finding, Level
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.settings import Settings
+    from ros2_memory.config import Settings
 
 _METRICS: Final = ("prometheus_client",)
 _TRACES: Final = ("opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http")

@@ -9,9 +9,9 @@ from ros2_memory.cli.index import Bar, die_with, fill, orphaned, step_back
 from ros2_memory.cli.opening import opened
 from ros2_memory.cli.running import CANNOT_RUN, BagDir, Overrides, Verbose, reporting
 from ros2_memory.cli.settling import settings_for
+from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.logging_setup import configure_logging
-from ros2_memory.settings import Settings
 
 
 def index(

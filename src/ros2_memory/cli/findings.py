@@ -18,6 +18,7 @@ from ros2_memory.adapters import GB, build_recorder
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bootstrap import query_settings_of
 from ros2_memory.cli.oddities import counted_as_active, merged
+from ros2_memory.config import NullRecorderNode
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, iso_local, unix_from_ns
@@ -28,7 +29,6 @@ from ros2_memory.index.listed_splits import absence_told, absent_splits
 from ros2_memory.overview import data_time_range, nothing_here, odd_bags
 from ros2_memory.recorder.daemon import Ticking
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
-from ros2_memory.settings import NullRecorderNode
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.config import Settings
     from ros2_memory.core.model import JsonValue, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.history.latching import Latching
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.settings import Settings
     from ros2_memory.storage.base import BagReader
 
 LATELY_NS: Final = 3600 * NS_PER_S

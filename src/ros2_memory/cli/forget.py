@@ -21,6 +21,7 @@ from ros2_memory.cli.output import moment
 from ros2_memory.cli.running import NOT_SO, BagDir, Overrides, Verbose, busy, reporting, say
 from ros2_memory.cli.settling import settings_for
 from ros2_memory.cli.windows import End, Last, Start, window_of
+from ros2_memory.config import NullRecorderNode
 from ros2_memory.core import directories
 from ros2_memory.core.errors import (
     BagError,
@@ -35,7 +36,6 @@ from ros2_memory.history.context import Memory
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
 from ros2_memory.retention.latched_carry import Carrier
-from ros2_memory.settings import NullRecorderNode
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.upkeep import supposed_own

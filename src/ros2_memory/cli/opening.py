@@ -2,10 +2,10 @@
 
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.cli.running import busy
+from ros2_memory.config import Settings
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.withheld import withhold_warnings
 from ros2_memory.history.context import Memory
-from ros2_memory.settings import Settings
 
 
 def opened(settings: Settings, *, verbose: bool = False) -> Memory:

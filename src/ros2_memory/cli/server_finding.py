@@ -15,8 +15,8 @@ from ros2_memory.serving.api_token import api_token
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from ros2_memory.config import Settings
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.settings import Settings
 
 _SERVER_PATIENCE_S: Final = 5.0
 _MOST_REPLY: Final = 1 << 20

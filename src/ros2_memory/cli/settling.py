@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from ros2_memory.config import load_explained, quoted
-from ros2_memory.config_sources import Sources
-from ros2_memory.settings import Settings
+from ros2_memory.config import Settings, load_explained
+from ros2_memory.config_sources import Sources, quoted
 
 
 def settings_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:

@@ -11,7 +11,7 @@ import structlog
 from ros2_memory.adapters import build_reader, build_recorder
 from ros2_memory.bag_dir.confined import ConfinedReader
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.config import exit_on_config_error, load_settings
+from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_settings
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.sd_notify import ServiceManager
@@ -23,13 +23,12 @@ from ros2_memory.recorder.daemon import (
     record_until_told,
 )
 from ros2_memory.recorder.process.topics import load_topics
-from ros2_memory.settings import NullRecorderNode
 from ros2_memory.upkeep import build_housekeeper, claim
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.settings import Settings
+    from ros2_memory.config import Settings
 
 PROGRAM: Final = "ros2-memory-recorder"
 FAILED: Final = 1

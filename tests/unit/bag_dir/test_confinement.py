@@ -49,8 +49,8 @@ from tests.support.housekeepers import keeper_of
 from tests.support.robot_run import ANSWERED, T0, T0_S, write_run
 
 if TYPE_CHECKING:
+    from ros2_memory.config import Settings
     from ros2_memory.serving.mcp_server import EpisodicServer
-    from ros2_memory.settings import Settings
 
 SECRET = "/outside/secret"  # noqa: S105  the name of a topic
 HEARD = {

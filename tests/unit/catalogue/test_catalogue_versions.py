@@ -22,8 +22,8 @@ from tests.support.memories import ROOT
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from ros2_memory.config import Settings
     from ros2_memory.history.context import Memory
-    from ros2_memory.settings import Settings
 
 DATA: Final = ROOT / "tests" / "data"
 WRITTEN_S: Final = 1_700_000_000
