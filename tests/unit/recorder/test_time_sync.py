@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from ros2_memory.recorder import time_sync
 from ros2_memory.recorder.time_sync import SystemTimeSync, kernel_error
-from ros2_memory.retention import time_sync
 from ros2_memory.retention.time_sync import TimeSync
 from tests.support.housekeepers import FakeTimeSync
 

@@ -247,7 +247,7 @@ class TestCrashes:
         assert (outcome.moment, outcome.bags, outcome.pending) == (folder.name, 2, False)
         assert len(in_moments(tmp_path)) == 2
 
-    @pytest.mark.parametrize("step", ["link", "write_keepsake"])
+    @pytest.mark.parametrize("step", ["link", "write_saved_moment"])
     def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_completes(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
     ) -> None:
