@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -32,18 +33,26 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     sys.dont_write_bytecode = False
 
 
+# A shell starts what runs in its background with these ignored, and children inherit that.
+for _number, _handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGHUP, signal.SIG_DFL),
+):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _handler)
+
 UNMEASURED = (
     "fuzz/*.py",
     "soak/*.py",
-    "unit/test_benchmarks.py",
-    "unit/test_documents.py",
-    "unit/test_hostile_arguments.py",
-    "unit/test_*_real_bags.py",
-    "unit/test_planner_questions.py",
-    "unit/test_real_bags*.py",
-    "unit/test_recorded_sessions.py",
-    "unit/test_same_answers.py",
-    "unit/test_week.py",
+    "test_benchmarks.py",
+    "test_documents.py",
+    "test_hostile_arguments.py",
+    "test_*_real_bags.py",
+    "test_planner_questions.py",
+    "test_real_bags*.py",
+    "test_recorded_sessions.py",
+    "test_same_answers.py",
+    "test_week.py",
 )
 """Tests in which coverage is not measured, which takes up to five times as long as the test itself.
 

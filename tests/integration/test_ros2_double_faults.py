@@ -152,7 +152,8 @@ def kill_at_once(env: dict[str, str], folder: Path, number: signal.Signals) -> N
     with Recording(env, folder / "a", "-e", "/odom") as recording:
         # As these tests may, where they run in the background of a shell.
         until(lambda: not ignores(recording.process.pid, number))
-        assert recording.stop(number) == -number
+        # 1: SIGINT came while CPython imported `site`, which it takes for a fatal error.
+        assert recording.stop(number) in {-number, 1 if number == signal.SIGINT else -number}
     assert not recording.directory.exists()
 
 
