@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ros2_memory.adapters import build_reader, retention_limits
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
-from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import has_recorded
-from ros2_memory.bag_dir.stand_in import StandInReader
 from ros2_memory.catalogue.digest import DIGEST_VERSION, Digester
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
@@ -50,8 +48,7 @@ def build_memory(settings: Settings) -> Memory:
     schemas = load_message_schemas(settings)
     extractor = SchemaExtractor(schemas, settings.data.max_array_length)
     bag_dir = settings.recording.bag_dir
-    counting = CountingReader(build_reader(settings))
-    reader = StandInReader(ConfinedReader(counting, bag_dir), bag_dir)
+    reader = BagDirReader(build_reader(settings), bag_dir)
     reading = catalogue_fingerprint(settings, schemas)
     places = partial(catalogue_paths, settings)
     catalogue = Catalogue(places, reading, waits_for=bag_dir)

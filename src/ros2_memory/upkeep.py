@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory.adapters import GB, retention_limits
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
@@ -60,7 +60,7 @@ def build_housekeeper(
     return InBackground(
         Housekeeping(
             bag_dir,
-            CountingReader(reader),
+            BagDirReader(reader),
             McapWriter(settings.reader.max_chunk_mb),
             WallClock(),
             limits,

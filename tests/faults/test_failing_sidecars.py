@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 import pytest
 
 from ros2_memory.bag_dir import handover_file as handovers
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import (
     Counting,
     Handover,
@@ -38,7 +38,7 @@ def test_messages_that_do_not_count_do_not_come_in_because_the_disk_fails(
     path = write_bag(tmp_path, 0)
     write_handover(path.parent, HIDDEN)
     everything = TimeWindow.everything()
-    reader = CountingReader(McapReader())
+    reader = BagDirReader(McapReader())
     with monkeypatch.context() as patched:
         patched.setattr(handovers, "read_small_file", fails)
         with pytest.raises(BagUnreachableError, match=r"handover\.json cannot be read: Input"):

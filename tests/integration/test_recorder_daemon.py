@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
@@ -168,7 +168,7 @@ def at_a_site(folder: Path, test: Callable[[Site], None]) -> None:
 
 def published(bag_dir: Path, *, counting: bool) -> Counter[int]:
     """How often each publish time of `/odom` stands in the bags, or counts in them."""
-    reader = CountingReader(McapReader()) if counting else McapReader()
+    reader = BagDirReader(McapReader()) if counting else McapReader()
     found: Counter[int] = Counter()
     for path in sorted(bag_dir.glob("*/*.mcap")):
         if path.stat().st_size:

@@ -8,7 +8,7 @@ import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
@@ -64,7 +64,7 @@ def keeper_of(
     """
     return Housekeeping(
         bag_dir,
-        CountingReader(reader or McapReader()),
+        BagDirReader(reader or McapReader()),
         writer or McapWriter(),
         clock or later(),
         RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=keeps_foreign),

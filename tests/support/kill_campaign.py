@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
@@ -256,7 +256,7 @@ def _missing(numbers: set[int]) -> list[int]:
 
 def _bytes_of(files: Sequence[Path]) -> int:
     """What the messages that count take in a chunk, before compression."""
-    reader, total = CountingReader(McapReader()), 0
+    reader, total = BagDirReader(McapReader()), 0
     for path in files:
         with suppress(BagError):
             topics = [each.topic for each in reader.summarize(path).topics if not each.latched]

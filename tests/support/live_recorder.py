@@ -24,7 +24,7 @@ import anyio
 from mcp import Client
 from mcp.client.sse import sse_client
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import (
     HeartbeatReading,
     RecorderState,
@@ -320,7 +320,7 @@ def ticks(files: Sequence[Path], t0: int, hz: float, *, counting: bool = True) -
     Files without a readable message hold none. `counting`: only those that count where they stand.
     """
     plain = McapReader()
-    reader = CountingReader(plain) if counting else plain
+    reader = BagDirReader(plain) if counting else plain
     found: list[Tick] = []
     for path in files:
         with suppress(BagError):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import zstandard
 from mcap.writer import CompressionType, IndexType
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, write_db3, write_mcap
@@ -156,7 +156,7 @@ ROSBAG2: Final = [
 COUNTING: Final = [
     Shelf(
         "counting: mcap",
-        lambda: CountingReader(McapReader()),
+        lambda: BagDirReader(McapReader()),
         partial(_mcap, McapLayout(chunk_size=200)),
     )
 ]

@@ -11,7 +11,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
@@ -212,7 +212,7 @@ class World:
 
     def published(self, *, counting: bool) -> Counter[int]:
         """How often each publish time of `/bumper` stands in the bags, or counts in them."""
-        reader = CountingReader(self.reader) if counting else self.reader
+        reader = BagDirReader(self.reader) if counting else self.reader
         found: Counter[int] = Counter()
         for path in sorted(self.bag_dir.glob("*/*.mcap")):
             if path.stat().st_size:

@@ -1,17 +1,24 @@
-"""A reader that leaves out what counts in another recording.
+"""The reader of a bag directory: an adapter of `BagReader`, and what the directory adds to it.
 
-Where one recording took over from another the recorder wrote down which messages of each count
-(see `handover`). This stands between an adapter and everything that reads through one, so that no
-count, sum, search or answer has to think of it.
+- It stays inside the directory. The index follows no symbolic link, but seconds pass between a scan
+  and a query, in which a folder can be replaced by a link to somewhere else. `O_NOFOLLOW` protects
+  the last part of a path; this reader checks the parts before it.
+- It leaves out messages that count in another recording, as `handover.json` says, so that no count,
+  sum, search or answer has to consider them.
+- It finds the messages of a bag under another hard link when retention deleted the path that the
+  index knows, and a saved moment still has the bag.
 """
 
 from __future__ import annotations
 
 import os
+import stat
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import (
@@ -20,42 +27,64 @@ from ros2_memory.bag_dir.handover_file import (
     read_handover,
     sure_handover,
 )
-from ros2_memory.bag_dir.layered import LayeredReader
+from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
-from ros2_memory.core.errors import BagUnreachableError
+from ros2_memory.bag_dir.moment_file import moments_of
+from ros2_memory.core.directories import LINK_NOT_FOLLOWED
+from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import BagSummary, TimeWindow, TopicSummary
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
-    from pathlib import Path
 
     from ros2_memory.bag_dir.handover_file import Exclusion
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Record
+    from ros2_memory.storage.base import CdrLayout, Channel, Closing, Record
 
-_KNOWN_SIDECARS: Final = 4096
-_NONE: Final = HandoverReading(Handover(), None)
-"""What is read where there is no sidecar."""
+_MAX_CACHED_SIDECARS: Final = 4096
+_NO_SIDECAR: Final = HandoverReading(Handover(), None)
 
 
-class CountingReader(LayeredReader):
-    """Reads through another reader, and gives only the messages that count where they stand.
+class BagDirReader(BagReader):
+    """Reads bags through an adapter, under the rules of a bag directory.
 
-    Latched messages all count: one that was received again is recognised by what it is.
+    Latched messages always count: a recording that receives one again is recognised by topic,
+    publish time and payload.
+
+    Args:
+        reader: the adapter; it alone decides what a message says.
+        bag_dir: the directory that paths must lie in, which may be a link itself; None allows any.
+        every_message: ignores `handover.json`, for whoever compares counts with the files.
     """
 
-    def __init__(self, reader: BagReader) -> None:
-        super().__init__(reader)
-        self._known: dict[str, tuple[tuple[int, int, int], HandoverReading]] = {}
+    def __init__(
+        self, reader: BagReader, bag_dir: Path | None = None, *, every_message: bool = False
+    ) -> None:
+        self._reader = reader
+        self._bag_dir = bag_dir
+        self._every_message = every_message
+        self._sidecars: dict[str, tuple[tuple[int, int, int], HandoverReading]] = {}
 
-    def summarize(self, path: Path) -> BagSummary:
-        """Counts and times of the messages that count.
+    def reads(self, path: Path) -> bool:
+        """Returns what the adapter returns."""
+        return self._reader.reads(path)
+
+    def closing(self, path: Path) -> Closing:
+        """Returns whether the writer has finished the file, which must lie in the directory.
 
         Raises:
-            BagError: as the reader beneath.
+            BagError: as the adapter, or the path leads out of the bag directory.
         """
-        summary = self._reader.summarize(path)
+        return self._reader.closing(self._confined(path))
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Returns counts and times of the messages that count in this recording.
+
+        Raises:
+            BagError: as the adapter, or the path leads out of the bag directory.
+        """
+        summary = self._reader.summarize(self._confined(path))
         handover, problem = self._handover(path)
         if problem is not None:
             summary = summary.replaced(notes=(*summary.notes, problem))
@@ -78,87 +107,155 @@ class CountingReader(LayeredReader):
         *,
         newest_first: bool = False,
     ) -> Iterator[Record]:
-        """The messages that count.
+        """Yields the messages that count in this recording.
 
         Raises:
-            BagError: as the reader beneath.
+            BagError: as the adapter, or the path leads out of the bag directory.
         """
 
-        def found() -> Iterator[Iterator[Record]]:
-            handover = self._handover(path).handover
-            if handover.hides_all:
+        def opened() -> Iterator[Iterator[Record]]:
+            found = self._located(path)
+            exclusions = self._exclusions(found, window)
+            if exclusions is None:
                 return
-            records = self._reader.records(path, topics, window, newest_first=newest_first)
-            exclusions = _touching(handover.exclusions(path.name), window)
-            # Not a generator, which would end where some messages are lost.
+            records = self._reader.records(found, topics, window, newest_first=newest_first)
             counts = partial(_counts, exclusions=exclusions)
             yield filter(counts, records) if exclusions else records
 
-        return chain.from_iterable(found())
+        # A generator would end at the first error; after a damaged chunk the adapter's iterator
+        # goes on behind it, and so do `filter` and `chain`.
+        return chain.from_iterable(opened())
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """The latest message that counts.
+        """Returns the latest message that counts in this recording.
 
         Raises:
-            BagError: as the reader beneath.
+            BagError: as the adapter, or the path leads out of the bag directory.
         """
-        handover = self._handover(path).handover
-        if handover.hides_all:
+        found = self._located(path)
+        exclusions = self._exclusions(found, window)
+        if exclusions is None:
             return None
-        if _touching(handover.exclusions(path.name), window):
-            # Out of those that count: the port's own way.
-            return BagReader.newest(self, path, topic, window)
-        return self._reader.newest(path, topic, window)
+        if exclusions:
+            return super().newest(found, topic, window)
+        return self._reader.newest(found, topic, window)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """The log times of the messages that count.
+        """Returns the log times of the messages that count in this recording.
 
         Raises:
-            BagError: as the reader beneath.
+            BagError: as the adapter, or the path leads out of the bag directory.
         """
-        handover = self._handover(path).handover
-        if handover.hides_all:
+        found = self._located(path)
+        exclusions = self._exclusions(found, window)
+        if exclusions is None:
             return ()
-        if not _touching(handover.exclusions(path.name), window):
-            return self._reader.log_times(path, topic, window)
-        return [record.log_time for record in self.records(path, [topic], window)]
+        if exclusions:
+            return [record.log_time for record in self.records(found, [topic], window)]
+        return self._reader.log_times(found, topic, window)
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """Returns every channel that the file declares."""
+        return self._reader.channels(self._located(path))
+
+    def profile(self, path: Path) -> str:
+        """Returns the profile of the file."""
+        return self._reader.profile(self._located(path))
+
+    def undecodable(self, channel: Channel) -> str | None:
+        """Returns what the adapter returns."""
+        return self._reader.undecodable(channel)
+
+    def decode(self, record: Record) -> object:
+        """Decodes as the adapter does."""
+        return self._reader.decode(record)
+
+    def layout(self, record: Record) -> CdrLayout | None:
+        """Returns what the adapter returns."""
+        return self._reader.layout(record)
+
+    def _confined(self, path: Path) -> Path:
+        """Returns the path, which must lie in the bag directory and behind no link inside it.
+
+        Raises:
+            BagVanishedError: a folder of the path does not exist.
+            BagError: the path leads out of the directory.
+        """
+        if self._bag_dir is None:
+            return path
+        text, folder = str(path), f"{str(self._bag_dir).rstrip(os.sep)}{os.sep}"
+        names = text[len(folder) :].split("/")[:-1]
+        if not text.startswith(folder) or os.pardir in names:
+            raise BagError(text, "it does not lie in the bag directory")
+        for name in names:
+            folder += name
+            try:
+                mode = os.lstat(folder).st_mode
+            except OSError as error:
+                raise BagVanishedError(text, "the file is not there any more") from error
+            if stat.S_ISLNK(mode):
+                raise BagError(text, LINK_NOT_FOLLOWED)
+            folder += os.sep
+        return path
+
+    def _located(self, path: Path) -> Path:
+        """Returns where the bag's messages are: the path, or another hard link of a deleted one.
+
+        Raises:
+            BagError: as `_confined`.
+        """
+        if self._bag_dir is not None and not os.path.lexists(path):
+            recorded = Path(HardLinks(self._bag_dir).recorded_as(str(path)))
+            name = os.path.relpath(recorded, self._bag_dir)
+            links = [recorded]
+            with suppress(OSError):
+                links += (each / name for each in sorted(moments_of(self._bag_dir).iterdir()))
+            path = next((each for each in links if os.path.lexists(each)), path)
+        return self._confined(path)
+
+    def _exclusions(self, path: Path, window: TimeWindow) -> list[Exclusion] | None:
+        """Returns what does not count among the log times of a window; None: nothing does."""
+        handover = self._handover(path).handover
+        return None if handover.hides_all else _touching(handover.exclusions(path.name), window)
 
     def _handover(self, path: Path) -> HandoverReading:
-        """The sidecar of a file's recording; parsed again when it is another one than before.
+        """Returns the sidecar of a file's recording, parsed again only when it has changed.
 
         Raises:
-            BagUnreachableError: the disk fails: which messages count is not known.
+            BagUnreachableError: the disk fails, so which messages count is unknown.
         """
+        if self._every_message:
+            return _NO_SIDECAR
         file = str(path)
         sidecar = file[: file.rfind("/") + 1] + HANDOVER_FILE
         try:
-            stat = os.stat(sidecar)  # noqa: PTH116 - before every reading; a Path costs more
-            stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
-            known = self._known.get(sidecar)
+            status = os.stat(sidecar)  # noqa: PTH116 - before every reading; a Path costs more
+            stamp = (status.st_mtime_ns, status.st_size, status.st_ino)
+            known = self._sidecars.get(sidecar)
             if known is not None and known[0] == stamp:
                 return known[1]
             reading = sure_handover(path.parent)
         except (FileNotFoundError, NotADirectoryError):
-            return _NONE
+            return _NO_SIDECAR
         except PermissionError:
             return read_handover(path.parent)
         except OSError as error:
-            # Taken for missing, it would have messages count twice.
+            # Without its sidecar a recording would count messages twice.
             reason = f"{HANDOVER_FILE} cannot be read: {error.strerror or error}"
             raise BagUnreachableError(file, reason) from error
-        if len(self._known) >= _KNOWN_SIDECARS:
-            self._known.clear()
-        self._known[sidecar] = (stamp, reading)
+        if len(self._sidecars) >= _MAX_CACHED_SIDECARS:
+            self._sidecars.clear()
+        self._sidecars[sidecar] = (stamp, reading)
         return reading
 
     def _counted(
         self, path: Path, topic: TopicSummary, exclusions: Sequence[Exclusion]
     ) -> TopicSummary | None:
-        """The topic without what counts elsewhere; None where nothing of it is left."""
+        """Returns the topic without the messages that count elsewhere; None if none is left."""
         span = TimeWindow(topic.first, topic.last + 1)
         if topic.latched or not _touching(exclusions, span):
             return topic
-        # What is excluded lies in few of the chunks: only these are read.
+        # Excluded messages lie in few chunks: only these are read.
         lost = sum(
             record.channel.type == topic.type and not _counts(record, exclusions)
             for window in _united(exclusions, span)
@@ -179,14 +276,14 @@ class CountingReader(LayeredReader):
 
 
 def _touching(exclusions: Iterable[Exclusion], window: TimeWindow) -> list[Exclusion]:
-    """What of a file may not count among the log times of a window."""
+    """Returns the exclusions that apply to log times of a window."""
     return [
         each for each in exclusions if each.log_from < window.stop and window.start < each.log_until
     ]
 
 
 def _united(exclusions: Iterable[Exclusion], span: TimeWindow) -> list[TimeWindow]:
-    """The log times of a span in which something may not count; none twice."""
+    """Returns the parts of a span that exclusions touch, without overlaps."""
     united: list[TimeWindow] = []
     for each in sorted(_touching(exclusions, span), key=attrgetter("log_from")):
         start = max(each.log_from, united[-1].stop if united else span.start)
@@ -195,6 +292,7 @@ def _united(exclusions: Iterable[Exclusion], span: TimeWindow) -> list[TimeWindo
 
 
 def _counts(record: Record, exclusions: Sequence[Exclusion]) -> bool:
+    """Returns whether a message counts in its recording."""
     return record.channel.latched or not any(
         each.excludes(record.publish_time, record.log_time) for each in exclusions
     )

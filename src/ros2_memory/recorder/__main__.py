@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.adapters import build_reader, build_recorder
-from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_settings
 from ros2_memory.core.errors import ConfigError, EpisodicError
@@ -68,7 +68,7 @@ def _record(settings: Settings) -> None:
     # A list that is refused stops it before anything is deleted.
     load_topics(settings.recording.topics_file)
     bag_dir = settings.recording.bag_dir.absolute()
-    reader = ConfinedReader(build_reader(settings), bag_dir)
+    reader = BagDirReader(build_reader(settings), bag_dir, every_message=True)
     own = OwnRecordings(bag_dir)
     housekeeper = build_housekeeper(settings, bag_dir, reader, own)
     clear = settings.recording.clear_on_startup

@@ -1,14 +1,15 @@
-"""Messages that count in another recording are left out of every reading."""
+"""The reader of a bag directory: what counts elsewhere is left out, the rest is as in the files."""
 
 from __future__ import annotations
 
 import random
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import (
     Counting,
     Handover,
@@ -18,13 +19,13 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.storage.base import CdrLayout, Closing, Record
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
+from tests.support.fakes import FakeReader
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from ros2_memory.history.context import Memory
 
 T0 = 1_700_000_000 * 10**9
@@ -58,7 +59,7 @@ def cut(bag_dir: Path, at: int) -> None:
 
 
 def counting(bag_dir: Path) -> Memory:
-    return memory_of(bag_dir, reader=CountingReader(McapReader()))
+    return memory_of(bag_dir, reader=BagDirReader(McapReader()))
 
 
 def bumps(memory: Memory) -> int:
@@ -69,7 +70,7 @@ def bumps(memory: Memory) -> int:
 def test_each_message_counts_on_its_side_of_the_cut(tmp_path: Path) -> None:
     old, new = taken_over(tmp_path)
     cut(tmp_path, T0 + 8 * S)
-    reader = CountingReader(McapReader())
+    reader = BagDirReader(McapReader())
     everything = TimeWindow.everything()
     before = [record.publish_time for record in reader.records(old, ["/bumper"], everything)]
     after = [record.publish_time for record in reader.records(new, ["/bumper"], everything)]
@@ -114,13 +115,13 @@ def test_a_latched_message_received_again_is_not_cut_off(tmp_path: Path) -> None
     new = write_mcap(tmp_path / "b" / "b_0.mcap", [again], layout)
     begin = Overlap(None, None, ("b_0.mcap",))
     write_handover(tmp_path / "b", Handover(previous="a", counts_from=T0 + 8 * S, begin=begin))
-    assert CountingReader(McapReader()).summarize(new).count == 1
+    assert BagDirReader(McapReader()).summarize(new).count == 1
 
 
 def test_a_sidecar_that_cannot_be_read_hides_nothing_and_is_named(tmp_path: Path) -> None:
     old, _ = taken_over(tmp_path)
     (tmp_path / "a" / "handover.json").write_text("[")
-    summary = CountingReader(McapReader()).summarize(old)
+    summary = BagDirReader(McapReader()).summarize(old)
     assert summary.count == 20
     assert "handover.json" in summary.notes[-1]
     assert "handover.json" in queries.data_time_range(counting(tmp_path), Call()).notes[0]
@@ -157,7 +158,7 @@ def test_a_summary_states_what_a_reading_gives(tmp_path: Path, seed: int) -> Non
             end=overlap(),
         ),
     )
-    reader = CountingReader(McapReader())
+    reader = BagDirReader(McapReader())
     found: dict[tuple[str, str], list[int]] = {}
     for record in reader.records(bag, ["/bumper", "/other"], TimeWindow.everything()):
         found.setdefault((record.channel.topic, record.channel.type), []).append(record.log_time)
@@ -173,4 +174,62 @@ def test_a_relative_path_has_its_sidecar_beside_it(
     old, _ = taken_over(tmp_path)
     cut(tmp_path, T0 + 8 * S)
     monkeypatch.chdir(old.parent)
-    assert CountingReader(McapReader()).summarize(old.relative_to(old.parent)).count == 16
+    assert BagDirReader(McapReader()).summarize(old.relative_to(old.parent)).count == 16
+
+
+OPEN, FULL = Path("rec/rec_1.mcap"), Path("rec/rec_2.mcap")
+EVER = TimeWindow.everything()
+
+
+class Adapter(FakeReader):
+    """Knows the layout of every message."""
+
+    def __init__(self) -> None:
+        super().__init__({"nav_msgs/msg/Odometry": "it is not wanted"})
+        self.add(OPEN, [text(10, "open")], closing=Closing.OPEN)
+        self.add(FULL, [text(1, "first"), text(2, "last"), odom(3, 0, 0)])
+
+    def layout(self, record: Record) -> CdrLayout:
+        return CdrLayout(len(record.payload), (), (), ())
+
+
+def test_without_a_sidecar_it_answers_as_the_adapter() -> None:
+    adapter = Adapter()
+    reader = BagDirReader(adapter)
+    assert [reader.reads(Path(name)) for name in ("a.mcap", "a.db3")] == [True, False]
+    assert reader.closing(OPEN) is Closing.OPEN
+    assert reader.summarize(FULL) == adapter.summarize(FULL)
+    newest_first = reader.records(FULL, ["/chatter"], EVER, newest_first=True)
+    assert [record.log_time for record in newest_first] == [2, 1]
+    assert list(reader.log_times(FULL, "/chatter", EVER)) == [1, 2]
+    newest = reader.newest(FULL, "/chatter", EVER)
+    assert newest is not None
+    assert newest.log_time == 2
+    assert [channel.topic for channel in reader.channels(FULL)] == ["/chatter", "/odom"]
+    assert reader.profile(FULL) == adapter.profile(FULL)
+
+
+def test_messages_are_decoded_as_the_adapter_decodes_them() -> None:
+    adapter = Adapter()
+    reader = BagDirReader(adapter)
+    chatter, *_, pose = reader.records(FULL, ["/chatter", "/odom"], EVER)
+    assert reader.undecodable(chatter.channel) is None
+    assert reader.undecodable(pose.channel) == "it is not wanted"
+    assert getattr(reader.decode(chatter), "data", None) == "first"
+    assert reader.layout(chatter) == adapter.layout(chatter)
+
+
+def test_nothing_is_opened_before_the_first_message_is_asked_for() -> None:
+    adapter = Adapter()
+    records = BagDirReader(adapter).records(FULL, ["/chatter"], EVER)
+    assert adapter.opened == []
+    next(records)
+    assert adapter.opened == [FULL]
+
+
+def test_every_message_is_read_where_counts_are_compared_with_the_files(tmp_path: Path) -> None:
+    old, _ = taken_over(tmp_path)
+    cut(tmp_path, T0 + 8 * S)
+    reader = BagDirReader(McapReader(), tmp_path, every_message=True)
+    assert reader.summarize(old).count == 20
+    assert len(list(reader.records(old, ["/bumper"], EVER))) == 20

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
@@ -224,7 +224,7 @@ def test_a_folder_that_a_link_replaces_during_a_look_is_not_listed(
 def test_the_reader_of_a_bag_directory_opens_nothing_beside_it(
     bags: Path, outside: Path, path: str
 ) -> None:
-    reader = ConfinedReader(McapReader(), bags)
+    reader = BagDirReader(McapReader(), bags)
     with pytest.raises(BagError, match="does not lie in the bag directory"):
         reader.summarize(bags / path)
     with pytest.raises(BagError, match="does not lie in the bag directory"):

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.hard_links import HardLinks
-from ros2_memory.bag_dir.stand_in import StandInReader
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
@@ -77,7 +76,7 @@ class TestAQuestionMeanwhile:
         linked = tmp_path / "moments/one/rec/rec_0.mcap"
         linked.parent.mkdir(parents=True)
         os.link(recorded, linked)
-        reader = StandInReader(ConfinedReader(McapReader(), tmp_path), tmp_path)
+        reader = BagDirReader(McapReader(), tmp_path)
         everything = TimeWindow.everything()
 
         def read(path: Path) -> tuple[object, ...]:

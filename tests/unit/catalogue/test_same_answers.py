@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
@@ -192,7 +192,7 @@ def test_every_question_is_answered_as_without_a_catalogue(
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
         limits = QuerySettings(tf_clock=clock)  # type: ignore[arg-type]
-        plain = memory_of(bag_dir, reader=CountingReader(McapReader()), limits=limits)
+        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=limits)
         recalled = recalling(replace(plain), bag_dir, part=part)
         for asked, ask in questions(moments, draw):
             assert answer(recalled, ask) == answer(plain, ask), (seed, part, asked)
@@ -205,7 +205,7 @@ def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
-        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
         recalled = recalling(replace(plain), bag_dir)
         for _ in range(60):
             stop = draw.choice(moments) + draw.choice([0, 1, 10**6])

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import (
     Counting,
     Handover,
@@ -292,7 +292,7 @@ def test_as_splits_grow_and_close_nothing_is_missing_and_nothing_doubled(tail: T
 
 
 def test_splits_that_overlap_while_one_recording_takes_over_count_once(tmp_path: Path) -> None:
-    tail = Tail(tmp_path, reader=CountingReader(McapReader()))
+    tail = Tail(tmp_path, reader=BagDirReader(McapReader()))
     old = written(tmp_path / "x" / "x_0.mcap", driven(0, 80))
     new = written(tmp_path / "x" / "x_1.mcap", driven(50, 80, late=100_000))
     tail.write("a/a_0.mcap", old[:-300], at=8 * S)
@@ -308,7 +308,7 @@ def test_splits_that_overlap_while_one_recording_takes_over_count_once(tmp_path:
 
 
 def test_what_the_older_of_two_recordings_has_yet_to_write_is_no_gap(tmp_path: Path) -> None:
-    tail = Tail(tmp_path, reader=CountingReader(McapReader()))
+    tail = Tail(tmp_path, reader=BagDirReader(McapReader()))
     old, chunks = split(LAYOUTS[0])
     new = written(tmp_path / "x" / "x_1.mcap", driven(80, 80, late=100_000))
     behind, reach = max(chunk for chunk in chunks if chunk[1] < 80)

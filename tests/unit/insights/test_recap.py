@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.accounts import Event, Recap
 from ros2_memory.analysis.topic_events import MOST_FLAGS, MOST_LABELS
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import FixedClock, unix_from_ns
 from ros2_memory.demo import robot as demo_robot
@@ -547,7 +547,7 @@ def test_a_recap_is_the_same_whatever_the_catalogue_knows(seed: int, part: float
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
-        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
         memory = recalling(replace(plain), bag_dir, part=part)
         for _ in range(3):
             first, last = sorted(draw.choices(moments, k=2))

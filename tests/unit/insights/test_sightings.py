@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -296,7 +296,7 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         write_history(bag_dir, draw)
-        plain = memory_of(bag_dir, reader=CountingReader(McapReader()), limits=QuerySettings())
+        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=QuerySettings())
         memory = recalling(replace(plain), bag_dir, part=part)
         for topic, kind, value in ASKED:
             try:

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
@@ -367,7 +367,7 @@ def test_visits_are_the_same_whatever_the_catalogue_knows(seed: int, part: float
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         write_history(bag_dir, draw)
-        plain = memory_of(bag_dir, reader=CountingReader(McapReader()))
+        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
         memory = recalling(replace(plain), bag_dir, part=part)
         for radius in (0.5, 3.0):
             place = (draw.uniform(-2, 2), draw.uniform(-1, 1))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from ros2_memory.bag_dir.stand_in import StandInReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
@@ -56,7 +56,7 @@ LONG: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
 )
 
 
-class Watched(StandInReader):
+class Watched(BagDirReader):
     """Counts the messages that are read, and has the client leave after so many."""
 
     def __init__(self, bag_dir: Path, leaves_after: int) -> None:

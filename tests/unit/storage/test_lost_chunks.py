@@ -14,8 +14,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
-from ros2_memory.bag_dir.confined import ConfinedReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
@@ -57,8 +56,8 @@ def damaged_bag(path: Path) -> tuple[Path, range]:
     [
         lambda _: McapReader(),
         lambda _: Rosbag2Reader(),
-        lambda _: CountingReader(McapReader()),
-        lambda root: ConfinedReader(McapReader(), root),
+        lambda _: BagDirReader(McapReader()),
+        lambda root: BagDirReader(McapReader(), root),
     ],
 )
 def test_reading_goes_on_behind_a_damaged_chunk(

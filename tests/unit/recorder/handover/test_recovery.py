@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
-from ros2_memory.bag_dir.bag_dir_reader import CountingReader
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import (
     Counting,
     CutClock,
@@ -53,7 +53,7 @@ def counted(bag_dir: Path) -> Counter[int]:
     found: Counter[int] = Counter()
     for path in bag_dir.glob("*/*.mcap"):
         if path.stat().st_size:
-            records = CountingReader(READER).records(path, ["/bumper"], TimeWindow.everything())
+            records = BagDirReader(READER).records(path, ["/bumper"], TimeWindow.everything())
             found.update(record.publish_time for record in records)
     return found
 
