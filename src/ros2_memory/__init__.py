@@ -37,3 +37,17 @@ A call: `serving.mcp_server` -> `serving.dispatch` -> a declaration in `tools` -
 `queries` or `insights` -> `history.view` over `index.snapshot` -> a `storage` adapter ->
 `extract` -> `results` -> `tools.replies`. docs/architecture.md has the whole picture.
 """
+
+from typing import Final
+
+PACKAGE: Final = "ros2-memory"
+
+
+def package_version() -> str:
+    """Returns the installed version of this package; `0` where it is not installed."""
+    from importlib import metadata  # noqa: PLC0415 - 30 ms of every start, for one reply
+
+    try:
+        return metadata.version(PACKAGE)
+    except metadata.PackageNotFoundError:
+        return "0"

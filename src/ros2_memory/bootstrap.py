@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ros2_memory import PACKAGE, package_version
 from ros2_memory.adapters import build_reader, retention_limits
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import has_recorded
@@ -19,7 +20,6 @@ from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.config import NullRecorderNode, load_message_schemas
 from ros2_memory.core import directories
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.core.release import PACKAGE, package_version
 from ros2_memory.core.telemetry import SILENT, Telemetry
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.extract import SchemaExtractor

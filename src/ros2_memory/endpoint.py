@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ros2_memory import package_version
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.core.release import package_version
 from ros2_memory.core.telemetry import SILENT
 from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.tools.instructions import instructions

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import Ns, ns_from_unix
-from ros2_memory.core.wording import counted
 from ros2_memory.history.coverage import require_bags
 from ros2_memory.history.unseen import amiss, by_remark, misdated
 from ros2_memory.history.view import View

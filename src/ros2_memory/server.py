@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
 import anyio
 import uvicorn
 
+from ros2_memory import package_version
 from ros2_memory.bootstrap import (
     build_backfill,
     build_memory,
@@ -24,7 +25,6 @@ from ros2_memory.bootstrap import (
 )
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.core.logging_setup import configure_logging, get_logger
-from ros2_memory.core.release import package_version
 from ros2_memory.core.sd_notify import READY, STOPPING, ServiceManager
 from ros2_memory.endpoint import build_server
 from ros2_memory.serving.api_token import take_token

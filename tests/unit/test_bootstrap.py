@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import pytest
 from mcp import Client
 
+from ros2_memory import package_version
 from ros2_memory.adapters import build_reader
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.core.release import package_version
 from ros2_memory.endpoint import build_server
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader

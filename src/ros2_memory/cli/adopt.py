@@ -27,7 +27,7 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     RecorderError,
 )
-from ros2_memory.core.wording import counted
+from ros2_memory.core.text import counted
 from ros2_memory.upkeep import claim
 
 _MB = 1_000_000

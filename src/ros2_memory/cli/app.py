@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Final, cast
 import typer
 from typer.main import get_command
 
+from ros2_memory import package_version
 from ros2_memory.cli.deferred import Deferred
-from ros2_memory.core.release import package_version
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.withheld import withheld_warnings
-from ros2_memory.core.wording import counted, listed
 
 if TYPE_CHECKING:
     from typer.core import TyperGroup

@@ -22,10 +22,9 @@ from ros2_memory.core.errors import (
     NoDataReason,
     UndecodableError,
 )
-from ros2_memory.core.globs import match_topics
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import counted, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
-from ros2_memory.core.wording import counted
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.unseen import lost_in, note_unread

@@ -21,8 +21,8 @@ from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.config import NullRecorderNode
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
+from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, iso_local, unix_from_ns
-from ros2_memory.core.wording import NAMED, counted, listed
 from ros2_memory.history.context import Call
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import absence_told, absent_splits
@@ -263,15 +263,15 @@ def _is_repairable(path: Path, reader: BagReader) -> bool:
 def of_what_lies_there(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
     """Whether what lies in the directory is one history, and whether all of it is told of."""
     pairs = merged(snapshot)
-    for pair in pairs[:NAMED]:
+    for pair in pairs[:MAX_NAMED]:
         seen = (
             f"recordings {pair.first} and {pair.second} overlap from {iso_local(pair.start)} to "
             f"{iso_local(pair.end)}, and are answered together"
         )
         do = "give the bags of each robot or run a folder of their own, and a server each"
         yield Finding(Level.WARNING, "bags", seen, do)
-    if len(pairs) > NAMED:
-        seen = f"{counted(len(pairs) - NAMED, 'more pair overlaps', 'more pairs overlap')}"
+    if len(pairs) > MAX_NAMED:
+        seen = f"{counted(len(pairs) - MAX_NAMED, 'more pair overlaps', 'more pairs overlap')}"
         do = "`ros2-memory info` lists them all"
         yield Finding(Level.WARNING, "bags", seen, do)
     for path, until in counted_as_active(memory, snapshot):

@@ -30,8 +30,8 @@ from ros2_memory.core.errors import (
     RecorderError,
 )
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.core.wording import counted
 from ros2_memory.history.context import Memory
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied

@@ -9,7 +9,7 @@ import sys
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, TextIO
 
-from ros2_memory.core.wording import counted
+from ros2_memory.core.text import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,8 +21,8 @@ from ros2_memory.cli.running import BagDir, Overrides, Verbose, output, reportin
 from ros2_memory.cli.settling import settings_for
 from ros2_memory.core.errors import BagError, InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
-from ros2_memory.core.wording import counted, listed
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status

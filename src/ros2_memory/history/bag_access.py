@@ -14,8 +14,8 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.core.wording import Reason
 from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:

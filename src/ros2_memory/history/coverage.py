@@ -7,8 +7,8 @@ from difflib import get_close_matches
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
-from ros2_memory.core.globs import match_topics
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import (
     MAX_NS,
     MIN_NS,
@@ -16,7 +16,6 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
     unix_rounded_up,
 )
-from ros2_memory.core.wording import counted, listed
 from ros2_memory.history.unseen import may_be_written, note_unread
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
-from ros2_memory.core.wording import counted, listed
+from ros2_memory.core.text import counted, listed
 from ros2_memory.history.coverage import topics_with, undecodable, undecodable_in
 from ros2_memory.history.stored_parts import DigestKind, StoredPart, is_whole
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
-from ros2_memory.core.globs import match_topics
+from ros2_memory.core.text import match_topics
 from ros2_memory.index.pace import is_rare
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.core.wording import Reason
 from ros2_memory.history.candidates import CandidateBags
 from ros2_memory.history.coverage import matching_topics, moment, undecodable_in
 from ros2_memory.history.duplicates import COPY_HORIZON_NS

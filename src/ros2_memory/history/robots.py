@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.core.wording import listed
 from ros2_memory.history.duplicates import COPY_HORIZON_NS, copy_key
 from ros2_memory.history.transforms import sessions_of
 

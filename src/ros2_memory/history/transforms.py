@@ -25,6 +25,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import alike
 from ros2_memory.core.model import StampedTransform, TimeWindow
+from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -33,7 +34,6 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     Ns,
 )
-from ros2_memory.core.wording import Reason
 from ros2_memory.history.coverage import (
     between,
     beyond,

@@ -26,12 +26,12 @@ from ros2_memory.core.bag_summary import (
     READ_WITHOUT_INDEXES,
 )
 from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     START_SLACK_NS,
     unix_rounded_up,
 )
-from ros2_memory.core.wording import NAMED, counted, listed, shortened
 from ros2_memory.history.bag_access import short_name
 from ros2_memory.index.listed_splits import absent_files
 
@@ -60,7 +60,7 @@ def note_unread(
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.note(sentence)
     # Of more than are named a reason is not given for each.
-    if len({bag.summary.remarks for bag in odd}) <= NAMED:
+    if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
         view.note_remarks(odd)
 
 
@@ -176,7 +176,7 @@ def may_be_written(snapshot: Snapshot, window: TimeWindow) -> bool:
 
 def not_read(files: Sequence[SetAside]) -> str:
     """The sentence on files that no question can look into, the latest ones named."""
-    names = [f"{short_name(each.path)} ({shortened(each.reason)})" for each in files[-NAMED:]]
+    names = [f"{short_name(each.path)} ({shortened(each.reason)})" for each in files[-MAX_NAMED:]]
     what = counted(len(files), "bag file")
     return f"{what} could not be read and may hold more: {listed(names, len(files))}"
 
@@ -208,7 +208,7 @@ def _still_written(snapshot: Snapshot, active: Sequence[SetAside], window: TimeW
 
 def _left_open(bags: Sequence[BagFile]) -> Iterator[str]:
     if bags:
-        names = [_with_notes(bag) for bag in bags[-NAMED:]]
+        names = [_with_notes(bag) for bag in bags[-MAX_NAMED:]]
         yield (
             f"{counted(len(bags), 'bag')} left open by a crash; what is readable is used: "
             f"{listed(names, len(bags))}"
@@ -216,7 +216,7 @@ def _left_open(bags: Sequence[BagFile]) -> Iterator[str]:
 
 
 def _odd(bags: Sequence[BagFile]) -> Iterator[str]:
-    yield from by_remark([(bag, "; ".join(bag.summary.remarks)) for bag in bags], NAMED)
+    yield from by_remark([(bag, "; ".join(bag.summary.remarks)) for bag in bags], MAX_NAMED)
 
 
 def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
@@ -242,7 +242,7 @@ def amiss(bags: Sequence[BagFile]) -> Iterator[str]:
 
 def misdated(faults: Sequence[ClockFault]) -> str:
     """The sentence on bags that a wrong clock dated, the last ones named."""
-    names = [f"{short_name(fault.bag.path)} ({fault.told})" for fault in faults[-NAMED:]]
+    names = [f"{short_name(fault.bag.path)} ({fault.told})" for fault in faults[-MAX_NAMED:]]
     return f"{counted(len(faults), 'bag')} dated by a wrong clock: {listed(names, len(faults))}"
 
 

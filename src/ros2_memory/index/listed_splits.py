@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.layout import COMPRESSED, HANDOVER_FILE, METADATA_FILE,
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import opened
 from ros2_memory.core.model import SetAside
-from ros2_memory.core.wording import NAMED, counted, listed
+from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.index.scan import settled
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def absence_told(absent: Sequence[Absent]) -> Iterator[str]:
 
 def _named(absent: Sequence[Absent]) -> str:
     names = [PurePosixPath(each.folder).name for each in absent]
-    return listed(names[:NAMED], len(names))
+    return listed(names[:MAX_NAMED], len(names))
 
 
 def _absent(folder: str, beside: _Beside, bags: int, held: int, *, is_ours: bool) -> Absent:

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.geometry import alike, invert, rotate
 from ros2_memory.core.model import TimeWindow, Transform
-from ros2_memory.core.text import abbreviate
+from ros2_memory.core.text import Reason, abbreviate
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
-from ros2_memory.core.wording import Reason
 from ros2_memory.history.transforms import (
     children_moving,
     connected,

@@ -16,8 +16,8 @@ from ros2_memory.analysis.intervals import united
 from ros2_memory.analysis.standstills import CREEP_MPS, SHORTEST_NS
 from ros2_memory.analysis.topic_events import has_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.text import Reason, counted
 from ros2_memory.core.timebase import ns_from_unix, unix_from_ns
-from ros2_memory.core.wording import Reason, counted
 from ros2_memory.history.coverage import resolve_pose_topic
 from ros2_memory.history.driven_path import driven_path, length_notes
 from ros2_memory.history.robots import note_robots

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.accounts import Budget, Status, Stillness
 from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.core.wording import counted, listed
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absence_told, absent_splits
 from ros2_memory.overview import nothing_here, odd_bags, undecodable_topics

@@ -22,8 +22,8 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings, has_own_name
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import BagState
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
-from ros2_memory.core.wording import counted
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.collect import GarbageCollector
 from ros2_memory.retention.delete import left_by_repair, remove_emptied

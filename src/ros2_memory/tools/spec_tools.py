@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory import queries, results
 from ros2_memory.core.errors import NoDataError, NoDataReason
-from ros2_memory.core.globs import match_topics
+from ros2_memory.core.text import match_topics
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,

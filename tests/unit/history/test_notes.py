@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
-from ros2_memory.core.wording import Reason
+from ros2_memory.core.text import Reason
 from tests.support.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of

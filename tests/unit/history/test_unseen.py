@@ -16,7 +16,7 @@ from ros2_memory.core.model import (
     TimeWindow,
     TopicSummary,
 )
-from ros2_memory.core.wording import counted, listed
+from ros2_memory.core.text import counted, listed
 from ros2_memory.history.unseen import unread_spans
 from ros2_memory.index.snapshot import Snapshot
 
