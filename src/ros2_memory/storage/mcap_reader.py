@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.errors import raise_if_lost, reading
-from ros2_memory.storage.limits import MAX_CHUNK_MB
+from ros2_memory.storage.errors import MAX_CHUNK_MB, raise_if_lost, reading
 from ros2_memory.storage.mcap.bag_file import McapBags
 
 if TYPE_CHECKING:

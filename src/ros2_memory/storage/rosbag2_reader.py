@@ -8,9 +8,14 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.errors import LostError, UnreadableError, raise_if_lost, reading
+from ros2_memory.storage.errors import (
+    MAX_CHUNK_MB,
+    LostError,
+    UnreadableError,
+    raise_if_lost,
+    reading,
+)
 from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.sqlite_bag import (
     SqliteBags,

@@ -22,15 +22,16 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import ROS2_PROFILE, Channel, Closing, Record, Schema
 from ros2_memory.storage.cache import ByteLru, Shared
-from ros2_memory.storage.errors import ContradictionError, UnreadableError
-from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
-from ros2_memory.storage.limits import (
+from ros2_memory.storage.errors import (
     MAX_CHANNELS,
     MAX_CHUNK_MB,
     MAX_DEFINITION_BYTES,
     MAX_NAMES_CHARS,
     MAX_SECTION_BYTES,
+    ContradictionError,
+    UnreadableError,
 )
+from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.mcap.records import offered_as_latched
 from ros2_memory.storage.sqlite_guard import guard, require_plain_tables
 from ros2_memory.storage.summary import Held, bag_summary

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import zstandard
 
-from ros2_memory.storage.errors import UnreadableError
-from ros2_memory.storage.limits import too_large
+from ros2_memory.storage.errors import UnreadableError, too_large
 
 if TYPE_CHECKING:
     from ros2_memory.storage.file_io import OpenFile

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Final
 import zstandard
 
 from ros2_memory.storage.base import Closing
-from ros2_memory.storage.errors import UnreadableError
+from ros2_memory.storage.errors import MAX_TIMES_PACKED, UnreadableError, most_unpacked
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
-from ros2_memory.storage.limits import MAX_TIMES_PACKED, most_unpacked
 from ros2_memory.storage.zstd import begins_as_zstd, ends_whole
 
 if TYPE_CHECKING:

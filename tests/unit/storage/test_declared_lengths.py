@@ -10,7 +10,7 @@ from mcap.writer import CompressionType, Writer
 from ros2_memory.core.errors import BagError
 from ros2_memory.storage.base import Channel, Schema
 from ros2_memory.storage.cache import Shared
-from ros2_memory.storage.limits import MAX_DEFINITION_BYTES, MAX_NAMES_CHARS
+from ros2_memory.storage.errors import MAX_DEFINITION_BYTES, MAX_NAMES_CHARS
 from ros2_memory.storage.mcap_reader import McapReader
 
 if TYPE_CHECKING:

@@ -23,11 +23,11 @@ from ros2_memory.messages.to_json import MAX_EXACT_NUMBERS
 from ros2_memory.queries import topic_range
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.errors import UnreadableError
-from ros2_memory.storage.limits import (
+from ros2_memory.storage.errors import (
     MAX_CHANNELS,
     MAX_CHUNK_MESSAGES,
     MAX_CHUNKS,
+    UnreadableError,
     most_unpacked,
 )
 from ros2_memory.storage.mcap.chunk import walk

@@ -21,6 +21,7 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import Channel, Closing, Record
 from ros2_memory.storage.cache import ByteLru, Shared
 from ros2_memory.storage.errors import (
+    MAX_CHUNK_MB,
     ContradictionError,
     LostError,
     UnreachableError,
@@ -29,7 +30,6 @@ from ros2_memory.storage.errors import (
     reason_of,
 )
 from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap.chunk import (
     NO_MESSAGES,
     NOT_THERE,

@@ -14,10 +14,10 @@ import zstandard
 from mcap.opcode import Opcode
 
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.errors import UnreadableError
-from ros2_memory.storage.limits import (
+from ros2_memory.storage.errors import (
     MAX_CHUNK_DECLARATIONS,
     MAX_CHUNK_MESSAGES,
+    UnreadableError,
     too_large,
 )
 from ros2_memory.storage.mcap.records import (

@@ -20,8 +20,7 @@ from ros2_memory.core.bag_summary import (
     WRONG_STATISTICS,
 )
 from ros2_memory.core.timebase import MAX_NS, unix_from_ns
-from ros2_memory.storage.errors import UnreadableError, reason_of
-from ros2_memory.storage.limits import MAX_CHUNKS, MAX_SECTION_BYTES
+from ros2_memory.storage.errors import MAX_CHUNKS, MAX_SECTION_BYTES, UnreadableError, reason_of
 from ros2_memory.storage.mcap.chunk import (
     Column,
     Extent,

@@ -20,8 +20,12 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from ros2_memory.storage.base import Channel, Schema
-from ros2_memory.storage.errors import UnreadableError
-from ros2_memory.storage.limits import MAX_CHANNELS, MAX_DEFINITION_BYTES, MAX_NAMES_CHARS
+from ros2_memory.storage.errors import (
+    MAX_CHANNELS,
+    MAX_DEFINITION_BYTES,
+    MAX_NAMES_CHARS,
+    UnreadableError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -16,8 +16,12 @@ from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.errors import UnreadableError, as_unreadable
-from ros2_memory.storage.limits import MAX_SECTION_BYTES, most_unpacked
+from ros2_memory.storage.errors import (
+    MAX_SECTION_BYTES,
+    UnreadableError,
+    as_unreadable,
+    most_unpacked,
+)
 from ros2_memory.storage.mcap.chunk import (
     packed_chunk,
     unpacked,

@@ -15,12 +15,13 @@ from mcap.opcode import Opcode
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import Closing
-from ros2_memory.storage.errors import UnreadableError, as_unreadable
-from ros2_memory.storage.limits import (
+from ros2_memory.storage.errors import (
     MAX_CHUNKS,
     MAX_SECTION_BYTES,
     MAX_TIMES_PACKED,
     MESSAGE_BYTES,
+    UnreadableError,
+    as_unreadable,
     most_unpacked,
     too_large,
 )

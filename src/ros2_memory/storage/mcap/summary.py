@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mcap.opcode import Opcode
 
-from ros2_memory.storage.errors import UnreadableError
-from ros2_memory.storage.limits import MAX_SECTION_BYTES
+from ros2_memory.storage.errors import MAX_SECTION_BYTES, UnreadableError
 from ros2_memory.storage.mcap.records import (
     FOOTER,
     MAGIC_SIZE,

@@ -12,9 +12,8 @@ from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.storage.base import ROS2_PROFILE
-from ros2_memory.storage.errors import UnreadableError, reading, reason_of
+from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, reason_of
 from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.limits import MAX_CHUNK_MB
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.mcap.salvage import Salvage, Tally, parsed
 from ros2_memory.storage.writing import BagWriter, Rewritten
