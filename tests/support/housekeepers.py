@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.timebase import Clock
-    from ros2_memory.storage.base import BagReader
-    from ros2_memory.storage.writing import BagWriter
+    from ros2_memory.storage.base import BagReader, BagWriter
 
 PLENTY = 10**15
 HOUR = 3600 * NS_PER_S

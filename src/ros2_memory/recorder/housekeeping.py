@@ -44,8 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
     from ros2_memory.retention.time_sync import TimeSync
-    from ros2_memory.storage.base import BagReader
-    from ros2_memory.storage.writing import BagWriter
+    from ros2_memory.storage.base import BagReader, BagWriter
 
 REFRESH_S: Final = 60.0
 MOST_REPAIRED_BYTES: Final = 1 << 30

@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.storage.base import BagReader, Record
-    from ros2_memory.storage.writing import BagWriter
+    from ros2_memory.storage.base import BagReader, BagWriter, Record
 
 RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
 """A latched message logged so long after it was published may have been received before."""

@@ -25,8 +25,7 @@ from ros2_memory.storage.base import Closing
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ros2_memory.storage.base import BagReader
-    from ros2_memory.storage.writing import BagWriter, Rewritten
+    from ros2_memory.storage.base import BagReader, BagWriter, Rewritten
 
 
 @dataclass(frozen=True, slots=True)

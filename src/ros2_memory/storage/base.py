@@ -14,7 +14,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import BagSummary, TimeWindow
@@ -214,3 +214,49 @@ class BagReader(ABC):
         """Where the numbers of this message lie; None where that is not told: then decode it."""
         del record
         return None
+
+
+@dataclass(frozen=True, slots=True)
+class Rewritten:
+    """What became of a file that was cut short.
+
+    `lost_bytes` are the bytes of it that made no whole record; how many messages never reached the
+    disk nobody knows. `notes` are sentences on what was lost.
+    """
+
+    messages: int
+    lost_bytes: int
+    notes: tuple[str, ...] = ()
+
+
+class BagWriter(ABC):
+    """Writes closed, indexed bag files."""
+
+    @abstractmethod
+    def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
+        """Writes a bag that holds these messages, in the order given, and nothing else.
+
+        Payloads, both times, definitions and the metadata of channels stay as they are; ROS 2
+        types are named `package/msg/Name`, as every reader knows them. `profile` is MCAP's. The bag
+        is on the disk when this returns. There must be no file of that name.
+
+        Raises:
+            BagError: it cannot be written; or what `records` raises.
+        """
+
+    @abstractmethod
+    def rewrite(
+        self, source: Path, target: Path, progress: Callable[[int], None] | None = None
+    ) -> Rewritten:
+        """Writes all that can be read of a file that was cut short into one that is whole.
+
+        Schemas, channels, metadata, attachments, both times and sequence numbers stay as they are,
+        and so does the order; what makes no whole record is left out. The target was read back and
+        compared with the source, and is on the disk, when this returns. There must be no file of
+        its name; the source is only read. `progress` is told how many bytes of it were read.
+
+        Raises:
+            BagVanishedError: the source is not there.
+            BagError: nothing of the source can be read, or the target cannot be written, or it
+                does not hold what was readable.
+        """

@@ -11,12 +11,11 @@ from mcap import records as mcap_records
 from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.errors import BagError, EpisodicError
-from ros2_memory.storage.base import ROS2_PROFILE
+from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Rewritten
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, reason_of
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.mcap.salvage import Salvage, Tally, parsed
-from ros2_memory.storage.writing import BagWriter, Rewritten
 from ros2_memory.typestore import full_name
 
 if TYPE_CHECKING:
