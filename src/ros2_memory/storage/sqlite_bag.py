@@ -20,7 +20,15 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.base import ROS2_PROFILE, Channel, Closing, Record, Schema
+from ros2_memory.storage.base import (
+    ROS2_PROFILE,
+    Channel,
+    Closing,
+    Held,
+    Record,
+    Schema,
+    bag_summary,
+)
 from ros2_memory.storage.cache import ByteLru, Shared
 from ros2_memory.storage.errors import (
     MAX_CHANNELS,
@@ -33,7 +41,6 @@ from ros2_memory.storage.errors import (
 )
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.mcap.records import offered_as_latched
-from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.base import Channel, Closing, Record
+from ros2_memory.storage.base import Channel, Closing, Held, Record, bag_summary
 from ros2_memory.storage.cache import ByteLru, Shared
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
@@ -52,7 +52,6 @@ from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
 from ros2_memory.storage.mcap.records import MESSAGE, RECORD
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.mcap.summary import Chunk, DoubtError
-from ros2_memory.storage.summary import Held, bag_summary
 from ros2_memory.storage.zstd import plain_payload
 
 if TYPE_CHECKING:
