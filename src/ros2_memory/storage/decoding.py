@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.storage.cdr_layout import MOST_ELEMENTS, holds_too_many, layout_of
 from ros2_memory.storage.errors import UnreadableError
-from ros2_memory.storage.zstd import FRAME_MAGIC
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC
 from ros2_memory.typestore import Typestores, full_name
 
 if TYPE_CHECKING:

@@ -41,7 +41,7 @@ from ros2_memory.storage.errors import (
 )
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.mcap.records import offered_as_latched
-from ros2_memory.storage.zstd import plain_payload
+from ros2_memory.storage.zstd_bag import plain_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

@@ -35,7 +35,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.sqlite_bag import guard
-from ros2_memory.storage.zstd import unpacked_zstd
+from ros2_memory.storage.zstd_bag import unpacked_zstd
 from tests.fuzz.bombs import rle_frame
 from tests.fuzz.records import (
     MAGIC,

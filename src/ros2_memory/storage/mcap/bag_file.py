@@ -52,7 +52,7 @@ from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
 from ros2_memory.storage.mcap.records import MESSAGE, RECORD
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.mcap.summary import Chunk, DoubtError
-from ros2_memory.storage.zstd import plain_payload
+from ros2_memory.storage.zstd_bag import plain_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

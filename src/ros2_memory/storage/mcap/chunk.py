@@ -26,7 +26,7 @@ from ros2_memory.storage.mcap.records import (
     MESSAGE_FIELDS,
     RECORD,
 )
-from ros2_memory.storage.zstd import unpacked_zstd
+from ros2_memory.storage.zstd_bag import unpacked_zstd
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
