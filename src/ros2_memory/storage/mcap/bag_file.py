@@ -37,7 +37,6 @@ from ros2_memory.storage.mcap.chunk import (
     joined,
     walk,
 )
-from ros2_memory.storage.mcap.file import closing_of, is_finished, profile_of
 from ros2_memory.storage.mcap.index import (
     McapIndex,
     channels_bytes,
@@ -49,7 +48,7 @@ from ros2_memory.storage.mcap.index import (
     require_declared,
 )
 from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
-from ros2_memory.storage.mcap.records import MESSAGE, RECORD
+from ros2_memory.storage.mcap.records import MESSAGE, RECORD, closing_of, is_finished, profile_of
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.mcap.summary import Chunk, DoubtError
 from ros2_memory.storage.zstd_bag import plain_payload

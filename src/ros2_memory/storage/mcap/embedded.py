@@ -14,8 +14,7 @@ from mcap.records import Metadata
 
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.mcap.file import require_mcap
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, RECORD, Opcode
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, RECORD, Opcode, require_mcap
 from ros2_memory.storage.mcap.salvage import parsed
 
 if TYPE_CHECKING:

@@ -19,18 +19,20 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from ros2_memory.storage.base import Channel, Schema
+from ros2_memory.storage.base import Channel, Closing, Schema
 from ros2_memory.storage.errors import (
     MAX_CHANNELS,
     MAX_DEFINITION_BYTES,
     MAX_NAMES_CHARS,
     UnreadableError,
 )
+from ros2_memory.storage.file_io import EMPTY_FILE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.file_io import OpenFile
 
 __all__ = [
     "CHUNK_TIMES",
@@ -207,3 +209,62 @@ def _is_short(body: bytes) -> bool:
 
 def _stream(body: bytes) -> ReadDataStream:
     return ReadDataStream(BytesIO(body))
+
+
+_MOST_PROFILE_BYTES: Final = 256
+_LENGTH_BYTES: Final = 4
+
+
+def closing_of(file: OpenFile) -> Closing:
+    """Open while the closing magic is missing; what is not MCAP at all counts as closed."""
+    if file.size and not begins_as_mcap(file):
+        return Closing.CLOSED
+    return Closing.CLOSED if _ends_as_mcap(file) else Closing.OPEN
+
+
+def is_finished(file: OpenFile) -> bool:
+    """Whether it is MCAP and its writer finished it."""
+    return _ends_as_mcap(file) and begins_as_mcap(file)
+
+
+def _ends_as_mcap(file: OpenFile) -> bool:
+    whole = file.size >= 2 * MAGIC_SIZE
+    return whole and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
+
+
+def begins_as_mcap(file: OpenFile) -> bool:
+    """Whether it begins with MCAP's magic, or with as much of it as the file has bytes."""
+    return MAGIC.startswith(file.read(0, min(file.size, MAGIC_SIZE)))
+
+
+def require_mcap(file: OpenFile) -> None:
+    """Refuses what cannot be read as MCAP from its beginning.
+
+    Raises:
+        UnreadableError: it is no MCAP file, or ends within its magic.
+    """
+    if not file.size:
+        raise UnreadableError(EMPTY_FILE)
+    if not begins_as_mcap(file):
+        raise UnreadableError("not an MCAP file: it does not begin as one")
+    if file.size < MAGIC_SIZE:
+        raise UnreadableError(f"only its first {file.size} bytes had reached the disk")
+
+
+def profile_of(file: OpenFile) -> str:
+    """The profile that the header record holds; empty where there is no header.
+
+    Raises:
+        UnreadableError: it is no MCAP file, or its header is damaged.
+    """
+    require_mcap(file)
+    text_at = MAGIC_SIZE + RECORD.size + _LENGTH_BYTES
+    if file.size < text_at:
+        return ""
+    head = file.read(MAGIC_SIZE, RECORD.size + _LENGTH_BYTES)
+    if head[0] != Opcode.HEADER:
+        return ""
+    length = int.from_bytes(head[RECORD.size :], "little")
+    if length > _MOST_PROFILE_BYTES:
+        raise UnreadableError("damaged: its profile is longer than any can be")
+    return file.read(text_at, length).decode()

@@ -28,12 +28,12 @@ from ros2_memory.storage.mcap.chunk import (
     unpacked_in_part,
     walk,
 )
-from ros2_memory.storage.mcap.file import require_mcap
 from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
     MESSAGE_FIELDS,
     RECORD,
     Opcode,
+    require_mcap,
 )
 
 if TYPE_CHECKING:

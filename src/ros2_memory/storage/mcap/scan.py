@@ -33,7 +33,6 @@ from ros2_memory.storage.mcap.chunk import (
     unpacked_in_part,
     walk,
 )
-from ros2_memory.storage.mcap.file import closing_of, require_mcap
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     McapIndex,
@@ -49,6 +48,8 @@ from ros2_memory.storage.mcap.records import (
     RECORD,
     Declarations,
     Statistics,
+    closing_of,
+    require_mcap,
     statistics,
 )
 from ros2_memory.storage.mcap.summary import Chunk
