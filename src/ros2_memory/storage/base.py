@@ -1,4 +1,6 @@
-"""The port for reading bag files. The docstrings are the contract; one suite holds every adapter.
+"""The ports for reading and writing bag files.
+
+The docstrings are the contract; one test suite holds every adapter to it.
 
 A reader takes single bag *files*; a rosbag2 directory is opened split by split, so that a deleted
 split or a wrong metadata.yaml costs nothing of the others. Adapters translate every foreign
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagSummary, TimeWindow
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
 
 

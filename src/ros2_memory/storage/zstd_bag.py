@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from ros2_memory.storage.file_io import OpenFile
-
 # As large as a block: what stands before a damaged one is not lost with it.
 _PIECE: Final = zstandard.DECOMPRESSION_RECOMMENDED_OUTPUT_SIZE
 
