@@ -11,7 +11,7 @@ import math
 import time
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
 from ros2_memory.analysis.conditions import parse_condition
@@ -31,7 +31,9 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history import transforms as frame_history
-from ros2_memory.history.coverage import (
+from ros2_memory.history.coverage import amiss, by_remark, misdated, note_edges, note_unread
+from ros2_memory.history.driven_path import carries_no, decoded, driven_path
+from ros2_memory.history.no_data import (
     moment,
     no_data_at,
     no_data_between,
@@ -40,7 +42,6 @@ from ros2_memory.history.coverage import (
     resolve_topic,
     seconds,
 )
-from ros2_memory.history.driven_path import carries_no, decoded, driven_path
 from ros2_memory.history.reverse_search import last_match, unsearched
 from ros2_memory.history.robots import note_robots, note_robots_near
 from ros2_memory.history.time_arguments import (
@@ -50,38 +51,33 @@ from ros2_memory.history.time_arguments import (
     open_moment,
     open_span,
 )
-from ros2_memory.history.unseen import note_edges, note_unread
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FUTURE_NS
+from ros2_memory.index.listed_splits import absence_told, absent_splits
 from ros2_memory.insights.field_extremes import (
     MOST_MESSAGES,
     TOO_MANY,
     extremes_of,
 )
+from ros2_memory.insights.status import (
+    clock_faults,
+    left_open,
+    odd_bags,
+    undecodable_topics,
+    undecodable_types,
+)
 from ros2_memory.messages.downsample import samples_note
-from ros2_memory.overview import data_time_range, list_recorded_topics
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import Extracted
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.index.snapshot import Snapshot
 
-__all__ = [
-    "data_time_range",
-    "find_last_match",
-    "frames",
-    "list_recorded_topics",
-    "position",
-    "topic_range",
-    "topic_value",
-    "trajectory_summary",
-    "transform",
-    "value_when",
-    "velocity",
-]
+_ODD_BAGS: Final = 5
 
 
 def topic_value(
@@ -287,6 +283,72 @@ def value_when(
     return results.ValueWhen(matched, told, view.notes)
 
 
+def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
+    """Every topic that was heard, under each of its types; empty for an empty memory.
+
+    A row has notes where its numbers are of bags that are not whole, or that a wrong clock dated.
+
+    Raises:
+        NoDataError: the bag directory is not there, or its disk: what was heard is not known.
+    """
+    view = View(memory, call, memory.clock.now())
+    if view.snapshot.problem is not None:
+        require_bags(view)
+    notes = _notes_by_topic(view.snapshot)
+    rows = []
+    for topic in view.snapshot.topics():
+        reasons = undecodable_types(view, topic)
+        for type_name, census in sorted(view.census(topic).items()):
+            rows.append(
+                results.TopicRow(
+                    topic,
+                    type_name,
+                    census.first,
+                    census.last,
+                    census.count,
+                    reasons.get(type_name),
+                    notes.get(topic, ()),
+                )
+            )
+    return tuple(rows)
+
+
+def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
+    """What the memory spans, where it has holes, and which files do not answer.
+
+    Bags that a wrong clock dated are listed, and neither begin nor end the span or a hole in it.
+    """
+    now = memory.clock.now()
+    view = View(memory, call, now if memory.limits.now == "wall" else None)
+    view.count_all()
+    snapshot = view.snapshot
+    if memory.limits.now == "latest" and snapshot.latest is not None:
+        now = snapshot.latest
+    if snapshot.problem:
+        view.note(snapshot.problem)
+    if snapshot.dating.note:
+        view.note(snapshot.dating.note)
+    _note_odd_bags(view)
+    for sentence in absence_told(absent_splits(snapshot, memory.index.bag_dir)):
+        view.note(sentence)
+    undecodable = undecodable_topics(view)
+    return results.DataTimeRange(
+        earliest=snapshot.dating.earliest,
+        latest=snapshot.dating.latest,
+        now=now,
+        bags=len(snapshot.bags),
+        gaps=_gaps(view),
+        incomplete=left_open(snapshot),
+        active=snapshot.active,
+        damaged=snapshot.damaged,
+        unread=snapshot.unread,
+        silent_topics=len(snapshot.silent_topics),
+        notes=view.notes,
+        undecodable=undecodable,
+        clock_faults=clock_faults(snapshot),
+    )
+
+
 def _newest_beside(
     view: View, topic: str, window: TimeWindow, match: StoredMessage
 ) -> StoredMessage | None:
@@ -444,3 +506,46 @@ def _age(found: StoredMessage, now: Ns | None) -> Ns | None:
 
 def _around(at: Ns, reach: Ns) -> TimeWindow:
     return TimeWindow(max(at - reach, MIN_NS), min(at + reach + 1, MAX_NS))
+
+
+def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
+    """What is amiss in the bags that hold a topic, for the topics of which something is."""
+    odd: dict[str, list[BagFile]] = {}
+    for bag in snapshot.odd(TimeWindow.everything()):
+        for heading in bag.summary.shape.topics:
+            odd.setdefault(heading.topic, []).append(bag)
+    notes = {topic: list(amiss(bags)) for topic, bags in odd.items()}
+    if snapshot.misdated:
+        named = {fault.bag.file: fault for fault in snapshot.misdated}
+        held: dict[str, list[str]] = {}
+        for fault in snapshot.misdated:
+            for heading in fault.bag.summary.shape.topics:
+                held.setdefault(heading.topic, []).append(fault.bag.file)
+        for topic, files in held.items():
+            faults = [named[file] for file in dict.fromkeys(files)]
+            notes.setdefault(topic, []).append(misdated(faults))
+    return {topic: tuple(sentences) for topic, sentences in notes.items()}
+
+
+def _note_odd_bags(view: View) -> None:
+    """Says of the newest bags that are odd, not left open, and no fault of a clock, in what way."""
+    odd = [(bag, "; ".join(bag.summary.notes)) for bag in odd_bags(view.snapshot)]
+    for sentence in by_remark(odd, _ODD_BAGS):
+        view.note(sentence)
+
+
+def _gaps(view: View) -> tuple[results.Gap, ...]:
+    """Holes of more than two splits between one bag's end and the next one's start."""
+    longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
+    return tuple(_holes(view.snapshot, longest))
+
+
+def _holes(snapshot: Snapshot, longest: Ns) -> Iterator[results.Gap]:
+    reach: Ns | None = None
+    left_out = snapshot.dating.misdated
+    for bag in snapshot.bags:
+        if bag.file in left_out:
+            continue
+        if reach is not None and bag.start - reach > longest:
+            yield results.Gap(reach, bag.start)
+        reach = bag.end if reach is None else max(reach, bag.end)

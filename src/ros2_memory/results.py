@@ -8,19 +8,12 @@ only. `notes` are sentences on what was downsampled, skipped, clamped or could n
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.analysis.transform_tree import FrameEdge
-    from ros2_memory.core.model import (
-        Geodetic,
-        Pose,
-        Sample,
-        SetAside,
-        Transform,
-        Twist,
-    )
+    from ros2_memory.core.model import Geodetic, Pose, Sample, SetAside, Transform, Twist, Vector3
     from ros2_memory.core.timebase import Ns
 
 
@@ -194,3 +187,256 @@ class TrajectorySummary:
     end: Ns
     trajectory: Trajectory
     notes: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A place (m) in a frame; `label` names what is there."""
+
+    label: str
+    position: Vector3
+    frame_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """Message after message of one topic that met a condition.
+
+    Attributes:
+        topic: where.
+        first: log time of the first of them; of the earliest one read where `begun` is False.
+        last: of the last.
+        messages: how many there are.
+        begun: whether the search went on to before the first.
+        robot: where the robot was at the last.
+        thing: where the thing itself was then, if the message says so.
+    """
+
+    topic: str
+    first: Ns
+    last: Ns
+    messages: int
+    begun: bool
+    robot: Pose | None
+    thing: Spot | None
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """Sightings in the order asked for; `more`: there are others. `start` and `end` were searched.
+
+    `total` is how many there are; None where the search did not go through all.
+    """
+
+    sightings: tuple[Sighting, ...]
+    more: bool
+    total: int | None
+    start: Ns | None
+    end: Ns | None
+    now: Ns
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened at `start`, and went on until `end` where it took time.
+
+    `goes_on`: `end` is only that of what is known.
+    """
+
+    kind: str
+    start: Ns
+    end: Ns | None
+    text: str
+    goes_on: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Recap:
+    """What happened in a window.
+
+    Attributes:
+        start: of the window, inclusive.
+        end: of the window, inclusive.
+        now: what ages count from.
+        distance_m: the way driven; None, as what follows, where no pose tells.
+        max_speed: in m/s.
+        stood: how long the robot stood in all, in standstills that last `shortest_stop` or longer.
+            One that goes on outside of the window counts as far as it is inside, so the times of
+            windows that follow each other add up. None where poses are there, but too noisy or too
+            few to tell.
+        shortest_stop: what stands for less is no standstill.
+        frame_id: of the places in texts.
+        events: what happened, in order of time.
+        throughout: things that a detector saw all the time of the window at its usual rate.
+        counts: how many events of which kind there were, those that are left out too.
+        path_sum_m: the way with what the noise of positions adds, where that is much.
+        gap_m: the way across gaps in the recording, in straight lines; None without a gap.
+    """
+
+    start: Ns
+    end: Ns
+    now: Ns
+    distance_m: float | None
+    max_speed: float | None
+    stood: Ns | None
+    shortest_stop: Ns
+    frame_id: str | None
+    events: tuple[Event, ...]
+    throughout: tuple[str, ...]
+    counts: tuple[tuple[str, int], ...] = ()
+    notes: tuple[str, ...] = ()
+    path_sum_m: float | None = None
+    gap_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Stillness:
+    """A topic that fell silent: its last message, and how far apart they usually are."""
+
+    topic: str
+    last: Ns
+    usual: Ns
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """Bytes of all bags, how many may be kept, and what a day adds; None where not known.
+
+    `foreign`: the bytes of bags that the recorder did not make; they are in none of the others.
+    """
+
+    used: int
+    most: int | None
+    per_day: int | None
+    max_age: Ns | None
+    foreign: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How far the memory can be trusted.
+
+    Attributes:
+        now: what ages count from.
+        earliest: the oldest moment that can be asked about; None where the memory is empty.
+        latest: the newest one.
+        recorder: its state; None where no recorder has written here.
+        live: whether it is there still.
+        restarts: how often it had to start `ros2 bag record` anew; 0 where there is none.
+        missing: topics that it is to record by name, and that no publisher has offered to it.
+        never_heard: topics it subscribed to that brought no message.
+        fell_silent: topics that brought some, and none lately.
+        damaged: files that cannot be read.
+        incomplete: bags that a crash left open.
+        unread: files of a kind that is not read here.
+        budget: how long the disk lasts.
+        problems: why answers may be missing something.
+    """
+
+    now: Ns
+    earliest: Ns | None
+    latest: Ns | None
+    recorder: str | None
+    live: bool
+    restarts: int
+    missing: tuple[str, ...]
+    never_heard: tuple[str, ...]
+    fell_silent: tuple[Stillness, ...]
+    damaged: int
+    incomplete: int
+    unread: int
+    budget: Budget
+    problems: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """A time in which the robot was near a place.
+
+    Attributes:
+        arrived: log time of its first pose there; None where it was there before what was searched.
+        departed: of its last one; None where it is there still, by a pose recent enough to know.
+        duration: between the first and the last that are known.
+        closest_m: distance (m, in the plane) of the recorded pose that is nearest; the robot may
+            have been nearer between two messages.
+        closest_at: log time of that pose.
+        restarts: how often odometry began anew since.
+    """
+
+    arrived: Ns | None
+    departed: Ns | None
+    duration: Ns
+    closest_m: float
+    closest_at: Ns
+    restarts: int
+
+
+@dataclass(frozen=True, slots=True)
+class Visits:
+    """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
+
+    `total` is how many were found; a note says so where there may be more.
+    """
+
+    frame_id: str
+    x: float
+    y: float
+    radius_m: float
+    visits: tuple[Visit, ...]
+    more: bool
+    total: int
+    now: Ns
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TypeFields:
+    """The fields that replies show of a message type, and the topics recorded under it."""
+
+    type: str
+    topics: tuple[str, ...]
+    fields: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Remembered:
+    """A moment that the recorder keeps: its name, and the bags that it has so far.
+
+    `start` and `end` (inclusive) are those asked for. `pending`: the rest is still being written.
+    """
+
+    moment: str
+    label: str
+    start: Ns
+    end: Ns
+    bags: int
+    pending: bool
+
+
+@dataclass(frozen=True, slots=True)
+class KeptMoment:
+    """A moment that is kept; `size` in bytes, `missing` says what of it is not kept."""
+
+    moment: str
+    label: str
+    start: Ns
+    end: Ns
+    bags: int
+    size: int
+    pending: bool
+    missing: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptMoments:
+    """The moments that are kept, newest first; `more` is how many there are besides."""
+
+    moments: tuple[KeptMoment, ...]
+    more: int
+    now: Ns
+
+
+Account: TypeAlias = Sightings | Recap | Status | Visits | TypeFields | Remembered | KeptMoments

@@ -26,7 +26,8 @@ from ros2_memory.core.timebase import NS_PER_S, iso_local, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import absence_told, absent_splits
-from ros2_memory.overview import data_time_range, nothing_here, odd_bags
+from ros2_memory.insights.status import nothing_here, odd_bags
+from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.daemon import Ticking
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.storage.base import Closing
@@ -39,8 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.config import Settings
     from ros2_memory.core.model import JsonValue, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Memory
-    from ros2_memory.history.latching import Latching
+    from ros2_memory.history.context import Latching, Memory
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import BagReader
 

@@ -23,10 +23,9 @@ from ros2_memory.cli.running import (
 from ros2_memory.cli.settling import settings_for
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
-from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.latching import Latching
+from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.overview import list_recorded_topics
+from ros2_memory.queries import list_recorded_topics
 
 _WHOLE: Final = "server.max_reply_chars=1000000000"
 """A planner's context is short; a person's screen scrolls."""

@@ -12,7 +12,6 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from ros2_memory.accounts import Status
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.cli.info import usual_rate
 from ros2_memory.cli.opening import opened
@@ -26,6 +25,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status
+from ros2_memory.results import Status
 
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S
 """The newest data of this length is what goes on just now."""

@@ -7,16 +7,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
+from ros2_memory.bag_dir.carried_origin import origin_of
+from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
+from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Deadline, ms_from_ns
-from ros2_memory.history.latching import Latching
+from ros2_memory.index.pace import is_rare
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.catalogue.lookup import DigestCache
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.recorder.index_manager import IndexManager
     from ros2_memory.retention.foreign import Foreign
@@ -134,3 +139,62 @@ class Call:
     deadline: Deadline = field(default_factory=Deadline.never)
     stages: Stages = field(default_factory=Stages)
     sources: Sources = field(default_factory=Sources)
+
+
+@dataclass(frozen=True, slots=True)
+class Latching:
+    """Judges topics.
+
+    Attributes:
+        static_topics: those of static transforms.
+        include: names or globs of topics that are latched whatever their publishers offer.
+        exclude: names or globs of topics that are not; it wins.
+    """
+
+    static_topics: tuple[str, ...] = ()
+    include: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+
+    def may_hold(self, snapshot: Snapshot, topic: str) -> bool:
+        """Whether some message of a topic may be latched."""
+        said = self._configured(topic)
+        return snapshot.is_held(topic) if said is None else said
+
+    def holds(self, snapshot: Snapshot, found: StoredMessage) -> bool:
+        """Whether a message is latched, by the pace of its topic in its own recording."""
+        channel = found.record.channel
+        said = self._configured(channel.topic)
+        if said is not None or not snapshot.is_held(channel.topic):
+            return bool(said)
+        if is_carried(found.bag.path):
+            origin = origin_of(channel)
+            return origin is None or not origin.often
+        return is_rare(snapshot.pace(channel.topic, found.bag.recording))
+
+    def is_latched(self, snapshot: Snapshot, topic: str) -> bool:
+        """Whether a topic is latched, by its pace in the newest recording that holds it."""
+        said = self._configured(topic)
+        if said is not None or not snapshot.is_held(topic):
+            return bool(said)
+        newest = _newest(snapshot, topic)
+        return newest is not None and is_rare(snapshot.pace(topic, newest))
+
+    def _configured(self, topic: str) -> bool | None:
+        """What the configuration says of a topic; None where it says nothing."""
+        if any(match_topics((topic,), glob) for glob in self.exclude):
+            return False
+        if topic in self.static_topics or any(
+            match_topics((topic,), glob) for glob in self.include
+        ):
+            return True
+        return None
+
+
+def _newest(snapshot: Snapshot, topic: str) -> Path | None:
+    """The recording with the newest message of a topic; that of carried ones where no other is."""
+    spans = {
+        recording: last
+        for recording, (_, last) in snapshot.recordings(topic).items()
+        if recording.name != CARRY_FOLDER
+    } or {recording: last for recording, (_, last) in snapshot.recordings(topic).items()}
+    return max(spans, key=lambda each: (spans[each], str(each)), default=None)

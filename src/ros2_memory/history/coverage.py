@@ -1,278 +1,251 @@
-"""Why there is nothing to answer with, and what to ask instead."""
+"""What a question's window touched and could not be read: part of the answer, never passed over.
+
+Named are, the first few of each and the others counted:
+
+- files that were not read at all: damaged, or of a kind that is not read here. Such a file says
+  nothing of its times, so it counts where its recording and its own date have it lie (see
+  `recorder.whereabouts`): an old one that nobody removes is not part of every answer for ever.
+  Where the answer is that there is nothing, it counts unless it is known to lie elsewhere.
+- splits that the metadata.yaml of a recording lists and that are not there, beside searches and
+  answers that there is nothing.
+- the file that is still being written, from the end of the split before it on, or, where what is
+  whole of it answers, from there on;
+- bags that a crash left open, on to the last time that their files were written to;
+- closed bags of which parts could not be read, or that contradict themselves;
+- bags that a wrong clock dated, where the answer is not that there is nothing.
+"""
 
 from __future__ import annotations
 
-import math
-from difflib import get_close_matches
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import counted, listed, match_topics
+from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
+from ros2_memory.core.bag_summary import (
+    DOUBTS,
+    MESSAGES_MISSING,
+    READ_WITHOUT_INDEXES,
+)
+from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
-    MAX_NS,
-    MIN_NS,
-    Ns,
-    unix_from_ns,
+    AT_OR_BEFORE_SLACK_NS,
+    START_SLACK_NS,
     unix_rounded_up,
 )
-from ros2_memory.history.unseen import may_be_written, note_unread
+from ros2_memory.history.bag_access import short_name
+from ros2_memory.index.listed_splits import absent_files
 
 if TYPE_CHECKING:
-    from ros2_memory.history.view import View
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.core.model import BagFile, SetAside
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.bag_access import BagAccess
+    from ros2_memory.index.clock_faults import ClockFault
+    from ros2_memory.index.snapshot import Snapshot
 
 
-ON_DISK_S: Final = 3
-"""A message that the recorder received longer ago is on disk, as small as its chunks are."""
+def note_unread(
+    view: BagAccess, window: TimeWindow, *, nothing: bool = False, search: bool = False
+) -> None:
+    """Notes what of a window could not be read.
+
+    `nothing`: the answer is that there is nothing. Then, and after a `search`, splits that are
+    listed and not there count too.
+    """
+    if window.empty:
+        return
+    absent = _absent(view) if nothing or search else ()
+    odd = [bag for bag in view.snapshot.odd(window) if not _is_noted(view, bag)]
+    for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
+        view.note(sentence)
+    # Of more than are named a reason is not given for each.
+    if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
+        view.note_remarks(odd)
 
 
-def seconds(duration: Ns) -> str:
-    """A duration for a sentence: to three digits, and never less exact than to the second."""
-    length = unix_from_ns(duration)
-    return f"{length:.0f} s" if length >= 100 else f"{length:.3g} s"
+def note_edges(view: BagAccess, window: TimeWindow) -> None:
+    """Says where a window was asked to reach past what the memory can answer."""
+    snapshot = view.snapshot
+    asked_from, asked_to = window.asked()
+    earliest = snapshot.earliest
+    if earliest is not None and asked_from < earliest:
+        before = TimeWindow(asked_from, earliest)
+        if not any(before.overlaps(each.bag.start, each.bag.end) for each in snapshot.misdated):
+            view.note(f"the memory begins at {_moment(earliest)}")
+    if snapshot.latest is None or asked_to <= snapshot.latest:
+        return
+    if snapshot.active:
+        view.note(nothing_after(snapshot.active, snapshot.latest))
+    else:
+        view.note(f"the memory ends at {_moment(snapshot.latest)}")
 
 
-def moment(at: Ns) -> str:
-    """A moment for a sentence: the Unix seconds that find it again."""
+def nothing_after(active: Sequence[SetAside], latest: Ns) -> str:
+    """The sentence on a window that reaches past the newest message, while files are written."""
+    if all(aside.answers for aside in active):
+        return f"nothing after {_moment(latest)} is on disk yet"
+    return f"the split being written is not included: nothing after {_moment(latest)}"
+
+
+def _moment(at: Ns) -> str:
     return f"{unix_rounded_up(at):.6f}"
 
 
-def resolve_topic(view: View, name: str) -> str:
-    """The recorded topic that a question means; a missing or extra leading slash is forgiven.
+def is_searched(view: BagAccess, window: TimeWindow) -> bool:
+    """Whether a search of a window that found nothing read all that closed files hold of it.
 
-    Raises:
-        NoDataError: `topic_not_recorded` with the nearest names, or `empty_memory`.
+    That one is being written is no reason to doubt it, or a robot that records would never be told
+    that something was not there.
     """
-    topics = view.snapshot.topics()
-    for candidate in (name, f"/{name}", name.removeprefix("/")):
-        if candidate in topics:
-            return candidate
-    raise not_recorded(view, name)
+    lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
+    return view.complete and not lost and not any(map(_may_lack, view.snapshot.odd(window)))
 
 
-def resolve_pose_topic(
-    view: View, name: str | None = None, what: str = "position", *, degrees: bool = False
-) -> str:
-    """The recorded topic that a question about the robot's motion means.
+def _is_noted(view: BagAccess, bag: BagFile) -> bool:
+    """Whether the notes have what is amiss of a bag; that it was left open they have not."""
+    return bag.state is not BagState.INCOMPLETE and view.has_noted(bag)
 
-    Args:
-        view: what is recorded.
-        name: the topic that was asked for; None for `data.pose_topic`.
-        what: "position" or "velocity".
-        degrees: whether the latitude and longitude of a satellite receiver answer too.
 
-    Raises:
-        NoDataError: as `resolve_topic`; where the configured topic is not recorded the sentence
-            names those that carry poses.
+def _absent(view: BagAccess) -> Sequence[SetAside]:
+    return absent_files(view.snapshot, view.memory.index.bag_dir)
+
+
+def _may_lack(bag: BagFile) -> bool:
+    """Whether not all messages of a bag could be read."""
+    return bag.state is BagState.INCOMPLETE or not all(map(_is_whole, bag.summary.notes))
+
+
+def _is_whole(note: str) -> bool:
+    """Whether all messages of a bag were read of which this note says what is odd."""
+    if note.startswith(DOUBTS):
+        return not note.endswith(MESSAGES_MISSING)
+    return note.endswith(READ_WITHOUT_INDEXES) or note == LOG_CLOCK_NOTE
+
+
+def unread_spans(
+    snapshot: Snapshot,
+    window: TimeWindow,
+    *,
+    nothing: bool = False,
+    absent: Sequence[SetAside] = (),
+    odd: Sequence[BagFile] | None = None,
+) -> Iterator[str]:
+    """The sentences for a window; none where all of it was read.
+
+    `odd`: the bags to name of those of which something is amiss; all where it is not given.
     """
-    if name is not None:
-        return resolve_topic(view, name)
-    configured = view.memory.limits.pose_topic
-    try:
-        return resolve_topic(view, configured)
-    except NoDataError as error:
-        if error.reason is not NoDataReason.TOPIC_NOT_RECORDED:
-            raise
-        those = topics_with(view, what)
-        if not those and what == "position" and (fixes := topics_with(view, "geodetic")):
-            told = (
-                f"no topic {configured} is recorded, which data.pose_topic names, nor another with "
-                f"poses in metres; latitude and longitude are on {listed(fixes)}"
-            )
-            advice = "give topic" if degrees else "get_position_at answers them by topic"
-            raise NoDataError(error.reason, f"{told}: {advice}", error.notes) from error
-        if not those:
-            raise
-        what = {"position": "poses", "velocity": "velocities"}[what]
-        which = those[0].partition(" ")[0] if len(those) == 1 else "to one of them"
-        told = (
-            f"no topic {configured} is recorded, which data.pose_topic names; {what} are on "
-            f"{listed(those)}: set data.pose_topic{'=' if len(those) == 1 else ' '}{which}, "
-            "or give topic where the tool takes it"
-        )
-        raise NoDataError(error.reason, told, error.notes) from error
+    if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
+        yield not_read(lost)
+    active = _being_written(snapshot, window)
+    if active:
+        yield _still_written(snapshot, active, window)
+    faults = [
+        fault for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
+    ]
+    if faults and not nothing:
+        yield misdated(faults)
+    yield from amiss(snapshot.odd(window) if odd is None else odd)
 
 
-def topics_with(view: View, what: str) -> list[str]:
-    """The recorded topics of types that carry a `position`, `velocity` or `geodetic` place.
+def lost_in(
+    snapshot: Snapshot,
+    window: TimeWindow,
+    *,
+    nothing: bool = False,
+    absent: Sequence[SetAside] = (),
+) -> list[SetAside]:
+    """The files, also `absent` ones, that were not read at all and probably hold some of a window.
 
-    Each with its type behind it. What types that are not in the schema map carry is not known.
+    With `nothing` all that may.
     """
-    kinds_of = view.memory.extractor.kinds_of
+    places = snapshot.bounds if nothing else snapshot.places
+    if absent:
+        places = {**snapshot.bounds_of(absent), **places}
     return [
-        f"{topic} ({type_name})"
-        for topic in view.snapshot.topics()
-        for type_name in sorted(view.snapshot.types_of(topic))
-        if what in kinds_of(type_name)
+        aside
+        for aside in (*absent, *snapshot.damaged, *snapshot.unread)
+        if _touches(places[aside], window, unknown=nothing)
     ]
 
 
-def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
-    """The recorded topics that a name or glob (`/vision/*/scene_objects`) means.
-
-    Raises:
-        NoDataError: none does.
-    """
-    if not any(mark in pattern for mark in "*?["):
-        return (resolve_topic(view, pattern),)
-    matched = tuple(match_topics(view.snapshot.topics(), pattern))
-    if not matched:
-        raise not_recorded(view, pattern)
-    return matched
+def may_be_written(snapshot: Snapshot, window: TimeWindow) -> bool:
+    """Whether a file that is still being written may hold messages of a window unseen."""
+    return bool(_being_written(snapshot, window))
 
 
-def require_bags(view: View) -> None:
-    """Refuses a question to a memory that holds nothing.
+def not_read(files: Sequence[SetAside]) -> str:
+    """The sentence on files that no question can look into, the latest ones named."""
+    names = [f"{short_name(each.path)} ({shortened(each.reason)})" for each in files[-MAX_NAMED:]]
+    what = counted(len(files), "bag file")
+    return f"{what} could not be read and may hold more: {listed(names, len(files))}"
 
-    Raises:
-        NoDataError: `empty_memory`, or `not_closed_yet` where the first split is being written.
-    """
-    snapshot = view.snapshot
-    if snapshot.bags:
-        return
-    if snapshot.active:
-        raise NoDataError(
-            NoDataReason.NOT_CLOSED_YET,
-            f"nothing of the first split is on disk yet; ask again in {ON_DISK_S} s"
-            if _answering(view)
-            else "the first split is still being written; ask again when it closes, in "
-            f"{view.memory.limits.split_duration_s:g} s or less",
+
+def _being_written(snapshot: Snapshot, window: TimeWindow) -> list[SetAside]:
+    return [
+        aside for aside in snapshot.active if _touches(snapshot.places[aside], window, unknown=True)
+    ]
+
+
+def _touches(place: TimeWindow | None, window: TimeWindow, *, unknown: bool) -> bool:
+    if place is None:
+        return unknown
+    # Without what the bounds were widened by: a window up to a split's end does not touch the next.
+    stop = max(window.stop - AT_OR_BEFORE_SLACK_NS, window.start + 1)
+    return place.start < stop - 1 and window.start + START_SLACK_NS < place.stop
+
+
+def _still_written(snapshot: Snapshot, active: Sequence[SetAside], window: TimeWindow) -> str:
+    latest = snapshot.latest
+    if latest is not None and window.stop - 1 - AT_OR_BEFORE_SLACK_NS > latest:
+        return nothing_after(snapshot.active, latest)
+    lacking = [short_name(each.path) for each in active if not each.answers]
+    if lacking:
+        return f"still being written and not included: {listed(lacking)}"
+    names = [short_name(each.path) for each in active]
+    return f"still being written and not all on disk yet: {listed(names)}"
+
+
+def _left_open(bags: Sequence[BagFile]) -> Iterator[str]:
+    if bags:
+        names = [_with_notes(bag) for bag in bags[-MAX_NAMED:]]
+        yield (
+            f"{counted(len(bags), 'bag')} left open by a crash; what is readable is used: "
+            f"{listed(names, len(bags))}"
         )
-    why = [snapshot.problem or "no bag with messages lies in the bag directory"]
-    if snapshot.damaged:
-        why.append(f"{counted(len(snapshot.damaged), 'damaged file')} set aside")
-    if snapshot.unread:
-        why.append(f"{counted(len(snapshot.unread), 'file')} of a kind that is not read here")
-    raise NoDataError(
-        NoDataReason.EMPTY_MEMORY, f"{'; '.join(why)}; data_time_range lists the files"
-    )
 
 
-def not_recorded(view: View, name: str) -> NoDataError:
-    """No message of such a topic lies in any closed bag."""
-    require_bags(view)
-    snapshot = view.snapshot
-    if name in snapshot.silent_topics or f"/{name}" in snapshot.silent_topics:
-        told = f"{name} is declared in the bags, but not one message of it was recorded"
-    else:
-        told = f"no topic {name} is recorded"
-    close = get_close_matches(name, snapshot.topics(), n=5, cutoff=0.6)
-    if not close:
-        stem = name.rstrip("/").rpartition("/")[2].strip("*")
-        close = [topic for topic in snapshot.topics() if stem and stem in topic][:5]
-    hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
-    note_unread(view, TimeWindow.everything(), nothing=True)
-    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}", view.notes)
+def _odd(bags: Sequence[BagFile]) -> Iterator[str]:
+    yield from by_remark([(bag, "; ".join(bag.summary.remarks)) for bag in bags], MAX_NAMED)
 
 
-def no_data_at(
-    view: View,
-    topics: tuple[str, ...],
-    at: Ns,
-    tolerance: Ns | None,
-    around: Ns | None = None,
-) -> NoDataError:
-    """No message of these topics at or shortly before a moment; with `around`, nor shortly after.
-
-    The sentence names the nearest older and newer message with their distances, and what to do.
-    """
-    older = next(view.stream(topics, TimeWindow.until(at), newest_first=True), None)
-    newer = next(view.stream(topics, TimeWindow(at + 1, TimeWindow.everything().stop)), None)
-    names = " or ".join(topics)
-    when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
-    if around is not None:
-        when = f"within {seconds(around)} of"
-    told = [f"no message of {names} {when} {moment(at)}"]
-    if older:
-        told.append(
-            f"the nearest older one is {seconds(at - older.time)} before it, at "
-            f"{moment(older.time)}"
-        )
-    if newer:
-        told.append(
-            f"the nearest newer one is {seconds(newer.time - at)} after it, at {moment(newer.time)}"
-        )
-    before = tolerance if around is None else around
-    start = TimeWindow.everything().start if before is None else max(at - before, MIN_NS)
-    window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
-    reason = between(view, window) if older and newer else beyond(view, at)
-    acceptable = older.time if older and tolerance is not None else None
-    told.append(_advice(view, reason, at, acceptable))
-    note_unread(view, window, nothing=True)
-    return NoDataError(reason, "; ".join(told), view.notes)
+def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
+    """One sentence for each remark that bags have in common, those of the newest bags alone."""
+    names: dict[str, list[str]] = {}
+    for bag, remark in reversed(bags):
+        names.setdefault(shortened(remark), []).append(short_name(bag.path))
+    told = [*names.items()][:most]
+    for remark, [name, *others] in reversed(told):
+        subject = f"{len(others) + 1} bags ({listed([name, *others])})" if others else name
+        yield f"{subject}: {remark}"
+    more = len(bags) - sum(len(each) for _, each in told)
+    if more:
+        yield f"{counted(more, 'older bag is', 'older bags are')} odd too"
 
 
-def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
-    """No message of these topics in a window."""
-    older = next(view.stream(topics, TimeWindow.until(window.start - 1), newest_first=True), None)
-    newer = next(view.stream(topics, TimeWindow(window.stop, TimeWindow.everything().stop)), None)
-    names = " or ".join(topics)
-    start, end = window.asked()
-    told = [f"no message of {names} between {moment(start)} and {moment(end)}"]
-    if older:
-        told.append(f"the last one before is at {moment(older.time)}")
-    if newer:
-        told.append(f"the first one after is at {moment(newer.time)}")
-    reason = between(view, window) if older and newer else beyond(view, end)
-    told.append(_advice(view, reason, window.start, None))
-    note_unread(view, window, nothing=True)
-    return NoDataError(reason, "; ".join(told), view.notes)
+def amiss(bags: Sequence[BagFile]) -> Iterator[str]:
+    """The sentences on bags that are not whole or contradict themselves."""
+    if bags:
+        yield from _left_open([bag for bag in bags if bag.state is BagState.INCOMPLETE])
+        yield from _odd([bag for bag in bags if bag.state is not BagState.INCOMPLETE])
 
 
-def between(view: View, window: TimeWindow) -> NoDataReason:
-    """Why a window with something on either of its sides has no answer.
-
-    While one recording takes over from another, the older one may not be on disk as far as the
-    newer one begins: what lies between is no gap.
-    """
-    written = may_be_written(view.snapshot, window)
-    return NoDataReason.NOT_CLOSED_YET if written else NoDataReason.GAP
+def misdated(faults: Sequence[ClockFault]) -> str:
+    """The sentence on bags that a wrong clock dated, the last ones named."""
+    names = [f"{short_name(fault.bag.path)} ({fault.told})" for fault in faults[-MAX_NAMED:]]
+    return f"{counted(len(faults), 'bag')} dated by a wrong clock: {listed(names, len(faults))}"
 
 
-def beyond(view: View, at: Ns) -> NoDataReason:
-    """Why a moment with nothing on one of its sides has no answer."""
-    latest = view.snapshot.latest
-    if latest is not None and at > latest and view.snapshot.active:
-        return NoDataReason.NOT_CLOSED_YET
-    return NoDataReason.OUTSIDE_RANGE
-
-
-def undecodable(topic: str, type_name: str, error: UndecodableError) -> NoDataError:
-    """Messages are there, but mean nothing to us."""
-    return NoDataError(
-        NoDataReason.UNDECODABLE,
-        f"messages of {topic} ({type_name}) are recorded but cannot be decoded: {error.reason}",
-    )
-
-
-def undecodable_in(
-    view: View, window: TimeWindow, topic: str, type_name: str, error: UndecodableError
-) -> NoDataError:
-    """As `undecodable`, of all that a window holds, with the notes on what else was not read."""
-    note_unread(view, window, nothing=True)
-    told = undecodable(topic, type_name, error)
-    return NoDataError(told.reason, told.detail, view.notes)
-
-
-def _answering(view: View) -> bool:
-    """Whether what is being written answers, as far as it is on disk."""
-    return all(aside.answers for aside in view.snapshot.active)
-
-
-def _advice(view: View, reason: NoDataReason, at: Ns, older: Ns | None) -> str:
-    snapshot = view.snapshot
-    earliest, latest = snapshot.earliest, snapshot.latest
-    advice = []
-    if earliest is not None and latest is not None:
-        advice.append(f"the memory reaches from {moment(earliest)} to {moment(latest)}")
-    if reason is NoDataReason.NOT_CLOSED_YET:
-        advice.append(
-            f"ask about an earlier moment, or again in {ON_DISK_S} s"
-            if _answering(view)
-            else "the split being written does not answer until it closes: ask about an earlier "
-            f"moment, or again in {view.memory.limits.split_duration_s:g} s"
-        )
-    if older is not None:
-        enough = math.ceil(unix_from_ns(at - older) * 1000) / 1000
-        advice.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
-    return "; ".join(advice)
+def _with_notes(bag: BagFile) -> str:
+    name = short_name(bag.path)
+    return f"{name} ({shortened('; '.join(bag.summary.remarks))})" if bag.summary.remarks else name

@@ -15,8 +15,8 @@ from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import counted, listed
-from ros2_memory.history.coverage import topics_with, undecodable, undecodable_in
-from ros2_memory.history.stored_parts import DigestKind, StoredPart, is_whole
+from ros2_memory.history.bag_groups import DigestKind, StoredPart, is_whole
+from ros2_memory.history.no_data import topics_with, undecodable, undecodable_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -24,8 +24,8 @@ from ros2_memory.core.timebase import (
     Ns,
     ns_from_unix,
 )
-from ros2_memory.history.coverage import moment as told
-from ros2_memory.history.coverage import require_bags
+from ros2_memory.history.no_data import moment as told
+from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.view import View
 
 if TYPE_CHECKING:

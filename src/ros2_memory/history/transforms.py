@@ -34,7 +34,8 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     Ns,
 )
-from ros2_memory.history.coverage import (
+from ros2_memory.history.duplicates import united
+from ros2_memory.history.no_data import (
     between,
     beyond,
     moment,
@@ -42,7 +43,6 @@ from ros2_memory.history.coverage import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.duplicates import united
 from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.accounts import KeptMoment, KeptMoments, Remembered
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.moment_file import stored_moments_in
 from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
 from ros2_memory.history.view import View
+from ros2_memory.results import KeptMoment, KeptMoments, Remembered
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.request_queue import Outcome

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.accounts import Sighting, Sightings, Spot
 from ros2_memory.analysis.conditions import NearPosition, parse_condition
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import (
@@ -31,22 +30,23 @@ from ros2_memory.core.timebase import (
     START_SLACK_NS,
     Ns,
 )
-from ros2_memory.history.coverage import moment, require_bags
+from ros2_memory.history.coverage import note_unread
+from ros2_memory.history.no_data import moment, require_bags
 from ros2_memory.history.reverse_search import Search
 from ros2_memory.history.time_arguments import TimeRange, clamped, ns_argument
 from ros2_memory.history.transforms import own_holdings, transform_at
-from ros2_memory.history.unseen import note_unread
 from ros2_memory.history.view import View
 from ros2_memory.messages.detections import detections_of
+from ros2_memory.results import Sighting, Sightings, Spot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
-    from ros2_memory.history.candidates import SearchWindow
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.reverse_search import SearchWindow
     from ros2_memory.messages.detections import Detection
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.accounts import Budget, Status, Stillness
 from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absence_told, absent_splits
-from ros2_memory.overview import nothing_here, odd_bags, undecodable_topics
+from ros2_memory.results import Budget, Status, Stillness, Undecodable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.latching import Latching
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.history.context import Call, Latching, Memory
     from ros2_memory.index.snapshot import Snapshot
 
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
@@ -155,3 +155,69 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
 
 def _is_recording(heartbeat: Heartbeat, wall: Ns) -> bool:
     return heartbeat.state is RecorderState.RECORDING and heartbeat.is_live(wall)
+
+
+def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
+    """The bags that a crash left open, each with what is lost of it."""
+    return tuple(
+        SetAside(bag.path, "; ".join(bag.summary.remarks) or "left open by a crash")
+        for bag in snapshot.odd(TimeWindow.everything())
+        if bag.state is BagState.INCOMPLETE
+    )
+
+
+def odd_bags(snapshot: Snapshot) -> list[BagFile]:
+    """The bags of which something is amiss, be it no crash and no clock, in bag order."""
+    bags = snapshot.odd(TimeWindow.everything())
+    return [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
+
+
+def nothing_here(snapshot: Snapshot) -> str:
+    """The sentence on a bag directory of which no bag answers."""
+    if snapshot.active:
+        return "no bag answers yet: the first one is still being written"
+    if snapshot.empty:
+        return (
+            f"no message is recorded here: {counted(snapshot.empty, 'bag holds', 'bags hold')} none"
+        )
+    if snapshot.damaged or snapshot.unread:
+        return "no bag answers"
+    return "no bag is here: nothing is recorded yet, or it is recorded elsewhere"
+
+
+def clock_faults(snapshot: Snapshot) -> tuple[SetAside, ...]:
+    """The bags that a wrong clock dated, each with how that is known."""
+    return tuple(SetAside(fault.bag.path, fault.reason) for fault in snapshot.dating.faults)
+
+
+def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
+    """The topics of which messages are recorded that cannot be decoded, under which types."""
+    return tuple(
+        Undecodable(topic, type_name, reason)
+        for topic in view.snapshot.topics()
+        for type_name, reason in sorted(undecodable_types(view, topic).items())
+    )
+
+
+def undecodable_types(view: View, topic: str) -> dict[str, str]:
+    """Why messages of the topic cannot be decoded, by type; from one bag for each type."""
+    reasons: dict[str, str] = {}
+    for type_name in view.snapshot.types_of(topic):
+        reason = _why_undecodable(view, topic, type_name)
+        if reason:
+            reasons[type_name] = reason
+    return reasons
+
+
+def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
+    bag = view.snapshot.first_with(topic, type_name)
+    entry = view.entry(bag)
+    known = None if entry is None else entry[0].undecodable(topic, entry[1])
+    if known is not None:
+        return known.get(type_name)
+    reasons = [
+        view.memory.reader.undecodable(channel)
+        for channel in view.channels(bag)
+        if channel.topic == topic and channel.type == type_name
+    ]
+    return next(filter(None, reversed(reasons)), None)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.accounts import TypeFields
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.coverage import require_bags
+from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.view import View
+from ros2_memory.results import TypeFields
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

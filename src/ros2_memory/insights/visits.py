@@ -13,7 +13,6 @@ from itertools import chain, islice, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.accounts import Visit, Visits
 from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.analysis.dwell import Approach, DwellBuilder, Unread
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -21,28 +20,29 @@ from ros2_memory.analysis.odometry import is_place
 from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
+    NoDataError,
     QueryTimeoutError,
     UndecodableError,
 )
 from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
-from ros2_memory.history.bag_groups import groups_of
-from ros2_memory.history.candidates import CandidateBags
-from ros2_memory.history.coverage import moment, require_bags, resolve_pose_topic
+from ros2_memory.history.bag_groups import StoredPart, groups_of, is_whole
+from ros2_memory.history.coverage import note_unread
 from ros2_memory.history.driven_path import (
     POSES,
     add_poses,
     carries_no,
+    driven_path,
     leave_out,
     stops,
 )
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.stored_parts import StoredPart, is_whole
-from ros2_memory.history.unseen import note_unread
+from ros2_memory.history.no_data import moment, require_bags, resolve_pose_topic
+from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.view import View
-from ros2_memory.insights.odometry_resets import odometry_resets
-from ros2_memory.insights.places import map_placement
+from ros2_memory.insights.map_placement import map_placement
+from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
-    from ros2_memory.insights.places import MapPlacement
+    from ros2_memory.insights.map_placement import MapPlacement
 
 _COUNTING_S: Final = 5.0
 """For so long visits are counted that are not shown."""
@@ -392,3 +392,13 @@ def _off_path(path: Sequence[Vector3], here: tuple[float, float]) -> float:
     pairs = chain(zip(path, path, strict=True), pairwise(path))
     gaps = [off_segment(here, before[:2], after[:2]) for before, after in pairs]
     return min(gap for gap in gaps if not math.isnan(gap))
+
+
+def odometry_resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
+    """The times of the first poses of odometry that began anew after a moment, in order."""
+    # Poses that cannot be read, or are none, do not say where odometry is.
+    with suppress(InvalidArgumentsError, NoDataError):
+        way = driven_path(view, topic, TimeWindow(since, MAX_NS))
+        if way is not None:
+            return way.trajectory.resets
+    return ()

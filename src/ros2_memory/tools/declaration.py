@@ -13,8 +13,8 @@ from ros2_memory.tools.schema import Signature
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from ros2_memory.accounts import Account
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.results import Account
     from ros2_memory.tools.arguments import TimeArgument
     from ros2_memory.tools.reply_json import Answer
     from ros2_memory.tools.reply_size import JsonObject

@@ -1,4 +1,4 @@
-"""The answers of `accounts` as JSON values; names, units and rounding are those of `shapes`.
+"""The answers of `results` as JSON values; names, units and rounding are those of `shapes`.
 
 Whatever has a time also says how long before now that was, so that nobody has to subtract.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory import accounts
+from ros2_memory import results
 from ros2_memory.core.geometry import normalised, yaw
 from ros2_memory.core.timebase import unix_rounded_up
 from ros2_memory.tools.figures import (
@@ -33,8 +33,8 @@ __all__ = ["robot", "shown"]
 _MOST_TOPICS: Final = 10
 
 
-@shown.register(accounts.Sightings)
-def _sightings(answer: accounts.Sightings, _bag_dir: Path) -> JsonObject:
+@shown.register(results.Sightings)
+def _sightings(answer: results.Sightings, _bag_dir: Path) -> JsonObject:
     reply: JsonObject = {
         "sightings": [_sighting(each, answer.now) for each in answer.sightings],
         "total": answer.total,
@@ -46,7 +46,7 @@ def _sightings(answer: accounts.Sightings, _bag_dir: Path) -> JsonObject:
     return with_notes(reply, answer.notes)
 
 
-def _sighting(sighting: accounts.Sighting, now: Ns) -> JsonObject:
+def _sighting(sighting: results.Sighting, now: Ns) -> JsonObject:
     reply: JsonObject = {
         "topic": sighting.topic,
         "first_seen": unix_rounded_up(sighting.first),
@@ -64,8 +64,8 @@ def _sighting(sighting: accounts.Sighting, now: Ns) -> JsonObject:
     return reply
 
 
-@shown.register(accounts.Recap)
-def _recap(answer: accounts.Recap, _bag_dir: Path) -> JsonObject:
+@shown.register(results.Recap)
+def _recap(answer: results.Recap, _bag_dir: Path) -> JsonObject:
     reply: JsonObject = {
         "start": moment(answer.start),
         "end": moment(answer.end),
@@ -87,7 +87,7 @@ def _recap(answer: accounts.Recap, _bag_dir: Path) -> JsonObject:
     return with_notes(reply, answer.notes)
 
 
-def _event(event: accounts.Event, now: Ns) -> JsonObject:
+def _event(event: results.Event, now: Ns) -> JsonObject:
     shown_event: JsonObject = {
         "timestamp": moment(event.start),
         "ago_s": round(seconds(now - event.start), 1),
@@ -100,8 +100,8 @@ def _event(event: accounts.Event, now: Ns) -> JsonObject:
     return shown_event
 
 
-@shown.register(accounts.Visits)
-def _visits(answer: accounts.Visits, _bag_dir: Path) -> JsonObject:
+@shown.register(results.Visits)
+def _visits(answer: results.Visits, _bag_dir: Path) -> JsonObject:
     reply: JsonObject = {
         "frame_id": answer.frame_id or None,
         "x": answer.x,
@@ -116,7 +116,7 @@ def _visits(answer: accounts.Visits, _bag_dir: Path) -> JsonObject:
     return with_notes(reply, answer.notes)
 
 
-def _visit(visit: accounts.Visit, now: Ns) -> JsonObject:
+def _visit(visit: results.Visit, now: Ns) -> JsonObject:
     reply: JsonObject = {
         "arrived": moment(visit.arrived),
         "departed": moment(visit.departed),
@@ -130,8 +130,8 @@ def _visit(visit: accounts.Visit, now: Ns) -> JsonObject:
     return reply
 
 
-@shown.register(accounts.TypeFields)
-def _type_fields(answer: accounts.TypeFields, _bag_dir: Path) -> JsonObject:
+@shown.register(results.TypeFields)
+def _type_fields(answer: results.TypeFields, _bag_dir: Path) -> JsonObject:
     reply: JsonObject = {
         "type": answer.type,
         "topics": [*answer.topics],
@@ -140,8 +140,8 @@ def _type_fields(answer: accounts.TypeFields, _bag_dir: Path) -> JsonObject:
     return with_notes(reply, answer.notes)
 
 
-@shown.register(accounts.Status)
-def _status(answer: accounts.Status, _bag_dir: Path) -> JsonObject:
+@shown.register(results.Status)
+def _status(answer: results.Status, _bag_dir: Path) -> JsonObject:
     latest = answer.latest
     reply: JsonObject = {
         "trust": "; ".join(answer.problems) or "nothing is known to be missing",
@@ -176,7 +176,7 @@ def _status(answer: accounts.Status, _bag_dir: Path) -> JsonObject:
     return with_notes(reply, answer.notes)
 
 
-def _budget(answer: accounts.Status) -> JsonObject:
+def _budget(answer: results.Status) -> JsonObject:
     """Gigabytes, and for how many days they last: what is older is deleted then.
 
     `foreign_gb` is what bags take that the recorder did not make; the others leave it out.
@@ -197,8 +197,8 @@ def _budget(answer: accounts.Status) -> JsonObject:
     return shown_budget
 
 
-@shown.register(accounts.Remembered)
-def _remembered(answer: accounts.Remembered, _bag_dir: Path) -> JsonObject:
+@shown.register(results.Remembered)
+def _remembered(answer: results.Remembered, _bag_dir: Path) -> JsonObject:
     return {
         "moment": answer.moment,
         "label": answer.label,
@@ -209,15 +209,15 @@ def _remembered(answer: accounts.Remembered, _bag_dir: Path) -> JsonObject:
     }
 
 
-@shown.register(accounts.KeptMoments)
-def _kept_moments(answer: accounts.KeptMoments, _bag_dir: Path) -> JsonObject:
+@shown.register(results.KeptMoments)
+def _kept_moments(answer: results.KeptMoments, _bag_dir: Path) -> JsonObject:
     reply: JsonObject = {"moments": [_kept(each, answer.now) for each in answer.moments]}
     if answer.more:
         reply["more"] = answer.more
     return reply
 
 
-def _kept(kept: accounts.KeptMoment, now: Ns) -> JsonObject:
+def _kept(kept: results.KeptMoment, now: Ns) -> JsonObject:
     shown_moment: JsonObject = {
         "moment": kept.moment,
         "label": kept.label,

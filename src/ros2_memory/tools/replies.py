@@ -22,8 +22,8 @@ from ros2_memory.tools.reply_size import fit_reply, to_json_text
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.accounts import Account
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.results import Account
     from ros2_memory.tools.reply_json import Answer
     from ros2_memory.tools.reply_size import JsonObject
 

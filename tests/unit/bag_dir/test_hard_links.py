@@ -13,7 +13,7 @@ from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.overview import list_recorded_topics
+from ros2_memory.queries import list_recorded_topics
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of

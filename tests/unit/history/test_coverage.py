@@ -1,164 +1,166 @@
-"""What an answer says must hold: of which time it speaks, how far off, and what would help."""
+"""What a window touched and could not be read, in sentences."""
 
 from __future__ import annotations
 
-import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from ros2_memory import queries
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.core.errors import NoDataError, NoDataReason
-from ros2_memory.core.model import Transform
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
-from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.coverage import seconds
-from ros2_memory.history.time_arguments import AtTime, TimeRange
-from ros2_memory.results import TransformAt
-from ros2_memory.tools.reply_json import shown
-from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
-from tests.support.memories import SettableClock, memory_of
-from tests.support.with_catalogue import recalling
+from ros2_memory.core.model import (
+    BagFile,
+    BagState,
+    BagSummary,
+    SetAside,
+    TimeWindow,
+    TopicSummary,
+)
+from ros2_memory.core.text import counted, listed
+from ros2_memory.history.coverage import unread_spans
+from ros2_memory.index.snapshot import Snapshot
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-T0_S = 1_784_023_200
-T0 = T0_S * NS_PER_S
+S = 10**9
+T0 = 1_784_023_200 * S
+DAY = 24 * 3600 * S
 
 
-def after(seconds_later: float) -> AtTime:
-    return AtTime(at_s=T0_S + seconds_later)
+def split(
+    number: int, *, state: BagState = BagState.CLOSED, notes: tuple[str, ...] = ()
+) -> BagFile:
+    start, end = T0 + number * 10 * S, T0 + number * 10 * S + 9 * S
+    topics = (TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),)
+    summary = BagSummary(topics, notes=notes)
+    return BagFile(f"/b/rec/rec_{number}.mcap", 1, end, state, summary, start, end)
 
 
-def frames_that_part(bag_dir: Path) -> None:
-    """For ten seconds `map` is told of, for a minute `odom`."""
-    messages = [
-        tf(T0 + tick * NS_PER_S // 2, transform(T0 + tick * NS_PER_S // 2, *pair, (tick, 0.0, 0.0)))
-        for tick in range(120)
-        for pair in [("map", "odom"), ("odom", "base_link")]
-        if tick <= 20 or pair[0] == "odom"
+def torn(number: int, written: int | None = T0 + DAY, folder: str = "rec") -> SetAside:
+    return SetAside(Path(f"/b/{folder}/{folder}_{number}.mcap"), "torn", written)
+
+
+def told(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False) -> list[str]:
+    window = TimeWindow(T0 + round(start * S), T0 + round(stop * S))
+    return list(unread_spans(snapshot, window, nothing=nothing))
+
+
+LOST_SPLIT = Snapshot(bags=(split(0), split(2), split(3)), damaged=(torn(1),), scanned_at=T0 + DAY)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "touched"),
+    [(0, 9, False), (5, 12, True), (12, 15, True), (19.5, 31, True), (21, 31, False)],
+)
+def test_a_split_that_could_not_be_read_is_told_in_windows_that_may_touch_it(
+    start: float, stop: float, touched: bool
+) -> None:
+    sentence = "1 bag file could not be read and may hold more: rec/rec_1.mcap (torn)"
+    assert told(LOST_SPLIT, start, stop) == [sentence] * touched
+
+
+def test_a_file_of_which_the_time_is_unknown_is_told_where_nothing_was_found() -> None:
+    snapshot = Snapshot(bags=(split(0),), damaged=(torn(7, None, "alone"),), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 9) == []
+    assert told(snapshot, 0, 9, nothing=True) == [
+        "1 bag file could not be read and may hold more: alone/alone_7.mcap (torn)"
     ]
-    write_mcap(bag_dir / "run" / "run_0.mcap", messages)
 
 
-def test_a_frame_that_is_not_told_of_around_a_time_is_not_said_to_be_unknown_at_all_times(
-    tmp_path: Path,
-) -> None:
-    frames_that_part(tmp_path)
-    with pytest.raises(NoDataError) as caught:
-        queries.transform(memory_of(tmp_path), Call(), "map", "base_link", after(50))
-    assert f"within 10 s of {T0_S + 50}" in caught.value.detail
-    assert "list_frames" in caught.value.detail
-    assert caught.value.reason is NoDataReason.GAP
-    assert "within 3600 s the two were connected" in caught.value.detail
+def test_an_old_file_that_nobody_removes_is_not_part_of_every_answer() -> None:
+    old = torn(0, T0 - 30 * DAY, "old")
+    snapshot = Snapshot(bags=(split(0), split(1)), damaged=(old,), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 20) == []
+    assert told(snapshot, 0, 20, nothing=True) == []
+    assert len(told(snapshot, -30 * 86400 - 5, 20)) == 1
 
 
-@pytest.mark.parametrize(
-    ("parent", "child", "later", "reason"),
-    [
-        ("map", "nobody", 50, NoDataReason.FRAME_UNKNOWN),
-        ("/map", "base_link", 50, NoDataReason.GAP),
-        ("map", "base_link", 3 * 3600 + 50, NoDataReason.FRAME_UNKNOWN),
-    ],
+def test_files_that_are_not_read_here_count_too() -> None:
+    other = SetAside(Path("/b/rec/rec_1.db3"), "choose storage=rosbag2", T0 + DAY)
+    snapshot = Snapshot(bags=(split(0), split(2)), unread=(other,), scanned_at=T0 + DAY)
+    assert told(snapshot, 11, 12) == [
+        "1 bag file could not be read and may hold more: rec/rec_1.db3 (choose storage=rosbag2)"
+    ]
+
+
+def test_many_files_are_counted_and_the_last_ones_named() -> None:
+    lost = tuple(torn(number) for number in range(1, 9))
+    snapshot = Snapshot(bags=(split(0), split(9)), damaged=lost, scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 100) == [
+        (
+            "8 bag files could not be read and may hold more: rec/rec_6.mcap (torn), "
+            "rec/rec_7.mcap (torn), rec/rec_8.mcap (torn) and 5 more"
+        )
+    ]
+
+
+def test_the_split_being_written_is_told_from_the_end_of_the_one_before_it_on() -> None:
+    active = SetAside(Path("/b/rec/rec_1.mcap"), "still being written")
+    snapshot = Snapshot(bags=(split(0),), active=(active,), scanned_at=T0 + 15 * S)
+    assert told(snapshot, 0, 9) == []
+    assert told(snapshot, 5, 12) == [
+        "the split being written is not included: nothing after 1784023209.000000"
+    ]
+
+
+def test_a_file_that_is_written_beside_closed_ones_is_named() -> None:
+    active = SetAside(Path("/b/other/other_0.mcap"), "still being written")
+    snapshot = Snapshot(bags=(split(0), split(1)), active=(active,), scanned_at=T0 + 25 * S)
+    assert told(snapshot, 0, 9) == ["still being written and not included: other/other_0.mcap"]
+
+
+def test_a_bag_that_a_crash_left_open_is_told_with_what_is_lost_of_it() -> None:
+    cut = split(1, state=BagState.INCOMPLETE, notes=("the last 41 bytes could not be read",))
+    snapshot = Snapshot(bags=(split(0), cut), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 9) == []
+    assert told(snapshot, 5, 15) == [
+        (
+            "1 bag left open by a crash; what is readable is used: rec/rec_1.mcap (the last 41 "
+            "bytes could not be read)"
+        )
+    ]
+
+
+def test_a_closed_bag_that_contradicts_itself_is_told() -> None:
+    odd = [split(number, notes=("its own statistics are wrong",)) for number in range(5)]
+    snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 5) == ["rec/rec_0.mcap: its own statistics are wrong"]
+    named = "rec/rec_4.mcap, rec/rec_3.mcap, rec/rec_2.mcap and 2 more"
+    assert told(snapshot, 0, 60) == [f"5 bags ({named}): its own statistics are wrong"]
+
+
+def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_told() -> None:
+    odd = [split(number, notes=(f"way {number}",)) for number in range(5)]
+    snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
+    assert told(snapshot, 0, 60) == [
+        "rec/rec_2.mcap: way 2",
+        "rec/rec_3.mcap: way 3",
+        "rec/rec_4.mcap: way 4",
+        "2 older bags are odd too",
+    ]
+
+
+@given(
+    lost=st.sets(st.integers(0, 40), max_size=30),
+    reason=st.text(min_size=1, max_size=3000),
+    window=st.tuples(st.integers(-100, 500), st.integers(-100, 500)),
+    nothing=st.booleans(),
 )
-def test_a_frame_that_is_told_of_within_an_hour_is_not_unknown_but_silent(
-    tmp_path: Path, parent: str, child: str, later: float, reason: NoDataReason
+def test_what_is_told_stays_short_however_much_was_lost(
+    lost: set[int], reason: str, window: tuple[int, int], nothing: bool
 ) -> None:
-    frames_that_part(tmp_path)
-    at = T0 + 3 * 3600 * NS_PER_S + 50 * NS_PER_S
-    moved = [tf(at, transform(at, "odom", "base_link", (0.0, 0.0, 0.0)))]
-    write_mcap(tmp_path / "late" / "late_0.mcap", moved)
-    plain = memory_of(tmp_path)
-    for memory in (plain, recalling(plain, tmp_path)):
-        with pytest.raises(NoDataError) as caught:
-            queries.transform(memory, Call(), parent, child, after(later))
-        assert caught.value.reason is reason
+    asides = tuple(SetAside(Path(f"/b/rec/rec_{n}.mcap"), reason, T0) for n in sorted(lost))
+    bags = tuple(split(n, notes=(reason,)) for n in range(41) if n not in lost)
+    snapshot = Snapshot(bags=bags, damaged=asides, scanned_at=T0 + DAY)
+    sentences = told(snapshot, *sorted(window), nothing=nothing)
+    assert len(sentences) <= 5
+    assert sum(map(len, sentences)) < 2000
 
 
-def test_the_reach_of_a_transform_is_told_of_the_time_asked_alone(tmp_path: Path) -> None:
-    frames_that_part(tmp_path)
-    with pytest.raises(NoDataError, match="around then it is recorded"):
-        queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(61))
+def test_a_count_of_one_is_not_a_plural() -> None:
+    assert [counted(n, "jump") for n in (0, 1, 2)] == ["0 jumps", "1 jump", "2 jumps"]
+    assert counted(2, "entry", "entries") == "2 entries"
 
 
-def test_by_header_stamps_a_time_without_any_is_out_of_range_and_no_fault_of_the_frames(
-    tmp_path: Path,
-) -> None:
-    frames_that_part(tmp_path)
-    memory = memory_of(tmp_path, limits=QuerySettings(tf_clock="stamp"))
-    with pytest.raises(NoDataError) as caught:
-        queries.transform(memory, Call(), "odom", "base_link", after(5000))
-    assert caught.value.reason is NoDataReason.OUTSIDE_RANGE
-    assert "header stamp" in caught.value.detail
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_told(
-    tmp_path: Path, sign: float
-) -> None:
-    turned = Transform((1.0, 2.0, 3.0), (0.0, 0.0, sign * 0.6, sign * 0.8))
-    told = shown(TransformAt("odom", "base_link", T0, turned, "stamp"), tmp_path)
-    assert isinstance(told, dict)
-    assert told["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
-
-
-@pytest.mark.parametrize(
-    ("length_s", "told"),
-    [(0.0493, "0.0493 s"), (2.0, "2 s"), (99.96, "100 s"), (515_219.9, "515220 s")],
-)
-def test_a_duration_is_told_without_powers_of_ten(length_s: float, told: str) -> None:
-    assert seconds(round(length_s * NS_PER_S)) == told
-
-
-@pytest.mark.parametrize("older_s", [12_345.631, 1_234_567.891])
-def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s: float) -> None:
-    messages = [boolean(T0, True), text(T0 + round(older_s * NS_PER_S), "late")]
-    write_mcap(tmp_path / "run" / "run_0.mcap", messages)
-    memory = memory_of(tmp_path)
-    with pytest.raises(NoDataError) as caught:
-        queries.topic_value(memory, Call(), "/bumper", after(older_s))
-    advised = re.search(r"tolerance_s of at least ([\d.]+)", caught.value.detail)
-    assert advised
-    told = queries.topic_value(
-        memory, Call(), "/bumper", after(older_s), tolerance_s=float(advised[1])
-    )
-    assert told.sample.time == T0
-
-
-def test_what_never_had_a_message_before_a_time_is_said_in_words(tmp_path: Path) -> None:
-    frames_that_part(tmp_path)
-    with pytest.raises(NoDataError, match=f"no message of /tf within 10 s of {T0_S - 100}"):
-        queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(-100))
-
-
-def test_a_window_that_reaches_into_the_split_being_written_has_no_answer_yet(
-    tmp_path: Path,
-) -> None:
-    clock = SettableClock(T0 + 21 * NS_PER_S)
-    messages = [boolean(T0 + second * NS_PER_S, False) for second in range(10)]
-    closed = write_mcap(
-        tmp_path / "run" / "run_0.mcap", [*messages, odom(T0 + 9_900 * NS_PER_MS, 0.0, 0.0)]
-    )
-    (tmp_path / "run" / "run_1.mcap").write_bytes(closed.read_bytes()[:200])
-    write_heartbeat(
-        tmp_path,
-        Heartbeat(
-            pid=1,
-            updated=clock.at,
-            state=RecorderState.RECORDING,
-            recordings=("run",),
-            since=T0,
-            bytes_written=0,
-            subscribed=(),
-            silent=(),
-            last_error=None,
-            interval_s=5.0,
-        ),
-    )
-    memory = memory_of(tmp_path, clock=clock)
-    assert memory.index.snapshot(None).active
-    with pytest.raises(NoDataError) as caught:
-        queries.topic_range(memory, Call(), "/bumper", TimeRange(T0_S + 9.5, T0_S + 15))
-    assert caught.value.reason is NoDataReason.NOT_CLOSED_YET
+def test_a_list_names_a_few_and_counts_the_rest() -> None:
+    assert listed(["a", "b"]) == "a, b"
+    assert listed(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"
+    assert listed(["a", "b", "c"], 9) == "a, b, c and 6 more"

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.accounts import Event, Recap
 from ros2_memory.analysis.topic_events import MOST_FLAGS, MOST_LABELS
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import EpisodicError
@@ -25,6 +24,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.insights.recap import MOST_EVENTS, recap
 from ros2_memory.queries import trajectory_summary
+from ros2_memory.results import Event, Recap
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import STATUS_FLAGS, Msg, boolean, detections, make, odom, stamp, write_mcap

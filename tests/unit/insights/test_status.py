@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 from mcap.writer import Writer
 
-from ros2_memory.accounts import Stillness
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.history.context import Call
 from ros2_memory.index.listed_splits import absent_splits
 from ros2_memory.insights.status import memory_status
+from ros2_memory.results import Stillness
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap

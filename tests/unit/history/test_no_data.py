@@ -1,0 +1,164 @@
+"""What an answer says must hold: of which time it speaks, how far off, and what would help."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory import queries
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.core.errors import NoDataError, NoDataReason
+from ros2_memory.core.model import Transform
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.no_data import seconds
+from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.results import TransformAt
+from ros2_memory.tools.reply_json import shown
+from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
+from tests.support.memories import SettableClock, memory_of
+from tests.support.with_catalogue import recalling
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+T0_S = 1_784_023_200
+T0 = T0_S * NS_PER_S
+
+
+def after(seconds_later: float) -> AtTime:
+    return AtTime(at_s=T0_S + seconds_later)
+
+
+def frames_that_part(bag_dir: Path) -> None:
+    """For ten seconds `map` is told of, for a minute `odom`."""
+    messages = [
+        tf(T0 + tick * NS_PER_S // 2, transform(T0 + tick * NS_PER_S // 2, *pair, (tick, 0.0, 0.0)))
+        for tick in range(120)
+        for pair in [("map", "odom"), ("odom", "base_link")]
+        if tick <= 20 or pair[0] == "odom"
+    ]
+    write_mcap(bag_dir / "run" / "run_0.mcap", messages)
+
+
+def test_a_frame_that_is_not_told_of_around_a_time_is_not_said_to_be_unknown_at_all_times(
+    tmp_path: Path,
+) -> None:
+    frames_that_part(tmp_path)
+    with pytest.raises(NoDataError) as caught:
+        queries.transform(memory_of(tmp_path), Call(), "map", "base_link", after(50))
+    assert f"within 10 s of {T0_S + 50}" in caught.value.detail
+    assert "list_frames" in caught.value.detail
+    assert caught.value.reason is NoDataReason.GAP
+    assert "within 3600 s the two were connected" in caught.value.detail
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "later", "reason"),
+    [
+        ("map", "nobody", 50, NoDataReason.FRAME_UNKNOWN),
+        ("/map", "base_link", 50, NoDataReason.GAP),
+        ("map", "base_link", 3 * 3600 + 50, NoDataReason.FRAME_UNKNOWN),
+    ],
+)
+def test_a_frame_that_is_told_of_within_an_hour_is_not_unknown_but_silent(
+    tmp_path: Path, parent: str, child: str, later: float, reason: NoDataReason
+) -> None:
+    frames_that_part(tmp_path)
+    at = T0 + 3 * 3600 * NS_PER_S + 50 * NS_PER_S
+    moved = [tf(at, transform(at, "odom", "base_link", (0.0, 0.0, 0.0)))]
+    write_mcap(tmp_path / "late" / "late_0.mcap", moved)
+    plain = memory_of(tmp_path)
+    for memory in (plain, recalling(plain, tmp_path)):
+        with pytest.raises(NoDataError) as caught:
+            queries.transform(memory, Call(), parent, child, after(later))
+        assert caught.value.reason is reason
+
+
+def test_the_reach_of_a_transform_is_told_of_the_time_asked_alone(tmp_path: Path) -> None:
+    frames_that_part(tmp_path)
+    with pytest.raises(NoDataError, match="around then it is recorded"):
+        queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(61))
+
+
+def test_by_header_stamps_a_time_without_any_is_out_of_range_and_no_fault_of_the_frames(
+    tmp_path: Path,
+) -> None:
+    frames_that_part(tmp_path)
+    memory = memory_of(tmp_path, limits=QuerySettings(tf_clock="stamp"))
+    with pytest.raises(NoDataError) as caught:
+        queries.transform(memory, Call(), "odom", "base_link", after(5000))
+    assert caught.value.reason is NoDataReason.OUTSIDE_RANGE
+    assert "header stamp" in caught.value.detail
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_told(
+    tmp_path: Path, sign: float
+) -> None:
+    turned = Transform((1.0, 2.0, 3.0), (0.0, 0.0, sign * 0.6, sign * 0.8))
+    told = shown(TransformAt("odom", "base_link", T0, turned, "stamp"), tmp_path)
+    assert isinstance(told, dict)
+    assert told["rotation"] == {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8}
+
+
+@pytest.mark.parametrize(
+    ("length_s", "told"),
+    [(0.0493, "0.0493 s"), (2.0, "2 s"), (99.96, "100 s"), (515_219.9, "515220 s")],
+)
+def test_a_duration_is_told_without_powers_of_ten(length_s: float, told: str) -> None:
+    assert seconds(round(length_s * NS_PER_S)) == told
+
+
+@pytest.mark.parametrize("older_s", [12_345.631, 1_234_567.891])
+def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s: float) -> None:
+    messages = [boolean(T0, True), text(T0 + round(older_s * NS_PER_S), "late")]
+    write_mcap(tmp_path / "run" / "run_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    with pytest.raises(NoDataError) as caught:
+        queries.topic_value(memory, Call(), "/bumper", after(older_s))
+    advised = re.search(r"tolerance_s of at least ([\d.]+)", caught.value.detail)
+    assert advised
+    told = queries.topic_value(
+        memory, Call(), "/bumper", after(older_s), tolerance_s=float(advised[1])
+    )
+    assert told.sample.time == T0
+
+
+def test_what_never_had_a_message_before_a_time_is_said_in_words(tmp_path: Path) -> None:
+    frames_that_part(tmp_path)
+    with pytest.raises(NoDataError, match=f"no message of /tf within 10 s of {T0_S - 100}"):
+        queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(-100))
+
+
+def test_a_window_that_reaches_into_the_split_being_written_has_no_answer_yet(
+    tmp_path: Path,
+) -> None:
+    clock = SettableClock(T0 + 21 * NS_PER_S)
+    messages = [boolean(T0 + second * NS_PER_S, False) for second in range(10)]
+    closed = write_mcap(
+        tmp_path / "run" / "run_0.mcap", [*messages, odom(T0 + 9_900 * NS_PER_MS, 0.0, 0.0)]
+    )
+    (tmp_path / "run" / "run_1.mcap").write_bytes(closed.read_bytes()[:200])
+    write_heartbeat(
+        tmp_path,
+        Heartbeat(
+            pid=1,
+            updated=clock.at,
+            state=RecorderState.RECORDING,
+            recordings=("run",),
+            since=T0,
+            bytes_written=0,
+            subscribed=(),
+            silent=(),
+            last_error=None,
+            interval_s=5.0,
+        ),
+    )
+    memory = memory_of(tmp_path, clock=clock)
+    assert memory.index.snapshot(None).active
+    with pytest.raises(NoDataError) as caught:
+        queries.topic_range(memory, Call(), "/bumper", TimeRange(T0_S + 9.5, T0_S + 15))
+    assert caught.value.reason is NoDataReason.NOT_CLOSED_YET
