@@ -8,12 +8,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from ros2_memory import queries
-from ros2_memory.bootstrap import build_memory
+from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.endpoint import build_server
 from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import AtTime, TimeRange
 

@@ -1,4 +1,10 @@
-"""Builds what answers: a memory over the adapters, and the dispatcher of questions to it."""
+"""The composition root of both programs: builds their parts from the configuration.
+
+Each function imports what it builds: the recorder must not load what answers questions, the query
+server not what repairs and deletes, and a program that asks in process not the libraries of a
+server (`tests/project/test_imports.py`).
+"""
+# ruff: noqa: PLC0415 - as the docstring says
 
 from __future__ import annotations
 
@@ -8,50 +14,172 @@ import os
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+
+from hydra.errors import HydraException
+from hydra.utils import instantiate
 
 from ros2_memory import PACKAGE, package_version
-from ros2_memory.adapters import build_reader, retention_limits
-from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.layout import has_recorded
-from ros2_memory.catalogue.digest import DIGEST_VERSION, Digester
-from ros2_memory.catalogue.lookup import DigestCache
-from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.config import NullRecorderNode, load_message_schemas
 from ros2_memory.core import directories
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.telemetry import SILENT, Telemetry
-from ros2_memory.core.timebase import WallClock
-from ros2_memory.extract import SchemaExtractor
-from ros2_memory.history.context import Memory, QuerySettings
-from ros2_memory.observability.gauges import Measuring
-from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.serving.backfill import Backfill
-from ros2_memory.serving.dispatch import Dispatcher
-from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools, readable_tools
+from ros2_memory.core.timebase import WallClock, ns_from_unix
+from ros2_memory.recorder.base import Recorder
+from ros2_memory.retention.policy import GB, RetentionLimits
+from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from ros2_memory.config import Settings
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.config import AdapterNode, Settings
     from ros2_memory.core.telemetry import Observer
+    from ros2_memory.history.context import Memory, QuerySettings
+    from ros2_memory.recorder.ports import Housekeeper
+    from ros2_memory.retention.repair import Repairer
+    from ros2_memory.serving.backfill import Backfill
+    from ros2_memory.serving.dispatch import Dispatcher
+    from ros2_memory.serving.mcp_server import EpisodicServer
+
+_Port = TypeVar("_Port")
+
+
+def build_reader(settings: Settings) -> BagReader:
+    """Returns the bag reader that the configuration chooses.
+
+    Raises:
+        ConfigError: it cannot be built.
+    """
+    return _instantiated("storage", settings.storage, BagReader)  # type: ignore[type-abstract]  # only compared with
+
+
+def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
+    """Returns the recorder that the configuration chooses.
+
+    `collaborators` are arguments of its constructor that are not plain values.
+
+    Raises:
+        ConfigError: it cannot be built.
+    """
+    node = settings.recorder
+    return _instantiated("recorder", node, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
+
+
+def _instantiated(key: str, node: AdapterNode, port: type[_Port], **collaborators: object) -> _Port:
+    try:
+        # `all`: the adapter receives plain lists, not OmegaConf's. `partial`: collaborators do not
+        # go through a configuration, which would copy them.
+        partial: object = instantiate(
+            {"_target_": node.target, "_convert_": "all", "_partial_": True}, **node.arguments
+        )
+    except HydraException as error:
+        raise ConfigError(f"{key}: {node.target} cannot be built: {error}") from error
+    built: object = partial(**collaborators) if callable(partial) else None
+    if not isinstance(built, port):
+        raise ConfigError(f"{key}: {node.target} is not a {port.__name__}")
+    return built
+
+
+def retention_limits(settings: Settings) -> RetentionLimits:
+    """Returns how much the recorder keeps."""
+    retention = settings.retention
+    return RetentionLimits(
+        max_total_bytes=round(retention.max_total_gb * GB),
+        max_age_ns=ns_from_unix(retention.max_age_h * 3600),
+        min_free_bytes=round(retention.min_free_gb * GB),
+        keeps_foreign=retention.foreign == "keep",
+    )
+
+
+def build_housekeeper(
+    settings: Settings, bag_dir: Path, reader: BagReader, own: OwnRecordings | None = None
+) -> Housekeeper:
+    """Returns what repairs and deletes bags for the recorder; no other program may delete.
+
+    `own` lists the recordings that were made in the bag directory.
+    """
+    from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+    from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
+    from ros2_memory.recorder.time_sync import SystemTimeSync
+    from ros2_memory.storage.mcap.writer import McapWriter
+
+    retention = settings.retention
+    return InBackground(
+        Housekeeping(
+            bag_dir,
+            BagDirReader(reader),
+            McapWriter(settings.reader.max_chunk_mb),
+            WallClock(),
+            retention_limits(settings),
+            time_sync=SystemTimeSync(),
+            split_duration_s=settings.recording.split_duration_s,
+            own=own,
+            # At most half the budget, so that saved moments leave room for new recordings.
+            moments_bytes=round(min(retention.max_moments_gb, retention.max_total_gb / 2) * GB),
+            static_topics=settings.data.tf_static_topics,
+            grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
+        )
+    )
+
+
+def build_repairer() -> Repairer:
+    """Returns what repairs single MCAP files."""
+    from ros2_memory.retention.repair import Repairer
+    from ros2_memory.storage.mcap.writer import McapWriter
+    from ros2_memory.storage.mcap_reader import McapReader
+
+    return Repairer(McapReader(), McapWriter())
+
+
+def claim(own: OwnRecordings) -> None:
+    """Completes the list of a bag directory's own recordings; nobody may be recording there.
+
+    Raises:
+        RecorderError: the list cannot be read, or the bag directory cannot be listed.
+    """
+    from ros2_memory.storage.mcap.embedded import custom_data
+
+    own.claim(custom_data)
+
+
+def supposed_own(bag_dir: Path) -> OwnRecordings:
+    """Returns a bag directory's own recordings; without a list, those that `claim` would add.
+
+    Raises:
+        OSError: the list cannot be read, or the bag directory cannot be listed.
+    """
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.storage.mcap.embedded import custom_data
+
+    own = OwnRecordings(bag_dir)
+    own.suppose(custom_data)
+    return own
 
 
 def build_memory(settings: Settings) -> Memory:
-    """The memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
+    """Returns the memory over `recording.bag_dir`, which need not exist yet. Reads no bag.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.
     """
+    from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+    from ros2_memory.catalogue.lookup import DigestCache
+    from ros2_memory.catalogue.store import Catalogue
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.history.context import Memory
+    from ros2_memory.recorder.index_manager import IndexManager
+
     clock = WallClock()
     schemas = load_message_schemas(settings)
     extractor = SchemaExtractor(schemas, settings.data.max_array_length)
     bag_dir = settings.recording.bag_dir
     reader = BagDirReader(build_reader(settings), bag_dir)
-    reading = catalogue_fingerprint(settings, schemas)
-    places = partial(catalogue_paths, settings)
-    catalogue = Catalogue(places, reading, waits_for=bag_dir)
+    catalogue = Catalogue(
+        partial(catalogue_paths, settings),
+        catalogue_fingerprint(settings, schemas),
+        waits_for=bag_dir,
+    )
     index = IndexManager(
         bag_dir,
         reader,
@@ -67,28 +195,34 @@ def build_memory(settings: Settings) -> Memory:
 
 
 def catalogue_paths(settings: Settings) -> tuple[Path, ...]:
-    """Where the catalogue may lie now, best first.
+    """Returns the paths that the catalogue may have now, best first.
 
-    Beside the bags only where a recorder has been at work, and may be again: a folder of other
-    people's bags is left as it is.
+    It is beside the bags only where the configured recorder has recorded. Nothing is written to a
+    folder of other programs' bags.
     """
+    from ros2_memory.bag_dir.layout import has_recorded
+    from ros2_memory.catalogue.store import FILE, FOLDER
+
     bag_dir = settings.recording.bag_dir
     records = not isinstance(settings.recorder, NullRecorderNode) and has_recorded(bag_dir)
-    places = (bag_dir / FOLDER / FILE,) if records else ()
+    beside = (bag_dir / FOLDER / FILE,) if records else ()
     given = os.environ.get("XDG_CACHE_HOME")
     try:
         cache = Path(given) if given else Path.home() / ".cache"
     except RuntimeError:  # a user without a home
-        return places
+        return beside
     name = hashlib.sha256(os.fsencode(bag_dir.absolute())).hexdigest()[:16]
-    return (*places, cache / PACKAGE / name / FILE) if cache.is_absolute() else places
+    return (*beside, cache / PACKAGE / name / FILE) if cache.is_absolute() else beside
 
 
 def catalogue_fingerprint(settings: Settings, schemas: Mapping[str, Mapping[str, str]]) -> str:
-    """A hash of all that digests depend on besides the bags: settings, definitions, this program.
+    """Returns a hash of all that digests depend on besides the bags.
 
-    `schemas` is the schema map of these settings.
+    That is settings, message definitions, and this program's version. `schemas` is the schema map
+    of these settings.
     """
+    from ros2_memory.catalogue.digest import DIGEST_VERSION
+
     folders = [str(folder) for folder in settings.storage.custom_msg_paths]
     definitions = [
         (str(path.relative_to(folder)), path.stat().st_size, path.stat().st_mtime_ns)
@@ -110,7 +244,10 @@ def catalogue_fingerprint(settings: Settings, schemas: Mapping[str, Mapping[str,
 
 
 def build_backfill(settings: Settings, memory: Memory) -> Backfill:
-    """What fills the catalogue of a memory."""
+    """Returns what fills the catalogue of a memory."""
+    from ros2_memory.catalogue.digest import Digester
+    from ros2_memory.serving.backfill import Backfill
+
     limit = memory.limits.max_plausible_speed_mps
     return Backfill(
         memory, Digester(memory.reader, memory.extractor, limit), settings.recording.bag_dir
@@ -118,7 +255,9 @@ def build_backfill(settings: Settings, memory: Memory) -> Backfill:
 
 
 def query_settings_of(settings: Settings) -> QuerySettings:
-    """What questions need of the configuration."""
+    """Returns what queries need of the configuration."""
+    from ros2_memory.history.context import QuerySettings
+
     data = settings.data
     records = not isinstance(settings.recorder, NullRecorderNode)
     return QuerySettings(
@@ -139,12 +278,54 @@ def query_settings_of(settings: Settings) -> QuerySettings:
     )
 
 
+def build_dispatcher(
+    settings: Settings, memory: Memory, telemetry: Telemetry = SILENT
+) -> Dispatcher:
+    """Returns what answers tool calls from a memory."""
+    from ros2_memory.serving.dispatch import Dispatcher
+    from ros2_memory.tools.replies import Replies
+    from ros2_memory.tools.spec_tools import build_tools, readable_tools
+
+    server = settings.server
+    tools = build_tools(
+        memory.limits,
+        server.call_timeout_s,
+        additions=server.tools == "all",
+        writing=server.write_tools,
+    )
+    return Dispatcher(
+        memory,
+        tools,
+        Replies(settings.recording.bag_dir, server.max_reply_chars),
+        call_timeout_s=server.call_timeout_s,
+        readable=readable_tools(memory.limits),
+        telemetry=telemetry,
+        log_arguments=settings.logging.arguments,
+    )
+
+
+def build_server(
+    settings: Settings, memory: Memory, telemetry: Telemetry = SILENT
+) -> EpisodicServer:
+    """Returns the MCP server that answers from a memory."""
+    from ros2_memory.serving.mcp_server import EpisodicServer
+    from ros2_memory.tools.instructions import instructions
+
+    server = settings.server
+    return EpisodicServer(
+        build_dispatcher(settings, memory, telemetry),
+        name=server.name,
+        version=package_version(),
+        instructions=instructions(memory.limits, additions=server.tools == "all"),
+    )
+
+
 def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
-    """Who is told of answers, as the configuration wants it; nobody by default.
+    """Returns the observers of tool calls that the configuration chooses; none by default.
 
     Raises:
-        ConfigError: the optional part of the package is missing, there is no HTTP to show metrics
-            on, or the environment describes no exporter.
+        ConfigError: the extra is not installed, metrics have no HTTP to be served by, or the
+            environment describes no exporter.
     """
     observers: list[Observer] = []
     exposition = None
@@ -154,14 +335,16 @@ def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
                 "server.metrics: true is not allowed with server.transport=stdio, which has no "
                 "/metrics; choose server.transport=sse or leave it out"
             )
-        with _optional("server.metrics"):
-            from ros2_memory.observability.prometheus import Metrics  # noqa: PLC0415 - an extra
+        with _extra_required("server.metrics"):
+            from ros2_memory.observability.prometheus import Metrics
+        from ros2_memory.observability.gauges import Measuring
+
         metrics = Metrics(Measuring(memory), package_version())
         observers.append(metrics)
         exposition = metrics.exposition
     if settings.server.traces:
-        with _optional("server.traces"):
-            from ros2_memory.observability import opentelemetry  # noqa: PLC0415 - an extra
+        with _extra_required("server.traces"):
+            from ros2_memory.observability import opentelemetry
         observers.append(
             opentelemetry.traces_from_environment(arguments=settings.logging.arguments)
         )
@@ -169,8 +352,8 @@ def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
 
 
 @contextmanager
-def _optional(key: str) -> Iterator[None]:
-    """Around the import of what few install."""
+def _extra_required(key: str) -> Iterator[None]:
+    """Names the extra where the import of an optional dependency fails."""
     try:
         yield
     except ImportError as error:
@@ -178,25 +361,3 @@ def _optional(key: str) -> Iterator[None]:
             f"{key}: true needs the optional part of this package (no {error.name}): "
             "pip install 'ros2-memory[observability]'"
         ) from error
-
-
-def build_dispatcher(
-    settings: Settings, memory: Memory, telemetry: Telemetry = SILENT
-) -> Dispatcher:
-    """What answers tool calls from a memory."""
-    served = settings.server
-    tools = build_tools(
-        memory.limits,
-        served.call_timeout_s,
-        additions=served.tools == "all",
-        writing=served.write_tools,
-    )
-    return Dispatcher(
-        memory,
-        tools,
-        Replies(settings.recording.bag_dir, served.max_reply_chars),
-        call_timeout_s=served.call_timeout_s,
-        readable=readable_tools(memory.limits),
-        telemetry=telemetry,
-        log_arguments=settings.logging.arguments,
-    )

@@ -21,12 +21,12 @@ from ros2_memory import package_version
 from ros2_memory.bootstrap import (
     build_backfill,
     build_memory,
+    build_server,
     build_telemetry,
 )
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.sd_notify import READY, STOPPING, ServiceManager
-from ros2_memory.endpoint import build_server
 from ros2_memory.serving.api_token import take_token
 from ros2_memory.serving.backfill import keep_backfilled
 from ros2_memory.serving.connection_limits import (

@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Any, Final
 import structlog
 
 from ros2_memory import cli
-from ros2_memory.bootstrap import build_backfill, build_memory
+from ros2_memory.bootstrap import build_backfill, build_memory, build_server
 from ros2_memory.cli.index import Bar, fill
 from ros2_memory.cli.recovery import recover
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.endpoint import build_server
 from tests.fuzz.asking import OF_GOOD, ask, comparable, of_mutant
 from tests.fuzz.good import neighbours
 from tests.fuzz.holding import hold, truth_of

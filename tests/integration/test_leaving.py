@@ -51,7 +51,7 @@ async def serving(query: Endless) -> AsyncIterator[tuple[int, Dispatcher]]:
     )
     replies = Replies(Path("bags"), 1000)
     dispatcher = Dispatcher(cast("Memory", None), [asked], replies, call_timeout_s=3600)
-    server = EpisodicServer(dispatcher, [asked], name="x", version="1", instructions="")
+    server = EpisodicServer(dispatcher, name="x", version="1", instructions="")
 
     async def health() -> Any:
         return {"status": "ok"}

@@ -43,7 +43,7 @@ class Listening(Dispatcher):
 @asynccontextmanager
 async def serving() -> AsyncIterator[tuple[str, int, Listening]]:
     dispatcher = Listening()
-    server = EpisodicServer(dispatcher, [], name="x", version="1", instructions="")
+    server = EpisodicServer(dispatcher, name="x", version="1", instructions="")
 
     async def health() -> Any:
         return {"status": "ok"}
@@ -69,7 +69,7 @@ async def test_each_event_stream_is_a_client_of_its_own() -> None:
 
 async def test_a_client_that_is_in_memory_or_on_stdio_is_the_only_one() -> None:
     dispatcher = Listening()
-    server = EpisodicServer(dispatcher, [], name="x", version="1", instructions="")
+    server = EpisodicServer(dispatcher, name="x", version="1", instructions="")
     async with Client(server) as client:
         await client.call_tool("any", {})
     assert dispatcher.asked == [None]

@@ -36,7 +36,6 @@ DELETING: Final = {
     "ros2_memory.retention.repair",
     "ros2_memory.retention.saved_moments",
     "ros2_memory.storage.mcap.writer",
-    "ros2_memory.upkeep",
 }
 RECORDING: Final = {
     f"ros2_memory.{room}" for room in ("recorder.ros2bag", "recorder.supervisor", "retention.clear")
@@ -107,17 +106,30 @@ def test_a_name_is_completed_without_importing_what_has_it(env: dict[str, str]) 
 
 
 def test_the_recorder_imports_nothing_that_answers(env: dict[str, str]) -> None:
-    ((*there,),) = imported("import ros2_memory.recorder.__main__\nseen()\n", env)
-    rooms = {
-        f"ros2_memory.{room}" for room in ("bootstrap", "catalogue", "history.context", "queries")
-    }
+    program = (
+        "import ros2_memory.recorder.__main__\n"
+        "from ros2_memory import bootstrap, config\n"
+        "settings = config.load_settings()\n"
+        "reader = bootstrap.build_reader(settings)\n"
+        "bootstrap.build_housekeeper(settings, settings.recording.bag_dir, reader)\n"
+        "seen()\n"
+    )
+    ((*there,),) = imported(program, env)
+    rooms = {f"ros2_memory.{room}" for room in ("catalogue", "history.context", "queries")}
     assert (SERVING | PEOPLE | rooms | {"anyio"}) & {*there} == set()
 
 
 def test_the_server_imports_nothing_that_records_deletes_or_is_for_people(
     env: dict[str, str],
 ) -> None:
-    program = "from ros2_memory import server\nseen()\n"
+    program = (
+        "from ros2_memory import bootstrap, config, server\n"
+        "settings = config.load_settings()\n"
+        "memory = bootstrap.build_memory(settings)\n"
+        "bootstrap.build_server(settings, memory, bootstrap.build_telemetry(settings, memory))\n"
+        "bootstrap.build_backfill(settings, memory)\n"
+        "seen()\n"
+    )
     ((*there,),) = imported(program, env)
     observing = {"opentelemetry.sdk", "prometheus_client", "ros2_memory.observability.prometheus"}
     assert (DELETING | RECORDING | PEOPLE | observing | {"httpx", "jsonschema"}) & {*there} == set()

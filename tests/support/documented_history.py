@@ -24,10 +24,9 @@ from ros2_memory.bag_dir.heartbeat import (
 )
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
 from ros2_memory.bag_dir.moment_file import SavedMoment, write_saved_moment
-from ros2_memory.bootstrap import query_settings_of
+from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.endpoint import build_server
 from tests.support.bags import McapLayout, Msg, detections, odom, text, tf, transform, write_mcap
 from tests.support.housekeepers import recorder_at_work
 from tests.support.memories import SettableClock, memory_of

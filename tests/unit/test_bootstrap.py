@@ -8,11 +8,9 @@ import pytest
 from mcp import Client
 
 from ros2_memory import package_version
-from ros2_memory.adapters import build_reader
-from ros2_memory.bootstrap import build_memory
+from ros2_memory.bootstrap import build_memory, build_reader, build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.endpoint import build_server
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.reply_size import to_json_text

@@ -19,6 +19,7 @@ from ros2_memory.bag_dir.own_recordings import (
     is_kept_apart,
     is_regular,
 )
+from ros2_memory.bootstrap import claim
 from ros2_memory.cli.running import NOT_SO, BagDir, Sets, reporting, say
 from ros2_memory.cli.settling import settings_for
 from ros2_memory.config import NullRecorderNode
@@ -28,7 +29,6 @@ from ros2_memory.core.errors import (
     RecorderError,
 )
 from ros2_memory.core.text import counted
-from ros2_memory.upkeep import claim
 
 _MB = 1_000_000
 _NAMED = 5

@@ -14,9 +14,8 @@ from difflib import get_close_matches
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.adapters import GB, build_recorder
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
-from ros2_memory.bootstrap import query_settings_of
+from ros2_memory.bootstrap import build_recorder, query_settings_of
 from ros2_memory.cli.oddities import counted_as_active, merged
 from ros2_memory.config import NullRecorderNode
 from ros2_memory.core import directories
@@ -30,6 +29,7 @@ from ros2_memory.insights.status import nothing_here, odd_bags
 from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.daemon import Ticking
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
+from ros2_memory.retention.policy import GB
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:

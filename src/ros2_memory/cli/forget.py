@@ -9,12 +9,12 @@ from typing import Annotated
 
 import typer
 
-from ros2_memory.adapters import build_reader
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE, MOMENTS_FOLDER, other_form
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, is_kept_apart
+from ros2_memory.bootstrap import build_reader, supposed_own
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.cli.opening import opened
 from ros2_memory.cli.output import moment
@@ -38,7 +38,6 @@ from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap.writer import McapWriter
-from ros2_memory.upkeep import supposed_own
 
 _MB = 1_000_000
 

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE
+from ros2_memory.bootstrap import build_repairer
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, WallClock, unix_from_ns
 from ros2_memory.index.scan import Tree
 from ros2_memory.retention.repair import open_files
-from ros2_memory.upkeep import build_repairer
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory.adapters import build_reader, build_recorder
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bootstrap import build_housekeeper, build_reader, build_recorder, claim
 from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_settings
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
@@ -23,7 +23,6 @@ from ros2_memory.recorder.daemon import (
     record_until_told,
 )
 from ros2_memory.recorder.process.topics import load_topics
-from ros2_memory.upkeep import build_housekeeper, claim
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -29,6 +29,7 @@ from ros2_memory.recorder.process.command import (
 from ros2_memory.recorder.process.environment import find_ros2, robot_environment
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.recorder.supervisor import Orders, Supervisor
+from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -42,7 +43,6 @@ __all__ = ["Ros2BagRecorder", "record_argv"]
 
 HELP_TIMEOUT_S: Final = 60.0
 LOGS_KEPT: Final = 20
-GB: Final = 10**9
 
 
 class Ros2BagRecorder(Recorder):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
+from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +19,6 @@ REPAIRED_WITHIN_NS: Final[Ns] = 600 * NS_PER_S
 """A bag that a crash left open is waited for so long: once it is repaired it is another file."""
 LONGEST_WAIT_NS: Final[Ns] = 2 * 3600 * NS_PER_S
 """No split stays open for longer, unless somebody else's recorder writes it, or clocks differ."""
-_GB: Final = 10**9
 
 
 class Needed(NamedTuple):
@@ -98,8 +98,8 @@ def fitting(files: Iterable[Weight], held: Mapping[int, int], share: int) -> set
 def no_room(held: Mapping[int, int], more: int, share: int) -> str:
     """Why a moment of so many bytes more is refused."""
     return (
-        f"moments may take {share / _GB:.3g} GB, {sum(held.values()) / _GB:.3g} GB of that are "
-        f"used, and this one takes {more / _GB:.3g} GB more; delete folders in moments/ of the bag "
+        f"moments may take {share / GB:.3g} GB, {sum(held.values()) / GB:.3g} GB of that are "
+        f"used, and this one takes {more / GB:.3g} GB more; delete folders in moments/ of the bag "
         "directory, raise retention.max_moments_gb, or ask for fewer seconds"
     )
 

@@ -31,6 +31,8 @@ from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+GB: Final = 10**9
+"""Bytes of a gigabyte, as configuration keys that end in `_gb` count them."""
 SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """A shorter pause never parts two eras, however little history is kept."""
 

@@ -27,7 +27,7 @@ from ros2_memory.tools.instructions import PROMPT
 from ros2_memory.tools.resources import SCHEMA, STATUS, TOPICS, asked_of
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Mapping, Sequence
+    from collections.abc import Hashable, Iterable, Mapping
 
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.declaration import Tool
@@ -52,7 +52,6 @@ class EpisodicServer(MCPServer[object]):
     def __init__(
         self,
         dispatcher: Dispatcher,
-        tools: Sequence[Tool],
         *,
         name: str,
         version: str,
@@ -60,8 +59,8 @@ class EpisodicServer(MCPServer[object]):
     ) -> None:
         super().__init__(name, version=version, instructions=instructions)
         self.dispatcher = dispatcher
-        self._listed = [_listed(tool) for tool in tools]
-        reads_more = any(tool.name == STATUS.tool for tool in tools)
+        self._listed = [_listed(tool) for tool in dispatcher.tools]
+        reads_more = any(tool.name == STATUS.tool for tool in dispatcher.tools)
         self._offered = (TOPICS, STATUS, SCHEMA) if reads_more else (TOPICS,)
         self._prompt = f"{instructions}\n{PROMPT}"
 

@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.request_queue import PendingRequest, RequestQueue
-from ros2_memory.bootstrap import build_backfill, build_memory
+from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
 from ros2_memory.catalogue.file import open_file
 from ros2_memory.cli.recovery import recover
 from ros2_memory.config import load_settings
@@ -31,7 +31,6 @@ from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.endpoint import build_server
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.index.file_state import files_in_metadata
 from ros2_memory.index.scan import Tree
@@ -43,7 +42,6 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.spec_tools import build_tools
-from ros2_memory.upkeep import build_repairer
 from tests.support.bags import boolean, text, write_db3, write_mcap
 from tests.support.housekeepers import keeper_of
 from tests.support.robot_run import ANSWERED, T0, T0_S, write_run

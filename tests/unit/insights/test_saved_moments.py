@@ -17,10 +17,10 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from ros2_memory.bag_dir.request_queue import PendingRequest
+from ros2_memory.bootstrap import build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.endpoint import build_server
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights import saved_moments
 from ros2_memory.insights.saved_moments import (

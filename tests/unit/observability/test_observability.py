@@ -196,7 +196,7 @@ def traced() -> EpisodicServer:
         call_timeout_s=5,
         telemetry=Telemetry((Traces(provider),)),
     )
-    return EpisodicServer(dispatcher, tools, name="episodic", version="1", instructions="")
+    return EpisodicServer(dispatcher, name="episodic", version="1", instructions="")
 
 
 def told(exporter: InMemorySpanExporter, outcome: str) -> ReadableSpan:

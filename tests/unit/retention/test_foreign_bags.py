@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bootstrap import claim
 from ros2_memory.history.context import Call
 from ros2_memory.insights.status import memory_status
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
-from ros2_memory.upkeep import claim
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
 from tests.support.housekeepers import PLENTY, files_in, keeper_of, recording_now, size_of
 from tests.support.memories import SettableClock, memory_of

@@ -62,9 +62,7 @@ def served(*tools: Tool, timeout_s: float = 25.0, max_chars: int = 24_000) -> Ep
     dispatcher = Dispatcher(
         NOBODY, tools, Replies(Path("bags"), max_chars), call_timeout_s=timeout_s
     )
-    return EpisodicServer(
-        dispatcher, tools, name="episodic", version="1.2.3", instructions="Ask away."
-    )
+    return EpisodicServer(dispatcher, name="episodic", version="1.2.3", instructions="Ask away.")
 
 
 def told(result: CallToolResult) -> Any:

@@ -10,9 +10,8 @@ from mcp import Client
 from mcp.shared.exceptions import MCPError
 from mcp.types import INVALID_PARAMS, TextContent, TextResourceContents
 
-from ros2_memory.bootstrap import build_memory
+from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
-from ros2_memory.endpoint import build_server
 from tests.support.robot_run import write_run
 
 if TYPE_CHECKING:

@@ -41,7 +41,7 @@ def app(
     dispatcher = Dispatcher(
         cast("Memory", None), [tool], Replies(Path("bags"), 1000), call_timeout_s=5
     )
-    server = EpisodicServer(dispatcher, [tool], name="episodic", version="1", instructions="")
+    server = EpisodicServer(dispatcher, name="episodic", version="1", instructions="")
 
     async def health() -> Any:
         return {"status": "ok", "bags": 3}

@@ -13,13 +13,12 @@ import pytest
 from mcp import Client
 from mcp.types import TextContent
 
-from ros2_memory.bootstrap import query_settings_of
+from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import FixedClock, ns_from_unix
 from ros2_memory.demo.answer_checks import Asked, WrongAnswerError
 from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.recording import DemoRecorder
-from ros2_memory.endpoint import build_server
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.memories import memory_of
 from tests.support.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S

@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.adapters import build_reader
+from ros2_memory.bootstrap import build_housekeeper, build_reader, build_repairer
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.recorder.housekeeping import InBackground
-from ros2_memory.upkeep import build_housekeeper, build_repairer
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.housekeepers import files_in
 
