@@ -32,7 +32,7 @@ from tests.support.ros_processes import (
     ros_environment,
     wait_for,
 )
-from tests.timing.stalls import in_time
+from tests.timing import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,7 +17,7 @@ import pytest
 
 from tests.support.kill_campaign import KINDS, Campaign, Terms, place_is_right, run_campaign
 from tests.support.ros_processes import needs_ros
-from tests.timing.stalls import Watch, driven
+from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -59,7 +59,7 @@ def _run(folder: Path, watch: Watch) -> Campaigns:
         }
         found = {name: future.result() for name, future in running.items()}
     for name, campaign in found.items():
-        watch.tell(f"the robot of {name}", campaign.robot_late_s)
+        watch.report(f"the robot of {name}", campaign.robot_late_s)
     return Campaigns(watch, found)
 
 

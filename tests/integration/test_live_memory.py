@@ -32,7 +32,7 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.ros_processes import Robot, needs_ros, publishing_robot, ros_environment
-from tests.timing.stalls import Watch, driven
+from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -146,7 +146,7 @@ def _drive(drive: Drive, site: Machine, served: dict[str, Served], robot: Robot)
     ask("ten", "a killed daemon")
 
     drive.published = robot.stop()
-    drive.watch.tell("the robot", robot.late_s)
+    drive.watch.report("the robot", robot.late_s)
     for recorder in (drive.rotating, drive.killed, drive.ten):
         recorder.stop()
     _look_back(drive, served)

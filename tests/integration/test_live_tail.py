@@ -29,7 +29,7 @@ from tests.support.live_recorder import (
     ticks,
 )
 from tests.support.ros_processes import needs_ros, publishing_robot, ros_environment
-from tests.timing.stalls import Watch, driven
+from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -105,7 +105,7 @@ def drive_once(folder: Path, watch: Watch) -> Drive:
                 drive.newest.setdefault(name, []).append(newest)
                 drive.ago.setdefault(name, []).append(ago)
         drive.published = robot.stop()["/odom"]
-        watch.tell("the robot", robot.late_s)
+        watch.report("the robot", robot.late_s)
         for name, recorder in drive.recorders.items():
             recorder.stop()
             files = bag_files(recorder.bag_dir)

@@ -29,7 +29,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
 from tests.support.bags import odom, write_mcap
 from tests.support.waiting import PATIENCE_S, until
-from tests.timing.stalls import in_time
+from tests.timing import in_time
 
 PERIOD_NS = 10_000_000
 
@@ -157,7 +157,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
 
 
 def at_a_site(folder: Path, test: Callable[[Site], None]) -> None:
-    """Runs what a test does by the clock, on a site of its own (see `tests/timing/stalls.py`)."""
+    """Runs what a test does by the clock, on a site of its own."""
 
     def once() -> None:
         with sited(Path(mkdtemp(dir=folder))) as site:

@@ -28,7 +28,7 @@ from tests.support.ros_recordings import (
     summary_of,
 )
 from tests.support.shared_bags import RECORDED, needs_recorded
-from tests.timing.stalls import in_time
+from tests.timing import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

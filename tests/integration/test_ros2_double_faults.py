@@ -33,7 +33,7 @@ from tests.support.ros_recordings import (
 )
 from tests.support.shared_bags import RECORDED, needs_recorded
 from tests.support.waiting import PATIENCE_S, until
-from tests.timing.stalls import in_time
+from tests.timing import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -21,7 +21,7 @@ from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from tests.support.robot_run import ANSWERED, REFUSED, T0_S, ask, ask_everything, write_run
 from tests.support.waiting import PATIENCE_S, until
-from tests.timing.stalls import in_time
+from tests.timing import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

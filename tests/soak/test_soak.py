@@ -9,7 +9,7 @@ from tests.soak.clients import slow_loris
 from tests.soak.rounds import SHORT, soaked
 from tests.soak.server import serving
 from tests.support.robot_run import write_run
-from tests.timing.stalls import in_time
+from tests.timing import in_time
 
 if TYPE_CHECKING:
     from pathlib import Path
