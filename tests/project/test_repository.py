@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 
-from ros2_memory import config
+from ros2_memory import config, config_sources
 from ros2_memory.serving import api_token
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -172,7 +172,8 @@ class TestGates:
 
 class TestExamples:
     def test_the_environment_example_names_every_variable_that_is_read(self) -> None:
-        source = Path(config.__file__).read_text() + Path(api_token.__file__).read_text()
+        readers = (config.__file__, config_sources.__file__, api_token.__file__)
+        source = "".join(Path(file).read_text() for file in readers)
         read = set(re.findall(r'"((?:MCP|MEMORY|ROS)_[A-Z_]+)"', source))
         lines = (ROOT / ".env.example").read_text().splitlines()
         assert {line.split("=")[0] for line in lines if line and line[0] != "#"} == read
