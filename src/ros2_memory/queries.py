@@ -53,7 +53,7 @@ from ros2_memory.history.time_arguments import (
 )
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FUTURE_NS
-from ros2_memory.index.listed_splits import absence_told, absent_splits
+from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.field_extremes import (
     MOST_MESSAGES,
     TOO_MANY,
@@ -329,7 +329,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     if snapshot.dating.note:
         view.note(snapshot.dating.note)
     _note_odd_bags(view)
-    for sentence in absence_told(absent_splits(snapshot, memory.index.bag_dir)):
+    for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
         view.note(sentence)
     undecodable = undecodable_topics(view)
     return results.DataTimeRange(

@@ -92,14 +92,14 @@ def own_folder(folder: Path) -> None:
         raise OSError(errno.ELOOP, reason, str(folder))
 
 
-def open_plain(path: Path | str) -> BinaryIO:
+def open_plain(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
     """Opens a regular file for reading. Never waits, as opening a FIFO would; follows no link.
 
     Raises:
         OSError: it cannot be opened.
         ValueError: it is no regular file.
     """
-    descriptor = os.open(path, _AS_IT_IS)
+    descriptor = os.open(path, _AS_IT_IS, dir_fd=dir_fd)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise ValueError("it is not a regular file")

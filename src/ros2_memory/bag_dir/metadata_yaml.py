@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import yaml
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.layout import METADATA_FILE
+from ros2_memory.bag_dir.layout import COMPRESSED, METADATA_FILE, bag_kind
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,7 +28,17 @@ if TYPE_CHECKING:
     Counts = Mapping[str, int]
 
 _ROOT: Final = "rosbag2_bagfile_information"
-_ZSTD: Final = ".zstd"
+# Lines, not YAML: parsing what a day of splits lists takes a second (8640 files: 0.8 s).
+_BAG_NAME: Final = re.compile(
+    r"^[ \t]*(?:- )?(?:- |path:)[ \t]*['\"]?([^'\"\r\n]+?)['\"]?\s*$", re.MULTILINE
+)
+_FILE_ENTRY: Final = re.compile(
+    r"^[ ]*- path:[ ]*['\"]?([^'\"\r\n]+?)['\"]?[ \r]*\n"
+    r"(?:(?![ ]*- ).*\n)*?"
+    r"[ ]*message_count:[ ]*(\d+)",
+    re.MULTILINE,
+)
+_MESSAGE_COUNT: Final = re.compile(r"^ {2,4}message_count:\s*(\d+)\s*$", re.MULTILINE)
 _NAMED_POLICY: Final = re.compile(r"reliability:\s*[a-z]")
 _FIRST_OF_FILES: Final = 5
 _FIRST_OF_TYPE_HASHES: Final = 7
@@ -44,6 +54,30 @@ class Contents(NamedTuple):
 
     summary: BagSummary
     channels: Sequence[Channel]
+
+
+class Listing(NamedTuple):
+    """What a metadata.yaml lists.
+
+    Attributes:
+        names: of the bag files, in order.
+        messages: in each file, by its name without `.zstd`; empty before version 5.
+        total: messages in all files; None where it is not given.
+    """
+
+    names: tuple[str, ...]
+    messages: dict[str, int]
+    total: int | None
+
+
+def parse_listing(text: str) -> Listing:
+    """Returns what a metadata.yaml lists; nothing where it is none."""
+    total = _MESSAGE_COUNT.search(text)
+    return Listing(
+        tuple(PurePosixPath(name).name for name in _BAG_NAME.findall(text) if bag_kind(name)),
+        {bare_name(path): int(count) for path, count in _FILE_ENTRY.findall(text)},
+        None if total is None else int(total[1]),
+    )
 
 
 def correct(recording: Path, reader: BagReader) -> bool:
@@ -105,7 +139,7 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     first = min((start for start, _ in spans.values()), default=0)
     last = max((end for _, end in spans.values()), default=first)
     order = sorted(files, key=lambda name: (spans.get(name, (last, last)), name))
-    paths = {_bare(each): each for each in before}
+    paths = {bare_name(each): each for each in before}
     counts: dict[tuple[str, str], int] = {}
     for summary in held.values():
         for topic in summary.topics:
@@ -238,19 +272,19 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     """
     content = _parsed(text)
     info = _mapping(_mapping(content, "it").get(_ROOT), _ROOT)
-    names = {_bare(name): counts for name, counts in gone.items()}
+    names = {bare_name(name): counts for name, counts in gone.items()}
     files = [_mapping(each, "files") for each in _list(info, "files")]
     paths = _list(info, "relative_file_paths")
-    deleted = [each for each in files if _bare(each.get("path")) in names]
-    left = [each for each in files if _bare(each.get("path")) not in names]
-    left_paths = [each for each in paths if _bare(each) not in names]
+    deleted = [each for each in files if bare_name(each.get("path")) in names]
+    left = [each for each in files if bare_name(each.get("path")) not in names]
+    left_paths = [each for each in paths if bare_name(each) not in names]
     if len(left_paths) == len(paths) and not deleted:
         return None
     if not left or len(left) != len(left_paths):
         raise ValueError("it does not list the files that are left")
     held: dict[str, int] = {}
     for each in deleted:
-        counts = names[_bare(each.get("path"))]
+        counts = names[bare_name(each.get("path"))]
         if sum(counts.values()) != _int(each, "message_count"):
             raise ValueError("its numbers are not those of the files")
         for topic, count in counts.items():
@@ -270,9 +304,9 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
-def _bare(path: object) -> str:
-    """A file's name, whether it is compressed or not."""
-    return PurePosixPath(str(path)).name.removesuffix(_ZSTD)
+def bare_name(path: object) -> str:
+    """Returns the name of a bag file without the suffix of its compressed form."""
+    return PurePosixPath(str(path)).name.removesuffix(COMPRESSED)
 
 
 def _start(file: dict[object, object]) -> int:

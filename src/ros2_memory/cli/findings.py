@@ -24,7 +24,7 @@ from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, iso_local, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
-from ros2_memory.index.listed_splits import absence_told, absent_splits
+from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.status import nothing_here, odd_bags
 from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.daemon import Ticking
@@ -228,7 +228,7 @@ def of_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
         names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in odd])
         do = "what is readable of them answers; record or copy them anew for the rest"
         yield Finding(Level.WARNING, "bags", f"{seen}: {names}", do)
-    for sentence in absence_told(absent_splits(snapshot, memory.index.bag_dir)):
+    for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
         do = "copy what is missing from where it was recorded"
         yield Finding(Level.WARNING, "bags", sentence, do)
     if told.undecodable:

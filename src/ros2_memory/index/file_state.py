@@ -31,11 +31,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import open_plain
 from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.bag_dir.metadata_yaml import parse_listing
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import BagFile, BagState, BagSummary, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -43,6 +43,8 @@ from ros2_memory.index.scan import YOUNG_NS, settled
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ros2_memory.index.scan import Stamp
     from ros2_memory.storage.base import BagReader
 
@@ -244,21 +246,13 @@ def classify(notes: FileNotes, reader: BagReader, scene: ScanContext) -> Classif
 
 
 def files_in_metadata(path: Path) -> frozenset[str]:
-    """The bag files that a rosbag2 metadata.yaml mentions; none where it cannot be read.
-
-    Only the lines that name files are looked at (`relative_file_paths` and `files[].path`):
-    parsing the YAML of a long recording takes seconds.
-    """
+    """Returns the bag files that a metadata.yaml lists; none where it cannot be read."""
     try:
         with open_plain(path) as stream:
             text = stream.read(_METADATA_LIMIT).decode("utf-8", errors="replace")
     except (OSError, ValueError):
         return frozenset()
-    entries = (
-        line.strip().removeprefix("- ").removeprefix("path:").strip().strip("'\"")
-        for line in text.splitlines()
-    )
-    return frozenset(PurePosixPath(entry).name for entry in entries if bag_kind(entry))
+    return frozenset(parse_listing(text).names)
 
 
 def _is_active(notes: FileNotes, scene: ScanContext) -> bool:

@@ -9,7 +9,7 @@ from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.view import View
-from ros2_memory.index.listed_splits import absence_told, absent_splits
+from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.results import Budget, Status, Stillness, Undecodable
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def lacking_in(view: View) -> Iterator[str]:
     if odd := len(odd_bags(snapshot)):
         bags = counted(odd, "bag is", "bags are")
         yield f"{bags} not whole or contradictory; data_time_range says how"
-    yield from absence_told(absent_splits(snapshot, view.memory.index.bag_dir))
+    yield from describe_absent(absent_splits(snapshot, view.memory.index.bag_dir))
     if undecodable := {each.topic for each in undecodable_topics(view)}:
         topics = counted(len(undecodable), "topic")
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
