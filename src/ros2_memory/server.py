@@ -27,7 +27,7 @@ from ros2_memory.bootstrap import (
 from ros2_memory.config import exit_on_config_error, load_settings
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.sd_notify import READY, STOPPING, ServiceManager
-from ros2_memory.serving.api_token import take_token
+from ros2_memory.serving.auth import take_token
 from ros2_memory.serving.backfill import keep_backfilled
 from ros2_memory.serving.connection_limits import (
     ACCEPTED_AT_ONCE,

@@ -13,7 +13,7 @@ import yaml
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.config import Ros2BagNode, load_settings
-from ros2_memory.serving.api_token import CREDENTIAL
+from ros2_memory.serving.auth import CREDENTIAL
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 RECORDER = DEPLOY / "ros2-memory-recorder.service"

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from ros2_memory import config, config_sources
-from ros2_memory.serving import api_token
+from ros2_memory.serving import auth
 
 ROOT = Path(__file__).resolve().parents[2]
 GATES = (
@@ -172,7 +172,7 @@ class TestGates:
 
 class TestExamples:
     def test_the_environment_example_names_every_variable_that_is_read(self) -> None:
-        readers = (config.__file__, config_sources.__file__, api_token.__file__)
+        readers = (config.__file__, config_sources.__file__, auth.__file__)
         source = "".join(Path(file).read_text() for file in readers)
         read = set(re.findall(r'"((?:MCP|MEMORY|ROS)_[A-Z_]+)"', source))
         lines = (ROOT / ".env.example").read_text().splitlines()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.cli.findings import Finding, Level
 from ros2_memory.core.errors import EpisodicError
-from ros2_memory.serving.api_token import api_token
+from ros2_memory.serving.auth import api_token
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

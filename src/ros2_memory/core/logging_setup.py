@@ -124,10 +124,14 @@ class Refusals:
 
     Args:
         monotonic: a clock that never steps, in seconds.
+        every_s: how often at most one kind is logged.
     """
 
-    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, monotonic: Callable[[], float] = time.monotonic, every_s: float = EVERY_S
+    ) -> None:
         self._monotonic = monotonic
+        self._every_s = every_s
         self._counts: dict[str, int] = {}
         self._silent_until: dict[str, float] = {}
 
@@ -137,7 +141,7 @@ class Refusals:
         now = self._monotonic()
         if now < self._silent_until.get(reason, now):
             return 0
-        self._silent_until[reason] = now + EVERY_S
+        self._silent_until[reason] = now + self._every_s
         return self._counts.pop(reason)
 
 

@@ -1,62 +1,90 @@
-"""Demands a token of everybody, before anything else of a request is looked at.
+"""Who may ask: requests that no web page forged, and that show the API token.
+
+`ForgeryGuard` refuses requests by Host, Origin and Sec-Fetch-Site; `TokenGate` demands the token
+of every request. Both answer before a route or a body is looked at.
 
 The MCP library's own way (`TokenVerifier` with `AuthSettings`) describes an OAuth resource server:
 it needs the URL of an authorization server and announces it to clients, which then begin a login
-that does not exist here. It also stands behind the routes, so that `/health` is outside of it and
-a path that is added later would be open until somebody thinks of it.
+that does not exist here. It also runs behind the routes, so that `/health` is outside of it and a
+path that is added later would be open.
+
+The token comes from the environment, from a file, or from systemd's credentials, never from the
+configuration, which is written to disk and shown in diagnostics. No message repeats any of it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import hmac
+import ipaddress
+import os
+import re
+import socket
+import stat
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
 
+from pydantic import SecretStr
+from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 
-from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.logging_setup import Refusals, get_logger
+from ros2_memory.serving.page import PAGE_PATH
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, MutableMapping
 
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 HEALTH_PATH: Final = "/health"
-ADMITTED: Final = "ros2_memory.admitted"
-"""In the scope of a request to `/health`: whether it showed the token."""
+LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+AUTHENTICATED: Final = "ros2_memory.authenticated"
+"""The key in the scope of a request to `/health`: whether it showed the token."""
 
-_SHOWN: Final = "ros2_memory.shown"
-"""In the state of a request, which its connection sees: it was admitted."""
+VARIABLE: Final = "MEMORY_API_TOKEN"
+FILE_VARIABLE: Final = "MEMORY_API_TOKEN_FILE"
+CREDENTIAL: Final = "memory_api_token"
+"""The name under which a systemd unit passes the token: `LoadCredential=memory_api_token:PATH`."""
+SHORTEST_TOKEN: Final = 16
+LONGEST_TOKEN: Final = 1024
+LOG_INTERVAL_S: Final = 60.0
+"""Wrong tokens are logged at most this often: guessing must not fill the disk with log events."""
 
-TOLD_EVERY_S: Final = 60.0
-"""Refusals are logged this often at most: whoever guesses must not fill the disk with it."""
-
+_ADMITTED: Final = "ros2_memory.admitted"
+"""The key in the state of a request, which its connection can read."""
+_SAME_SITE: Final = frozenset({"same-origin", "none"})
+"""Values of Sec-Fetch-Site for a page of this server, or no page at all."""
+_ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - only compared with
 _SCHEME: Final = b"bearer "
 _MISSING: Final = "A token is needed: send it as Authorization: Bearer TOKEN.\n"
 _WRONG: Final = "The token is not the one of this server.\n"
-
+_HOW: Final = "make one with `openssl rand -hex 32`"
+# The characters of a bearer token: RFC 6750, section 2.1 (b64token).
+_TOKEN: Final = re.compile(r"[A-Za-z0-9._~+/-]+=*")
 
 log = get_logger(__name__)
 
 
 def admit(scope: Scope) -> None:
-    """Notes for the connection that one of its requests was admitted."""
-    scope.setdefault("state", {})[_SHOWN] = True
+    """Marks a request as admitted, for its connection."""
+    scope.setdefault("state", {})[_ADMITTED] = True
 
 
 def is_admitted(scope: Mapping[str, object]) -> bool:
-    """Whether a request was admitted."""
+    """Returns whether a request was admitted."""
     state = scope.get("state")
-    return isinstance(state, dict) and state.get(_SHOWN) is True
+    return isinstance(state, dict) and state.get(_ADMITTED) is True
 
 
 class TokenGate:
-    """Passes on what shows the token as `Authorization: Bearer ...` (RFC 6750, section 2.1).
+    """Passes on requests with the right `Authorization: Bearer ...` (RFC 6750, section 2.1).
 
-    Everything else is answered with 401 before its body is read; `/health` alone is passed on
-    without a token too, marked as such. A token in a query string is none: it would stand in logs.
-    Only the token's digest is kept, and digests are compared in constant time.
+    Every other request is answered with 401 before its body is read. `/health` is passed on without
+    a token too, marked as such. A token in a query string is not accepted, since query strings are
+    logged. Only the token's digest is kept, and digests are compared in constant time.
     """
 
     def __init__(
@@ -64,54 +92,217 @@ class TokenGate:
     ) -> None:
         self._app = app
         self._digest = _digest(token.encode("ascii"))
-        self._monotonic = monotonic
-        self._refused = 0
-        self._told_until = float("-inf")
+        self._refusals = Refusals(monotonic, LOG_INTERVAL_S)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
+        """Handles an ASGI connection."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
         shown = [value for name, value in scope["headers"] if name == b"authorization"]
         if len(shown) == 1 and self._is_right(shown[0]):
             admit(scope)
-            await self._app({**scope, ADMITTED: True}, receive, send)
+            await self._app({**scope, AUTHENTICATED: True}, receive, send)
         elif not shown and scope["path"] == HEALTH_PATH:
-            await self._app({**scope, ADMITTED: False}, receive, send)
+            await self._app({**scope, AUTHENTICATED: False}, receive, send)
         else:
-            self._tell(scope, is_wrong=bool(shown))
-            await _refusal(is_wrong=bool(shown))(scope, receive, send)
+            self._log_refused(scope, is_wrong=bool(shown))
+            await _unauthorized(is_wrong=bool(shown))(scope, receive, send)
 
     def _is_right(self, header: bytes) -> bool:
         scheme, token = header[: len(_SCHEME)].lower(), header[len(_SCHEME) :].strip(b" ")
         return hmac.compare_digest(_digest(token), self._digest) and scheme == _SCHEME
 
-    def _tell(self, scope: Scope, *, is_wrong: bool) -> None:
-        """Logs who was refused, and how many since; nothing of what was sent, not even the path."""
-        self._refused += 1
-        now = self._monotonic()
-        if now < self._told_until:
-            return
-        client = scope.get("client")
-        log.warning(
-            "refused_without_token",
-            reason="another token" if is_wrong else "no token",
-            client=client[0] if client else None,
-            refused=self._refused,
-        )
-        self._refused, self._told_until = 0, now + TOLD_EVERY_S
+    def _log_refused(self, scope: Scope, *, is_wrong: bool) -> None:
+        """Logs the client and the number of refusals; nothing that was sent, not even the path."""
+        if refused := self._refusals.count("token"):
+            client = scope.get("client")
+            log.warning(
+                "refused_without_token",
+                reason="another token" if is_wrong else "no token",
+                client=client[0] if client else None,
+                refused=refused,
+            )
 
 
 def _digest(token: bytes) -> bytes:
     return hashlib.sha256(token).digest()
 
 
-def _refusal(*, is_wrong: bool) -> PlainTextResponse:
-    """As RFC 6750, section 3: an error code only where a token was shown."""
+def _unauthorized(*, is_wrong: bool) -> PlainTextResponse:
+    """Returns a 401 as in RFC 6750, section 3: with an error code only where a token was sent."""
     challenge = 'Bearer realm="ros2-memory"' + (', error="invalid_token"' if is_wrong else "")
     return PlainTextResponse(
         _WRONG if is_wrong else _MISSING,
         status_code=401,
         headers={"WWW-Authenticate": challenge},
     )
+
+
+class ForgeryGuard:
+    """Refuses requests that a web page could have forged: by Host, Origin and Sec-Fetch-Site.
+
+    A page of another site reaches a server on this machine or network by having its own name
+    resolve to the server's address (DNS rebinding). Host carries that name then. So Host must be a
+    name of this server, or a bare address, which cannot be rebound.
+
+    A browser sends the page's site in Origin, which must be this server's own: other ports of this
+    machine serve other programs' pages. Where it sends no Origin, Sec-Fetch-Site (W3C Fetch
+    Metadata) says whether another site caused the request. A person may follow a link from anywhere
+    to the page itself, of which the other site sees nothing.
+
+    `admits`: whether requests that pass are admitted, because there is no token to ask for.
+    """
+
+    def __init__(self, app: ASGIApp, host: str, *, admits: bool = False) -> None:
+        self._app = app
+        self._admits = admits
+        self._refusals = Refusals()
+        self._names = LOOPBACK_NAMES | {host.lower()} - _ANY_ADDRESS
+        self._is_reachable = host.lower() not in LOOPBACK_NAMES
+        if self._is_reachable:
+            name = socket.gethostname().lower()
+            self._names |= {name, f"{name}.local", socket.getfqdn().lower()}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles an ASGI connection."""
+        if scope["type"] == "http":
+            refusal = self._refusal(scope)
+            if refusal is not None:
+                await refusal(scope, receive, send)
+                return
+            if self._admits:
+                admit(scope)
+        await self._app(scope, receive, send)
+
+    def _refusal(self, scope: Scope) -> PlainTextResponse | None:
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        name = _host_name(f"//{host}")
+        if name not in self._names and not (self._is_reachable and _is_address(name)):
+            self._log_refused("the host name of another site")
+            return PlainTextResponse(
+                "Host is not a name of this server; use its address instead.\n", status_code=421
+            )
+        same = {f"http://{host}".lower(), f"https://{host}".lower()}
+        if any(origin.lower() not in same for origin in headers.getlist("origin")):
+            self._log_refused("the origin of another site")
+            return PlainTextResponse("Origin is another site.\n", status_code=403)
+        is_same_site = _SAME_SITE.issuperset(headers.getlist("sec-fetch-site"))
+        if not is_same_site and not _is_visit(scope, headers):
+            self._log_refused("a request from another site")
+            return PlainTextResponse("Sec-Fetch-Site is another site.\n", status_code=403)
+        return None
+
+    def _log_refused(self, reason: str) -> None:
+        if refused := self._refusals.count(reason):
+            log.warning("request_refused", reason=reason, refused=refused)
+
+
+def _is_visit(scope: Scope, headers: Headers) -> bool:
+    """Returns whether a person has a browser open the page."""
+    return (
+        scope["method"] == "GET"
+        and scope["path"] == PAGE_PATH
+        and headers.getlist("sec-fetch-mode") == ["navigate"]
+        and headers.getlist("sec-fetch-dest") == ["document"]
+    )
+
+
+def _host_name(url: str) -> str:
+    try:
+        return (urlsplit(url).hostname or "").lower()
+    except ValueError:
+        return ""
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def api_token(env: Mapping[str, str]) -> SecretStr | None:
+    """Returns the token that clients have to show; None where there is none.
+
+    It is `MEMORY_API_TOKEN`, the content of the file that `MEMORY_API_TOKEN_FILE` names, or that of
+    `memory_api_token` in `CREDENTIALS_DIRECTORY`, which systemd sets. An empty variable counts as
+    unset, an empty file does not.
+
+    Raises:
+        ConfigError: it cannot be read, is given twice, or cannot be sent in a header.
+    """
+    files: dict[str, Path] = {}
+    if env.get(FILE_VARIABLE):
+        files[FILE_VARIABLE] = Path(env[FILE_VARIABLE])
+    credentials = env.get("CREDENTIALS_DIRECTORY")
+    if credentials and (Path(credentials) / CREDENTIAL).exists():
+        files[f"the credential {CREDENTIAL}"] = Path(credentials) / CREDENTIAL
+    given = [*([VARIABLE] if env.get(VARIABLE) else []), *files]
+    if not given:
+        return None
+    if len(given) > 1:
+        raise ConfigError(f"{' and '.join(given)} both give the API token; leave one of them")
+    source = given[0]
+    text = _read_token(files[source], source) if source in files else env[VARIABLE]
+    _require_usable(text, source)
+    return SecretStr(text)
+
+
+def take_token(env: MutableMapping[str, str], *, host: str, loopback: bool) -> SecretStr | None:
+    """Returns the token of a server on `host`; None only where no other machine can reach it.
+
+    Removes it from the environment, which child processes inherit.
+
+    Raises:
+        ConfigError: there must be a token, or the one that there is cannot be used.
+    """
+    token = api_token(env)
+    env.pop(VARIABLE, None)
+    if token is None and not loopback:
+        raise ConfigError(
+            f"{VARIABLE}: missing; server.host is {host!r}, which other machines can reach, so "
+            f"clients must show a token: {_HOW} and give it as {VARIABLE}, in a file that "
+            f"{FILE_VARIABLE} names, or by LoadCredential={CREDENTIAL}:PATH in a systemd unit; "
+            "or listen on 127.0.0.1, where none is needed"
+        )
+    return token
+
+
+def _read_token(path: Path, source: str) -> str:
+    """Returns the file's text without the line's end; never blocks, as opening a pipe would."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise ConfigError(f"{source}: {str(path)!r} is not a regular file")
+            data = os.read(descriptor, LONGEST_TOKEN + 3)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise ConfigError(
+            f"{source}: {str(path)!r} cannot be read: {error.strerror}; "
+            "give the server's user a file that it may read"
+        ) from None
+    # Bytes that are not text are refused below, without being shown.
+    return data.decode("ascii", errors="replace").removesuffix("\n").removesuffix("\r")
+
+
+def _require_usable(text: str, source: str) -> None:
+    if len(text) < SHORTEST_TOKEN:
+        length = f"has {len(text)} characters" if text else "is empty"
+        raise ConfigError(
+            f"{source}: the API token {length}, and must have at least {SHORTEST_TOKEN}; {_HOW}"
+        )
+    if len(text) > LONGEST_TOKEN:
+        raise ConfigError(
+            f"{source}: the API token is longer than {LONGEST_TOKEN} characters, too long for a "
+            f"header; {_HOW}"
+        )
+    if not _TOKEN.fullmatch(text):
+        raise ConfigError(
+            f"{source}: the API token holds characters that cannot stand in an Authorization "
+            f"header; letters, digits and -._~+/ can, with = at the end; {_HOW}"
+        )

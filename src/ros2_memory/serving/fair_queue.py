@@ -1,8 +1,8 @@
-"""Places for questions of one kind, given out in turn among those who ask.
+"""Runs a bounded number of queries at once, fairly among clients.
 
-A client that asks much waits for its own questions, not others for them: the next place goes to
-whoever has the fewest, and among equals to whoever had none for longest. Of one client, what came
-first is asked first.
+A client with many queries delays its own, not those of others: the next free thread goes to the
+client with the fewest running queries, and among equals to the one that has waited longest since
+its last. Queries of one client run in the order of their arrival.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ import contextvars
 from collections import Counter, deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import BusyError
 
@@ -23,92 +22,88 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+_Turn: TypeAlias = "asyncio.Future[None]"
+"""Done when a waiting query may begin; has an exception when it is refused."""
+
 MOST_WAITING: Final = 256
-"""Questions that wait for one kind of place. Each holds its arguments, so they are counted."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Waiting:
-    """One question that waits: the future is done when it may begin, or is refused."""
-
-    turn: asyncio.Future[None]
+"""Queries that may wait in one queue. Each holds its arguments in memory."""
 
 
 class FairQueue:
-    """At most `places` questions at once, each in a thread; the others wait, at most so many.
+    """Runs at most `threads` queries at once, each in a thread. At most `most_waiting` wait.
 
-    All methods belong to the event loop's thread. A place is taken until the thread is done with
-    it, also where nobody waits for the answer any more: what cannot be stopped is at least counted.
+    All methods must be called on the event loop's thread. A query counts as running until its
+    thread is done, also where nobody waits for the answer any more: a thread cannot be stopped.
     """
 
-    def __init__(self, name: str, places: int, most_waiting: int = MOST_WAITING) -> None:
-        self._threads = ThreadPoolExecutor(places, thread_name_prefix=name)
-        self._free = places
+    def __init__(self, name: str, threads: int, most_waiting: int = MOST_WAITING) -> None:
+        self._threads = ThreadPoolExecutor(threads, thread_name_prefix=name)
+        self._free = threads
         self._most_waiting = most_waiting
-        self._waiting: dict[Hashable, deque[_Waiting]] = {}
+        self._waiting: dict[Hashable, deque[_Turn]] = {}
         self._running: Counter[Hashable] = Counter()
 
     @property
     def waiting(self) -> int:
-        """How many questions wait for a place."""
+        """Returns how many queries wait for a thread."""
         return sum(len(each) for each in self._waiting.values())
 
     @property
     def running(self) -> int:
-        """How many places are taken."""
+        """Returns how many queries run."""
         return self._running.total()
 
     def stop(self) -> None:
-        """Takes no more questions, and lets the threads go when they are done."""
+        """Accepts no more queries, and ends the threads when they are done."""
         self._threads.shutdown(wait=False)
 
-    async def run(self, client: Hashable, ask: Callable[[], T]) -> T:
-        """What `ask` gives, when its turn has come.
+    async def run(self, client: Hashable, query: Callable[[], T]) -> T:
+        """Waits for the client's turn, and returns what `query` returns.
 
-        Where the caller is cancelled its question leaves the queue, or is left behind in its
-        thread, which keeps the place until it is done.
+        Where the caller is cancelled, its query leaves the queue. If it runs already, it goes on in
+        its thread.
 
         Raises:
-            BusyError: too many wait already, or the lane was stopped.
+            BusyError: too many queries wait already, or the queue was stopped.
         """
-        await self._turn(client)
+        await self._wait_for_turn(client)
         loop = asyncio.get_running_loop()
         try:
             context = contextvars.copy_context()
-            running = self._threads.submit(context.run, ask)
+            running = self._threads.submit(context.run, query)
         except RuntimeError as error:
-            self._leave(client)
+            self._release(client)
             raise BusyError(
                 "the server takes no questions, because it is stopping or out of threads; "
                 "ask again later"
             ) from error
-        running.add_done_callback(lambda _: _soon(loop, partial(self._leave, client)))
+        running.add_done_callback(lambda _: _call_soon(loop, partial(self._release, client)))
         return await asyncio.wrap_future(running)
 
-    async def _turn(self, client: Hashable) -> None:
-        """Waits for a place, and takes it."""
+    async def _wait_for_turn(self, client: Hashable) -> None:
+        """Waits for a free thread, and takes it."""
         if self._free and not self._waiting:
             self._take(client)
             return
         if self.waiting >= self._most_waiting:
             self._make_room(client)
-        waiting = _Waiting(asyncio.get_running_loop().create_future())
-        self._waiting.setdefault(client, deque()).append(waiting)
+        turn = asyncio.get_running_loop().create_future()
+        self._waiting.setdefault(client, deque()).append(turn)
         try:
-            await waiting.turn
+            await turn
         except asyncio.CancelledError:
-            if waiting.turn.done() and not waiting.turn.cancelled():
-                if waiting.turn.exception() is None:
-                    self._leave(client)
+            if turn.done() and not turn.cancelled():
+                if turn.exception() is None:
+                    self._release(client)
             else:
-                self._forget(client, waiting)
+                self._remove(client, turn)
             raise
 
     def _make_room(self, client: Hashable) -> None:
-        """Refuses the newest question of whoever has most of them waiting.
+        """Refuses the newest query of the client that has most of them waiting.
 
         Raises:
-            BusyError: that is the one who asks.
+            BusyError: that is the client that asks.
         """
         most = max(self._waiting, key=lambda each: len(self._waiting[each]))
         refusal = BusyError(
@@ -119,38 +114,38 @@ class FairQueue:
         if len(self._waiting[most]) <= own + 1:
             raise refusal
         last = self._waiting[most][-1]
-        self._forget(most, last)
-        last.turn.set_exception(refusal)
+        self._remove(most, last)
+        last.set_exception(refusal)
 
-    def _forget(self, client: Hashable, waiting: _Waiting) -> None:
-        """Takes it out of the queue, where it may not be any more: its turn may just have come."""
-        left = self._waiting.get(client, deque())
-        if waiting in left:
-            left.remove(waiting)
-            if not left:
+    def _remove(self, client: Hashable, turn: _Turn) -> None:
+        """Takes a query out of the queue; it is not in it any more if its turn has just come."""
+        turns = self._waiting.get(client, deque())
+        if turn in turns:
+            turns.remove(turn)
+            if not turns:
                 del self._waiting[client]
 
     def _take(self, client: Hashable) -> None:
         self._free -= 1
         self._running[client] += 1
 
-    def _leave(self, client: Hashable) -> None:
-        """Gives a place back, and to the next."""
+    def _release(self, client: Hashable) -> None:
+        """Frees a thread, and begins the next query."""
         self._free += 1
         self._running[client] -= 1
         if not self._running[client]:
             del self._running[client]
         while self._free and self._waiting:
             following = min(self._waiting, key=self._running.__getitem__)
-            waiting = self._waiting[following].popleft()
-            left = self._waiting.pop(following)
-            if left:  # behind the others: a dictionary keeps its order
-                self._waiting[following] = left
-            if not waiting.turn.done():
+            turns = self._waiting.pop(following)
+            turn = turns.popleft()
+            if turns:  # behind the others: a dictionary keeps its order
+                self._waiting[following] = turns
+            if not turn.done():
                 self._take(following)
-                waiting.turn.set_result(None)
+                turn.set_result(None)
 
 
-def _soon(loop: asyncio.AbstractEventLoop, leave: Callable[[], None]) -> None:
+def _call_soon(loop: asyncio.AbstractEventLoop, release: Callable[[], None]) -> None:
     with suppress(RuntimeError):  # the loop has ended, and with it the queue
-        loop.call_soon_threadsafe(leave)
+        loop.call_soon_threadsafe(release)

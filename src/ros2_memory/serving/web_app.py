@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import ipaddress
-import socket
+import uuid
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Final, TypeAlias
-from urllib.parse import urlsplit
 
 import anyio
 import anyio.to_thread
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.applications import Starlette
-from starlette.datastructures import Headers
+from starlette.datastructures import MutableHeaders
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
-from ros2_memory.core.logging_setup import Refusals, get_logger
-from ros2_memory.serving.auth import ADMITTED, HEALTH_PATH, TokenGate, admit
-from ros2_memory.serving.page import PAGE_PATH, Page
+from ros2_memory.serving.auth import (
+    AUTHENTICATED,
+    HEALTH_PATH,
+    LOOPBACK_NAMES,
+    ForgeryGuard,
+    TokenGate,
+)
+from ros2_memory.serving.page import Page
 from ros2_memory.serving.request_limits import RequestLimits
-from ros2_memory.serving.session_ids import SessionIds
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
@@ -32,8 +34,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.telemetry import Exposition
     from ros2_memory.tools.reply_size import JsonObject
 
-log = get_logger(__name__)
-
 Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 
 STREAM_PATH: Final = "/sse"
@@ -44,10 +44,10 @@ GRACE_S: Final = 0.4
 THREADS: Final = 4
 """For what nobody asked, such as a look at the bags. One that was needed once stays a while."""
 
-_LOOPBACK: Final = frozenset({"localhost", "127.0.0.1", "::1"})
-_SAME_SITE: Final = frozenset({"same-origin", "none"})
-"""Of Sec-Fetch-Site: a page of this server, or no page at all."""
-_ANY_ADDRESS: Final = frozenset({"0.0.0.0", "::", ""})  # noqa: S104 - only compared with
+_MCP_PATH: Final = "/mcp"
+_SESSION_HEADER: Final = "mcp-session-id"
+_INITIALIZE: Final = b'"initialize"'
+_OK: Final = 200
 
 
 def web_app(
@@ -66,7 +66,7 @@ def web_app(
     request; without it `/health` shows its status alone, and on the loopback address the page is
     shown, which asks for it.
     """
-    # `Guard` stands before all routes, and knows the addresses of a host such as 0.0.0.0.
+    # `ForgeryGuard` stands before all routes, and knows the addresses of a host such as 0.0.0.0.
     guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
     streams = server.sse_app(sse_path=STREAM_PATH, transport_security=guarded)
     requests = server.streamable_http_app(
@@ -75,7 +75,7 @@ def web_app(
 
     async def show_health(request: Request) -> JSONResponse:
         told = await health()
-        if api_token is not None and not request.scope.get(ADMITTED, False):
+        if api_token is not None and not request.scope.get(AUTHENTICATED, False):
             # Enough for whoever only watches that the server is up.
             told = {"status": told["status"]}
         return JSONResponse(told)
@@ -92,15 +92,15 @@ def web_app(
     if metrics is not None:
         routes.append(Route(METRICS_PATH, _showing(metrics), methods=["GET"]))
     app: ASGIApp = RequestLimits(SessionIds(Starlette(routes=routes, lifespan=lifespan)))
-    if host.lower() not in _LOOPBACK:
+    if host.lower() not in LOOPBACK_NAMES:
         app = Page(app)
     if api_token is not None:
         app = TokenGate(app, api_token)
-    if host.lower() in _LOOPBACK:
+    if host.lower() in LOOPBACK_NAMES:
         # It holds no data, and a browser cannot show a token before it has a page to ask for it.
         # Where others can reach the server, the token comes first nevertheless.
         app = Page(app)
-    return WebApp(Guard(app, host, admits=api_token is None))
+    return WebApp(ForgeryGuard(app, host, admits=api_token is None))
 
 
 def _showing(
@@ -196,87 +196,38 @@ class _Exchange:
             await self._send(message)
 
 
-class Guard:
-    """Refuses requests that a web page could have forged: by Host, Origin and Sec-Fetch-Site.
+class SessionIds:
+    """Names each conversation over streamable HTTP, for clients that require a session.
 
-    A page of another site reaches a server on this machine or network by having its own name
-    resolve to the server's address (DNS rebinding): then Host carries that name. So Host must be a
-    name that is known to be this server's, or a bare address, which cannot be rebound.
-
-    A browser names the page that sends a request in Origin, which must be this server's own: other
-    ports of this machine serve other programs' pages. Where it sends none it still says in
-    Sec-Fetch-Site (W3C Fetch Metadata) whether another site is behind a request. A person may
-    follow a link from anywhere to the page itself, of which the other site sees nothing.
-
-    `admits`: whoever passes is admitted, since no token is asked for.
+    The transport lets a server name a session in its reply to `initialize`, and clients then send
+    that name along (MCP specification, streamable HTTP, session management). Nothing is stored
+    under it: a call needs no earlier one. Names of before a restart, of another server, or none at
+    all are answered alike, and clients that never end their session cost nothing.
     """
 
-    def __init__(self, app: ASGIApp, host: str, *, admits: bool = False) -> None:
+    def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._admits = admits
-        self._refusals = Refusals()
-        self._names = _LOOPBACK | {host.lower()} - _ANY_ADDRESS
-        self._reachable = host.lower() not in _LOOPBACK
-        if self._reachable:
-            name = socket.gethostname().lower()
-            self._names |= {name, f"{name}.local", socket.getfqdn().lower()}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
-        if scope["type"] == "http":
-            refusal = self._refusal(scope)
-            if refusal is not None:
-                await refusal(scope, receive, send)
-                return
-            if self._admits:
-                admit(scope)
-        await self._app(scope, receive, send)
+        """Handles an ASGI connection."""
+        is_post = scope["type"] == "http" and scope["method"] == "POST"
+        has_session = any(name == _SESSION_HEADER.encode() for name, _ in scope.get("headers", ()))
+        if not is_post or scope["path"] != _MCP_PATH or has_session:
+            await self._app(scope, receive, send)
+            return
+        initializes = False
 
-    def _refusal(self, scope: Scope) -> PlainTextResponse | None:
-        headers = Headers(scope=scope)
-        host = headers.get("host", "")
-        name = _host_name(f"//{host}")
-        if name not in self._names and not (self._reachable and _is_address(name)):
-            self._log_refused("the host name of another site")
-            return PlainTextResponse(
-                "Host is not a name of this server; use its address instead.\n", status_code=421
-            )
-        same = {f"http://{host}".lower(), f"https://{host}".lower()}
-        if any(origin.lower() not in same for origin in headers.getlist("origin")):
-            self._log_refused("the origin of another site")
-            return PlainTextResponse("Origin is another site.\n", status_code=403)
-        if not _SAME_SITE.issuperset(headers.getlist("sec-fetch-site")) and not _is_visit(
-            scope, headers
-        ):
-            self._log_refused("a request from another site")
-            return PlainTextResponse("Sec-Fetch-Site is another site.\n", status_code=403)
-        return None
+        async def receive_watched() -> Message:
+            nonlocal initializes
+            message = await receive()
+            # `initialize` is short, so the first chunk of the body holds it.
+            initializes = initializes or _INITIALIZE in message.get("body", b"")
+            return message
 
-    def _log_refused(self, reason: str) -> None:
-        if refused := self._refusals.count(reason):
-            log.warning("request_refused", reason=reason, refused=refused)
+        async def send_named(message: Message) -> None:
+            is_start = message["type"] == "http.response.start"
+            if initializes and is_start and message["status"] == _OK:
+                MutableHeaders(scope=message)[_SESSION_HEADER] = uuid.uuid4().hex
+            await send(message)
 
-
-def _is_visit(scope: Scope, headers: Headers) -> bool:
-    """Whether a person has a browser open the page."""
-    return (
-        scope["method"] == "GET"
-        and scope["path"] == PAGE_PATH
-        and headers.getlist("sec-fetch-mode") == ["navigate"]
-        and headers.getlist("sec-fetch-dest") == ["document"]
-    )
-
-
-def _host_name(url: str) -> str:
-    try:
-        return (urlsplit(url).hostname or "").lower()
-    except ValueError:
-        return ""
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+        await self._app(scope, receive_watched, send_named)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.recorder.process.environment import without_ours
-from ros2_memory.serving.api_token import LONGEST, SHORTEST, api_token, take_token
+from ros2_memory.serving.auth import LONGEST_TOKEN, SHORTEST_TOKEN, api_token, take_token
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 GOOD = "kJ7-x._~+/0123456789=="
 UNUSABLE = {
     "short": "sEcReT7",
-    "one_too_few": "s" * (SHORTEST - 1),
+    "one_too_few": "s" * (SHORTEST_TOKEN - 1),
     "inner_space": "sEcReT7 sEcReT7 sEcReT7",
     "line_break": "sEcReT7sEcReT7\nX-Other: sEcReT7",
     "quote": 'sEcReT7sEcReT7"sEcReT7',
@@ -31,7 +31,7 @@ UNUSABLE = {
     "padding_inside": "sEcReT7=sEcReT7sEcReT7",
     "nothing_but_spaces": " " * 20,
     "control": "sEcReT7sEcReT7\x00sEcReT7",
-    "long": "s" * (LONGEST + 1),
+    "long": "s" * (LONGEST_TOKEN + 1),
 }
 
 
@@ -112,7 +112,7 @@ def test_a_token_is_not_shown_by_whoever_prints_it(shape: type[str]) -> None:
     assert GOOD not in shape(api_token({"MEMORY_API_TOKEN": GOOD}))
 
 
-@given(st.text(min_size=SHORTEST, max_size=60))
+@given(st.text(min_size=SHORTEST_TOKEN, max_size=60))
 def test_what_is_taken_can_stand_in_a_header(text: str) -> None:
     with suppress(ConfigError):
         assert revealed({"MEMORY_API_TOKEN": text}) == text
@@ -124,7 +124,7 @@ def test_what_is_taken_can_stand_in_a_header(text: str) -> None:
 @given(st.text(max_size=60))
 def test_what_is_refused_is_not_shown(text: str) -> None:
     token = f"sEcReT7{text}\x7f"
-    assert "cannot stand" in refused({"MEMORY_API_TOKEN": token}) or len(token) < SHORTEST
+    assert "cannot stand" in refused({"MEMORY_API_TOKEN": token}) or len(token) < SHORTEST_TOKEN
 
 
 def test_a_server_that_others_can_reach_needs_one() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from starlette.responses import PlainTextResponse
 from structlog.testing import capture_logs
 
-from ros2_memory.serving.auth import ADMITTED, TOLD_EVERY_S, TokenGate
+from ros2_memory.serving.auth import AUTHENTICATED, LOG_INTERVAL_S, TokenGate
 
 GOOD = "kJ7-x._~+/0123456789=="
 
@@ -25,7 +25,7 @@ class Inside:
         self.seen: list[tuple[str, object]] = []
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        self.seen.append((scope["type"], scope.get(ADMITTED)))
+        self.seen.append((scope["type"], scope.get(AUTHENTICATED)))
         if scope["type"] == "http":
             await PlainTextResponse("inside")(scope, receive, send)
 
@@ -179,7 +179,7 @@ async def test_refusals_are_logged_now_and_then_with_nothing_of_what_was_sent() 
         async with httpx2.AsyncClient(transport=transport, base_url="http://robot") as http:
             for _ in range(5):
                 await http.get(f"/{GOOD}?token={GOOD}", headers={"authorization": "Bearer gUeSs"})
-            now[0] = TOLD_EVERY_S
+            now[0] = LOG_INTERVAL_S
             await http.get("/mcp")
             await http.get("/mcp", headers={"authorization": f"Bearer {GOOD}"})
     assert [(event["reason"], event["client"], event["refused"]) for event in events] == [

@@ -14,9 +14,10 @@ from structlog.testing import capture_logs
 from ros2_memory import results
 from ros2_memory.core.model import Sample
 from ros2_memory.history.context import Memory
+from ros2_memory.serving.auth import ForgeryGuard
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.mcp_server import EpisodicServer
-from ros2_memory.serving.web_app import GRACE_S, Guard, WebApp, web_app
+from ros2_memory.serving.web_app import GRACE_S, WebApp, web_app
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Replies
 
@@ -345,5 +346,5 @@ async def test_the_guard_leaves_other_scopes_alone() -> None:
         seen.append(scope["type"])
 
     nothing: Any = None
-    await Guard(inner, "127.0.0.1")({"type": "lifespan"}, nothing, nothing)
+    await ForgeryGuard(inner, "127.0.0.1")({"type": "lifespan"}, nothing, nothing)
     assert seen == ["lifespan"]
