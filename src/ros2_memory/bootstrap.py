@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.config import AdapterNode, Settings
     from ros2_memory.core.telemetry import Observer
     from ros2_memory.history.context import Memory, QuerySettings
-    from ros2_memory.recorder.ports import Housekeeper
+    from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.dispatch import Dispatcher
@@ -100,19 +100,19 @@ def build_housekeeper(
     `own` lists the recordings that were made in the bag directory.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-    from ros2_memory.recorder.housekeeping import Housekeeping, InBackground
-    from ros2_memory.recorder.time_sync import SystemTimeSync
+    from ros2_memory.recorder.housekeeping import BackgroundHousekeeper, Housekeeping
+    from ros2_memory.recorder.time_sync import is_synchronised
     from ros2_memory.storage.mcap.writer import McapWriter
 
     retention = settings.retention
-    return InBackground(
+    return BackgroundHousekeeper(
         Housekeeping(
             bag_dir,
             BagDirReader(reader),
             McapWriter(settings.reader.max_chunk_mb),
             WallClock(),
             retention_limits(settings),
-            time_sync=SystemTimeSync(),
+            is_synchronised=is_synchronised,
             split_duration_s=settings.recording.split_duration_s,
             own=own,
             # At most half the budget, so that saved moments leave room for new recordings.

@@ -170,13 +170,13 @@ def test_the_budget_is_held_while_it_is_recorded_and_asked(tmp_path: Path) -> No
             for _ in range(SPLITS - 2):
                 seen.add(step()["opened"])
                 assert size_of(bag_dir) <= budget + split + SLACK
-                keeper.apply(bag_dir)
+                keeper.apply()
                 assert size_of(bag_dir) <= budget + SLACK
                 asker.wait_for_a_round()
                 deleted = {path for path in seen if not Path(path).exists()}
         assert asker.wrong == []
         assert asker.rounds > 0
-    keeper.apply(bag_dir)
+    keeper.apply()
     left = sorted(path for path in bag_dir.rglob("*.mcap") if not is_carried(path))
     assert len(deleted) > SPLITS // 2
     assert len(left) >= KEPT_SPLITS - 2

@@ -13,7 +13,6 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartb
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.retention.time_sync import TimeSync
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -30,18 +29,6 @@ PLENTY = 10**15
 HOUR = 3600 * NS_PER_S
 
 
-class FakeTimeSync(TimeSync):
-    """Reports what it is told, and counts how often it is asked."""
-
-    def __init__(self, *, synchronised: bool = True) -> None:
-        self.synchronised = synchronised
-        self.asked = 0
-
-    def is_synchronised(self) -> bool:
-        self.asked += 1
-        return self.synchronised
-
-
 def keeper_of(
     bag_dir: Path,
     *,
@@ -54,7 +41,7 @@ def keeper_of(
     moments_bytes: int = PLENTY,
     monotonic: Callable[[], float] = time.monotonic,
     measure_free: Callable[[Path], int] = lambda _: PLENTY,
-    time_sync: TimeSync | None = None,
+    is_synchronised: Callable[[], bool] = lambda: True,
     keeps_foreign: bool = False,
 ) -> Housekeeping:
     """A housekeeper, mostly of all bags, whoever made them (retention.foreign=delete).
@@ -67,7 +54,7 @@ def keeper_of(
         writer or McapWriter(),
         clock or later(),
         RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=keeps_foreign),
-        time_sync=time_sync or FakeTimeSync(),
+        is_synchronised=is_synchronised,
         split_duration_s=10.0,
         moments_bytes=moments_bytes,
         static_topics=("/tf_static",),
@@ -110,7 +97,7 @@ def recorder_at_work(bag_dir: Path, clock: Clock) -> Iterator[None]:
 
     def work() -> None:
         while not over.wait(0.01):
-            house.keep_moments(bag_dir)
+            house.keep_moments()
 
     thread = threading.Thread(target=work)
     thread.start()

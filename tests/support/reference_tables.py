@@ -20,7 +20,7 @@ from ros2_memory.cli.app import COMMANDS
 from ros2_memory.cli.exits import EVERYWHERE, EXITS
 from ros2_memory.config import Ros2BagNode, Rosbag2Node, Settings
 from ros2_memory.recorder import event_log
-from ros2_memory.recorder.process.output import Said
+from ros2_memory.recorder.process.output import LineKind
 from tests.support.documented_history import CALLS
 from tests.support.memories import ROOT
 
@@ -34,7 +34,6 @@ SOURCE: Final = ROOT / "src" / "ros2_memory"
 LEVELS: Final = {
     "debug": "debug",
     "info": "info",
-    "note": "info",
     "warning": "warning",
     "warn": "warning",
     "error": "error",
@@ -241,10 +240,10 @@ def events() -> list[Event]:
         for each in _events_of(ast.parse(path.read_text(encoding="utf-8")))
     }
     found |= {
-        Event(name, "info", ("recording", *(("topic",) if said is Said.SUBSCRIBED else ())))
-        for said, name in event_log._INFORM.items()
+        Event(name, "info", ("recording", *(("topic",) if kind is LineKind.SUBSCRIBED else ())))
+        for kind, name in event_log._INFORM.items()
     }
-    found |= {Event(said.value, "warning", ("reason", "recording")) for said in event_log._ADVICE}
+    found |= {Event(kind.value, "warning", ("reason", "recording")) for kind in event_log._ADVICE}
     return sorted(found)
 
 
@@ -266,8 +265,8 @@ def _events_of(tree: ast.AST) -> Iterator[Event]:
 
 def _is_log(node: ast.AST) -> bool:
     name = node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
-    is_own_journal = name == "self"  # of Journal.tell
-    return name in {"log", "_log", "_journal", "journal"} or is_own_journal
+    is_own_method = name == "self"  # of EventLog
+    return name in {"log", "_log", "_events"} or is_own_method
 
 
 def told_events(page: str) -> str:

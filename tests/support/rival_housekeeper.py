@@ -15,9 +15,9 @@ from tests.support.housekeepers import keeper_of
 def main(bag_dir: Path, max_bytes: int, stop: Path) -> None:
     house = keeper_of(bag_dir, max_bytes=max_bytes, clock=WallClock(), keeps_foreign=True)
     while not stop.exists():
-        house.keep_moments(bag_dir)
-        house.apply(bag_dir)
-    house.keep_moments(bag_dir)
+        house.keep_moments()
+        house.apply()
+    house.keep_moments()
 
 
 if __name__ == "__main__":

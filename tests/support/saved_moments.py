@@ -48,7 +48,7 @@ def kept(
     house: Housekeeping, bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW
 ) -> Outcome:
     slot = asked(bag_dir, start, end, label, at)
-    house.keep_moments(bag_dir)
+    house.keep_moments()
     outcome = slot.outcome()
     slot.close()
     assert outcome is not None

@@ -16,7 +16,8 @@ from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
-from ros2_memory.recorder.ports import NoHousekeeping
+from ros2_memory.recorder.base import Housekeeper
+from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.supervisor import Orders, Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, write_mcap
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.ports import Housekeeper
     from tests.support.bags import Msg
 
 T0 = 1_795_150_800 * NS_PER_S
@@ -35,7 +35,7 @@ TOPICS = ("/bumper", "/door")
 
 
 @dataclass
-class PlayedRecorder:
+class PlayedRecorder(Child):
     """A `ros2 bag record` as far as its supervision sees it."""
 
     pid: int
@@ -167,7 +167,7 @@ class World:
             self.orders,
             self._start,
             self.reader,
-            housekeeper or NoHousekeeping(),
+            housekeeper or Housekeeper(),
             WorldClock(self),
             monotonic=lambda: self.mono,
             free_bytes_of=lambda _directory: self.free,

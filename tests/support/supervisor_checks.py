@@ -1,12 +1,11 @@
-"""What the tests of the supervisor share: a housekeeper that is played, and what is asserted."""
+"""What the tests of the supervisor share: a housekeeper for tests, and assertions."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, MutableMapping
-from pathlib import Path
 from typing import Any
 
-from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.base import Housekeeper
 from tests.support.simulated_recorders import PERIOD, World
 
 
@@ -22,37 +21,31 @@ def assert_each_counts_once(world: World) -> None:
     assert len(stands) == (max(stands) - min(stands)) // PERIOD + 1
 
 
-class Housekeeping:
-    """Notes what it is asked for, and frees what it is told to."""
+class PlayedHousekeeper(Housekeeper):
+    """Records what it is asked for, and frees what the test sets."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
         self.world: World | None = None
         self.frees_to = 0
-        self.fails = False
         self.making = False
         self.moments_kept = 0
         self.failed: dict[str, str] = {}
         self.recorded: list[tuple[tuple[str, ...], int, float]] = []
         self.held: str | None = None
 
-    def repair(self, bag_dir: Path) -> None:
-        self.asked.append("repair")
-
-    def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
+    def make_room(self, free_bytes_wanted: int) -> None:
         self.asked.append(f"room {free_bytes_wanted}")
         if self.world is not None:
             self.world.free = max(self.world.free, self.frees_to)
 
-    def making_room(self) -> bool:
+    def is_making_room(self) -> bool:
         return self.making
 
-    def apply(self, bag_dir: Path) -> None:
+    def apply(self) -> None:
         self.asked.append("apply")
-        if self.fails:
-            raise RecorderError("the catalogue is locked")
 
-    def keep_moments(self, bag_dir: Path) -> None:
+    def keep_moments(self) -> None:
         self.moments_kept += 1
 
     def note_recorded(

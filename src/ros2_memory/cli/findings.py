@@ -27,7 +27,6 @@ from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.status import nothing_here, odd_bags
 from ros2_memory.queries import data_time_range
-from ros2_memory.recorder.daemon import Ticking
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.retention.policy import GB
 from ros2_memory.storage.base import Closing
@@ -336,9 +335,7 @@ def of_ros(settings: Settings, reader: BagReader) -> Iterator[Finding]:
     if isinstance(settings.recorder, NullRecorderNode):
         return
     try:
-        recorder = build_recorder(settings, reader=reader)
-        if isinstance(recorder, Ticking):
-            recorder.check()
+        build_recorder(settings, reader=reader).check()
     except EpisodicError as error:
         reason, _, do = str(error).partition("; ")
         yield Finding(Level.ERROR, "ros", reason, do or "correct recorder.setup_files")

@@ -16,7 +16,6 @@ from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.sd_notify import ServiceManager
 from ros2_memory.recorder.daemon import (
-    Ticking,
     Upkeep,
     lock_bag_dir,
     put_in_order,
@@ -80,8 +79,6 @@ def _record(settings: Settings) -> None:
             own=own,
             keep_open=(lock.descriptor,),
         )
-        if not isinstance(recorder, Ticking):
-            raise ConfigError(f"recorder: {settings.recorder.target} cannot be run by {PROGRAM}")
         # So does an environment in which nothing can be recorded.
         recorder.check()
         claim(own)

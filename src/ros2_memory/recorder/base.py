@@ -1,37 +1,128 @@
-"""The port for recording. The docstrings are the contract; one suite holds every adapter."""
+"""The port for recording and its null adapter, and what a recorder asks of its housekeeper.
+
+The docstrings of `Recorder` are the contract; one suite holds every adapter to it.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
 
 
 class Recorder(ABC):
     """Records the robot's topics into the bag directory until it is stopped.
 
-    A recorder is driven from one thread: the one that starts it also stops it. What it is doing
-    meanwhile stands in the heartbeat file (see `heartbeat`), for whoever else wants to know.
+    A recorder is driven from one thread: the one that starts it also ticks and stops it. Other
+    programs read what it does from the heartbeat file (see `bag_dir.heartbeat`).
     """
+
+    @abstractmethod
+    def check(self) -> None:
+        """Checks that recording can begin. Touches no bag and starts no recording.
+
+        Raises:
+            ConfigError: the configuration of what is recorded is refused.
+            RecorderError: nothing on this machine can record.
+        """
 
     @abstractmethod
     def start(self) -> None:
         """Begins to record, and returns without waiting for the first message.
 
-        A recorder that is running goes on as it is: a second `start` changes nothing. After `stop`
-        it may be started again, and goes on in a new recording.
+        From then on `tick` must be called several times a second. Starting a recorder that is
+        running changes nothing. After `stop` it may be started again, into a new recording.
 
         Raises:
+            ConfigError: the configuration of what is recorded is refused.
             RecorderError: recording cannot begin; nothing is left running.
         """
+
+    @abstractmethod
+    def tick(self) -> None:
+        """Does what is due at this moment. Does not wait, and raises nothing."""
 
     @abstractmethod
     def stop(self) -> None:
         """Ends recording within a bounded time, and closes what can be closed.
 
-        When it returns nothing of this recorder runs any more, and `is_running` is False. Stopping
-        what does not run does nothing, so it is safe in every clean-up. Raises nothing for a child
-        process that ended badly: what it left behind is repaired at the next start.
+        When it returns, nothing of this recorder runs and `is_running` is False. Stopping a
+        recorder that does not run does nothing, so it is safe in every clean-up. Raises nothing
+        for a child process that ended badly: the next start repairs what it left.
         """
 
     @abstractmethod
     def is_running(self) -> bool:
         """Whether topics are being recorded at this moment. Cheap, and raises nothing."""
+
+
+class NullRecorder(Recorder):
+    """Records nothing and touches no file: `recorder=none`, for bags that come from elsewhere."""
+
+    def check(self) -> None:
+        """Does nothing."""
+
+    def start(self) -> None:
+        """Does nothing; `is_running` stays False."""
+
+    def tick(self) -> None:
+        """Does nothing."""
+
+    def stop(self) -> None:
+        """Does nothing."""
+
+    def is_running(self) -> bool:
+        """Always False."""
+        return False
+
+
+class Housekeeper:
+    """Repairs what crashes left and deletes what exceeds the limits. This base class does nothing.
+
+    The recorder calls it between two ticks, so a call should return at once; the work may go on in
+    the background.
+    """
+
+    def repair(self) -> None:
+        """Repairs what a crash left. Called once, before anything is recorded.
+
+        Raises:
+            EpisodicError: the bag directory cannot be repaired.
+            OSError: the bag directory cannot be read.
+        """
+
+    def make_room(self, free_bytes_wanted: int) -> None:
+        """Deletes the oldest bags beyond the budget's needs until so much of the disk is free."""
+
+    def is_making_room(self) -> bool:
+        """Whether an earlier `make_room` is still under way."""
+        return False
+
+    def apply(self) -> None:
+        """Deletes what exceeds the budget or the maximum age."""
+
+    def keep_moments(self) -> None:
+        """Saves the moments that were asked for. Called about once a second."""
+
+    def note_recorded(
+        self, recordings: Collection[str], bytes_written: int, monotonic_s: float
+    ) -> None:
+        """Counts recorded time, by which recordings age where the wall clock is wrong.
+
+        Called several times a second, with no recordings while nothing is recorded.
+
+        Args:
+            recordings: the directories being written, relative to the bag directory.
+            bytes_written: the bytes that all recordings wrote since the recorder started.
+            monotonic_s: the monotonic clock, in seconds.
+        """
+
+    def age_held(self) -> str | None:
+        """Describes the bags that are kept although their dates make them too old, or None."""
+        return None
+
+    def faults(self) -> Mapping[str, str]:
+        """Maps each task that failed in the background, such as `apply`, to the reason."""
+        return {}

@@ -7,7 +7,7 @@ import signal
 import socket
 import time
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Final, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Final, Self
 
 import structlog
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.sd_notify import ServiceManager
-    from ros2_memory.recorder.ports import Housekeeper
+    from ros2_memory.recorder.base import Housekeeper, Recorder
     from ros2_memory.storage.base import BagReader
 
 TICK_S: Final = 0.2
@@ -38,23 +38,6 @@ SETTLE_EVERY_S: Final = 60.0
 ENDING: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
-
-
-@runtime_checkable
-class Ticking(Protocol):
-    """A recorder that works while it is ticked."""
-
-    def check(self) -> None:
-        """Raises an error of the tree where recording cannot begin; touches no bag."""
-
-    def start(self) -> None:
-        """Begins to record."""
-
-    def tick(self) -> None:
-        """Does what is due."""
-
-    def stop(self) -> None:
-        """Ends."""
 
 
 def lock_bag_dir(bag_dir: Path, *, clear: bool) -> BagDirLock:
@@ -138,7 +121,7 @@ class Upkeep:
             recover_handovers(self._bag_dir, self._reader, running)
 
 
-def record_until_told(recorder: Ticking, manager: ServiceManager, upkeep: Upkeep) -> None:
+def record_until_told(recorder: Recorder, manager: ServiceManager, upkeep: Upkeep) -> None:
     """Records until SIGTERM, SIGINT or SIGHUP comes, and ends what it started.
 
     It must be called from the main thread, which the recorder's processes die with.
@@ -211,9 +194,9 @@ class EndingSignals:
 
 def _prepare(bag_dir: Path, reader: BagReader, housekeeper: Housekeeper) -> None:
     tasks: dict[str, Callable[[], None]] = {
-        "repair": lambda: housekeeper.repair(bag_dir),
+        "repair": housekeeper.repair,
         "settle": lambda: recover_handovers(bag_dir, reader),
-        "apply": lambda: housekeeper.apply(bag_dir),
+        "apply": housekeeper.apply,
     }
     for name, task in tasks.items():
         try:

@@ -1,4 +1,4 @@
-"""What the recorder reports: log events, and the last of them that was a fault."""
+"""What the recorder reports: log events, and the newest of them that was a fault."""
 
 from __future__ import annotations
 
@@ -6,24 +6,28 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from ros2_memory.recorder.process.output import Said
+from ros2_memory.recorder.process.output import LineKind
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from ros2_memory.recorder.process.output import Line
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
-_INFORM = {Said.READY: "recording", Said.SUBSCRIBED: "subscribed", Said.STOPPED: "recorder_stopped"}
+_INFORM = {
+    LineKind.READY: "recording",
+    LineKind.SUBSCRIBED: "subscribed",
+    LineKind.STOPPED: "recorder_stopped",
+}
 _ADVICE = {
-    Said.QOS_REFUSED: "messages of this publisher are not recorded: its QoS does not fit",
-    Said.UNKNOWN_TYPE: (
+    LineKind.QOS_REFUSED: ("messages of this publisher are not recorded: its QoS does not fit"),
+    LineKind.UNKNOWN_TYPE: (
         "the topic is not recorded: name the workspace that defines its type in "
         "recorder.setup_files"
     ),
-    Said.SEVERAL_TYPES: "the topic is not recorded: publishers disagree on its type",
-    Said.MESSAGES_LOST: "messages were lost: the disk is too slow for what is recorded",
+    LineKind.SEVERAL_TYPES: "the topic is not recorded: publishers disagree on its type",
+    LineKind.MESSAGES_LOST: "messages were lost: the disk is too slow for what is recorded",
 }
 
 
@@ -32,43 +36,53 @@ class EventLog:
 
     def __init__(self) -> None:
         self.last_error: str | None = None
-        self._standing: set[tuple[str, str]] = set()
+        self._unresolved: set[tuple[str, str]] = set()
 
-    def note(self, event: str, **values: object) -> None:
-        """Something that is as it should be."""
+    def info(self, event: str, **values: object) -> None:
+        """Logs an event of normal operation."""
         _log.info(event, **values)
 
     def warn(self, event: str, sentence: str, **values: object) -> None:
-        """A fault that recording goes on with."""
+        """Logs a fault that recording goes on with."""
         self.last_error = sentence
         _log.warning(event, reason=sentence, **values)
 
     def fail(self, event: str, sentence: str, **values: object) -> None:
-        """A fault that keeps something from being recorded."""
+        """Logs a fault that keeps something from being recorded."""
         self.last_error = sentence
         _log.error(event, reason=sentence, **values)
 
-    def fail_once(self, event: str, about: str, sentence: str, **values: object) -> None:
-        """As `fail`, and silent while the fault stands for what it is about (see `over`)."""
-        if (event, about) not in self._standing:
-            self._standing.add((event, about))
+    def fail_once(self, event: str, subject: str, sentence: str, **values: object) -> None:
+        """Logs as `fail` does, once for each subject until `resolve` is called for it."""
+        if (event, subject) not in self._unresolved:
+            self._unresolved.add((event, subject))
             self.fail(event, sentence, **values)
 
-    def over(self, event: str, about: str) -> None:
-        """The fault does not stand any more: it is told when it comes again."""
-        self._standing.discard((event, about))
+    def resolve(self, event: str, subject: str) -> None:
+        """Has `fail_once` log the fault when it comes again."""
+        self._unresolved.discard((event, subject))
 
-    def tell(self, recording: str, lines: Iterable[Line]) -> None:
-        """What the recorder of a recording said."""
+    def report_faults(self, faults: Mapping[str, str]) -> None:
+        """Logs each task of the housekeeper that fails, once for as long as it does."""
+        self._unresolved = {
+            (event, task)
+            for event, task in self._unresolved
+            if event != "housekeeping_failed" or task in faults
+        }
+        for task, sentence in faults.items():
+            self.fail_once("housekeeping_failed", task, sentence, task=task)
+
+    def report_output(self, recording: str, lines: Iterable[Line]) -> None:
+        """Logs what the `ros2 bag record` of a recording printed."""
         for line in lines:
-            if line.said in _INFORM:
-                about_topic = {} if line.topic is None else {"topic": line.topic}
-                self.note(_INFORM[line.said], recording=recording, **about_topic)
-            elif line.said in _ADVICE:
+            if line.kind in _INFORM:
+                topic = {} if line.topic is None else {"topic": line.topic}
+                self.info(_INFORM[line.kind], recording=recording, **topic)
+            elif line.kind in _ADVICE:
                 about = f"{line.topic}: " if line.topic else ""
-                sentence = f"{about}{_ADVICE[line.said]} ({line.text})"
-                self.warn(line.said.value, sentence, recording=recording)
-            elif line.said in {Said.ERROR, Said.FOLDER_EXISTS}:
+                sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
+                self.warn(line.kind.value, sentence, recording=recording)
+            elif line.kind in {LineKind.ERROR, LineKind.FOLDER_EXISTS}:
                 self.fail("recorder_error", line.text, recording=recording)
             else:
                 self.warn("recorder_warning", line.text, recording=recording)

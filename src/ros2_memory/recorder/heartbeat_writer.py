@@ -1,4 +1,4 @@
-"""The heartbeat of a running recorder: what it is doing, written every few seconds."""
+"""Writes the heartbeat of a running recorder: what it is doing, every few seconds."""
 
 from __future__ import annotations
 
@@ -19,9 +19,15 @@ if TYPE_CHECKING:
 
 
 class HeartbeatWriter:
-    """Writes `recorder.json`; `interval_s` is how often it is asked to.
+    """Writes `recorder.json`.
 
-    `expected` gives the topics that are to be recorded by name, `age_held` which bags age leaves.
+    Args:
+        bag_dir: the directory in which it is written.
+        interval_s: how often it is written, in seconds.
+        clock: the wall clock.
+        events: where a heartbeat that cannot be written is reported.
+        age_held: describes bags that are kept though their dates make them too old, or None.
+        expected: gives the topics that are to be recorded by name.
     """
 
     def __init__(
@@ -29,82 +35,81 @@ class HeartbeatWriter:
         bag_dir: Path,
         interval_s: float,
         clock: Clock,
-        journal: EventLog,
+        events: EventLog,
         *,
-        expected: Callable[[], Sequence[str]] = tuple,
-        age_held: Callable[[], str | None] = lambda: None,
+        age_held: Callable[[], str | None],
+        expected: Callable[[], Sequence[str]],
     ) -> None:
         self._bag_dir = bag_dir
         self._interval_s = interval_s
         self._clock = clock
-        self._journal = journal
-        self._expected = expected
+        self._events = events
         self._age_held = age_held
+        self._expected = expected
         self._offered = set[str]()
         self._state = RecorderState.STOPPED
         self._since = clock.now()
-        self._announced: tuple[str, ...] = ()
-        self._told: Heartbeat | None = None
+        self._written: Heartbeat | None = None
 
-    def announce(self, name: str) -> None:
-        """Names a recording that is about to be begun, in every heartbeat until `arrived`."""
-        self._announced = (name,)
+    def write(
+        self, state: RecorderState, sessions: RecordingSessions, announced: str | None = None
+    ) -> None:
+        """Writes a heartbeat; one that cannot be written is reported and stops nothing.
 
-    def arrived(self) -> None:
-        """The recording that was announced is one of the crew's, or does not come."""
-        self._announced = ()
+        `announced` is a recording that is about to be begun.
+        """
+        self._write(self._heartbeat(state, sessions, announced))
 
-    def beat(self, state: RecorderState, crew: RecordingSessions) -> None:
-        """Writes a heartbeat. One that cannot be written is reported, and stops nothing."""
-        self._write(self._heartbeat(state, crew))
-
-    def beat_if_news(self, state: RecorderState, crew: RecordingSessions) -> None:
-        """Writes a heartbeat where it would say something new, besides times and amounts."""
-        heartbeat = self._heartbeat(state, crew)
-        if _news(heartbeat) != self._told:
+    def write_if_changed(self, state: RecorderState, sessions: RecordingSessions) -> None:
+        """Writes a heartbeat if more than its times and amounts changed."""
+        heartbeat = self._heartbeat(state, sessions, None)
+        if _without_amounts(heartbeat) != self._written:
             self._write(heartbeat)
 
-    def _heartbeat(self, state: RecorderState, crew: RecordingSessions) -> Heartbeat:
+    def _heartbeat(
+        self, state: RecorderState, sessions: RecordingSessions, announced: str | None
+    ) -> Heartbeat:
         now = self._clock.now()
         if state is not self._state:
             self._state, self._since = state, now
-        sessions = crew.sessions
-        names = (*(session.name for session in sessions), *self._announced)
-        subscribed = frozenset[str]().union(*(session.subscribed for session in sessions))
-        silent = frozenset() if crew.current is None else crew.current.silent()
+        names = [session.name for session in sessions.running]
+        if announced is not None and announced not in names:
+            names.append(announced)
+        subscribed = frozenset[str]().union(*(each.subscribed for each in sessions.running))
+        silent = frozenset() if sessions.current is None else sessions.current.silent_topics()
         return Heartbeat(
             pid=os.getpid(),
             updated=now,
             state=state,
-            recordings=tuple(dict.fromkeys(names)),
+            recordings=tuple(names),
             since=self._since,
-            bytes_written=crew.bytes_written,
+            bytes_written=sessions.bytes_written,
             subscribed=tuple(sorted(subscribed)),
             silent=tuple(sorted(silent)),
-            last_error=self._journal.last_error,
+            last_error=self._events.last_error,
             interval_s=self._interval_s,
-            restarts=crew.restarts,
-            missing=self._missing(crew),
+            restarts=sessions.restarts,
+            missing=self._missing(sessions),
             age_held=self._age_held(),
         )
 
-    def _missing(self, crew: RecordingSessions) -> tuple[str, ...]:
-        """What no publisher has offered; nothing before the first recorder has looked around."""
-        for session in crew.sessions:
-            self._offered |= session.subscribed | session.splits.heard
-        if not any(session.ready for session in crew.sessions):
+    def _missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
+        """Returns the topics that no publisher has offered; none before a recorder has looked."""
+        for session in sessions.running:
+            self._offered |= session.subscribed | session.splits.received
+        if not any(session.has_recorded for session in sessions.running):
             return ()
         return tuple(sorted({*self._expected()} - self._offered))
 
     def _write(self, heartbeat: Heartbeat) -> None:
-        self._told = _news(heartbeat)
+        self._written = _without_amounts(heartbeat)
         try:
             write_heartbeat(self._bag_dir, heartbeat)
         except RecorderError as error:
-            self._journal.fail_once("heartbeat_not_written", "", str(error))
+            self._events.fail_once("heartbeat_not_written", "", str(error))
         else:
-            self._journal.over("heartbeat_not_written", "")
+            self._events.resolve("heartbeat_not_written", "")
 
 
-def _news(heartbeat: Heartbeat) -> Heartbeat:
+def _without_amounts(heartbeat: Heartbeat) -> Heartbeat:
     return replace(heartbeat, updated=0, bytes_written=0)

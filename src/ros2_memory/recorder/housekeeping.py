@@ -24,6 +24,7 @@ from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
+from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.collect import GarbageCollector
 from ros2_memory.retention.delete import left_by_repair, remove_emptied
@@ -39,11 +40,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Clock
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.recorder.ports import Housekeeper
     from ros2_memory.retention.collect import Collected
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
-    from ros2_memory.retention.time_sync import TimeSync
     from ros2_memory.storage.base import BagReader, BagWriter
 
 REFRESH_S: Final = 60.0
@@ -54,7 +53,7 @@ _MCAP: Final = ".mcap"
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-class Housekeeping:
+class Housekeeping(Housekeeper):
     """Repairs and deletes in one bag directory, whose lock its caller holds.
 
     Args:
@@ -64,7 +63,7 @@ class Housekeeping:
         clock: the wall clock.
         limits: how much is kept, and whether bags of other programs are no part of it. Then those
             are not repaired either.
-        time_sync: knows whether the system clock is synchronised.
+        is_synchronised: whether the system clock is synchronised; may take some seconds.
         split_duration_s: how long the recorder writes one file.
         own: the recordings that the recorder made.
         moments_bytes: how much of it moments may take that were asked to be kept.
@@ -82,7 +81,7 @@ class Housekeeping:
         clock: Clock,
         limits: RetentionLimits,
         *,
-        time_sync: TimeSync,
+        is_synchronised: Callable[[], bool],
         split_duration_s: float,
         own: OwnRecordings | None = None,
         moments_bytes: int = 0,
@@ -91,6 +90,7 @@ class Housekeeping:
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._bag_dir = bag_dir
         self._recorded = RecordedTime(bag_dir)
         self._own = own or OwnRecordings(bag_dir)
         self._keeps_foreign = limits.keeps_foreign
@@ -100,7 +100,7 @@ class Housekeeping:
             Carrier(bag_dir, reader, writer, static_topics),
             self._own,
             recorded=self._recorded,
-            time_sync=time_sync,
+            is_synchronised=is_synchronised,
             static_topics=static_topics,
             grace_s=grace_s,
             monotonic=monotonic,
@@ -125,15 +125,15 @@ class Housekeeping:
         self._short = False
         self._foreign = False
 
-    def repair(self, bag_dir: Path) -> None:
+    def repair(self) -> None:
         """Puts right what a crash left in recordings of this program. Nothing may be recording.
 
         Raises:
             OSError: the bag directory cannot be listed, or it cannot be read which recordings are
                 the recorder's own.
         """
-        named = _named(bag_dir)
-        for directory in sorted(bag_dir.iterdir()):
+        named = _named(self._bag_dir)
+        for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
                 continue
             if self._keeps_foreign:
@@ -141,9 +141,9 @@ class Housekeeping:
             else:
                 left = directory in named or has_own_name(directory.name)
             if left and (directory in named or _unfinished(directory)):
-                self._repair_recording(bag_dir, directory)
+                self._repair_recording(directory)
 
-    def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
+    def make_room(self, free_bytes_wanted: int) -> None:
         """Deletes, oldest first, until so much of the disk is free, or nothing may be deleted.
 
         Raises:
@@ -152,16 +152,12 @@ class Housekeeping:
         begun = time.perf_counter_ns()
         self._mind_moments()
         done = self._index.apply_retention(
-            free_bytes=lambda: self._measure_free(bag_dir), min_free_bytes=free_bytes_wanted
+            free_bytes=lambda: self._measure_free(self._bag_dir), min_free_bytes=free_bytes_wanted
         )
         self._report(done, begun, free_bytes_wanted=free_bytes_wanted)
         self._tell_held(done)
 
-    def making_room(self) -> bool:
-        """Never: it is made when `make_room` returns."""
-        return False
-
-    def apply(self, bag_dir: Path) -> None:
+    def apply(self) -> None:
         """Deletes what is beyond the budget or too old; repairs what nobody writes any more."""
         begun = time.perf_counter_ns()
         self._mind_moments()
@@ -170,16 +166,15 @@ class Housekeeping:
         self._tell_shortage(done)
         self._tell_held(done)
         self._tell_foreign(done)
-        if self._repair_left(bag_dir, self._index.snapshot()):
+        if self._repair_left(self._index.snapshot()):
             self._index.refresh()
 
-    def keep_moments(self, bag_dir: Path) -> None:
+    def keep_moments(self) -> None:
         """Keeps from deletion what is asked for, and goes on with moments that wait for bags.
 
         Raises:
             OSError: the folders of requests or moments cannot be listed or written to.
         """
-        del bag_dir
         self._keeper.open()
         if self._keeper.has_work():
             with self._index.undisturbed() as snapshot:
@@ -203,10 +198,6 @@ class Housekeeping:
             f"(timedatectl shows that), or when {limit} have been recorded after them"
         )
 
-    def faults(self) -> Mapping[str, str]:
-        """None: what fails is raised."""
-        return {}
-
     def _mind_moments(self) -> None:
         """Before anything is deleted: what is asked to be kept, and the sidecars of what is.
 
@@ -220,9 +211,9 @@ class Housekeeping:
         except OSError as error:
             _log.error("moments_not_minded", reason=str(error))
 
-    def _repair_recording(self, bag_dir: Path, directory: Path) -> None:
+    def _repair_recording(self, directory: Path) -> None:
         try:
-            with directories.opened(bag_dir, directory) as opened:
+            with directories.opened(self._bag_dir, directory) as opened:
                 names = sorted(os.listdir(opened))  # noqa: PTH208 - a descriptor has no path
                 for name in filter(left_by_repair, names):
                     os.unlink(name, dir_fd=opened)
@@ -230,18 +221,18 @@ class Housekeeping:
                 if name.endswith(_MCAP) and not left_by_repair(name):
                     self._repair(directory / name)
             # A recording of nothing but empty splits.
-            remove_emptied(bag_dir, directory)
+            remove_emptied(self._bag_dir, directory)
         except OSError as error:
             _log.error("not_repaired", path=str(directory), reason=error.strerror or str(error))
 
-    def _repair_left(self, bag_dir: Path, snapshot: Snapshot) -> int:
+    def _repair_left(self, snapshot: Snapshot) -> int:
         """Repairs what the index found unfinished and nothing writes; how many files."""
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
         candidates = [path for path in paths if path.suffix == _MCAP and self._is_left(path)]
         if not candidates:
             return 0
-        named, held = _named(bag_dir), open_files()
+        named, held = _named(self._bag_dir), open_files()
         repaired = 0
         for path in candidates:
             with suppress(OSError):
@@ -352,7 +343,7 @@ class Housekeeping:
         self._short = not done.fits
 
 
-class InBackground:
+class BackgroundHousekeeper(Housekeeper):
     """Has another housekeeper delete in threads of its own.
 
     The first look at a week of bags takes from seconds to minutes, in which the robot shall be
@@ -364,25 +355,25 @@ class InBackground:
         self._threads: dict[str, threading.Thread] = {}
         self._faults: dict[str, str] = {}
 
-    def repair(self, bag_dir: Path) -> None:
+    def repair(self) -> None:
         """Puts right what a crash left, and returns when that is done."""
-        self._housekeeper.repair(bag_dir)
+        self._housekeeper.repair()
 
-    def make_room(self, bag_dir: Path, free_bytes_wanted: int) -> None:
+    def make_room(self, free_bytes_wanted: int) -> None:
         """Begins to delete until so much of the disk is free, unless that is under way."""
-        self._begin("make_room", lambda: self._housekeeper.make_room(bag_dir, free_bytes_wanted))
+        self._begin("make_room", lambda: self._housekeeper.make_room(free_bytes_wanted))
 
-    def making_room(self) -> bool:
+    def is_making_room(self) -> bool:
         """Whether room is being made."""
         return self._is_under_way("make_room")
 
-    def apply(self, bag_dir: Path) -> None:
+    def apply(self) -> None:
         """Begins to apply the limits, unless that is still under way."""
-        self._begin("apply", lambda: self._housekeeper.apply(bag_dir))
+        self._begin("apply", self._housekeeper.apply)
 
-    def keep_moments(self, bag_dir: Path) -> None:
+    def keep_moments(self) -> None:
         """Begins to keep what is asked for, unless that is still under way."""
-        self._begin("keep_moments", lambda: self._housekeeper.keep_moments(bag_dir))
+        self._begin("keep_moments", self._housekeeper.keep_moments)
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float

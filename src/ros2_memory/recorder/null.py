@@ -1,19 +1,5 @@
-"""`recorder=none`: bags come from elsewhere, and nothing is written into the bag directory."""
+"""The path under which configurations name `NullRecorder`; the class is in `recorder.base`."""
 
-from __future__ import annotations
+from ros2_memory.recorder.base import NullRecorder
 
-from ros2_memory.recorder.base import Recorder
-
-
-class NullRecorder(Recorder):
-    """Records nothing, starts nothing and touches no file."""
-
-    def start(self) -> None:
-        """Does nothing; `is_running` stays False."""
-
-    def stop(self) -> None:
-        """Does nothing."""
-
-    def is_running(self) -> bool:
-        """Always False."""
-        return False
+__all__ = ["NullRecorder"]

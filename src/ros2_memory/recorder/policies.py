@@ -1,19 +1,31 @@
-"""When to begin anew: after a death, after a session, after a silence. Pure decisions."""
+"""When to begin anew, when to make room or pause, and what a silence means. Pure decisions."""
 
 from __future__ import annotations
 
-from typing import Final
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.recorder.handover.plan import set_back
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from ros2_memory.recorder.handover.plan import ClockReading
 
 SILENT_SPLITS: Final = 3
 """Splits without growth after which a robot counts as silent."""
-_LONGEST_DOUBLING: Final = 16
+RESUME_FACTOR: Final = 1.2
+"""Recording that was paused resumes when this many times the least free space is free again."""
+SET_BACK_NS: Final[Ns] = 120 * NS_PER_S
+_MAX_DOUBLINGS: Final = 16
 
 
 class Backoff:
     """How long to wait before the next attempt: twice as long each time, up to a cap.
 
-    An attempt that lasted at least `stable_s` was none of a series of failures: the wait after it
-    is the first again. All in seconds.
+    An attempt that lasted at least `stable_s` ends a series of failures: the wait after it is the
+    first again. All in seconds.
     """
 
     def __init__(self, first_s: float = 1.0, cap_s: float = 60.0, stable_s: float = 60.0) -> None:
@@ -23,25 +35,25 @@ class Backoff:
         self._failures = 0
 
     def failed(self, lasted_s: float) -> float:
-        """The wait after an attempt that ended after `lasted_s`."""
+        """Returns the wait after an attempt that ended after `lasted_s`."""
         if lasted_s >= self._stable_s:
             self._failures = 0
-        doublings = min(self._failures, _LONGEST_DOUBLING)
+        doublings = min(self._failures, _MAX_DOUBLINGS)
         wait_s = min(self._first_s * (1 << doublings), self._cap_s)
         self._failures += 1
         return wait_s
 
 
 class SilenceWatch:
-    """Tells when a recording should be closed because its robot has fallen silent.
+    """Decides when to close a recording because its robot has fallen silent.
 
     A split is closed only by a message that comes after its time, so the last messages before a
-    silence would stay unreadable for as long as it lasts. A recording that grew and then stood
-    still is rotated once: the one after it must grow before it can be rotated for silence again.
+    silence would stay unreadable for as long as it lasts. A recording that grew and then stopped
+    growing is rotated once: the next one must grow before it can be rotated for silence again.
 
-    A robot that speaks now and then, and is silent for longer than three splits in between, would
-    begin a recording with every word. So each rotation for silence doubles the patience, up to a
-    session; one that lived its session sets it back.
+    A robot that publishes now and then, and is silent for longer than three splits in between,
+    would begin a recording with every message. So each rotation for silence doubles the patience,
+    up to a session; a recording that lived for its whole session resets it.
     """
 
     def __init__(self, split_duration_s: float, session_duration_s: float) -> None:
@@ -54,7 +66,7 @@ class SilenceWatch:
         self._grown = False
 
     def began(self, now_s: float, settle_s: float) -> None:
-        """A recording began; what it writes within `settle_s` says nothing of the robot.
+        """Notes that a recording began; what it writes within `settle_s` is not the robot's.
 
         Those are its headers, and the latched messages that every recording receives again.
         """
@@ -73,15 +85,74 @@ class SilenceWatch:
         return self._grown and now_s - self._grew_at_s >= self._patience_s
 
     def rotated(self, *, for_silence: bool) -> None:
-        """The recording was rotated, for silence or because its session was over."""
+        """Notes that the recording was rotated, for silence or because its session was over."""
         doubled_s = min(2 * self._patience_s, self._cap_s)
         self._patience_s = doubled_s if for_silence else self._first_s
 
 
-def session_over(age_s: float, session_duration_s: float) -> bool:
-    """Whether a recording has lived long enough.
+class SpaceAction(Enum):
+    """What the free space asks for."""
 
-    Every split repeats the list of all splits before it, so a recording that is never rotated
-    grows with the square of its age.
+    NONE = auto()
+    MAKE_ROOM = auto()  # delete more than the budget asks
+    WAIT = auto()  # for room that is being made
+    PAUSE = auto()
+    STAY_PAUSED = auto()
+    RESUME = auto()
+
+
+def resume_bytes(min_free_bytes: int) -> int:
+    """Returns how much must be free for recording to resume: more than what it was paused for."""
+    return round(min_free_bytes * RESUME_FACTOR)
+
+
+def space_action(
+    free_bytes: int,
+    min_free_bytes: int,
+    *,
+    paused: bool,
+    room_requested: bool,
+    making_room: bool = False,
+) -> SpaceAction:
+    """Decides what to do about the free space.
+
+    Args:
+        free_bytes: what the file system of the bag directory has left for this user.
+        min_free_bytes: what it must have for recording to go on.
+        paused: whether recording is paused.
+        room_requested: whether deleting was requested for this shortage already.
+        making_room: whether that is still under way; it is waited for while half of
+            `min_free_bytes` is free.
     """
-    return age_s >= session_duration_s
+    if paused:
+        enough = free_bytes >= resume_bytes(min_free_bytes)
+        return SpaceAction.RESUME if enough else SpaceAction.STAY_PAUSED
+    if free_bytes >= min_free_bytes:
+        return SpaceAction.NONE
+    if not room_requested:
+        return SpaceAction.MAKE_ROOM
+    waits = making_room and free_bytes >= min_free_bytes // 2
+    return SpaceAction.WAIT if waits else SpaceAction.PAUSE
+
+
+def clock_was_set_back(before: ClockReading, now: ClockReading) -> bool:
+    """Whether the wall clock was set back by so much that the open split would not be closed.
+
+    A split is closed by the time of a message that comes long enough after its first, so it would
+    stay open until the clock has caught up. A smaller step is waited out.
+    """
+    return set_back(before, now, SET_BACK_NS)
+
+
+def describe_silent_topics(subscribed: Collection[str], received: Collection[str]) -> str | None:
+    """Describes the topics that brought nothing in a whole recording; None where all did."""
+    silent = sorted(set(subscribed) - set(received))
+    if not silent:
+        return None
+    if not received:
+        return (
+            f"subscribed to {len(silent)} topics and received nothing from any of them; "
+            "if the publishers run under another user, set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 "
+            "for the recorder: Fast DDS does not share memory between users"
+        )
+    return f"subscribed, and no message in the whole recording: {', '.join(silent)}"

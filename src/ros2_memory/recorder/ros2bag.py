@@ -16,8 +16,7 @@ from ros2_memory.bag_dir.layout import (
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import WallClock
-from ros2_memory.recorder.base import Recorder
-from ros2_memory.recorder.ports import NoHousekeeping
+from ros2_memory.recorder.base import Housekeeper, Recorder
 from ros2_memory.recorder.process.child import Child, run_bounded
 from ros2_memory.recorder.process.command import (
     HELP_ARGV,
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.timebase import Clock
-    from ros2_memory.recorder.ports import Housekeeper
     from ros2_memory.storage.base import BagReader
 
 __all__ = ["Ros2BagRecorder", "record_argv"]
@@ -113,7 +111,7 @@ class Ros2BagRecorder(Recorder):
             ),
             self._start_child,
             reader,
-            housekeeper or NoHousekeeping(),
+            housekeeper or Housekeeper(),
             clock or WallClock(),
             expected=lambda: self._topics.exact,
             own=self._own,

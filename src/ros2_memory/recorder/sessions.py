@@ -1,10 +1,11 @@
-"""The recorders that run: mostly one, two during a handover, and those that are ending.
+"""The recordings under way: mostly one, two during a handover, and those that are ending.
 
-What each step does; when it is taken is `supervisor`'s business. Nothing here waits.
+This module does each step; `supervisor` decides when. Nothing here waits, except `stop`.
 """
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import flush_bags
@@ -12,54 +13,57 @@ from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.handover.plan import READY_TIMEOUT_S, HandoverPlan, Step
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
+from ros2_memory.recorder.policies import describe_silent_topics
 from ros2_memory.recorder.process.child import end_all
-from ros2_memory.recorder.session import RecordingSession
+from ros2_memory.recorder.session import RecordingSession, SessionState
 from ros2_memory.recorder.split_watcher import Splits
-from ros2_memory.recorder.watchdog import silence_told
 from ros2_memory.retention.clear import remove_if_empty
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.handover.plan import ClockReading
-    from ros2_memory.recorder.ports import RecorderProcess
-    from ros2_memory.recorder.split_watcher import Changes
+    from ros2_memory.recorder.process.child import Child
+    from ros2_memory.recorder.split_watcher import SplitChanges
     from ros2_memory.storage.base import BagReader
 
 WHOLE_RECORDING_S: Final = 15.0
-"""A recording that lived for less says nothing of topics that brought no message."""
+"""A recording that lived for less says nothing about topics that brought no message."""
 
 
 class RecordingSessions:
-    """The sessions of one bag directory; `restarts` is how often one had to be begun anew.
+    """The sessions of one bag directory.
 
     Args:
         bag_dir: where recordings lie.
-        start_child: starts the recorder of a recording, given its name and directory.
-        announce: is told the name of a recording before anything of it exists.
+        start_child: starts the `ros2 bag record` of a recording, given its name and directory.
+        announce: receives the name of a recording before anything of it exists.
         reader: reads splits that are closed.
-        journal: where everything is reported.
+        events: where everything is reported.
         own: the list of recordings that were made here.
         simulated: whether log times come from a simulated clock.
-        subscribe_timeout_s: how long a new recorder is waited for in a handover.
-        both_s: how long both record then.
+        subscribe_timeout_s: how long a handover waits for the new recorder.
+
+    Attributes:
+        current: the session that records; None while none does.
+        handover: the handover from the current session to the next; None mostly.
+        restarts: how often a recording had to be begun anew.
     """
 
     def __init__(
         self,
         bag_dir: Path,
-        start_child: Callable[[str, Path], RecorderProcess],
+        start_child: Callable[[str, Path], Child],
         announce: Callable[[str], None],
         reader: BagReader,
-        journal: EventLog,
+        events: EventLog,
         *,
         own: OwnRecordings,
         simulated: bool,
         subscribe_timeout_s: float,
-        both_s: float,
     ) -> None:
         self._bag_dir = bag_dir
         self._start_child = start_child
@@ -67,28 +71,26 @@ class RecordingSessions:
         self._own = own
         self._unlisted: set[str] = set()
         self._reader = reader
-        self._journal = journal
+        self._events = events
         self._simulated = simulated
         self._subscribe_timeout_s = subscribe_timeout_s
-        self._both_s = both_s
         self.current: RecordingSession | None = None
-        self.takeover: HandoverTransfer | None = None
-        self._leaving: list[RecordingSession] = []
-        self._completed: list[HandoverTransfer] = []
-        self._retired_bytes = 0
+        self.handover: HandoverTransfer | None = None
+        self._running: list[RecordingSession] = []
+        # By the old recording's name, until that has ended.
+        self._completed: dict[str, HandoverTransfer] = {}
+        self._ended_bytes = 0
         self.restarts = 0
 
     @property
-    def sessions(self) -> tuple[RecordingSession, ...]:
-        """All sessions whose recorders have not ended, the current one first."""
-        current = () if self.current is None else (self.current,)
-        incoming = () if self.takeover is None else (self.takeover.new,)
-        return (*current, *incoming, *self._leaving)
+    def running(self) -> tuple[RecordingSession, ...]:
+        """All sessions whose children have not ended, oldest first."""
+        return tuple(self._running)
 
     @property
     def bytes_written(self) -> int:
-        """By all recordings since the start."""
-        return self._retired_bytes + sum(each.splits.bytes_written for each in self.sessions)
+        """The bytes that all recordings wrote since the start."""
+        return self._ended_bytes + sum(each.splits.bytes_written for each in self._running)
 
     def begin(self, now: ClockReading) -> None:
         """Starts a recording when there is none.
@@ -98,119 +100,109 @@ class RecordingSessions:
         """
         self.current = self._launch(recording_name(now.wall, self._bag_dir), now)
 
-    def begin_takeover(self, now: ClockReading) -> None:
+    def begin_handover(self, now: ClockReading) -> None:
         """Starts a recording that is to take over from the current one.
 
         Raises:
             RecorderError: it cannot be started; the current one goes on.
         """
         old = self.current
-        if old is None or self.takeover is not None:
+        if old is None or self.handover is not None:
             return
         name = recording_name(now.wall, self._bag_dir)
         HandoverTransfer.announce(old, name)
-        passage = HandoverPlan(
-            now, subscribe_timeout_s=self._subscribe_timeout_s, both_s=self._both_s
-        )
         try:
             new = self._launch(name, now)
         except RecorderError:
             HandoverTransfer.withdraw(old)
             raise
-        self.takeover = HandoverTransfer(old, new, passage, self._reader, simulated=self._simulated)
-        self._journal.note("rotation_begun", recording=old.name, next=name)
+        plan = HandoverPlan(now, subscribe_timeout_s=self._subscribe_timeout_s)
+        self.handover = HandoverTransfer(old, new, plan, self._reader, simulated=self._simulated)
+        self._events.info("rotation_begun", recording=old.name, next=name)
 
-    def look(self, now: ClockReading) -> bool:
-        """Takes in what the recorders said and wrote; whether a split was closed."""
+    def observe(self, now: ClockReading) -> bool:
+        """Reads what the children printed and wrote; returns whether a split was closed."""
         closed = False
-        for session in self.sessions:
-            self._journal.tell(session.name, session.hear())
-            changes = session.splits.look(now.monotonic_s)
-            self._list(session)
+        for session in self.running:
+            changes = self._observe(session, now)
+            self._list_own(session)
             closed = closed or bool(changes.closed)
-            self._report(session, changes)
-            if changes.gone and session not in self._leaving:
-                self._has_vanished(session)
+            if changes.gone and session.state is not SessionState.ENDING:
+                self._handle_vanished(session)
         return closed
 
-    def advance_takeover(self, now: ClockReading) -> Step:
-        """Takes a handover further; COMPLETE or ABANDON when it is over."""
-        takeover = self.takeover
-        if takeover is None:
+    def advance_handover(self, now: ClockReading) -> Step:
+        """Takes a handover further; returns COMPLETE or ABANDON when it is over."""
+        handover = self.handover
+        if handover is None:
             return Step.WAIT
-        try:
-            step = takeover.advance(now)
-            if step is Step.COMPLETE:
-                self._complete(takeover, now)
-        except RecorderError as error:
-            self._journal.fail("rotation_failed", str(error), recording=takeover.old.name)
-            step = Step.ABANDON
+        step = Step.ABANDON
+        with self._reported(handover.old):
+            due = handover.advance(now)
+            if due is Step.COMPLETE:
+                self._complete(handover, now)
+            step = due
         if step is Step.ABANDON:
-            self._abandon(takeover)
+            self._abandon(handover)
         return step
 
     def handle_exits(self, now: ClockReading) -> list[float]:
-        """Deals with recorders that died; for how long each had lived, in seconds.
+        """Handles children that ended by themselves; returns how long each had lived, in seconds.
 
-        Where the current one died during a handover the new one is the current one from then on.
+        If the current one died during a handover, the new one becomes the current one.
         """
         lived: list[float] = []
-        takeover = self.takeover
-        if takeover is not None and takeover.new.child.exit_status() is not None:
-            lived.append(self._has_died(takeover.new, now))
-            self._abandon(takeover)
+        handover = self.handover
+        if handover is not None and handover.new.child.exit_status() is not None:
+            lived.append(self._report_death(handover.new, now))
+            self._abandon(handover)
         current = self.current
         if current is not None and current.child.exit_status() is not None:
-            lived.append(self._has_died(current, now))
-            self._lose_current()
+            lived.append(self._report_death(current, now))
+            self._finalize(current, now)
+            self._replace_current()
         return lived
 
-    def give_up(self, now: ClockReading) -> bool:
-        """Ends a current recorder that does not begin to record; whether there was one."""
+    def end_unready(self, now: ClockReading) -> bool:
+        """Ends the current session if it does not begin to record; returns whether it did."""
         current = self.current
-        if current is None or current.ready:
+        if current is None or current.is_recording or current.age_s(now) < READY_TIMEOUT_S:
             return False
-        if now.monotonic_s - current.began.monotonic_s < READY_TIMEOUT_S:
-            return False
-        sentence = f"ros2 bag record does not begin to record: {current.last_words}"
-        self._journal.fail("recorder_not_ready", sentence, recording=current.name)
+        sentence = f"ros2 bag record does not begin to record: {current.last_output}"
+        self._events.fail("recorder_not_ready", sentence, recording=current.name)
         self.restarts += 1
-        self._leave(current)
+        current.end()
         self.current = None
         return True
 
     def collect_ended(self, now: ClockReading) -> None:
-        """Reminds those that are ending, and lets go of those that have ended."""
-        for session in tuple(self._leaving):
-            if session.child.end() is not None:
-                self._leaving.remove(session)
-                self._retire(session, now)
+        """Signals sessions that are ending again, and finalizes those that have ended."""
+        for session in self.running:
+            if session.state is SessionState.ENDING and session.child.end() is not None:
+                self._finalize(session, now)
 
-    def dismiss(self, now: ClockReading) -> None:
-        """Has all recorders end; `collect_ended` then lets go of them."""
-        takeover = self.takeover
-        if takeover is not None:
-            try:
-                if takeover.complete(now):
-                    self._completed.append(takeover)
-                    self._leave(takeover.new)
-                    self.takeover = None
-                else:
-                    self._abandon(takeover)
-            except RecorderError as error:
-                self._journal.fail("rotation_failed", str(error), recording=takeover.old.name)
-                self._abandon(takeover)
-        if self.current is not None:
-            self._leave(self.current)
-            self.current = None
+    def end_all(self, now: ClockReading) -> None:
+        """Asks all sessions to end; `collect_ended` finalizes them later."""
+        handover = self.handover
+        if handover is not None:
+            completed = False
+            with self._reported(handover.old):
+                completed = handover.complete(now)
+            if completed:
+                self._completed[handover.old.name] = handover
+            else:
+                self._abandon(handover)
+        for session in self.running:
+            session.end()
+        self.current, self.handover = None, None
 
-    def end(self, now: ClockReading) -> None:
-        """Has all recorders end, and waits for it, within the patience of the children."""
-        self.dismiss(now)
-        for child in end_all([session.child for session in self._leaving]):
-            self._journal.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
+    def stop(self, now: ClockReading) -> None:
+        """Ends all sessions, and waits for that within the patience of the children."""
+        self.end_all(now)
+        for child in end_all([session.child for session in self._running]):
+            self._events.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
         self.collect_ended(now)
-        self._leaving.clear()
+        self._running.clear()
 
     def _launch(self, name: str, now: ClockReading) -> RecordingSession:
         self._own.begin(name)
@@ -221,116 +213,110 @@ class RecordingSessions:
         except OSError as error:
             raise RecorderError(f"ros2 bag record cannot be started: {error}") from error
         self._unlisted.add(name)
-        self._journal.note("recorder_started", recording=name, pid=child.pid)
-        return RecordingSession(name, child, Splits(directory, self._reader), now)
+        self._events.info("recorder_started", recording=name, pid=child.pid)
+        session = RecordingSession(name, child, Splits(directory, self._reader), now)
+        self._running.append(session)
+        return session
 
-    def _list(self, session: RecordingSession) -> None:
-        """Notes which directory the child has made, as soon as it has; a fault is tried again."""
+    def _list_own(self, session: RecordingSession) -> None:
+        """Lists the directory that the child made, as soon as it exists; a fault is retried."""
         if session.name not in self._unlisted:
             return
         try:
             if self._own.complete(session.name):
                 self._unlisted.remove(session.name)
         except RecorderError as error:
-            self._journal.fail_once("recording_not_listed", session.name, str(error))
+            self._events.fail_once("recording_not_listed", session.name, str(error))
         else:
-            self._journal.over("recording_not_listed", session.name)
+            self._events.resolve("recording_not_listed", session.name)
 
-    def _report(self, session: RecordingSession, changes: Changes) -> None:
+    def _observe(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
+        self._events.report_output(session.name, session.new_lines())
+        changes = session.splits.observe(now.monotonic_s)
         for name in changes.closed:
-            self._journal.note("split_closed", recording=session.name, file=name)
+            self._events.info("split_closed", recording=session.name, file=name)
         if changes.closed:
-            for fault in flush_bags(session.splits.directory, changes.closed):
-                self._journal.warn("not_flushed", fault, recording=session.name)
+            self._flush(session, session.splits.directory, changes.closed)
         for name in changes.empty:
             sentence = f"{session.name}/{name} is empty although a newer split was begun"
-            self._journal.fail("split_empty", sentence, recording=session.name)
+            self._events.fail("split_empty", sentence, recording=session.name)
         for fault in changes.faults:
-            self._journal.fail_once("unreadable", session.name, fault, recording=session.name)
+            self._events.fail_once("unreadable", session.name, fault, recording=session.name)
+        return changes
 
-    def _complete(self, takeover: HandoverTransfer, now: ClockReading) -> None:
-        if takeover.missing:
-            missing = ", ".join(sorted(takeover.missing))
-            self._journal.warn(
+    def _flush(self, session: RecordingSession, directory: Path, names: tuple[str, ...]) -> None:
+        for fault in flush_bags(directory, names):
+            self._events.warn("not_flushed", fault, recording=session.name)
+
+    def _complete(self, handover: HandoverTransfer, now: ClockReading) -> None:
+        if handover.missing:
+            missing = ", ".join(sorted(handover.missing))
+            self._events.warn(
                 "rotated_without", f"not subscribed by the new recorder in time: {missing}"
             )
-        takeover.complete(now)
-        self._completed.append(takeover)
-        self._leave(takeover.old)
-        self.current, self.takeover = takeover.new, None
-        self._journal.note("rotated", recording=takeover.old.name, next=takeover.new.name)
+        handover.complete(now)
+        self._completed[handover.old.name] = handover
+        handover.old.end()
+        self.current, self.handover = handover.new, None
+        self._events.info("rotated", recording=handover.old.name, next=handover.new.name)
 
-    def _abandon(self, takeover: HandoverTransfer) -> None:
-        """Ends the new recorder; the old one goes on."""
-        self.takeover = None
-        try:
-            takeover.abandon()
-        except RecorderError as error:
-            self._journal.fail("rotation_failed", str(error), recording=takeover.old.name)
-        self._leave(takeover.new)
+    def _abandon(self, handover: HandoverTransfer) -> None:
+        """Ends the new session; the old one goes on."""
+        self.handover = None
+        with self._reported(handover.old):
+            handover.abandon()
+        handover.new.end()
 
-    def _lose_current(self) -> None:
-        """The current recorder is gone; the one that was to take over does so, if there is one."""
-        takeover = self.takeover
-        self.current, self.takeover = None, None
-        if takeover is None:
-            return
-        self.current = takeover.new
-        try:
-            takeover.settle()
-        except RecorderError as error:
-            self._journal.fail("rotation_failed", str(error), recording=takeover.old.name)
+    def _replace_current(self) -> None:
+        """Makes the session that was to take over the current one, if there is one."""
+        handover = self.handover
+        self.current, self.handover = None, None
+        if handover is not None:
+            self.current = handover.new
+            with self._reported(handover.old):
+                handover.settle()
 
-    def _has_vanished(self, session: RecordingSession) -> None:
+    def _handle_vanished(self, session: RecordingSession) -> None:
         sentence = f"the directory of recording {session.name} has gone; a new one is begun"
-        self._journal.fail("recording_vanished", sentence, recording=session.name)
+        self._events.fail("recording_vanished", sentence, recording=session.name)
         self.restarts += 1
-        if self.takeover is not None and session is self.takeover.new:
-            self._abandon(self.takeover)
+        if self.handover is not None and session is self.handover.new:
+            self._abandon(self.handover)
         elif session is self.current:
-            self._leave(session)
-            self._lose_current()
+            session.end()
+            self._replace_current()
 
-    def _has_died(self, session: RecordingSession, now: ClockReading) -> float:
-        self._journal.tell(session.name, session.hear())
-        lived_s = now.monotonic_s - session.began.monotonic_s
+    def _report_death(self, session: RecordingSession, now: ClockReading) -> float:
+        self._events.report_output(session.name, session.new_lines())
+        lived_s = session.age_s(now)
         status = session.child.exit_status()
-        sentence = f"ros2 bag record ended by itself with status {status}: {session.last_words}"
-        self._journal.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
+        sentence = f"ros2 bag record ended by itself with status {status}: {session.last_output}"
+        self._events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
         self.restarts += 1
-        if session is self.current:
-            self._retire(session, now)
         return lived_s
 
-    def _leave(self, session: RecordingSession) -> None:
-        if session not in self._leaving:
-            self._leaving.append(session)
-            session.child.end()
-
-    def _retire(self, session: RecordingSession, now: ClockReading) -> None:
-        """The recorder of this session has ended: looks at what it left a last time."""
-        self._journal.tell(session.name, session.hear())
-        self._report(session, session.splits.look(now.monotonic_s))
-        for takeover in [each for each in self._completed if each.old is session]:
-            self._completed.remove(takeover)
-            try:
-                takeover.old_has_ended()
-            except RecorderError as error:
-                self._journal.fail("rotation_failed", str(error), recording=session.name)
-        self._list(session)
+    def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
+        """Reads what an ended session left, completes its sidecar, and makes it durable."""
+        session.state = SessionState.ENDED
+        self._running = [each for each in self._running if each is not session]
+        self._observe(session, now)
+        completed = self._completed.pop(session.name, None)
+        if completed is not None:
+            with self._reported(session):
+                completed.add_late_splits()
+        self._list_own(session)
         self._unlisted.discard(session.name)
         splits = session.splits
         if remove_if_empty(splits.directory):
-            self._journal.note("recording_empty", recording=session.name)
-        faults = [*flush_bags(splits.directory, [METADATA_FILE]), *flush_bags(self._bag_dir, [])]
-        for fault in faults:
-            self._journal.warn("not_flushed", fault, recording=session.name)
-        self._retired_bytes += splits.bytes_written
-        lived_s = now.monotonic_s - session.began.monotonic_s
-        silence = silence_told(session.subscribed, splits.heard)
-        if silence is not None and lived_s >= WHOLE_RECORDING_S:
-            self._journal.warn("topics_silent", silence, recording=session.name)
-        self._journal.note(
+            self._events.info("recording_empty", recording=session.name)
+        self._flush(session, splits.directory, (METADATA_FILE,))
+        self._flush(session, self._bag_dir, ())
+        self._ended_bytes += splits.bytes_written
+        silent = describe_silent_topics(session.subscribed, splits.received)
+        lived_s = session.age_s(now)
+        if silent is not None and lived_s >= WHOLE_RECORDING_S:
+            self._events.warn("topics_silent", silent, recording=session.name)
+        self._events.info(
             "recording_ended",
             recording=session.name,
             splits=len(splits.closed_names),
@@ -338,3 +324,11 @@ class RecordingSessions:
             bytes=splits.bytes_written,
             lived_s=round(lived_s, 3),
         )
+
+    @contextmanager
+    def _reported(self, session: RecordingSession) -> Iterator[None]:
+        """Reports an error of the handover from this session, and goes on after the block."""
+        try:
+            yield
+        except RecorderError as error:
+            self._events.fail("rotation_failed", str(error), recording=session.name)

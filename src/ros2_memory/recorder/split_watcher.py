@@ -25,7 +25,7 @@ EMPTY_GRACE_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Changes:
+class SplitChanges:
     """What one look found: splits closed since the last, splits left empty, and what is amiss.
 
     `gone`: the directory was there and is not any more. `faults` are sentences on what could not
@@ -53,23 +53,23 @@ class Splits:
     directory: Path
     reader: BagReader
     exists: bool = False
-    heard: set[str] = field(default_factory=set)
+    received: set[str] = field(default_factory=set)
     messages: int = 0
     _files: dict[str, _Split] = field(default_factory=dict)
 
-    def look(self, now_s: float) -> Changes:
+    def observe(self, now_s: float) -> SplitChanges:
         """Looks at the directory again. Raises nothing.
 
-        `heard` then has every topic of which a closed split holds a message, and `messages` how
+        `received` then has every topic of which a closed split holds a message, and `messages` how
         many there are in all of them.
         """
         try:
             sizes = self._sizes()
         except (FileNotFoundError, NotADirectoryError):
             existed, self.exists = self.exists, False
-            return Changes(gone=existed)
+            return SplitChanges(gone=existed)
         except OSError as error:
-            return Changes(faults=(f"{self.directory}: {error.strerror or error}",))
+            return SplitChanges(faults=(f"{self.directory}: {error.strerror or error}",))
         self.exists = True
         for name, size in sizes.items():
             split = self._files.setdefault(name, _Split(now_s))
@@ -81,7 +81,7 @@ class Splits:
         empty = tuple(
             name for name, size in sizes.items() if overdue and self._is_empty(name, size, newest_s)
         )
-        return Changes(closed, empty, faults=tuple(faults))
+        return SplitChanges(closed, empty, faults=tuple(faults))
 
     @property
     def bytes_written(self) -> int:
@@ -125,7 +125,7 @@ class Splits:
         except OSError as error:
             faults.append(f"{path}: {error.strerror or error}")
             return split.closed
-        self.heard.update(topic.topic for topic in summary.topics)
+        self.received.update(topic.topic for topic in summary.topics)
         self.messages += summary.count
         return True
 

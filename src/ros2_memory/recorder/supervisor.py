@@ -1,8 +1,7 @@
-"""Keeps recording: when to begin, rotate, pause and restart, and who is told.
+"""Keeps a recording going: begins, rotates, pauses and restarts it, and reports what happens.
 
-Everything happens in `tick`, which its caller runs some times a second from the main thread, and
-which does not wait. What to do is decided elsewhere (`plan`, `rotation`, `watchdog`), and done
-elsewhere (`crew`); here the two meet.
+Everything happens in `tick`, which the main thread calls several times a second and which does not
+wait. `policies` and `handover.plan` decide what to do, and `sessions` does it; here the two meet.
 """
 
 from __future__ import annotations
@@ -14,18 +13,22 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.chores import QUIET_HOUSE_S, Chores
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.plan import (
-    BOTH_S,
     SUBSCRIBE_TIMEOUT_S,
     ClockReading,
     Step,
 )
 from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
-from ros2_memory.recorder.policies import Backoff, SilenceWatch, session_over
+from ros2_memory.recorder.policies import (
+    Backoff,
+    SilenceWatch,
+    SpaceAction,
+    clock_was_set_back,
+    resume_bytes,
+    space_action,
+)
 from ros2_memory.recorder.sessions import RecordingSessions
-from ros2_memory.recorder.watchdog import Space, resume_bytes, space, time_was_set_back
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
 if TYPE_CHECKING:
@@ -33,25 +36,31 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.timebase import Clock
-    from ros2_memory.recorder.ports import Housekeeper, RecorderProcess
+    from ros2_memory.recorder.base import Housekeeper
+    from ros2_memory.recorder.process.child import Child
     from ros2_memory.storage.base import BagReader
 
-LOOK_S: Final = 0.5
+OBSERVE_S: Final = 0.5
 SPACE_S: Final = 1.0
 MOMENTS_S: Final = 1.0
-"""How often it is looked whether somebody asks for a moment to be kept, and waits for the reply."""
+"""How often requests to save a moment are looked for: their callers wait for the reply."""
 FAULT_S: Final = 60.0
-"""How often it is told that a task fails, which is tried again with every tick."""
+"""How often a failing task, which every tick tries again, is reported."""
 SETTLE_S: Final = 5.0
-"""A young recording writes its headers and the latched messages; the robot has said nothing yet."""
+"""A recording this young writes its headers and latched messages, which say nothing of silence."""
+RETENTION_S: Final = 10.0
+"""How often the limits are applied when splits were closed."""
+QUIET_RETENTION_S: Final = 60.0
+"""How often the limits are applied when no split was closed: bags grow old all the same."""
+HEARTBEAT_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orders:
-    """What is to be done. Durations in seconds.
+    """What to record and for how long. Durations are in seconds.
 
-    `simulated`: log times come from a simulated clock. `subscribe_timeout_s` and `both_s` are
-    those of a handover (see `rotation`), the next three those of a recorder that dies.
+    `simulated`: log times come from a simulated clock. `subscribe_timeout_s` is how long a handover
+    waits for the new recorder (see `handover.plan`).
     """
 
     bag_dir: Path
@@ -59,25 +68,29 @@ class Orders:
     session_duration_s: float
     min_free_bytes: int
     simulated: bool = False
-    heartbeat_s: float = 5.0
     subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
-    both_s: float = BOTH_S
-    first_backoff_s: float = 1.0
-    longest_backoff_s: float = 60.0
-    stable_s: float = 60.0
 
 
 class Supervisor:
     """Keeps one recording going, two during a handover.
 
-    `start_child` starts the recorder of a recording, given its name and its directory. `expected`
-    gives the topics that are to be recorded by name, `own` is the list of recordings made here.
+    Args:
+        orders: what to record.
+        start_child: starts the `ros2 bag record` of a recording, given its name and directory.
+        reader: reads splits that are closed.
+        housekeeper: repairs and deletes in the background.
+        clock: the wall clock.
+        monotonic: a clock that never steps, in seconds.
+        free_bytes_of: measures what the file system of a directory has left.
+        device: gives the device that a directory lies on.
+        expected: gives the topics that are to be recorded by name.
+        own: the list of recordings that were made here.
     """
 
     def __init__(
         self,
         orders: Orders,
-        start_child: Callable[[str, Path], RecorderProcess],
+        start_child: Callable[[str, Path], Child],
         reader: BagReader,
         housekeeper: Housekeeper,
         clock: Clock,
@@ -89,49 +102,50 @@ class Supervisor:
         own: OwnRecordings | None = None,
     ) -> None:
         self._orders = orders
+        self._bag_dir = orders.bag_dir
         self._clock = clock
         self._monotonic = monotonic
         self._free_bytes_of = free_bytes_of
-        self._home = HomeDisk(orders.bag_dir, device)
-        self._away = False
-        self._journal = EventLog()
-        self._chores = Chores(orders.bag_dir, housekeeper, self._journal, monotonic())
-        self._pulse = HeartbeatWriter(
+        self._disk = HomeDisk(orders.bag_dir, device)
+        self._disk_gone = False
+        self._housekeeper = housekeeper
+        self._events = EventLog()
+        self._heartbeat = HeartbeatWriter(
             orders.bag_dir,
-            orders.heartbeat_s,
+            HEARTBEAT_S,
             clock,
-            self._journal,
-            expected=expected,
+            self._events,
             age_held=housekeeper.age_held,
+            expected=expected,
         )
-        self._crew = RecordingSessions(
+        self._sessions = RecordingSessions(
             orders.bag_dir,
             start_child,
             self._announce,
             reader,
-            self._journal,
+            self._events,
             own=own or OwnRecordings(orders.bag_dir),
             simulated=orders.simulated,
             subscribe_timeout_s=orders.subscribe_timeout_s,
-            both_s=orders.both_s,
         )
-        limits = (orders.first_backoff_s, orders.longest_backoff_s, orders.stable_s)
-        self._backoff = Backoff(*limits)
-        self._rotation_backoff = Backoff(*limits)
+        self._backoff = Backoff()
+        self._rotation_backoff = Backoff()
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
         self._rotating_for_silence = False
         self._rotate_now = False
         self._paused = False
-        self._room_made = False
+        self._room_requested = False
+        self._splits_closed = False
         self._stopped = True
         self._due_s: dict[str, float] = {}
         self._last = self._now()
+        self._applied_s = self._last.monotonic_s
 
     @property
     def is_recording(self) -> bool:
-        """Whether a recorder runs and has said that it records."""
-        current = self._crew.current
-        return current is not None and current.ready and current.child.exit_status() is None
+        """Whether a recorder runs and has reported that it records."""
+        current = self._sessions.current
+        return current is not None and current.is_recording and current.child.exit_status() is None
 
     def start(self) -> None:
         """Begins a first recording, unless one is under way or the disk is full.
@@ -144,153 +158,162 @@ class Supervisor:
         self._last = now = self._now()
         self._due_s.clear()
         self._make_bag_dir()
-        self._remember_disk()
-        self._mind_space(now)
+        try:
+            self._disk.remember()
+        except OSError as error:
+            raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
+        self._disk_gone = False
+        self._check_space(now)
         if not self._paused:
             self._begin(now)
         self._stopped = False
-        self._beat()
+        self._write_heartbeat()
 
     def tick(self) -> None:
-        """Does what is due. Raises nothing: what goes wrong is reported, and tried again."""
+        """Does what is due. Raises nothing: a failure is reported and tried again."""
         if self._stopped:
             return
         now = self._now()
-        if time_was_set_back(self._last, now):
+        if clock_was_set_back(self._last, now):
             self._rotate_now = True
-            self._journal.warn("clock_set_back", "the clock was set back: a new recording begins")
+            self._events.warn("clock_set_back", "the clock was set back: a new recording begins")
         self._last = now
-        self._mind_all(now)
-        if self._is_due("beat", self._orders.heartbeat_s, now):
-            self._beat()
-        elif not self._away:
-            self._pulse.beat_if_news(self._state, self._crew)
+        self._run_tasks(now)
+        if self._is_due("beat", HEARTBEAT_S, now):
+            self._write_heartbeat()
+        elif not self._disk_gone:
+            self._heartbeat.write_if_changed(self._state, self._sessions)
 
     def stop(self) -> None:
         """Ends everything that runs, within the patience of its children."""
         if self._stopped:
             return
         self._stopped = True
-        self._beat(RecorderState.STOPPING)
-        self._crew.end(self._now())
+        self._write_heartbeat(RecorderState.STOPPING)
+        self._sessions.stop(self._now())
         self._paused = False
-        self._beat(RecorderState.STOPPED)
+        self._write_heartbeat(RecorderState.STOPPED)
 
-    def _mind_all(self, now: ClockReading) -> None:
+    def _run_tasks(self, now: ClockReading) -> None:
+        # The names are those of the documented log event.
         tasks: dict[str, Callable[[ClockReading], object]] = {
-            "disk": self._mind_disk,
-            "look": self._look,
-            "deaths": self._mind_deaths,
-            "space": self._mind_space,
-            "takeover": self._mind_takeover,
-            "rotation": self._mind_rotation,
-            "restart": self._mind_restart,
-            "reap": self._crew.collect_ended,
+            "disk": self._check_disk,
+            "look": self._observe,
+            "deaths": self._check_exits,
+            "space": self._check_space,
+            "takeover": self._check_handover,
+            "rotation": self._check_rotation,
+            "restart": self._check_restart,
+            "reap": self._sessions.collect_ended,
             "recorded": self._note_recorded,
-            "house": self._keep_house,
+            "house": self._apply_retention,
             "moments": self._keep_moments,
         }
-        for task, mind in tasks.items():
+        for name, task in tasks.items():
             try:
-                mind(now)
+                task(now)
             except OSError as error:
-                # Of a disk or a server that fails at any touch: the next tick tries again.
-                if self._is_due(f"tell {task}", FAULT_S, now):
-                    self._journal.fail("supervision_failed", str(error), task=task)
+                # A disk or a server may fail at any access: the next tick tries again.
+                if self._is_due(f"report {name}", FAULT_S, now):
+                    self._events.fail("supervision_failed", str(error), task=name)
 
-    def _look(self, now: ClockReading) -> None:
-        if self._is_due("look", LOOK_S, now):
-            self._chores.splits_closed |= self._crew.look(now)
+    def _observe(self, now: ClockReading) -> None:
+        if self._is_due("observe", OBSERVE_S, now):
+            self._splits_closed |= self._sessions.observe(now)
 
-    def _mind_disk(self, now: ClockReading) -> None:
+    def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
-        there = [each.name for each in self._crew.sessions if each.splits.exists]
-        before, self._away = self._away, self._home.is_away(there)
-        if self._away and not before:
-            self._crew.dismiss(now)
-            self._journal.fail(
+        recordings = [each.name for each in self._sessions.running if each.splits.exists]
+        was_gone, self._disk_gone = self._disk_gone, self._disk.is_away(recordings)
+        if self._disk_gone and not was_gone:
+            self._sessions.end_all(now)
+            self._events.fail(
                 "disk_gone",
                 f"recording is paused: the disk of {self._bag_dir} has been unmounted, and another "
                 "lies there; recording resumes by itself when it is mounted again (to record onto "
                 "the other one, start the recorder anew)",
             )
-        elif before and not self._away:
-            self._put_off("restart", self._backoff.failed(0.0), now)
-            self._journal.note("disk_back", bag_dir=str(self._bag_dir))
+        elif was_gone and not self._disk_gone:
+            self._postpone("restart", self._backoff.failed(0.0), now)
+            self._events.info("disk_back", bag_dir=str(self._bag_dir))
 
-    def _mind_deaths(self, now: ClockReading) -> None:
-        before = self._crew.current
-        for lived_s in self._crew.handle_exits(now):
-            self._put_off("rotate", self._rotation_backoff.failed(lived_s), now)
-            self._put_off("restart", self._backoff.failed(lived_s), now)
-        if self._crew.give_up(now):
-            self._put_off("restart", self._backoff.failed(0.0), now)
-        current = self._crew.current
+    def _check_exits(self, now: ClockReading) -> None:
+        before = self._sessions.current
+        for lived_s in self._sessions.handle_exits(now):
+            self._postpone("rotate", self._rotation_backoff.failed(lived_s), now)
+            self._postpone("restart", self._backoff.failed(lived_s), now)
+        if self._sessions.end_unready(now):
+            self._postpone("restart", self._backoff.failed(0.0), now)
+        current = self._sessions.current
         if current is not None and current is not before:
             self._silence.began(now.monotonic_s, SETTLE_S)
 
-    def _mind_space(self, now: ClockReading) -> None:
+    def _check_space(self, now: ClockReading) -> None:
         """Deletes more, pauses and resumes, by what the disk has left."""
-        if self._away or not self._is_due("space", SPACE_S, now):
+        if self._disk_gone or not self._is_due("space", SPACE_S, now):
             return
         free = self._free_bytes()
         if free is None:
             return
-        action = self._space(free)
-        if action is Space.MAKE_ROOM:
-            self._room_made = True
+        action = self._space_action(free)
+        if action is SpaceAction.MAKE_ROOM:
+            self._room_requested = True
             self._make_room()
             free = self._free_bytes() or 0
-            action = self._space(free)
-        if action is Space.STAY_PAUSED and self._is_due("room", QUIET_HOUSE_S, now):
-            # What was being written when recording was paused may be deleted since.
+            action = self._space_action(free)
+        if action is SpaceAction.STAY_PAUSED and self._is_due("room", QUIET_RETENTION_S, now):
+            # Bags that were being written when recording was paused may be deleted by now.
             self._make_room()
-        if action is Space.PAUSE:
+        if action is SpaceAction.PAUSE:
             self._pause(now, free)
-        elif action is Space.RESUME:
+        elif action is SpaceAction.RESUME:
             self._paused = False
-            self._put_off("restart", 0.0, now)
-            self._journal.note("recording_resumed", free_bytes=free)
-        elif action is Space.ENOUGH:
-            self._room_made = False
+            self._postpone("restart", 0.0, now)
+            self._events.info("recording_resumed", free_bytes=free)
+        elif action is SpaceAction.NONE:
+            self._room_requested = False
 
-    def _space(self, free: int) -> Space:
-        return space(
+    def _space_action(self, free: int) -> SpaceAction:
+        return space_action(
             free,
             self._orders.min_free_bytes,
             paused=self._paused,
-            room_made=self._room_made,
-            making=self._chores.making_room(),
+            room_requested=self._room_requested,
+            making_room=self._housekeeper.is_making_room(),
         )
+
+    def _make_room(self) -> None:
+        self._housekeeper.make_room(resume_bytes(self._orders.min_free_bytes))
 
     def _pause(self, now: ClockReading, free: int) -> None:
         self._paused = True
-        self._crew.dismiss(now)
-        self._journal.fail(
+        self._sessions.end_all(now)
+        self._events.fail(
             "recording_paused",
             f"recording is paused: {free} bytes are free on the disk, and "
             f"{self._orders.min_free_bytes} are the least (retention.min_free_gb); it resumes "
             f"by itself at {resume_bytes(self._orders.min_free_bytes)}",
         )
-        self._beat()
+        self._write_heartbeat()
 
-    def _mind_takeover(self, now: ClockReading) -> None:
-        step = self._crew.advance_takeover(now)
+    def _check_handover(self, now: ClockReading) -> None:
+        step = self._sessions.advance_handover(now)
         if step is Step.COMPLETE:
             self._silence.rotated(for_silence=self._rotating_for_silence)
             self._silence.began(now.monotonic_s, SETTLE_S)
         elif step is Step.ABANDON:
-            self._put_off("rotate", self._rotation_backoff.failed(0.0), now)
+            self._postpone("rotate", self._rotation_backoff.failed(0.0), now)
 
-    def _mind_rotation(self, now: ClockReading) -> None:
-        current = self._crew.current
+    def _check_rotation(self, now: ClockReading) -> None:
+        current = self._sessions.current
         if current is None:
             return
         silent = self._silence.is_silent(now.monotonic_s, current.splits.bytes_written)
-        age_s = now.monotonic_s - current.began.monotonic_s
-        over = session_over(age_s, self._orders.session_duration_s)
+        # Every split repeats the list of all splits before it, so a recording that is never
+        # rotated grows with the square of its age.
+        over = current.age_s(now) >= self._orders.session_duration_s
         wanted = self._rotate_now or silent or over
-        ready = current.ready and current.splits.exists and self._crew.takeover is None
+        ready = current.is_recording and current.splits.exists and self._sessions.handover is None
         if not (wanted and ready and self._is_due("rotate", 0.0, now)):
             return
         if silent:
@@ -298,37 +321,30 @@ class Supervisor:
                 f"{current.name} has stopped growing: the robot is silent, or its messages do not "
                 "arrive; what was recorded is closed"
             )
-            self._journal.warn("no_growth", sentence, recording=current.name)
+            self._events.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = silent and not over
         self._rotate_now = False
         try:
-            self._crew.begin_takeover(now)
+            self._sessions.begin_handover(now)
         except RecorderError as error:
-            self._journal.fail("rotation_failed", str(error), recording=current.name)
-            self._put_off("rotate", self._rotation_backoff.failed(0.0), now)
+            self._events.fail("rotation_failed", str(error), recording=current.name)
+            self._postpone("rotate", self._rotation_backoff.failed(0.0), now)
 
-    def _mind_restart(self, now: ClockReading) -> None:
-        if self._crew.current is not None or self._paused or self._away:
+    def _check_restart(self, now: ClockReading) -> None:
+        if self._sessions.current is not None or self._paused or self._disk_gone:
             return
         if not self._is_due("restart", 0.0, now):
             return
         try:
             self._begin(now)
         except RecorderError as error:
-            self._journal.fail("recorder_not_started", str(error))
-            self._put_off("restart", self._backoff.failed(0.0), now)
+            self._events.fail("recorder_not_started", str(error))
+            self._postpone("restart", self._backoff.failed(0.0), now)
 
     def _begin(self, now: ClockReading) -> None:
         self._make_bag_dir()
-        self._crew.begin(now)
+        self._sessions.begin(now)
         self._silence.began(now.monotonic_s, SETTLE_S)
-
-    def _remember_disk(self) -> None:
-        try:
-            self._home.remember()
-        except OSError as error:
-            raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
-        self._away = False
 
     def _make_bag_dir(self) -> None:
         try:
@@ -338,36 +354,38 @@ class Supervisor:
                 f"{self._bag_dir} cannot be made: {error.strerror or error}"
             ) from error
 
-    def _make_room(self) -> None:
-        self._chores.make_room(resume_bytes(self._orders.min_free_bytes))
-
-    def _keep_house(self, now: ClockReading) -> None:
-        self._chores.tell()
-        if not self._away:
-            self._chores.keep_house(now.monotonic_s)
-
     def _note_recorded(self, now: ClockReading) -> None:
-        names = () if self._away else tuple(each.name for each in self._crew.sessions if each.ready)
-        self._chores.note_recorded(names, self._crew.bytes_written, now.monotonic_s)
+        names = [each.name for each in self._sessions.running if each.has_recorded]
+        self._housekeeper.note_recorded(
+            () if self._disk_gone else names, self._sessions.bytes_written, now.monotonic_s
+        )
+
+    def _apply_retention(self, now: ClockReading) -> None:
+        self._events.report_faults(self._housekeeper.faults())
+        every_s = RETENTION_S if self._splits_closed else QUIET_RETENTION_S
+        if self._disk_gone or now.monotonic_s - self._applied_s < every_s:
+            return
+        self._applied_s = now.monotonic_s
+        self._splits_closed = False
+        self._housekeeper.apply()
 
     def _keep_moments(self, now: ClockReading) -> None:
-        if not self._away and self._is_due("moments", MOMENTS_S, now):
-            self._chores.keep_moments()
+        if not self._disk_gone and self._is_due("moments", MOMENTS_S, now):
+            self._housekeeper.keep_moments()
 
     def _announce(self, name: str) -> None:
-        self._pulse.announce(name)
-        self._beat()
-        # It stays in that heartbeat until the next, and then is one of the crew's.
-        self._pulse.arrived()
+        """Names a recording in the heartbeat before anything of it exists."""
+        if not self._disk_gone:
+            self._heartbeat.write(self._state, self._sessions, announced=name)
 
-    def _beat(self, state: RecorderState | None = None) -> None:
-        # Below where the bags' own disk is unmounted nothing is written, as nothing is recorded.
-        if not self._away:
-            self._pulse.beat(state or self._state, self._crew)
+    def _write_heartbeat(self, state: RecorderState | None = None) -> None:
+        # While the bags' own disk is unmounted nothing is written to the disk below it.
+        if not self._disk_gone:
+            self._heartbeat.write(state or self._state, self._sessions)
 
     @property
     def _state(self) -> RecorderState:
-        if self._paused or self._away:
+        if self._paused or self._disk_gone:
             return RecorderState.PAUSED
         return RecorderState.RECORDING if self.is_recording else RecorderState.STARTING
 
@@ -376,24 +394,20 @@ class Supervisor:
             free = self._free_bytes_of(self._bag_dir)
         except OSError as error:
             sentence = f"{self._bag_dir}: {error.strerror or error}"
-            self._journal.fail_once("free_space_unknown", "", sentence)
+            self._events.fail_once("free_space_unknown", "", sentence)
             return None
-        self._journal.over("free_space_unknown", "")
+        self._events.resolve("free_space_unknown", "")
         return free
 
     def _is_due(self, task: str, every_s: float, now: ClockReading) -> bool:
-        """Whether a task is due; it then is not for `every_s`."""
+        """Whether a task is due; if so, it is not due again for `every_s` seconds."""
         if now.monotonic_s < self._due_s.get(task, 0.0):
             return False
         self._due_s[task] = now.monotonic_s + every_s
         return True
 
-    def _put_off(self, task: str, wait_s: float, now: ClockReading) -> None:
+    def _postpone(self, task: str, wait_s: float, now: ClockReading) -> None:
         self._due_s[task] = now.monotonic_s + wait_s
 
     def _now(self) -> ClockReading:
         return ClockReading(self._monotonic(), self._clock.now())
-
-    @property
-    def _bag_dir(self) -> Path:
-        return self._orders.bag_dir

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from ros2_memory.retention.latched_carry import Carrier
     from ros2_memory.retention.policy import RetentionLimits, RetentionStock, StoredBag
     from ros2_memory.retention.recorded_time import RecordedTime
-    from ros2_memory.retention.time_sync import TimeSync
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass: some tenths of a second. The next pass goes on."""
@@ -93,7 +92,7 @@ class GarbageCollector:
         carrier: carries latched messages on.
         own: the recordings that the recorder made.
         recorded: how long was recorded after each recording.
-        time_sync: knows whether the system clock is synchronised.
+        is_synchronised: whether the system clock is synchronised; may take some seconds.
         static_topics: topics that are latched whatever their publishers say.
         grace_s: how long latched messages are carried before the bag goes that they stood in.
         monotonic: a clock that never steps, in seconds.
@@ -107,7 +106,7 @@ class GarbageCollector:
         own: OwnRecordings,
         *,
         recorded: RecordedTime,
-        time_sync: TimeSync,
+        is_synchronised: Callable[[], bool],
         static_topics: Collection[str] = (),
         grace_s: float = 0.0,
         monotonic: Callable[[], float] = time.monotonic,
@@ -116,7 +115,7 @@ class GarbageCollector:
         self._limits = limits
         self._carrier = carrier
         self._recorded = recorded
-        self._time_sync = time_sync
+        self._is_synchronised = is_synchronised
         self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
         self._grace_s = grace_s
         self._monotonic = monotonic
@@ -179,7 +178,7 @@ class GarbageCollector:
         old = ages(stock, limits)
         # A program has to be started to know, so only where it matters.
         if old.by_dates != old.by_recording and under_way.synchronised is None:
-            under_way.synchronised = self._time_sync.is_synchronised()
+            under_way.synchronised = self._is_synchronised()
         synchronised = bool(under_way.synchronised)
         under_way.done.held = len(old.held(synchronised=synchronised))
         return replace(stock, synchronised=synchronised)

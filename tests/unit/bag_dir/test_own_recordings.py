@@ -90,7 +90,7 @@ class TestWhatARecorderLists:
             listed_at_start.append(lines(tmp_path))
             return start(name, directory)
 
-        world.supervisor._crew._start_child = starting
+        world.supervisor._sessions._start_child = starting
         world.supervisor.start()
         [recorder] = world.recorders
         name = recorder.directory.name

@@ -94,7 +94,7 @@ def test_they_are_scanned_repaired_measured_and_counted(
     put(bags, bag)
     memory = build_memory(load_settings([f"recording.bag_dir={bags}"], {"XDG_CACHE_HOME": ""}))
     assert len(memory.index.snapshot().bags) == 1
-    keeper_of(bags).apply(bags)
+    keeper_of(bags).apply()
     lines: list[str] = []
     assert recover(bags, lines.append).whole == 1
     assert _size(bags) >= bag.stat().st_size

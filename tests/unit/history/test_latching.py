@@ -239,7 +239,7 @@ def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
     telemetry = every(0.01, 7, TELEMETRY)
     messages = [text(T0, "office", MAP), log_line(T0 + S), *telemetry, *drive(T0, T0 + 30 * S)]
     record(tmp_path / "rec", messages)
-    keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+    keeper_of(tmp_path, max_bytes=1).apply()
     carried = tmp_path / "latched/carried.mcap"
     topics = [TELEMETRY, MAP, ROSOUT]
     found = {
@@ -261,7 +261,7 @@ def test_static_transforms_in_every_split_stay_few(tmp_path: Path) -> None:
         for n in range(20)
     ]
     record(tmp_path / "rec", [*mounts, *drive(T0, T0 + 200 * S)])
-    keeper_of(tmp_path, max_bytes=60_000).apply(tmp_path)
+    keeper_of(tmp_path, max_bytes=60_000).apply()
     left = [path for path in tmp_path.rglob("*.mcap") if path.parent.name == "rec"]
     assert 1 < len(left) < 20
     carried = tmp_path / "latched/carried.mcap"

@@ -170,7 +170,7 @@ def test_a_wish_that_was_begun_just_in_time_is_waited_for(
     withdraw = PendingRequest.withdraw
 
     def too_late(slot: PendingRequest) -> bool:
-        house.keep_moments(tmp_path)
+        house.keep_moments()
         return withdraw(slot)
 
     monkeypatch.setattr(saved_moments, "PATIENCE_S", 0.0)

@@ -14,15 +14,14 @@ from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.time_arguments import TimeRange
-from ros2_memory.recorder.housekeeping import InBackground
+from ros2_memory.recorder.base import Housekeeper
+from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.recorder.ports import Housekeeper, NoHousekeeping
 from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.housekeepers import (
     PLENTY,
-    FakeTimeSync,
     files_in,
     keeper_of,
     later,
@@ -35,6 +34,7 @@ from tests.support.memories import extractor
 if TYPE_CHECKING:
     from collections.abc import Iterator, MutableMapping
     from pathlib import Path
+from unittest.mock import Mock
 
 S = 10**9
 T0 = 1_790_000_000 * S
@@ -66,9 +66,7 @@ def events(captured: list[MutableMapping[str, Any]], name: str) -> list[MutableM
 class TestRetention:
     def test_the_oldest_bags_go_and_their_recording_after_them(self, tmp_path: Path) -> None:
         old, new = recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
-        keeper_of(tmp_path, max_bytes=sum(path.stat().st_size for path in new) + 100).apply(
-            tmp_path
-        )
+        keeper_of(tmp_path, max_bytes=sum(path.stat().st_size for path in new) + 100).apply()
         assert files_in(tmp_path) == [
             "b",
             "b/b_0.mcap",
@@ -89,16 +87,16 @@ class TestRetention:
             (tmp_path / name).write_bytes(bytes(5000))
         recording_now(tmp_path, "b")
         total = size_of(tmp_path)
-        keeper_of(tmp_path, max_bytes=total).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=total).apply()
         assert first.exists()
-        keeper_of(tmp_path, max_bytes=total - 1).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=total - 1).apply()
         assert not first.exists()
 
     def test_two_names_of_one_file_count_once(self, tmp_path: Path) -> None:
         first, second, third = recording(tmp_path, "a", 0)
         (tmp_path / "kept").mkdir()
         os.link(first, tmp_path / "kept/same.mcap")
-        keeper_of(tmp_path, max_bytes=size_of(tmp_path)).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=size_of(tmp_path)).apply()
         assert all(path.exists() for path in (first, second, third))
 
     def test_what_is_too_old_goes_by_the_time_inside_and_not_by_that_of_the_file(
@@ -106,42 +104,42 @@ class TestRetention:
     ) -> None:
         old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "a/a_1.mcap", 3 * 3600)
         os.utime(young, ns=(T0, T0))
-        keeper_of(tmp_path, max_age_h=2).apply(tmp_path)
+        keeper_of(tmp_path, max_age_h=2).apply()
         assert (old.exists(), young.exists()) == (False, True)
 
     def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
         self, tmp_path: Path
     ) -> None:
         old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "b/b_0.mcap", 3 * 3600)
-        clock = FakeTimeSync(synchronised=False)
-        keeper = keeper_of(tmp_path, max_age_h=2, time_sync=clock)
+        clock = Mock(return_value=False)
+        keeper = keeper_of(tmp_path, max_age_h=2, is_synchronised=clock)
         with structlog.testing.capture_logs() as captured:
-            keeper.apply(tmp_path)
-            keeper.apply(tmp_path)
-            assert (old.exists(), clock.asked) == (True, 2)
+            keeper.apply()
+            keeper.apply()
+            assert (old.exists(), clock.call_count) == (True, 2)
             [held] = events(captured, "age_held")
             assert (held["bags"], held["reason"]) == (1, keeper.age_held())
             assert "1 bag is older than 2 h" in held["reason"]
-            clock.synchronised = True
-            keeper.apply(tmp_path)
+            clock.return_value = True
+            keeper.apply()
         assert (old.exists(), young.exists(), keeper.age_held()) == (False, True, None)
         assert len(events(captured, "age_no_longer_held")) == 1
-        keeper.apply(tmp_path)
-        assert clock.asked == 3
+        keeper.apply()
+        assert clock.call_count == 3
 
     def test_what_was_recorded_longer_ago_than_the_limit_goes_by_the_monotonic_clock(
         self, tmp_path: Path
     ) -> None:
         old = bag(tmp_path / "a/a_0.mcap", 0)
-        keeper = keeper_of(tmp_path, max_age_h=0.1, time_sync=FakeTimeSync(synchronised=False))
-        keeper.apply(tmp_path)
+        keeper = keeper_of(tmp_path, max_age_h=0.1, is_synchronised=lambda: False)
+        keeper.apply()
         for second in range(400):
             keeper.note_recorded(["b"], second, float(second))
             if second == 350:
                 bag(tmp_path / "b/b_0.mcap", 30)
-                keeper.apply(tmp_path)
+                keeper.apply()
                 assert old.exists()
-        keeper.apply(tmp_path)
+        keeper.apply()
         assert files_in(tmp_path / "b") == ["b_0.mcap"]
         assert not old.exists()
 
@@ -149,8 +147,8 @@ class TestRetention:
         recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
         keeper = keeper_of(tmp_path, max_bytes=45_000)
         with structlog.testing.capture_logs() as captured:
-            keeper.apply(tmp_path)
-            keeper.apply(tmp_path)
+            keeper.apply()
+            keeper.apply()
         first, second = events(captured, "retention_applied")
         assert (first["log_level"], first["bags"], first["recordings"]) == ("info", 4, 1)
         assert first["bytes"] > 45_000
@@ -165,7 +163,7 @@ class TestRetention:
         os.utime(empty, ns=(T0, T0))
         bag(tmp_path / "a/a_0.mcap", 3 * 3600)
         bag(tmp_path / "a/a_1.mcap", 0)
-        keeper_of(tmp_path, max_age_h=2).apply(tmp_path)
+        keeper_of(tmp_path, max_age_h=2).apply()
         assert files_in(tmp_path) == ["a", "a/a_0.mcap"]
 
     def test_a_wrong_clock_neither_deletes_a_bag_before_its_time_nor_keeps_it_for_good(
@@ -185,7 +183,7 @@ class TestRetention:
         left = []
         for count in (3, 2, 1):
             keeper = keeper_of(tmp_path, max_bytes=count * size + size // 2, max_age_h=168)
-            keeper.apply(tmp_path)
+            keeper.apply()
             left.append([name for name, path in bags.items() if path.exists()])
         assert left == [["old", "new", "boot"], ["new", "boot"], ["new"]]
 
@@ -193,7 +191,7 @@ class TestRetention:
         first, *_ = recording(tmp_path, "a", 0)
         packed = zstandard.compress(first.read_bytes())
         first.with_name("a_0.mcap.zstd").write_bytes(packed[: len(packed) // 2])
-        keeper_of(tmp_path, max_bytes=30_000, reader=reader_of_both()).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=30_000, reader=reader_of_both()).apply()
         assert not first.exists()
         assert not first.with_name("a_0.mcap.zstd").exists()
 
@@ -203,7 +201,7 @@ class TestRetention:
         first.with_name("a_0.db3-shm").write_bytes(b"")
         first.with_name("a_1.db3-shm").write_bytes(b"")
         bag(tmp_path / "b/b_0.mcap", 100)
-        keeper_of(tmp_path, max_bytes=1, reader=reader_of_both()).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1, reader=reader_of_both()).apply()
         assert files_in(tmp_path) == ["b", "b/b_0.mcap"]
 
 
@@ -213,7 +211,7 @@ class TestWhatIsNeverDeleted:
         (tmp_path / "a/notes.txt").write_text("mine")
         (tmp_path / "a/.hidden.tmp").write_text("mine")
         (tmp_path / "elsewhere").mkdir()
-        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1).apply()
         assert files_in(tmp_path)[:4] == ["a", "a/.hidden.tmp", "a/notes.txt", "b"]
         assert (tmp_path / "elsewhere").is_dir()
 
@@ -223,7 +221,7 @@ class TestWhatIsNeverDeleted:
         (tmp_path / "a/handover.json").write_text("{}")
         bag(tmp_path / "b/b_0.mcap", 100)
         recording_now(tmp_path, "a")
-        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1).apply()
         assert not closed.exists()
         assert active.exists()
         assert (tmp_path / "a/handover.json").exists()
@@ -235,10 +233,10 @@ class TestWhatIsNeverDeleted:
         bag(tmp_path / "b/b_0.mcap", 100)
         recording_now(tmp_path, "a")
         keeper = keeper_of(tmp_path, max_bytes=1)
-        keeper.apply(tmp_path)
+        keeper.apply()
         assert files_in(tmp_path)[0] == "a"
         recording_now(tmp_path, "b")
-        keeper.apply(tmp_path)
+        keeper.apply()
         assert files_in(tmp_path)[0] == "b"
 
     def test_an_open_bag_that_the_recorder_named_last_though_its_heartbeat_is_old(
@@ -247,7 +245,7 @@ class TestWhatIsNeverDeleted:
         active = left_open(tmp_path / "a/a_0.mcap", 0)
         bag(tmp_path / "b/b_0.mcap", 100)
         recording_now(tmp_path, "a", clock=later(0))
-        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1).apply()
         assert active.exists()
 
     def test_a_bag_that_cannot_be_read(self, tmp_path: Path) -> None:
@@ -255,14 +253,14 @@ class TestWhatIsNeverDeleted:
         damaged.parent.mkdir()
         damaged.write_bytes(b"no bag at all")
         bag(tmp_path / "b/b_0.mcap", 100)
-        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1).apply()
         assert damaged.exists()
 
     def test_damaged_files_from_elsewhere_do_not_push_the_history_out(self, tmp_path: Path) -> None:
         (tmp_path / "a").mkdir()
         (tmp_path / "a/huge.mcap").write_bytes(bytes(100_000))
         first, *_ = recording(tmp_path, "b", 0)
-        keeper_of(tmp_path, max_bytes=size_of(tmp_path) - 100_000).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=size_of(tmp_path) - 100_000).apply()
         assert first.exists()
 
     def test_what_lies_behind_a_link(self, tmp_path: Path) -> None:
@@ -271,7 +269,7 @@ class TestWhatIsNeverDeleted:
         recording(bags, "b", 100)
         (bags / "x").symlink_to(outside / "x", target_is_directory=True)
         (bags / "b/b_9.mcap").symlink_to(kept[0])
-        keeper_of(bags, max_bytes=1).apply(bags)
+        keeper_of(bags, max_bytes=1).apply()
         assert all(path.exists() for path in kept)
         assert (bags / "b/b_9.mcap").is_symlink()
 
@@ -294,8 +292,8 @@ class TestDeletionsThatFail:
         recording(tmp_path, "b", 100)
         keeper = keeper_of(tmp_path, max_bytes=45_000)
         with structlog.testing.capture_logs() as captured:
-            keeper.apply(tmp_path)
-            keeper.apply(tmp_path)
+            keeper.apply()
+            keeper.apply()
         (told,) = events(captured, "not_deleted")
         assert told["path"] == str(stuck)
         assert told["reason"]
@@ -306,8 +304,8 @@ class TestDeletionsThatFail:
         recording(tmp_path, "b", 100, splits=1)
         keeper = keeper_of(tmp_path, max_bytes=1)
         with structlog.testing.capture_logs() as captured:
-            keeper.apply(tmp_path)
-            keeper.apply(tmp_path)
+            keeper.apply()
+            keeper.apply()
         (told,) = events(captured, "budget_not_held")
         assert told["total_bytes"] == size_of(tmp_path)
 
@@ -337,7 +335,7 @@ class TestMakingRoom:
         recording(tmp_path, "a", 0, splits=6)
         capacity = size_of(tmp_path) + 1000
         keeper = keeper_of(tmp_path, measure_free=lambda at: capacity - size_of(at))
-        keeper.make_room(tmp_path, 30_000)
+        keeper.make_room(30_000)
         assert capacity - size_of(tmp_path) >= 30_000
         left = [name for name in files_in(tmp_path) if name.endswith(".mcap")]
         assert left == ["a/a_2.mcap", "a/a_3.mcap", "a/a_4.mcap", "a/a_5.mcap"]
@@ -346,34 +344,34 @@ class TestMakingRoom:
         recording(tmp_path, "a", 0, splits=6)
         whole = size_of(tmp_path)
         keeper = keeper_of(tmp_path, measure_free=lambda at: (whole - size_of(at)) // 2)
-        keeper.make_room(tmp_path, 30_000)
+        keeper.make_room(30_000)
         assert (whole - size_of(tmp_path)) // 2 >= 30_000
 
     def test_the_newest_stays_though_it_is_not_enough(self, tmp_path: Path) -> None:
         recording(tmp_path, "a", 0)
-        keeper_of(tmp_path, measure_free=lambda _: 0).make_room(tmp_path, PLENTY)
+        keeper_of(tmp_path, measure_free=lambda _: 0).make_room(PLENTY)
         assert [name for name in files_in(tmp_path) if name.endswith(".mcap")] == ["a/a_2.mcap"]
 
     def test_nothing_is_deleted_where_enough_is_free(self, tmp_path: Path) -> None:
         recording(tmp_path, "a", 0)
         before = files_in(tmp_path)
-        keeper_of(tmp_path, measure_free=lambda _: 100).make_room(tmp_path, 100)
+        keeper_of(tmp_path, measure_free=lambda _: 100).make_room(100)
         assert files_in(tmp_path) == before
 
 
 class TestInTheBackground:
     def test_limits_are_applied_while_the_caller_goes_on(self, tmp_path: Path) -> None:
         first, *_ = recording(tmp_path, "a", 0)
-        keeper = InBackground(keeper_of(tmp_path, max_bytes=1))
-        keeper.apply(tmp_path)
-        keeper.apply(tmp_path)
+        keeper = BackgroundHousekeeper(keeper_of(tmp_path, max_bytes=1))
+        keeper.apply()
+        keeper.apply()
         keeper.wait()
         assert not first.exists()
 
     def test_repair_is_waited_for(self, tmp_path: Path) -> None:
         open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
-        keeper = InBackground(keeper_of(tmp_path))
-        keeper.repair(tmp_path)
+        keeper = BackgroundHousekeeper(keeper_of(tmp_path))
+        keeper.repair()
         assert McapReader().summarize(open_one).complete
 
     def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
@@ -384,14 +382,14 @@ class TestInTheBackground:
             asked.append(held.wait(30))
             return 0
 
-        keeper = InBackground(keeper_of(tmp_path, measure_free=measured))
-        keeper.make_room(tmp_path, PLENTY)
-        keeper.make_room(tmp_path, PLENTY)
-        assert keeper.making_room()
+        keeper = BackgroundHousekeeper(keeper_of(tmp_path, measure_free=measured))
+        keeper.make_room(PLENTY)
+        keeper.make_room(PLENTY)
+        assert keeper.is_making_room()
         assert first.exists()
         held.set()
         keeper.wait()
-        assert not keeper.making_room()
+        assert not keeper.is_making_room()
         assert not first.exists()
         assert all(asked)
 
@@ -404,26 +402,22 @@ class TestInTheBackground:
         ids=["of the disk", "of this program"],
     )
     def test_a_failure_is_reported(self, tmp_path: Path, error: Exception, told: str) -> None:
-        class Failing(NoHousekeeping):
+        class Failing(Housekeeper):
             mended = False
 
-            def apply(self, bag_dir: Path) -> None:
+            def apply(self) -> None:
                 if not self.mended:
                     raise error
 
         failing = Failing()
-        keeper = InBackground(failing)
-        keeper.apply(tmp_path)
+        keeper = BackgroundHousekeeper(failing)
+        keeper.apply()
         keeper.wait()
         assert keeper.faults() == {"apply": told}
         failing.mended = True
-        keeper.apply(tmp_path)
+        keeper.apply()
         keeper.wait()
         assert keeper.faults() == {}
-
-    def test_both_are_housekeepers(self, tmp_path: Path) -> None:
-        keepers: list[Housekeeper] = [keeper_of(tmp_path), InBackground(keeper_of(tmp_path))]
-        assert all(hasattr(each, "repair") for each in keepers)
 
 
 class TestQuestionsMeanwhile:
@@ -433,7 +427,7 @@ class TestQuestionsMeanwhile:
         first, *_ = recording(tmp_path, "a", 0)
         records = McapReader().records(first, ["/odom"], TimeWindow.everything())
         begun = next(records)
-        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1).apply()
         assert not first.exists()
         rest = list(records)
         assert (begun.log_time, len(rest)) == (T0, 19)

@@ -48,7 +48,7 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     empty.write_bytes(b"")
     readable = McapReader().summarize(open_one).topics
     with structlog.testing.capture_logs() as captured:
-        keeper_of(tmp_path, clock=later(0)).repair(tmp_path)
+        keeper_of(tmp_path, clock=later(0)).repair()
     after = McapReader().summarize(open_one)
     assert (after.complete, after.topics) == (True, readable)
     assert not empty.exists()
@@ -62,7 +62,7 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
 def test_a_metadata_file_of_no_bytes_is_no_last_word(tmp_path: Path) -> None:
     open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
     (tmp_path / OWN / "metadata.yaml").write_bytes(b"")
-    keeper_of(tmp_path).repair(tmp_path)
+    keeper_of(tmp_path).repair()
     assert McapReader().summarize(open_one).complete
 
 
@@ -70,7 +70,7 @@ def test_a_recording_that_the_dead_recorder_named_is_repaired_at_once(tmp_path: 
     open_one = left_open(tmp_path / "rec" / "rec_0.mcap")
     clock = later(0)
     recording_now(tmp_path, "rec", clock=clock)
-    keeper_of(tmp_path, clock=clock).repair(tmp_path)
+    keeper_of(tmp_path, clock=clock).repair()
     assert McapReader().summarize(open_one).complete
 
 
@@ -78,14 +78,14 @@ def test_a_recording_of_nothing_but_empty_splits_goes(tmp_path: Path) -> None:
     (tmp_path / OWN).mkdir()
     (tmp_path / OWN / f"{OWN}_0.mcap").write_bytes(b"")
     (tmp_path / OWN / "handover.json").write_text("{}")
-    keeper_of(tmp_path).repair(tmp_path)
+    keeper_of(tmp_path).repair()
     assert files_in(tmp_path) == []
 
 
 def test_what_a_repair_left_that_was_cut_short_goes(tmp_path: Path) -> None:
     left_open(tmp_path / OWN / f"{OWN}_0.mcap")
     (tmp_path / OWN / f".{OWN}_0.mcap.repair").write_bytes(b"half")
-    keeper_of(tmp_path).repair(tmp_path)
+    keeper_of(tmp_path).repair()
     assert files_in(tmp_path) == [OWN, f"{OWN}/{OWN}_0.mcap"]
 
 
@@ -93,20 +93,20 @@ def test_a_recording_of_another_is_left_alone_until_it_lay_still(tmp_path: Path)
     theirs = left_open(tmp_path / "theirs" / "theirs_0.mcap")
     clock = later(0)
     keeper = keeper_of(tmp_path, clock=clock)
-    keeper.repair(tmp_path)
-    keeper.apply(tmp_path)
+    keeper.repair()
+    keeper.apply()
     assert not McapReader().summarize(theirs).complete
     clock.at += HOUR
-    keeper.apply(tmp_path)
+    keeper.apply()
     assert McapReader().summarize(theirs).complete
 
 
 def test_a_file_that_a_process_holds_open_is_left_alone(tmp_path: Path) -> None:
     theirs = left_open(tmp_path / "theirs" / "theirs_0.mcap")
     with theirs.open("rb"):
-        keeper_of(tmp_path).apply(tmp_path)
+        keeper_of(tmp_path).apply()
     assert not McapReader().summarize(theirs).complete
-    keeper_of(tmp_path).apply(tmp_path)
+    keeper_of(tmp_path).apply()
     assert McapReader().summarize(theirs).complete
 
 
@@ -116,8 +116,8 @@ def test_splits_that_a_full_disk_cut_short_are_repaired_later_on(tmp_path: Path)
     empty = tmp_path / OWN / f"{OWN}_8.mcap"
     empty.write_bytes(b"")
     keeper = keeper_of(tmp_path)
-    keeper.repair(tmp_path)
-    keeper.apply(tmp_path)
+    keeper.repair()
+    keeper.apply()
     assert McapReader().summarize(cut).complete
     assert not empty.exists()
 
@@ -128,8 +128,8 @@ def test_what_cannot_be_repaired_is_told_once_and_stays(tmp_path: Path) -> None:
     damaged.write_bytes(b"\x89MCAP")
     keeper = keeper_of(tmp_path)
     with structlog.testing.capture_logs() as captured:
-        keeper.apply(tmp_path)
-        keeper.apply(tmp_path)
+        keeper.apply()
+        keeper.apply()
     (told,) = events(captured, "bag_not_repaired")
     assert told["path"] == str(damaged)
     assert "first 5 bytes" in told["reason"]
@@ -141,7 +141,7 @@ def test_what_real_recorders_left_when_they_were_killed(tmp_path: Path) -> None:
     for name in ("session_killed", "session_killed_chunk64k", "extra/full_truncated"):
         copied(RECORDED / name, tmp_path / name.rpartition("/")[2])
     before = counts(tmp_path)
-    keeper_of(tmp_path).apply(tmp_path)
+    keeper_of(tmp_path).apply()
     assert counts(tmp_path) == before
     snapshot = memory_of(tmp_path).index.snapshot()
     assert (snapshot.damaged, snapshot.active) == ((), ())

@@ -1,4 +1,4 @@
-"""When a recording begins anew: after a death, after a session, after a silence."""
+"""When a recording begins anew, what a full disk asks for, and how silent topics are described."""
 
 from __future__ import annotations
 
@@ -6,7 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.recorder.policies import Backoff, SilenceWatch, session_over
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.recorder.handover.plan import ClockReading
+from ros2_memory.recorder.policies import (
+    Backoff,
+    SilenceWatch,
+    SpaceAction,
+    clock_was_set_back,
+    describe_silent_topics,
+    resume_bytes,
+    space_action,
+)
 
 
 class TestBackoff:
@@ -88,6 +98,74 @@ class TestSilence:
         assert [now for now in range(40, 400) if watch.is_silent(now, 0)] == []
 
 
-@pytest.mark.parametrize(("age_s", "over"), [(599.9, False), (600.0, True), (9999.0, True)])
-def test_a_session_is_over_after_its_duration(age_s: float, over: bool) -> None:
-    assert session_over(age_s, 600) is over
+class TestSpace:
+    @pytest.mark.parametrize(
+        ("free", "paused", "room_requested", "expected"),
+        [
+            (1000, False, False, SpaceAction.NONE),
+            (999, False, False, SpaceAction.MAKE_ROOM),
+            (999, False, True, SpaceAction.PAUSE),
+            (1000, False, True, SpaceAction.NONE),
+            (0, True, True, SpaceAction.STAY_PAUSED),
+            (1199, True, True, SpaceAction.STAY_PAUSED),
+            (1200, True, True, SpaceAction.RESUME),
+        ],
+    )
+    def test_first_room_is_made_then_recording_pauses_and_resumes_by_itself(
+        self, free: int, paused: bool, room_requested: bool, expected: SpaceAction
+    ) -> None:
+        assert space_action(free, 1000, paused=paused, room_requested=room_requested) is expected
+
+    @pytest.mark.parametrize(
+        ("free", "paused", "expected"),
+        [
+            (999, False, SpaceAction.WAIT),
+            (500, False, SpaceAction.WAIT),
+            (499, False, SpaceAction.PAUSE),
+            (1000, False, SpaceAction.NONE),
+            (1199, True, SpaceAction.STAY_PAUSED),
+        ],
+    )
+    def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
+        self, free: int, paused: bool, expected: SpaceAction
+    ) -> None:
+        assert (
+            space_action(free, 1000, paused=paused, room_requested=True, making_room=True)
+            is expected
+        )
+
+    @given(st.integers(0, 10**13), st.integers(0, 10**12))
+    def test_what_it_resumes_with_is_never_what_it_pauses_for(self, free: int, least: int) -> None:
+        if space_action(free, least, paused=True, room_requested=True) is SpaceAction.RESUME:
+            assert space_action(free, least, paused=False, room_requested=True) is SpaceAction.NONE
+
+    def test_a_least_of_nothing_never_pauses(self) -> None:
+        assert space_action(0, 0, paused=False, room_requested=False) is SpaceAction.NONE
+        assert resume_bytes(0) == 0
+
+
+@pytest.mark.parametrize(
+    ("wall_s", "expected"), [(0.2, False), (-100.0, False), (-121.0, True), (5000.0, False)]
+)
+def test_only_a_clock_set_back_by_minutes_calls_for_a_new_recording(
+    wall_s: float, expected: bool
+) -> None:
+    before = ClockReading(10.0, 10**18)
+    now = ClockReading(10.2, 10**18 + round(wall_s * NS_PER_S))
+    assert clock_was_set_back(before, now) is expected
+
+
+class TestSilentTopics:
+    def test_nothing_is_said_where_all_were_heard(self) -> None:
+        assert describe_silent_topics(["/odom"], ["/odom", "/tf"]) is None
+        assert describe_silent_topics([], []) is None
+
+    def test_the_silent_ones_are_named(self) -> None:
+        said = describe_silent_topics(["/b", "/odom", "/a"], ["/odom"])
+        assert said is not None
+        assert said.endswith("/a, /b")
+
+    def test_silence_of_all_of_them_points_at_the_transport(self) -> None:
+        said = describe_silent_topics(["/odom", "/tf"], [])
+        assert said is not None
+        assert "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in said

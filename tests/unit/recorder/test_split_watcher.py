@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.recorder.split_watcher import EMPTY_GRACE_S, Changes, Splits
+from ros2_memory.recorder.split_watcher import EMPTY_GRACE_S, SplitChanges, Splits
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, write_mcap
 
@@ -27,17 +27,17 @@ def write(splits: Splits, number: int, *topics: str, finish: bool = True) -> Non
 
 
 def test_a_directory_that_is_not_there_yet_is_no_fault(splits: Splits) -> None:
-    assert splits.look(0) == Changes()
+    assert splits.observe(0) == SplitChanges()
     assert not splits.exists
 
 
 def test_a_split_is_told_once_when_it_closes(splits: Splits) -> None:
     write(splits, 0, "/a", finish=False)
-    assert splits.look(0) == Changes()
+    assert splits.observe(0) == SplitChanges()
     write(splits, 0, "/a")
     write(splits, 1, "/b", finish=False)
-    assert splits.look(1).closed == ("rec_1_0.mcap",)
-    assert splits.look(2) == Changes()
+    assert splits.observe(1).closed == ("rec_1_0.mcap",)
+    assert splits.observe(2) == SplitChanges()
     assert splits.closed_names == {"rec_1_0.mcap"}
     assert splits.names() == {"rec_1_0.mcap", "rec_1_1.mcap"}
 
@@ -45,25 +45,25 @@ def test_a_split_is_told_once_when_it_closes(splits: Splits) -> None:
 def test_what_was_heard_is_counted_over_closed_splits_alone(splits: Splits) -> None:
     write(splits, 0, "/a", "/a", "/b")
     write(splits, 1, "/c", finish=False)
-    splits.look(0)
-    assert splits.heard == {"/a", "/b"}
+    splits.observe(0)
+    assert splits.received == {"/a", "/b"}
     assert splits.messages == 3
 
 
 def test_a_directory_that_was_there_and_is_gone_is_told_once(splits: Splits) -> None:
     write(splits, 0, "/a")
-    splits.look(0)
+    splits.observe(0)
     splits.directory.rename(splits.directory.with_name("elsewhere"))
-    assert splits.look(1).gone
-    assert not splits.look(2).gone
+    assert splits.observe(1).gone
+    assert not splits.observe(2).gone
 
 
 def test_bytes_written_never_shrink_though_splits_are_deleted(splits: Splits) -> None:
     write(splits, 0, "/a", "/b")
-    splits.look(0)
+    splits.observe(0)
     before = splits.bytes_written
     (splits.directory / "rec_1_0.mcap").unlink()
-    splits.look(1)
+    splits.observe(1)
     assert splits.bytes_written == before > 0
     assert splits.names() == {"rec_1_0.mcap"}
 
@@ -71,27 +71,27 @@ def test_bytes_written_never_shrink_though_splits_are_deleted(splits: Splits) ->
 def test_an_open_split_of_no_bytes_is_as_it_should_be(splits: Splits) -> None:
     splits.directory.mkdir()
     (splits.directory / "rec_1_0.mcap").touch()
-    assert [splits.look(now).empty for now in (0, 10, 100)] == [(), (), ()]
+    assert [splits.observe(now).empty for now in (0, 10, 100)] == [(), (), ()]
 
 
 def test_a_split_of_no_bytes_behind_a_newer_one_is_told_once_after_a_while(splits: Splits) -> None:
     splits.directory.mkdir()
     (splits.directory / "rec_1_0.mcap").touch()
-    splits.look(0)
+    splits.observe(0)
     (splits.directory / "rec_1_1.mcap").touch()
-    assert splits.look(10).empty == ()
-    assert splits.look(10 + EMPTY_GRACE_S - 0.1).empty == ()
-    assert splits.look(10 + EMPTY_GRACE_S).empty == ("rec_1_0.mcap",)
-    assert splits.look(100).empty == ()
+    assert splits.observe(10).empty == ()
+    assert splits.observe(10 + EMPTY_GRACE_S - 0.1).empty == ()
+    assert splits.observe(10 + EMPTY_GRACE_S).empty == ("rec_1_0.mcap",)
+    assert splits.observe(100).empty == ()
 
 
 def test_a_closed_split_that_cannot_be_read_is_told_and_counts_as_closed(splits: Splits) -> None:
     splits.directory.mkdir()
     (splits.directory / "rec_1_0.mcap").write_bytes(b"a text file of that name")
-    changes = splits.look(0)
+    changes = splits.observe(0)
     assert changes.closed == ("rec_1_0.mcap",)
     assert len(changes.faults) == 1
-    assert splits.look(1) == Changes()
+    assert splits.observe(1) == SplitChanges()
 
 
 def test_other_files_are_not_looked_at(splits: Splits) -> None:
@@ -100,7 +100,7 @@ def test_other_files_are_not_looked_at(splits: Splits) -> None:
     (splits.directory / "handover.json").write_text("{}")
     (splits.directory / "dir.mcap").mkdir()
     (splits.directory / "link.mcap").symlink_to("metadata.yaml")
-    splits.look(0)
+    splits.observe(0)
     assert splits.names() == frozenset()
 
 
@@ -108,7 +108,7 @@ def test_other_files_are_not_looked_at(splits: Splits) -> None:
 def test_a_directory_that_may_not_be_read_is_told(splits: Splits) -> None:
     write(splits, 0, "/a")
     splits.directory.chmod(0)
-    assert len(splits.look(0).faults) == 1
+    assert len(splits.observe(0).faults) == 1
     splits.directory.chmod(0o755)
 
 
@@ -127,7 +127,7 @@ def test_a_look_does_not_compare_each_split_with_each(splits: Splits) -> None:
     splits.directory.mkdir()
     for number in range(100):
         (splits.directory / f"rec_1_{number}.mcap").touch()
-    splits.look(Seconds(0))
+    splits.observe(Seconds(0))
     Seconds.compared = 0
-    splits.look(Seconds(1))
+    splits.observe(Seconds(1))
     assert 0 < Seconds.compared <= 300

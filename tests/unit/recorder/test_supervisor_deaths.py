@@ -15,7 +15,7 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.recorder.handover.recovery import recover_handovers
 from ros2_memory.storage.base import Closing
 from tests.support.simulated_recorders import World
-from tests.support.supervisor_checks import Housekeeping, assert_each_counts_once, events
+from tests.support.supervisor_checks import PlayedHousekeeper, assert_each_counts_once, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
@@ -221,7 +221,7 @@ class TestFailingDisk:
     def test_one_task_that_fails_keeps_no_other_from_being_done(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        keeper = Housekeeping()
+        keeper = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=keeper)
         world.supervisor.start()
         world.run(3)

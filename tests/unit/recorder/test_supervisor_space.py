@@ -9,7 +9,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from tests.support.simulated_recorders import World
-from tests.support.supervisor_checks import Housekeeping, assert_each_counts_once, events
+from tests.support.supervisor_checks import PlayedHousekeeper, assert_each_counts_once, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
@@ -18,7 +18,7 @@ class TestRecordedTime:
     def test_the_house_is_told_what_is_recorded_and_what_it_holds_stands_in_the_heartbeat(
         self, tmp_path: Path
     ) -> None:
-        housekeeping = Housekeeping()
+        housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping)
         world.supervisor.start()
         world.run(20)
@@ -35,8 +35,8 @@ class TestRecordedTime:
 
 
 class TestSpace:
-    def world(self, tmp_path: Path) -> tuple[World, Housekeeping]:
-        housekeeping = Housekeeping()
+    def world(self, tmp_path: Path) -> tuple[World, PlayedHousekeeper]:
+        housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping)
         housekeeping.world = world
         return world, housekeeping
@@ -70,7 +70,7 @@ class TestSpace:
     def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
         self, tmp_path: Path
     ) -> None:
-        housekeeping = Housekeeping()
+        housekeeping = PlayedHousekeeper()
         housekeeping.making = True
         world = World(tmp_path, housekeeper=housekeeping)
         world.supervisor.start()
@@ -84,7 +84,7 @@ class TestSpace:
         assert world.heartbeat()["state"] == "paused"
 
     def test_room_that_was_made_too_little_has_recording_pause(self, tmp_path: Path) -> None:
-        housekeeping = Housekeeping()
+        housekeeping = PlayedHousekeeper()
         housekeeping.making = True
         world = World(tmp_path, housekeeper=housekeeping)
         world.supervisor.start()
@@ -129,7 +129,7 @@ class TestSpace:
         assert world.supervisor.is_recording
 
     def test_pausing_in_a_handover_loses_and_doubles_nothing(self, tmp_path: Path) -> None:
-        housekeeping = Housekeeping()
+        housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping, session_duration_s=20)
         world.supervisor.start()
         world.run(22.25)
@@ -162,7 +162,7 @@ class TestUnmounted:
         return aside
 
     def test_nothing_is_recorded_onto_another_disk_and_that_is_told(self, tmp_path: Path) -> None:
-        housekeeping = Housekeeping()
+        housekeeping = PlayedHousekeeper()
         world = World(tmp_path / "bags", housekeeper=housekeeping)
         world.supervisor.start()
         world.run(3)
@@ -214,7 +214,7 @@ class TestHouse:
     def test_what_failed_while_nobody_waited_is_told_once_and_in_the_heartbeat(
         self, tmp_path: Path
     ) -> None:
-        housekeeping = Housekeeping()
+        housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping)
         world.supervisor.start()
         world.run(3)
@@ -226,14 +226,14 @@ class TestHouse:
         assert world.heartbeat()["last_error"] == "the oldest bags cannot be deleted"
 
     def test_it_is_kept_after_splits_were_closed(self, tmp_path: Path) -> None:
-        housekeeping = Housekeeping()
+        housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping)
         world.supervisor.start()
         world.run(31)
         assert housekeeping.asked.count("apply") == 3
 
     def test_it_is_kept_now_and_then_when_nothing_comes(self, tmp_path: Path) -> None:
-        housekeeping = Housekeeping()
+        housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping)
         world.silent = True
         world.supervisor.start()
@@ -241,8 +241,8 @@ class TestHouse:
         assert housekeeping.asked.count("apply") == 2
 
     def test_what_goes_wrong_there_is_told_once_and_stops_nothing(self, tmp_path: Path) -> None:
-        housekeeping = Housekeeping()
-        housekeeping.fails = True
+        housekeeping = PlayedHousekeeper()
+        housekeeping.failed = {"apply": "the catalogue is locked"}
         world = World(tmp_path, housekeeper=housekeeping)
         world.supervisor.start()
         with capture_logs() as logs:

@@ -8,9 +8,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.recorder import time_sync
-from ros2_memory.recorder.time_sync import SystemTimeSync, kernel_error
-from ros2_memory.retention.time_sync import TimeSync
-from tests.support.housekeepers import FakeTimeSync
+from ros2_memory.recorder.time_sync import is_synchronised, kernel_error
 
 DISCIPLINED, UNDISCIPLINED = 4_000, 16_000_000
 
@@ -29,7 +27,7 @@ def test_timedated_is_believed_before_the_kernel(
     tmp_path: Path, answer: str, error_us: int | None, expected: bool
 ) -> None:
     env = timedatectl(tmp_path, f"echo {answer}")
-    assert SystemTimeSync(env, lambda: error_us).is_synchronised() is expected
+    assert is_synchronised(env, lambda: error_us) is expected
 
 
 def test_it_is_asked_for_the_one_property_and_inherits_nothing(
@@ -37,7 +35,7 @@ def test_it_is_asked_for_the_one_property_and_inherits_nothing(
 ) -> None:
     asked = tmp_path / "asked"
     env = timedatectl(tmp_path, f'echo "$@" > {asked}; env >> {asked}; echo yes')
-    assert SystemTimeSync({**env, "MEMORY_API_TOKEN": "secret"}).is_synchronised()
+    assert is_synchronised({**env, "MEMORY_API_TOKEN": "secret"})
     assert asked.read_text().startswith("show --property=NTPSynchronized --value\n")
     assert "secret" not in asked.read_text()
 
@@ -54,30 +52,21 @@ def test_where_timedated_cannot_say_the_kernel_does(
     tmp_path: Path, script: str, error_us: int | None, expected: bool
 ) -> None:
     env = timedatectl(tmp_path, script)
-    assert SystemTimeSync(env, lambda: error_us).is_synchronised() is expected
+    assert is_synchronised(env, lambda: error_us) is expected
 
 
 def test_without_systemd_the_kernel_is_asked(tmp_path: Path) -> None:
     env = {"PATH": str(tmp_path)}
-    assert SystemTimeSync(env, lambda: DISCIPLINED).is_synchronised()
-    assert not SystemTimeSync(env, lambda: None).is_synchronised()
+    assert is_synchronised(env, lambda: DISCIPLINED)
+    assert not is_synchronised(env, lambda: None)
 
 
 def test_one_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(time_sync, "TIMEOUT_S", 0.2)
     env = timedatectl(tmp_path, "exec sleep 60")
-    assert not SystemTimeSync(env, lambda: None).is_synchronised()
+    assert not is_synchronised(env, lambda: None)
 
 
 def test_the_kernel_of_this_machine_says_something_or_nothing() -> None:
     error_us = kernel_error()
     assert error_us is None or 0 <= error_us <= UNDISCIPLINED
-
-
-@pytest.mark.parametrize("answer", [True, False])
-def test_the_fake_keeps_the_contract(tmp_path: Path, answer: bool) -> None:
-    both: list[TimeSync] = [
-        FakeTimeSync(synchronised=answer),
-        SystemTimeSync(timedatectl(tmp_path, f"echo {'yes' if answer else 'no'}")),
-    ]
-    assert [each.is_synchronised() for each in both] == [answer, answer]

@@ -76,7 +76,7 @@ class TestRetention:
         bag_dir, mine, others = mixed
         for limits in ({"max_bytes": LITTLE}, {"max_age_h": 0.01}):
             for _ in range(3):
-                house_of(bag_dir, keeps_foreign=True, **limits).apply(bag_dir)
+                house_of(bag_dir, keeps_foreign=True, **limits).apply()
         assert all(path.exists() for path in others)
         assert [path for path in mine if path.exists()] == mine[-1:]
 
@@ -86,7 +86,7 @@ class TestRetention:
         bag_dir, mine, others = mixed
         house = house_of(bag_dir, keeps_foreign=True, measure_free=lambda _: 0)
         for _ in range(3):
-            house.make_room(bag_dir, PLENTY)
+            house.make_room(PLENTY)
         assert all(path.exists() for path in others)
         assert [path for path in mine if path.exists()] == mine[-1:]
 
@@ -101,14 +101,14 @@ class TestRetention:
         counted = size_of(bag_dir) - besides - len(b"no bag")
         counted -= (bag_dir / "session_mcap" / "metadata.yaml").stat().st_size
         with structlog.testing.capture_logs() as logs:
-            house_of(bag_dir, keeps_foreign=True, max_bytes=counted).apply(bag_dir)
+            house_of(bag_dir, keeps_foreign=True, max_bytes=counted).apply()
         [told] = [each for each in logs if each["event"] == "retention_applied"]
         assert (told["bags"], told["total_bytes"]) == (0, counted)
         assert told["foreign_bytes"] == besides + len(b"no bag")
         assert list_bytes
         [warned] = [each for each in logs if each["event"] == "foreign_bags_kept"]
         assert "adopt" in warned["reason"]
-        house_of(bag_dir, keeps_foreign=True, max_bytes=counted - 1).apply(bag_dir)
+        house_of(bag_dir, keeps_foreign=True, max_bytes=counted - 1).apply()
         # The first two are kept in a moment, and would free nothing.
         assert [path.exists() for path in mine[:4]] == [True, True, False, True]
 
@@ -116,14 +116,14 @@ class TestRetention:
         mine = recording(tmp_path, A, 0)
         own_all(tmp_path)
         foreign(tmp_path, "later/x_0.mcap", start=3 * 3600)
-        house_of(tmp_path, keeps_foreign=True, max_age_h=1).apply(tmp_path)
+        house_of(tmp_path, keeps_foreign=True, max_age_h=1).apply()
         assert all(path.exists() for path in mine)
 
     def test_with_delete_all_bags_are_weighed(
         self, mixed: tuple[Path, list[Path], list[Path]]
     ) -> None:
         bag_dir, mine, others = mixed
-        house_of(bag_dir, keeps_foreign=False, max_bytes=LITTLE).apply(bag_dir)
+        house_of(bag_dir, keeps_foreign=False, max_bytes=LITTLE).apply()
         assert not any(path.exists() for path in others)
         assert [path for path in mine if path.exists()] == mine[-1:]
 
@@ -134,7 +134,7 @@ class TestRetention:
         own_all(tmp_path)
         house = house_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE)
         with structlog.testing.capture_logs() as logs:
-            house.apply(tmp_path)
+            house.apply()
         assert not old.exists()
         [told] = [each for each in logs if each["event"] == "retention_applied"]
         assert told["foreign_bytes"] == 0
@@ -149,11 +149,11 @@ class TestRetention:
         (bags / A).rename(tmp_path / "moved")
         shutil.copytree(tmp_path / "backup", bags / A)
         house = house_of(bags, keeps_foreign=True, max_bytes=LITTLE)
-        house.apply(bags)
+        house.apply()
         assert len([*(bags / A).glob("*.mcap")]) == 6
         assert [path.exists() for path in newest] == [False] * 5 + [True]
         own_all(bags)
-        house.apply(bags)
+        house.apply()
         assert not (bags / A).exists()
 
     @settings(max_examples=25, deadline=None)
@@ -181,8 +181,8 @@ class TestRetention:
         house = house_of(
             bag_dir, keeps_foreign=True, max_bytes=budget, measure_free=lambda _: PLENTY * free
         )
-        house.apply(bag_dir)
-        house.make_room(bag_dir, PLENTY)
+        house.apply()
+        house.make_room(PLENTY)
         lost = {path.split("/")[0] for path in {*before} - {*files_in(bag_dir)}}
         listed = {each["recording"] for each in lines(bag_dir) if "recording" in each}
         assert lost <= listed
@@ -208,7 +208,7 @@ class TestUpgrade:
             os.utime(path, (1, 1))
         claim(OwnRecordings(tmp_path))
         before = files_in(tmp_path)
-        keeper_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE, clock=late()).apply(tmp_path)
+        keeper_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE, clock=late()).apply()
         assert files_in(tmp_path) == before
 
 
@@ -222,12 +222,12 @@ class TestRepair:
         empty.touch()
         before = cut.read_bytes()
         house = keeper_of(tmp_path, keeps_foreign=True)
-        house.repair(tmp_path)
-        house.apply(tmp_path)
+        house.repair()
+        house.apply()
         assert cut.read_bytes() == before
         assert empty.exists()
         own_all(tmp_path)
-        house.repair(tmp_path)
+        house.repair()
         assert cut.read_bytes() != before
         assert not empty.exists()
 
@@ -394,6 +394,6 @@ def test_a_bag_of_latched_messages_that_are_carried_is_not_foreign(tmp_path: Pat
     own_all(tmp_path)
     write_mcap(tmp_path / "latched" / "carried.mcap", [boolean(T0, True)])
     with structlog.testing.capture_logs() as logs:
-        house_of(tmp_path, keeps_foreign=True).apply(tmp_path)
+        house_of(tmp_path, keeps_foreign=True).apply()
     [told] = [each for each in logs if each["event"] == "retention_applied"]
     assert told["foreign_bytes"] == 0

@@ -40,7 +40,7 @@ class TestRetention:
         before = [ask() for ask in questions]
         kept(house, tmp_path, 15, 25)
         assert [ask() for ask in questions] == before
-        house.apply(tmp_path)
+        house.apply()
         assert not any(path.exists() for path in made)
         assert not (tmp_path / A).exists()
         assert [ask() for ask in questions] == before
@@ -76,9 +76,9 @@ class TestRetention:
         kept(house_of(tmp_path), tmp_path, 0, 15)
         total = size_of(tmp_path)
         with structlog.testing.capture_logs() as captured:
-            house_of(tmp_path, max_bytes=total).apply(tmp_path)
+            house_of(tmp_path, max_bytes=total).apply()
             assert all(path.exists() for path in made)
-            house_of(tmp_path, max_bytes=total - 1).apply(tmp_path)
+            house_of(tmp_path, max_bytes=total - 1).apply()
         # The first two would free nothing.
         assert [path.exists() for path in made] == [True, True, False, True, True, True]
         told = [event for event in captured if event["event"] == "retention_applied"]
@@ -92,10 +92,10 @@ class TestRetention:
         house = house_of(tmp_path, max_age_h=1)
         kept(house, tmp_path, 15, 25, "one")
         kept(house, tmp_path, 15, 35, "two")
-        house.apply(tmp_path)
+        house.apply()
         assert not (tmp_path / A).exists()
         with structlog.testing.capture_logs() as captured:
-            house.apply(tmp_path)
+            house.apply()
         [told] = [event for event in captured if event["event"] == "retention_applied"]
         sidecars = [path.stat() for path in (tmp_path / "moments").rglob("handover.json")]
         assert told["total_bytes"] - size_of(tmp_path) in {0, sidecars[0].st_size}
@@ -105,8 +105,8 @@ class TestRetention:
         house = house_of(tmp_path, max_bytes=1)
         kept(house, tmp_path, 0, 15)
         for _ in range(2):
-            house.apply(tmp_path)
-            house.make_room(tmp_path, PLENTY * 2)
+            house.apply()
+            house.make_room(PLENTY * 2)
         assert len(in_moments(tmp_path)) == 2
 
     def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
@@ -132,7 +132,7 @@ class TestRetention:
         before = mounted()
         assert "0.1" in str(before.value)
         for _ in range(2):
-            house.apply(tmp_path)
+            house.apply()
             assert mounted() == before
         assert not (tmp_path / A).exists()
 
@@ -143,7 +143,7 @@ class TestRetention:
         anew = tmp_path / A / "anew"
         anew.write_text('{"format": 1, "state": "counts", "clock": "publish", "notes": ["x"]}')
         anew.replace(tmp_path / A / "handover.json")
-        house.apply(tmp_path)
+        house.apply()
         [sidecar] = (tmp_path / "moments").rglob("handover.json")
         assert sidecar.samefile(tmp_path / A / "handover.json")
 
@@ -151,7 +151,7 @@ class TestRetention:
         recording(tmp_path, A, 0)
         kept(house_of(tmp_path), tmp_path, 15, 25)
         with structlog.testing.capture_logs() as captured:
-            house_of(tmp_path).apply(tmp_path)
+            house_of(tmp_path).apply()
         [told] = [event for event in captured if event["event"] == "retention_applied"]
         assert told["total_bytes"] == size_of(tmp_path)
 
@@ -195,7 +195,7 @@ def test_no_moments_in_any_order_break_a_budget_or_lose_what_is_kept(
             promised = {path: inode for path, inode in promised.items() if path.exists()}
         else:
             with structlog.testing.capture_logs() as captured:
-                house.apply(root)
+                house.apply()
             [told] = [each for each in captured if each["event"] == "retention_applied"]
             assert told["total_bytes"] == size_of(root) <= rooms
         assert {path: path.stat().st_ino for path in promised} == promised

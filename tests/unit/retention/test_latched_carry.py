@@ -59,7 +59,7 @@ def keep_only(bag_dir: Path, *kept: str) -> None:
     sidecars = {(bag_dir / name).with_name("handover.json") for name in kept}
     files = [*(bag_dir / name for name in kept), *(each for each in sidecars if each.exists())]
     size = sum(each.stat().st_size for each in files)
-    keeper_of(bag_dir, max_bytes=size + 1).apply(bag_dir)
+    keeper_of(bag_dir, max_bytes=size + 1).apply()
     left = [path for path in bag_dir.rglob("*.mcap") if not is_carried(path)]
     assert sorted(path.relative_to(bag_dir).as_posix() for path in left) == sorted(kept)
 
@@ -169,13 +169,13 @@ class TestTheBagOfCarriedMessages:
             drive(T0 + 10 * S, T0 + 20 * S),
         )
         keep_only(tmp_path, "rec/rec_1.mcap")
-        keeper_of(tmp_path, max_bytes=0, max_age_h=0.001).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=0, max_age_h=0.001).apply()
         assert "latched/carried.mcap" in files_in(tmp_path)
 
     def test_messages_of_a_sqlite_bag_are_carried(self, tmp_path: Path) -> None:
         write_db3(tmp_path / "rec/old_0.db3", [frame(T0, "laser", 0.1), *drive(T0, T0 + 9 * S)])
         recording(tmp_path, "rec", drive(T0 + 10 * S, T0 + 20 * S))
-        keeper_of(tmp_path, max_bytes=1, reader=reader_of_both()).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1, reader=reader_of_both()).apply()
         memory = memory_of(tmp_path, storage="rosbag2")
         assert places(memory, T0 + 15 * S, ["laser"]) == [(0.1, 0.0, 0.0)]
 
@@ -189,7 +189,7 @@ class TestTheBagOfCarriedMessages:
             drive(T0 + 10 * S, T0 + 20 * S),
         )
         (bags / "latched").symlink_to(elsewhere, target_is_directory=True)
-        keeper_of(bags, max_bytes=1).apply(bags)
+        keeper_of(bags, max_bytes=1).apply()
         assert not list(elsewhere.iterdir())
         assert "rec/rec_0.mcap" in files_in(bags)
 
@@ -209,9 +209,9 @@ class TestTheBagOfCarriedMessages:
             drive(T0 + 10 * S, T0 + 20 * S),
             drive(T0 + 20 * S, T0 + 30 * S),
         )
-        keeper_of(tmp_path, max_bytes=1, writer=FullDisk()).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1, writer=FullDisk()).apply()
         assert files_in(tmp_path) == ["rec", "rec/rec_0.mcap", "rec/rec_2.mcap"]
-        keeper_of(tmp_path, max_bytes=1).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1).apply()
         assert held(memory_of(tmp_path), DOCK, T0 + 25 * S) == (T0, {"value": "home"})
 
     def test_a_bag_stays_until_nobody_looks_for_latched_messages_in_it(
@@ -226,7 +226,7 @@ class TestTheBagOfCarriedMessages:
             drive(T0 + 30 * S, T0 + 40 * S),
         )
         budget = 3 * (tmp_path / "rec/rec_0.mcap").stat().st_size + 1
-        keeper_of(tmp_path, max_bytes=budget, grace_s=10**6).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=budget, grace_s=10**6).apply()
         left = [name for name in files_in(tmp_path) if name.endswith(".mcap")]
         assert left == [
             "latched/carried.mcap",
@@ -234,7 +234,7 @@ class TestTheBagOfCarriedMessages:
             "rec/rec_2.mcap",
             "rec/rec_3.mcap",
         ]
-        keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply()
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
 
     def test_where_no_other_bag_can_go_in_its_place_it_goes_at_once(self, tmp_path: Path) -> None:
@@ -244,7 +244,7 @@ class TestTheBagOfCarriedMessages:
             [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
             drive(T0 + 10 * S, T0 + 20 * S),
         )
-        keeper_of(tmp_path, max_bytes=1, grace_s=10**6).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1, grace_s=10**6).apply()
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
         assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
 
@@ -255,7 +255,7 @@ class TestTheBagOfCarriedMessages:
             [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
             drive(T0 + 10 * S, T0 + 20 * S),
         )
-        keeper_of(tmp_path, grace_s=10**6, measure_free=lambda _: 0).make_room(tmp_path, 1)
+        keeper_of(tmp_path, grace_s=10**6, measure_free=lambda _: 0).make_room(1)
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
         assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
 
@@ -303,7 +303,7 @@ class TestTheBagOfCarriedMessages:
             drive(T0 + 30 * S, T0 + 40 * S),
         )
         keep_only(tmp_path, *(f"rec/rec_{number}.mcap" for number in (1, 2, 3)))
-        keeper_of(tmp_path, max_bytes=1, reader=Unlucky()).apply(tmp_path)
+        keeper_of(tmp_path, max_bytes=1, reader=Unlucky()).apply()
         assert [each.log_time for each in records(tmp_path)] == [T0]
         assert not (tmp_path / "rec/rec_2.mcap").exists()
         assert (tmp_path / "rec/rec_1.mcap").exists()
@@ -394,7 +394,7 @@ class TestAnswers:
         memory = memory_of(bag_dir)
         before = [held(memory, DOCK, T0 + 290 * S), places(memory, T0 + 290 * S, ["laser", "arm"])]
         for size in range(200_000, 0, -10_000):
-            keeper_of(bag_dir, max_bytes=size).apply(bag_dir)
+            keeper_of(bag_dir, max_bytes=size).apply()
             after = [
                 held(memory, DOCK, T0 + 290 * S),
                 places(memory, T0 + 290 * S, ["laser", "arm"]),

@@ -133,11 +133,11 @@ class TestKeeping:
         slot = asked(tmp_path, 15, 25)
         request = tmp_path / REQUESTS_FOLDER / f"{slot.wish.number}.json"
         text = request.read_text()
-        house_of(tmp_path).keep_moments(tmp_path)
+        house_of(tmp_path).keep_moments()
         first = slot.outcome()
         slot.close()
         request.with_suffix(".taken").write_text(text)
-        house_of(tmp_path).keep_moments(tmp_path)
+        house_of(tmp_path).keep_moments()
         assert slot.outcome() == first
         assert len(list(stored_moments_in(tmp_path))) == 1
 
@@ -176,7 +176,7 @@ class TestOpenBags:
         bag(open_one, 20)
         bag(tmp_path / A / f"{A}_3.mcap", 30, layout)
         # Another recorder may be the one that goes on with it.
-        house_of(tmp_path, clock=now).keep_moments(tmp_path)
+        house_of(tmp_path, clock=now).keep_moments()
         assert [name.rpartition("/")[2] for name in in_moments(tmp_path)] == [
             f"{A}_1.mcap",
             f"{A}_2.mcap",
@@ -190,7 +190,7 @@ class TestOpenBags:
         assert (outcome.bags, outcome.pending) == (2, True)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
         clock.at = T0 + 26 * S
-        house.keep_moments(tmp_path)
+        house.keep_moments()
         assert told_of(tmp_path)["complete"] is True
         assert len(in_moments(tmp_path)) == 3
 
@@ -204,7 +204,7 @@ class TestOpenBags:
         kept(house, tmp_path, 0, 25, at=clock.at)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
         clock.at = T0 + 26 * S
-        house.keep_moments(tmp_path)
+        house.keep_moments()
         told = told_of(tmp_path)
         assert (told["pending"], told["complete"]) == (False, False)
         assert "retention.max_moments_gb" in told["missing"][0]
@@ -215,8 +215,8 @@ class TestOpenBags:
         bag(tmp_path / A / f"{A}_1.mcap", 10, McapLayout(chunk_size=400, finish=False))
         house = house_of(tmp_path)
         assert kept(house, tmp_path, 0, 15).pending
-        house.apply(tmp_path)
-        house.keep_moments(tmp_path)
+        house.apply()
+        house.keep_moments()
         assert told_of(tmp_path)["complete"] is True
         assert len(in_moments(tmp_path)) == 2
 
@@ -228,7 +228,7 @@ class TestOpenBags:
         bag(tmp_path / A / f"{A}_2.mcap", 20)
         recording(tmp_path, B, 100, splits=2)
         clock.at = NOW
-        house_of(tmp_path, clock=clock, max_bytes=1).apply(tmp_path)
+        house_of(tmp_path, clock=clock, max_bytes=1).apply()
         assert len(in_moments(tmp_path)) == 3
         assert told_of(tmp_path)["complete"] is True
 
@@ -241,7 +241,7 @@ class TestCrashes:
         slot = asked(tmp_path, 15, 25)
         folder = make_folder(tmp_path, slot.wish)
         write_saved_moment(folder, SavedMoment.of(slot.wish))
-        house_of(tmp_path).keep_moments(tmp_path)
+        house_of(tmp_path).keep_moments()
         outcome = slot.outcome()
         assert outcome is not None
         assert (outcome.moment, outcome.bags, outcome.pending) == (folder.name, 2, False)
@@ -266,8 +266,8 @@ class TestCrashes:
         with monkeypatch.context() as patched:
             patched.setattr(owner, step, killed)
             with pytest.raises(KeyboardInterrupt):
-                house_of(tmp_path).keep_moments(tmp_path)
-        house_of(tmp_path).keep_moments(tmp_path)
+                house_of(tmp_path).keep_moments()
+        house_of(tmp_path).keep_moments()
         outcome = slot.outcome()
         assert outcome is not None
         told = told_of(tmp_path)
@@ -283,7 +283,7 @@ class TestCrashes:
         (begun / f".{MOMENT_FILE}.tmp").write_text("{")
         mine = tmp_path / "moments/mine"
         mine.mkdir()
-        house_of(tmp_path).keep_moments(tmp_path)
+        house_of(tmp_path).keep_moments()
         assert (begun.exists(), mine.exists()) == (False, True)
 
     def test_a_moment_that_cannot_be_written_holds_up_no_other(
@@ -326,7 +326,7 @@ class TestOthers:
         layout = McapLayout(chunk_size=400, finish=False)
         left = bag(tmp_path / "moments/one" / A / f"{A}_7.mcap", 70, layout)
         before = left.read_bytes()
-        house_of(tmp_path).apply(tmp_path)
+        house_of(tmp_path).apply()
         assert left.read_bytes() == before
 
     def test_recover_leaves_moments_alone(self, tmp_path: Path) -> None:

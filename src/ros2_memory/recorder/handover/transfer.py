@@ -1,8 +1,8 @@
-"""One recording taking over from another: the sidecars are written as the handover goes on.
+"""Writes the sidecars (`handover.json`) of two recordings while one takes over from the other.
 
-Each is written before what it speaks of can matter: the old recording names the new one before
-that is started, the new one counts for nothing as soon as it exists, and when the cut is made it is
-written to the new one first. So a crash leaves a pair that `recover_handover` can bring to its end.
+Each is written before it can matter: the old recording names the new one before that is started,
+the new one is marked as not counting as soon as it exists, and the cut is written to the new one
+first. So a crash leaves a pair of sidecars that `recover_handover` can complete.
 """
 
 from __future__ import annotations
@@ -38,21 +38,26 @@ if TYPE_CHECKING:
 class HandoverTransfer:
     """A handover from one running session to another.
 
-    `simulated`: log times come from a simulated clock.
+    Args:
+        old: the session that records.
+        new: the session that takes over.
+        plan: decides when each step is due.
+        reader: reads splits that are closed.
+        simulated: whether log times come from a simulated clock.
     """
 
     def __init__(
         self,
         old: RecordingSession,
         new: RecordingSession,
-        passage: HandoverPlan,
+        plan: HandoverPlan,
         reader: BagReader,
         *,
         simulated: bool,
     ) -> None:
         self.old = old
         self.new = new
-        self._passage = passage
+        self._plan = plan
         self._reader = reader
         self._simulated = simulated
         self._marked = False
@@ -60,7 +65,7 @@ class HandoverTransfer:
 
     @staticmethod
     def announce(old: RecordingSession, new_name: str) -> None:
-        """Has the old recording name the new one, which is about to be started.
+        """Writes the name of the new recording, which is about to be started, into the old sidecar.
 
         Raises:
             RecorderError: it cannot be written.
@@ -70,7 +75,7 @@ class HandoverTransfer:
 
     @staticmethod
     def withdraw(old: RecordingSession) -> None:
-        """Has the old recording name no next one, if it is still there.
+        """Removes the name of the next recording from the old sidecar, if its directory exists.
 
         Raises:
             RecorderError: it cannot be written.
@@ -81,11 +86,11 @@ class HandoverTransfer:
 
     @property
     def missing(self) -> frozenset[str]:
-        """Topics that the old recorder has subscribed to, and the new one not yet."""
+        """Topics that the old recorder has subscribed to and the new one has not."""
         return frozenset(self.old.subscribed - self.new.subscribed)
 
     def advance(self, now: ClockReading) -> Step:
-        """What is due at this moment.
+        """Returns the step that is due at this moment.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -93,16 +98,16 @@ class HandoverTransfer:
         if not self._marked and self.new.splits.exists:
             write_handover(self.new.splits.directory, pending(self.old.name))
             self._marked = True
-        ready = self._marked and self.new.ready
-        return self._passage.advance(now, ready=ready, missing=self.missing)
+        ready = self._marked and self.new.is_recording
+        return self._plan.advance(now, ready=ready, missing=self.missing)
 
     def complete(self, now: ClockReading) -> bool:
-        """Makes the cut, when both recorders receive; False where they do not overlap yet.
+        """Writes the cut if both recorders receive; returns False while they do not overlap.
 
         Raises:
             RecorderError: a sidecar cannot be written.
         """
-        bounds = self._passage.bounds(now)
+        bounds = self._plan.bounds(now)
         if bounds is None:
             return False
         sidecars = complete_sidecars(
@@ -124,7 +129,7 @@ class HandoverTransfer:
         return True
 
     def abandon(self) -> None:
-        """The old recording goes on, and has all that the new one has.
+        """Marks the new recording as not counting: the old one goes on and has all of it.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -133,7 +138,7 @@ class HandoverTransfer:
             write_handover(self.new.splits.directory, void(self.old.name))
         self.withdraw(self.old)
 
-    def old_has_ended(self) -> None:
+    def add_late_splits(self) -> None:
         """Adds the splits that the old recorder opened after the cut, while it was ending.
 
         Raises:
@@ -146,7 +151,7 @@ class HandoverTransfer:
             write_handover(directory, replace(handover, end=replace(handover.end, files=files)))
 
     def settle(self) -> None:
-        """After the old recorder died half-way: the new recording counts from where it ends.
+        """Has the new recording count from where the old one ends, whose recorder died half-way.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -167,7 +172,11 @@ class HandoverTransfer:
 
 
 def _is_there(recording: Path) -> bool:
-    """Whether the directory of a recording is there; an error where that cannot be told."""
+    """Whether the directory of a recording exists.
+
+    Raises:
+        RecorderError: it cannot be looked at.
+    """
     try:
         return recording.is_dir()
     except OSError as error:

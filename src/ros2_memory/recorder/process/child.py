@@ -26,8 +26,6 @@ from ros2_memory.core.errors import RecorderError
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from ros2_memory.recorder.ports import RecorderProcess
-
 LAUNCHER: Final = Path(__file__).with_name("launch.py")
 MAX_LINE: Final = 4096
 """Characters of one line that are kept."""
@@ -61,13 +59,20 @@ class Patience:
 
 
 class Child:
-    """A running program, and what it printed. Built by `start`; used from one thread."""
+    """A running program, and what it printed. Built by `start`; used from one thread.
+
+    Attributes:
+        pid: its process number, which is also its group's.
+        patience_s: for how many seconds `end` is worth calling; after that nothing ends it.
+    """
 
     def __init__(
         self, process: subprocess.Popen[bytes], output: IO[bytes], patience: Patience
     ) -> None:
         self._process = process
         self._patience = patience
+        self.pid = process.pid
+        self.patience_s = patience.total_s
         self._lines: deque[str] = deque(maxlen=MAX_LINES)
         self._status: int | None = None
         self._ending_since: float | None = None
@@ -110,16 +115,6 @@ class Child:
         finally:
             os.close(writable)
         return cls(process, output, patience or Patience())
-
-    @property
-    def pid(self) -> int:
-        """Its process number, which is also its group's."""
-        return self._process.pid
-
-    @property
-    def patience_s(self) -> float:
-        """For how long `end` is worth calling; after that nothing ends it."""
-        return self._patience.total_s
 
     def take_lines(self) -> list[str]:
         """What it printed since the last call, oldest first."""
@@ -165,7 +160,7 @@ class Child:
             os.killpg(self.pid, number)
 
 
-def end_all(children: Collection[RecorderProcess]) -> list[RecorderProcess]:
+def end_all(children: Collection[Child]) -> list[Child]:
     """Ends all of them at once; returns those that not even SIGKILL ended in time, mostly none."""
     patience_s = max((child.patience_s for child in children), default=0.0)
     give_up = time.monotonic() + patience_s

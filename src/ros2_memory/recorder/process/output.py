@@ -1,7 +1,7 @@
-"""What `ros2 bag record` says on stderr, line by line, as events.
+"""Parses what `ros2 bag record` prints on stderr, line by line.
 
-The texts are those of rosbag2 0.15 (Humble) to 0.33 (Rolling); a line that none of them fits is
-kept by its level. Pure: `parse_line` knows one line and no history.
+The texts are those of rosbag2 0.15 (Humble) to 0.33 (Rolling); any other line is classified by its
+log level.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from enum import StrEnum
 from typing import Final
 
 
-class Said(StrEnum):
-    """What a line says."""
+class LineKind(StrEnum):
+    """What a line reports."""
 
     READY = "ready"
     SUBSCRIBED = "subscribed"
@@ -26,60 +26,60 @@ class Said(StrEnum):
     MESSAGES_LOST = "messages_lost"
     WARNING = "warning"
     ERROR = "error"
-    REMARK = "remark"
+    OTHER = "other"
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line: what it says, of which topic (where it names one), and its words."""
+    """One line: what it reports, its text, and the topic, where it names one."""
 
-    said: Said
+    kind: LineKind
     text: str
     topic: str | None = None
 
 
 _ANSI: Final = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
-# Searched, not matched: the first line of a recorder without a terminal has a sentence before it.
+# Searched, not matched: without a terminal, another sentence precedes the first line.
 _LOGGED: Final = re.compile(
     r"\[(?P<level>DEBUG|INFO|WARN|ERROR|FATAL)\] (?:\[[\d.]+\] )?\[[^\]]*\]: (?P<text>.*)"
 )
 _MEANINGS: Final = (
-    (Said.READY, re.compile(r"(?:Recording\.\.\.|Listening for topics\.\.\.)$")),
-    (Said.SUBSCRIBED, re.compile(r"Subscribed to topic '(?P<topic>[^']+)'")),
-    (Said.FLUSHING, re.compile(r"Writing remaining messages from cache")),
-    (Said.STOPPED, re.compile(r"Recording stopped")),
-    (Said.FOLDER_EXISTS, re.compile(r"Output folder '.*' already exists")),
+    (LineKind.READY, re.compile(r"(?:Recording\.\.\.|Listening for topics\.\.\.)$")),
+    (LineKind.SUBSCRIBED, re.compile(r"Subscribed to topic '(?P<topic>[^']+)'")),
+    (LineKind.FLUSHING, re.compile(r"Writing remaining messages from cache")),
+    (LineKind.STOPPED, re.compile(r"Recording stopped")),
+    (LineKind.FOLDER_EXISTS, re.compile(r"Output folder '.*' already exists")),
     (
-        Said.QOS_REFUSED,
+        LineKind.QOS_REFUSED,
         re.compile(r"A new publisher for subscribed topic (?P<topic>\S+) was found offering"),
     ),
     (
-        Said.QOS_REFUSED,
+        LineKind.QOS_REFUSED,
         re.compile(r"New publisher discovered on topic '(?P<topic>[^']+)', offering incompatible"),
     ),
-    (Said.UNKNOWN_TYPE, re.compile(r"Topic '(?P<topic>[^']+)' has unknown type")),
-    (Said.SEVERAL_TYPES, re.compile(r"Topic '(?P<topic>[^']+)' has more than one type")),
-    (Said.MESSAGES_LOST, re.compile(r"Cache buffers lost messages")),
+    (LineKind.UNKNOWN_TYPE, re.compile(r"Topic '(?P<topic>[^']+)' has unknown type")),
+    (LineKind.SEVERAL_TYPES, re.compile(r"Topic '(?P<topic>[^']+)' has more than one type")),
+    (LineKind.MESSAGES_LOST, re.compile(r"Cache buffers lost messages")),
 )
-# The total stands on a line of its own, below one line for each topic.
+# The total is on a line of its own, below one line for each topic.
 _LOST: Final = re.compile(r"Total lost: (?!0\b)\d+")
 
 
 def parse_line(raw: str) -> Line:
-    """What one line of the recorder's output says. Never fails."""
+    """Parses one line of the output. Never fails."""
     line = _ANSI.sub("", raw).strip()
     logged = _LOGGED.search(line)
     text = logged["text"].strip() if logged else line
-    for said, pattern in _MEANINGS:
+    for kind, pattern in _MEANINGS:
         found = pattern.match(text)
         if found is not None:
-            return Line(said, text, found.groupdict().get("topic"))
+            return Line(kind, text, found.groupdict().get("topic"))
     if _LOST.match(text):
-        return Line(Said.MESSAGES_LOST, text)
+        return Line(LineKind.MESSAGES_LOST, text)
     return Line(_by_level(logged["level"] if logged else ""), text)
 
 
-def _by_level(level: str) -> Said:
+def _by_level(level: str) -> LineKind:
     if level == "WARN":
-        return Said.WARNING
-    return Said.ERROR if level in {"ERROR", "FATAL"} else Said.REMARK
+        return LineKind.WARNING
+    return LineKind.ERROR if level in {"ERROR", "FATAL"} else LineKind.OTHER

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.recorder.process.output import Said, parse_line
+from ros2_memory.recorder.process.output import LineKind, parse_line
 from tests.support.shared_bags import RECORDED, needs_recorded
 
 ROBOTS_TOPICS = {
@@ -36,37 +36,42 @@ ROBOTS_TOPICS = {
 )
 def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended: bool) -> None:
     lines = [parse_line(raw) for raw in (RECORDED / f"logs/{name}.log").read_text().splitlines()]
-    said = [line.said for line in lines]
-    subscribed = {line.topic for line in lines if line.said is Said.SUBSCRIBED}
+    said = [line.kind for line in lines]
+    subscribed = {line.topic for line in lines if line.kind is LineKind.SUBSCRIBED}
     assert subscribed == ROBOTS_TOPICS
-    assert said.count(Said.FLUSHING) == splits
-    assert said.count(Said.STOPPED) == ended
-    assert said.index(Said.READY) < said.index(Said.SUBSCRIBED)
-    assert {Said.WARNING, Said.ERROR, Said.QOS_REFUSED, Said.UNKNOWN_TYPE}.isdisjoint(said)
+    assert said.count(LineKind.FLUSHING) == splits
+    assert said.count(LineKind.STOPPED) == ended
+    assert said.index(LineKind.READY) < said.index(LineKind.SUBSCRIBED)
+    assert {
+        LineKind.WARNING,
+        LineKind.ERROR,
+        LineKind.QOS_REFUSED,
+        LineKind.UNKNOWN_TYPE,
+    }.isdisjoint(said)
 
 
 @pytest.mark.parametrize(
     ("raw", "said", "topic"),
     [
-        ("[INFO] [1.5] [rosbag2_recorder]: Recording...", Said.READY, None),
-        ("[INFO] [1.5] [rosbag2_recorder]: Listening for topics...", Said.READY, None),
+        ("[INFO] [1.5] [rosbag2_recorder]: Recording...", LineKind.READY, None),
+        ("[INFO] [1.5] [rosbag2_recorder]: Listening for topics...", LineKind.READY, None),
         (
             (
                 "stdin is not a terminal device. Keyboard handling disabled.[INFO] [1.5] [n]: "
                 "Subscribed to topic '/odom'"
             ),
-            Said.SUBSCRIBED,
+            LineKind.SUBSCRIBED,
             "/odom",
         ),
         (
             "[INFO] [1.5] [n]: Subscribed to topic '/tf_static' (repeat-transient-local, depth=3)",
-            Said.SUBSCRIBED,
+            LineKind.SUBSCRIBED,
             "/tf_static",
         ),
-        ("\x1b[32m[INFO] [1.5] [n]: Recording...\x1b[0m", Said.READY, None),
+        ("\x1b[32m[INFO] [1.5] [n]: Recording...\x1b[0m", LineKind.READY, None),
         (
             "[ERROR] [ros2bag]: Output folder '/bags/rec_1' already exists.",
-            Said.FOLDER_EXISTS,
+            LineKind.FOLDER_EXISTS,
             None,
         ),
         (
@@ -76,7 +81,7 @@ def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended
                 "subscribed requesting RMW_QOS_POLICY_RELIABILITY_RELIABLE. Messages from this "
                 "new publisher will not be recorded."
             ),
-            Said.QOS_REFUSED,
+            LineKind.QOS_REFUSED,
             "/scan",
         ),
         (
@@ -85,7 +90,7 @@ def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended
                 "offering incompatible QoS. No messages will be received from it. "
                 "Last incompatible policy: DURABILITY_QOS_POLICY"
             ),
-            Said.QOS_REFUSED,
+            LineKind.QOS_REFUSED,
             "/tf_static",
         ),
         (
@@ -93,7 +98,7 @@ def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended
                 "[WARN] [1.5] [ROSBAG2_TRANSPORT]: Topic '/x' has unknown type 'my_msgs/msg/X' . "
                 "Only topics with known type are supported. Reason: 'package 'my_msgs' not found"
             ),
-            Said.UNKNOWN_TYPE,
+            LineKind.UNKNOWN_TYPE,
             "/x",
         ),
         (
@@ -101,26 +106,26 @@ def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended
                 "[ERROR] [1.5] [ROSBAG2_TRANSPORT]: Topic '/cmd_vel' has more than one type "
                 "associated. Only topics with one type are supported"
             ),
-            Said.SEVERAL_TYPES,
+            LineKind.SEVERAL_TYPES,
             "/cmd_vel",
         ),
         (
             "[WARN] [1.5] [rosbag2_cpp]: Cache buffers lost messages per topic: ",
-            Said.MESSAGES_LOST,
+            LineKind.MESSAGES_LOST,
             None,
         ),
-        ("Total lost: 12", Said.MESSAGES_LOST, None),
-        ("Total lost: 0", Said.REMARK, None),
-        ("[WARN] [1.5] [n]: something else", Said.WARNING, None),
-        ("[FATAL] [1.5] [n]: it is over", Said.ERROR, None),
-        ("[DEBUG] [1.5] [n]: detail", Said.REMARK, None),
-        ("ros2 bag record: error: unrecognized arguments: --x", Said.REMARK, None),
-        ("", Said.REMARK, None),
+        ("Total lost: 12", LineKind.MESSAGES_LOST, None),
+        ("Total lost: 0", LineKind.OTHER, None),
+        ("[WARN] [1.5] [n]: something else", LineKind.WARNING, None),
+        ("[FATAL] [1.5] [n]: it is over", LineKind.ERROR, None),
+        ("[DEBUG] [1.5] [n]: detail", LineKind.OTHER, None),
+        ("ros2 bag record: error: unrecognized arguments: --x", LineKind.OTHER, None),
+        ("", LineKind.OTHER, None),
     ],
 )
-def test_a_line_says_what_it_says(raw: str, said: Said, topic: str | None) -> None:
+def test_a_line_says_what_it_says(raw: str, said: LineKind, topic: str | None) -> None:
     line = parse_line(raw)
-    assert (line.said, line.topic) == (said, topic)
+    assert (line.kind, line.topic) == (said, topic)
 
 
 def test_the_words_are_kept_without_their_frame() -> None:
@@ -129,9 +134,9 @@ def test_the_words_are_kept_without_their_frame() -> None:
 
 def test_a_topic_named_like_a_message_is_only_a_topic() -> None:
     line = parse_line("[INFO] [1.5] [n]: Subscribed to topic '/Recording'")
-    assert (line.said, line.topic) == (Said.SUBSCRIBED, "/Recording")
+    assert (line.kind, line.topic) == (LineKind.SUBSCRIBED, "/Recording")
 
 
 @given(st.text())
 def test_no_line_is_too_odd(raw: str) -> None:
-    assert parse_line(raw).said in Said
+    assert parse_line(raw).kind in LineKind
