@@ -336,10 +336,8 @@ def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
                 "/metrics; choose server.transport=sse or leave it out"
             )
         with _extra_required("server.metrics"):
-            from ros2_memory.observability.prometheus import Metrics
-        from ros2_memory.observability.gauges import Measuring
-
-        metrics = Metrics(Measuring(memory), package_version())
+            from ros2_memory.observability.prometheus import MemoryGauges, Metrics
+        metrics = Metrics(MemoryGauges(memory), package_version())
         observers.append(metrics)
         exposition = metrics.exposition
     if settings.server.traces:

@@ -11,15 +11,14 @@ import anyio
 import pytest
 import yaml
 
-from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.core.telemetry import Answered
-from ros2_memory.observability.gauges import (
-    IndexMeasures,
-    Measures,
-    RecorderMeasures,
-)
-from tests.support.memories import ROOT
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import QuerySettings
+from ros2_memory.retention.policy import RetentionLimits
+from tests.support.bags import text, write_mcap
+from tests.support.memories import ROOT, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,7 +29,7 @@ pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")
 from prometheus_client.parser import text_string_to_metric_families
 
 from ros2_memory.observability.opentelemetry import SERVICE, _attributes
-from ros2_memory.observability.prometheus import BUCKETS_S, Metrics
+from ros2_memory.observability.prometheus import BUCKETS_S, MemoryGauges, Metrics
 
 PAGE = (ROOT / "docs/how-to/metrics.md").read_text(encoding="utf-8")
 SCRAPING, RULES = (
@@ -41,6 +40,18 @@ QUERIES = [
     *(rule["expr"] for rule in RULES["groups"][0]["rules"]),
     *re.findall(r"^\| [^|]+ \| `(.*?)` \|$", PAGE, re.MULTILINE),
 ]
+HEARTBEAT = Heartbeat(
+    pid=1,
+    updated=0,
+    state=RecorderState.RECORDING,
+    recordings=(),
+    since=0,
+    bytes_written=700,
+    subscribed=("/a",),
+    silent=(),
+    last_error=None,
+    interval_s=2.0,
+)
 CALL = Answered("ask", "no_data: gap", 0.03, 12, "abc", {"read": 2.0})
 
 
@@ -48,16 +59,19 @@ def codes(cls: type[EpisodicError] = EpisodicError) -> set[str]:
     return {cls.code}.union(*(codes(each) for each in cls.__subclasses__()))
 
 
-def shown() -> dict[str, dict[str, set[str]]]:
+def shown(bag_dir: Path) -> dict[str, dict[str, set[str]]]:
     """Every series of a memory that has a recorder, with its labels and their values."""
-    index = IndexMeasures(3, 1, 2, 0, 4096, 7.5, 0.5)
-    recorder = RecorderMeasures(RecorderState.RECORDING, True, 1.7e9, 1.0, 700, 1, 2)
-    metrics = Metrics(lambda: Measures(index, recorder, 5000), "1")
+    write_mcap(bag_dir / "a" / "a_0.mcap", [text(1_700_000_000 * NS_PER_S, "x")])
+    write_heartbeat(bag_dir, HEARTBEAT)
+    kept = RetentionLimits(max_total_bytes=5000, max_age_ns=NS_PER_S, min_free_bytes=0)
+    memory = memory_of(bag_dir, limits=QuerySettings(kept=kept))
+    memory.index.refresh()
+    metrics = Metrics(MemoryGauges(memory), "1")
     metrics.answered(CALL)
-    text = anyio.run(metrics.exposition).body.decode()
+    exposition = anyio.run(metrics.exposition).body.decode()
     metrics.stop()
     found: dict[str, dict[str, set[str]]] = {}
-    for family in text_string_to_metric_families(text):
+    for family in text_string_to_metric_families(exposition):
         for sample in family.samples:
             series = found.setdefault(sample.name, {})
             for label, value in sample.labels.items():
@@ -79,17 +93,17 @@ def chosen(text: str) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 @pytest.mark.parametrize("query", QUERIES)
-def test_a_query_asks_for_what_there_is(query: str) -> None:
-    known = shown()
+def test_a_query_asks_for_what_there_is(query: str, tmp_path: Path) -> None:
+    known = shown(tmp_path)
     for name, labels in chosen(query):
         assert name in known
         for label, value in labels:
             assert set(value.split("|")) <= known[name][label]
 
 
-def test_the_sample_is_what_a_scrape_shows() -> None:
+def test_the_sample_is_what_a_scrape_shows(tmp_path: Path) -> None:
     assert SAMPLES is not None
-    known = shown()
+    known = shown(tmp_path)
     named = chosen(SAMPLES[1])
     assert len(named) > 10
     for name, labels in named:

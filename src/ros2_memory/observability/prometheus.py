@@ -1,8 +1,8 @@
-"""Figures for Prometheus, in a registry of their own.
+"""Metrics for Prometheus, in a registry of their own.
 
-Nothing of the process itself is among them: what runs the server knows its memory and its time, and
-names them as for every other program. Labels are bounded: tools of this server or `unknown`, and
-outcomes and reasons of the error tree.
+Metrics of the process itself are left to what runs the server, which names them as for every other
+program. Labels are bounded: tools of this server or `unknown`, and the outcomes and reasons of the
+error tree.
 """
 
 from __future__ import annotations
@@ -25,39 +25,43 @@ from prometheus_client.exposition import generate_latest
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.telemetry import Exposition, Observer
+from ros2_memory.core.timebase import unix_from_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from prometheus_client.metrics_core import Metric
 
+    from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.telemetry import Answered
-    from ros2_memory.observability.gauges import (
-        IndexMeasures,
-        Measures,
-        RecorderMeasures,
-    )
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.context import Memory
+    from ros2_memory.index.snapshot import Snapshot
 
-PATIENCE_S: Final = 2.0
-"""How long the figures of the memory may take; the others are shown without them after that."""
+TIMEOUT_S: Final = 2.0
+"""How long the gauges of the memory may take; after that the counters are shown without them."""
 BUCKETS_S: Final = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 25.0)
 
 
 class Metrics(Observer):
-    """Counts answers, and shows them with the figures of the memory; for one event loop.
+    """Counts tool calls, and renders the counts with the gauges of the memory.
 
-    One look at the memory is under way at a time, also where nobody waits for it any more.
+    Belongs to one event loop. Gauges are measured in a thread, once at a time, even where a scrape
+    that waited for them has timed out: a disk that hangs must not cost a thread with every scrape.
     """
 
     def __init__(
-        self, measure: Callable[[], Measures], version: str, patience_s: float = PATIENCE_S
+        self,
+        measure: Callable[[], Sequence[Metric]],
+        version: str,
+        timeout_s: float = TIMEOUT_S,
     ) -> None:
         self._measure = measure
         self._version = version
-        self._patience_s = patience_s
+        self._timeout_s = timeout_s
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="metrics")
-        self._looking: asyncio.Future[Measures] | None = None
-        # A series more for each, of no use in this format.
+        self._measuring: asyncio.Future[Sequence[Metric]] | None = None
+        # One more series for each counter, of no use in this format.
         disable_created_metrics()  # type: ignore[no-untyped-call]  # has no types
         self._registry = CollectorRegistry(auto_describe=False)
         self._answers = Counter(
@@ -80,84 +84,109 @@ class Metrics(Observer):
         self._durations.labels(call.tool).observe(call.duration_s)
 
     def stop(self) -> None:
-        """Lets its thread go."""
+        """Ends the thread when it is done."""
         self._thread.shutdown(wait=False)
 
     async def exposition(self) -> Exposition:
-        """All figures in Prometheus' text format, version 0.0.4.
+        """Returns all metrics in Prometheus' text format, version 0.0.4.
 
-        Those of the memory are missing where a disk lets them wait for longer than `patience_s`.
+        The gauges of the memory are missing where measuring them takes longer than the timeout.
         """
-        found: Measures | None = None
-        with anyio.move_on_after(self._patience_s), suppress(RuntimeError):  # it has stopped
-            if self._looking is None or self._looking.done():
+        gauges: Sequence[Metric] = ()
+        with anyio.move_on_after(self._timeout_s), suppress(RuntimeError):  # it has stopped
+            if self._measuring is None or self._measuring.done():
                 loop = asyncio.get_running_loop()
-                self._looking = loop.run_in_executor(self._thread, self._measure)
-            found = await asyncio.shield(self._looking)
-        text = generate_latest(_Collected(self._registry, found, self._version))
+                self._measuring = loop.run_in_executor(self._thread, self._measure)
+            gauges = await asyncio.shield(self._measuring)
+        text = generate_latest(_Collector(self._registry, gauges, self._version))
         return Exposition(CONTENT_TYPE_PLAIN_0_0_4, text)
 
 
-class _Collected:
-    """What was counted, and what was measured at one moment."""
+class _Collector:
+    """What `generate_latest` renders: the counters, and the gauges of one moment."""
 
-    def __init__(
-        self, registry: CollectorRegistry, measures: Measures | None, version: str
-    ) -> None:
+    def __init__(self, registry: CollectorRegistry, gauges: Sequence[Metric], version: str) -> None:
         self._registry = registry
-        self._measures = measures
+        self._gauges = gauges
         self._version = version
 
     def collect(self) -> Iterator[Metric]:
-        """All families."""
+        """Yields all metric families."""
         yield InfoMetricFamily(
             "ros2_memory_build", "The version of this server.", {"version": self._version}
         )
         yield from self._registry.collect()
-        if self._measures is None:
-            return
-        if self._measures.index is not None:
-            yield from _of_index(self._measures.index)
-        if self._measures.budget_bytes is not None:
-            yield GaugeMetricFamily(
-                "ros2_memory_budget_bytes",
-                "How much the recorder may keep.",
-                self._measures.budget_bytes,
+        yield from self._gauges
+
+
+class MemoryGauges:
+    """Measures a memory, and what its recorder writes about itself; for one thread at a time."""
+
+    def __init__(self, memory: Memory) -> None:
+        self._memory = memory
+        self._pid: int | None = None
+        self._restarts = 0
+
+    def __call__(self) -> list[Metric]:
+        """Returns the metric families of this moment.
+
+        They are those of the last scan and of the heartbeat: the bag directory is not scanned, and
+        no bag is read. What is not known is left out.
+        """
+        memory = self._memory
+        now, snapshot, heartbeat = memory.clock.now(), memory.index.published, memory.heartbeat()
+        families: list[Metric] = []
+        if snapshot is not None:
+            families += _index_families(snapshot, now)
+        if memory.limits.kept is not None:
+            families.append(
+                GaugeMetricFamily(
+                    "ros2_memory_budget_bytes",
+                    "How much the recorder may keep.",
+                    memory.limits.kept.max_total_bytes,
+                )
             )
-        if self._measures.recorder is not None:
-            yield from _of_recorder(self._measures.recorder)
+        if heartbeat is not None:
+            if self._pid not in {None, heartbeat.pid}:
+                self._restarts += 1
+            self._pid = heartbeat.pid
+            families += _recorder_families(heartbeat, now, self._restarts)
+        return families
 
 
-def _of_index(index: IndexMeasures) -> Iterator[Metric]:
-    yield GaugeMetricFamily("ros2_memory_bags", "Bags that answer questions.", index.bags)
+def _index_families(snapshot: Snapshot, now: Ns) -> Iterator[Metric]:
+    yield GaugeMetricFamily("ros2_memory_bags", "Bags that answer questions.", len(snapshot.bags))
     aside = GaugeMetricFamily(
         "ros2_memory_files_set_aside",
         "Files in the bag directory: still being written, unreadable, or of another storage.",
         labels=("state",),
     )
-    aside.add_metric(("active",), index.active)
-    aside.add_metric(("damaged",), index.damaged)
-    aside.add_metric(("unread",), index.unread)
+    aside.add_metric(("active",), len(snapshot.active))
+    aside.add_metric(("damaged",), len(snapshot.damaged))
+    aside.add_metric(("unread",), len(snapshot.unread))
     yield aside
     yield GaugeMetricFamily(
-        "ros2_memory_kept_bytes", "Size of the bags that answer questions.", index.kept_bytes
+        "ros2_memory_kept_bytes",
+        "Size of the bags that answer questions.",
+        sum(bag.size for bag in snapshot.bags),
     )
     yield GaugeMetricFamily(
         "ros2_memory_index_age_seconds",
         "Since the bag directory was last looked through.",
-        index.age_s,
+        unix_from_ns(now - snapshot.scanned_at),
     )
-    if index.newest_age_s is not None:
+    latest = snapshot.dating.latest
+    if latest is not None:
         yield GaugeMetricFamily(
             "ros2_memory_newest_data_age_seconds",
             "Since the newest message in a bag.",
-            index.newest_age_s,
+            unix_from_ns(now - latest),
         )
 
 
-def _of_recorder(recorder: RecorderMeasures) -> Iterator[Metric]:
+def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator[Metric]:
     yield GaugeMetricFamily(
-        "ros2_memory_recorder_live", "Whether the recorder is there.", int(recorder.live)
+        "ros2_memory_recorder_live", "Whether the recorder is there.", int(heartbeat.is_live(now))
     )
     states = GaugeMetricFamily(
         "ros2_memory_recorder_state",
@@ -165,30 +194,30 @@ def _of_recorder(recorder: RecorderMeasures) -> Iterator[Metric]:
         labels=("state",),
     )
     for state in RecorderState:
-        states.add_metric((str(state),), int(state is recorder.state))
+        states.add_metric((str(state),), int(state is heartbeat.state))
     yield states
     yield GaugeMetricFamily(
         "ros2_memory_recorder_state_since_timestamp_seconds",
         "When that state began, Unix time.",
-        recorder.since,
+        unix_from_ns(heartbeat.since),
     )
     yield GaugeMetricFamily(
         "ros2_memory_recorder_heartbeat_age_seconds",
         "Since the recorder last said something of itself.",
-        recorder.heartbeat_age_s,
+        unix_from_ns(now - heartbeat.updated),
     )
     yield GaugeMetricFamily(
         "ros2_memory_recorder_silent_topics",
         "Topics that are subscribed to and brought no message.",
-        recorder.silent_topics,
+        len(heartbeat.silent),
     )
     yield CounterMetricFamily(
         "ros2_memory_recorder_written_bytes",
         "What the recorder has written since it started.",
-        recorder.written_bytes,
+        heartbeat.bytes_written,
     )
     yield CounterMetricFamily(
         "ros2_memory_recorder_restarts",
         "How often another process was found to be the recorder; looked at when scraped.",
-        recorder.restarts,
+        restarts,
     )

@@ -11,16 +11,10 @@ import pytest
 from mcp import Client, MCPError
 
 from ros2_memory import results
-from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
 from ros2_memory.core.model import Sample
 from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Telemetry
 from ros2_memory.history.context import Memory
-from ros2_memory.observability.gauges import (
-    IndexMeasures,
-    Measures,
-    RecorderMeasures,
-)
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.tools.declaration import Tool
@@ -30,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from opentelemetry.sdk.trace import ReadableSpan
+    from prometheus_client.metrics_core import Metric
 
 pytest.importorskip("prometheus_client", reason="needs the extra observability")
 pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")
@@ -37,6 +32,7 @@ pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")
 from opentelemetry import trace
 from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.parser import text_string_to_metric_families
 
 from ros2_memory.observability.opentelemetry import (
@@ -48,8 +44,6 @@ from ros2_memory.observability.opentelemetry import (
 )
 from ros2_memory.observability.prometheus import BUCKETS_S, Metrics
 
-INDEX = IndexMeasures(3, 1, 2, 0, 4096, 7.5, 0.5)
-RECORDER = RecorderMeasures(RecorderState.RECORDING, True, 1.7e9, 1.0, 700, 1, 2)
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
@@ -73,7 +67,7 @@ def at(found: Samples, name: str, **labels: str) -> float:
 
 class TestMetrics:
     async def test_answers_are_counted_by_tool_and_outcome(self) -> None:
-        metrics = Metrics(lambda: Measures(None, None, None), "1.2.3")
+        metrics = Metrics(lambda: (), "1.2.3")
         for outcome in ("ok", "ok", "no_data: gap", "timeout"):
             metrics.answered(call(outcome=outcome))
         found = await scraped(metrics)
@@ -83,7 +77,7 @@ class TestMetrics:
         assert at(found, "build_info", version="1.2.3") == 1
 
     async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole(self) -> None:
-        metrics = Metrics(lambda: Measures(None, None, None), "1")
+        metrics = Metrics(lambda: (), "1")
         tools = [Tool("full", "f", "A.", {}, blocking=False, question=partial(asking, "full"))]
         dispatcher = Dispatcher(
             cast("Memory", None),
@@ -107,7 +101,7 @@ class TestMetrics:
         dispatcher.stop()
 
     async def test_durations_are_counted_in_buckets_by_tool(self) -> None:
-        metrics = Metrics(lambda: Measures(None, None, None), "1")
+        metrics = Metrics(lambda: (), "1")
         for seconds in (0.03, 0.3, 100.0):
             metrics.answered(call(seconds=seconds))
         found = await scraped(metrics)
@@ -117,33 +111,23 @@ class TestMetrics:
         assert at(found, f"{name}_count", tool="ask") == 3
         assert at(found, f"{name}_sum", tool="ask") == pytest.approx(100.33)
 
-    async def test_the_memory_and_its_recorder_are_shown_as_measured(self) -> None:
-        metrics = Metrics(lambda: Measures(INDEX, RECORDER, 5000), "1")
-        found = await scraped(metrics)
+    async def test_gauges_are_shown_as_measured(self) -> None:
+        gauges = [GaugeMetricFamily("ros2_memory_bags", "Bags.", 3)]
+        found = await scraped(Metrics(lambda: gauges, "1"))
         assert at(found, "bags") == 3
-        aside = [at(found, "files_set_aside", state=each) for each in ("active", "damaged")]
-        assert aside == [1, 2]
-        assert (at(found, "kept_bytes"), at(found, "budget_bytes")) == (4096, 5000)
-        assert (at(found, "newest_data_age_seconds"), at(found, "index_age_seconds")) == (7.5, 0.5)
-        states = {each: at(found, "recorder_state", state=str(each)) for each in RecorderState}
-        assert [each for each, is_it in states.items() if is_it] == [RecorderState.RECORDING]
-        assert at(found, "recorder_live") == 1
-        assert at(found, "recorder_restarts_total") == 2
-        assert at(found, "recorder_written_bytes_total") == 700
-        assert at(found, "recorder_silent_topics") == 1
 
     async def test_what_is_not_known_is_not_shown(self) -> None:
-        found = await scraped(Metrics(lambda: Measures(None, None, None), "1"))
+        found = await scraped(Metrics(lambda: (), "1"))
         assert {name for name, _ in found} == {"ros2_memory_build_info"}
 
     async def test_a_disk_that_hangs_costs_the_figures_of_the_memory_alone(self) -> None:
         freed = threading.Event()
 
-        def hanging() -> Measures:
+        def hanging() -> list[Metric]:
             freed.wait()
-            return Measures(INDEX, None, None)
+            return [GaugeMetricFamily("ros2_memory_bags", "Bags.", 3)]
 
-        metrics = Metrics(hanging, "1", patience_s=0.01)
+        metrics = Metrics(hanging, "1", timeout_s=0.01)
         metrics.answered(call())
         try:
             for _ in range(2):
