@@ -1,8 +1,9 @@
-"""What is spoken of MCP: the tools as declared, what can be read as a resource, and a prompt."""
+"""The MCP server: the tools as declared, the resources, and a prompt."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import unquote
 
 from mcp.server.lowlevel.helper_types import ReadResourceContents
 from mcp.server.mcpserver import Context, MCPServer
@@ -22,13 +23,12 @@ from mcp.types import (
 from mcp.types import Tool as ListedTool
 from starlette.requests import Request
 
-from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.tools.instructions import PROMPT
-from ros2_memory.tools.resources import SCHEMA, STATUS, TOPICS, asked_of
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable, Mapping
+    from collections.abc import Hashable, Iterable, Mapping, Sequence
 
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.declaration import Tool
 
@@ -36,10 +36,37 @@ MESSAGES_PATH: Final = "/messages/"
 """Where the clients of event streams post, each with its session in the query string."""
 
 _LONGEST_NAME: Final = 64
+_LONGEST_URI: Final = 200
 _JSON: Final = "application/json"
 _PROMPT_NAME: Final = "use_memory"
 _PROMPT_TITLE: Final = "How to use the robot's memory"
-_PROMPT_SAYS: Final = "Teaches a planner which tool answers what, in one call each."
+_PROMPT_DESCRIPTION: Final = "Teaches a planner which tool answers what, in one call each."
+
+
+class ToolResource(NamedTuple):
+    """A resource, or a template of resources, whose text is the reply of a tool."""
+
+    uri: str
+    name: str
+    description: str
+    tool: str
+
+
+TOPICS: Final = ToolResource(
+    "episodic://topics",
+    "topics",
+    "Every recorded topic with its type, times and count.",
+    "list_recorded_topics",
+)
+STATUS: Final = ToolResource(
+    "episodic://status", "status", "How far the memory can be trusted just now.", "memory_status"
+)
+SCHEMA: Final = ToolResource(
+    "episodic://schema/{type}",
+    "schema",
+    "The fields that replies show of a message type, as dot-paths, e.g. nav_msgs/msg/Odometry.",
+    "describe_type",
+)
 
 
 class EpisodicServer(MCPServer[object]):
@@ -50,74 +77,65 @@ class EpisodicServer(MCPServer[object]):
     """
 
     def __init__(
-        self,
-        dispatcher: Dispatcher,
-        *,
-        name: str,
-        version: str,
-        instructions: str,
+        self, dispatcher: Dispatcher, *, name: str, version: str, instructions: str
     ) -> None:
         super().__init__(name, version=version, instructions=instructions)
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
-        reads_more = any(tool.name == STATUS.tool for tool in dispatcher.tools)
-        self._offered = (TOPICS, STATUS, SCHEMA) if reads_more else (TOPICS,)
+        has_status = any(tool.name == STATUS.tool for tool in dispatcher.tools)
+        self._resources = (TOPICS, STATUS, SCHEMA) if has_status else (TOPICS,)
         self._prompt = f"{instructions}\n{PROMPT}"
 
     async def list_tools(self) -> list[ListedTool]:
-        """The tools, in the order of their declaration."""
+        """Returns the tools, in the order of their declaration."""
         return self._listed
 
     async def call_tool(
         self, name: str, arguments: Mapping[str, object], context: object | None = None
     ) -> CallToolResult:
-        """One call's reply as one text block. Raises nothing but cancellation."""
-        client = _client(context)
-        reply = await self.dispatcher.answer(name, arguments, client)
+        """Returns a call's reply as one text block. Raises nothing but cancellation."""
+        reply = await self.dispatcher.answer(name, arguments, _client(context))
         return CallToolResult(
             content=[TextContent(type="text", text=reply.text)], is_error=reply.is_error
         )
 
     async def list_resources(self) -> list[Resource]:
-        """What can be read as it is."""
+        """Returns the resources that have no parameter."""
         return [
             Resource(uri=each.uri, name=each.name, description=each.description, mime_type=_JSON)
-            for each in self._offered
+            for each in self._resources
             if each is not SCHEMA
         ]
 
     async def list_resource_templates(self) -> list[ResourceTemplate]:
-        """What can be read for each message type."""
-        if SCHEMA not in self._offered:
-            return []
+        """Returns the template of the resources of message types."""
         return [
             ResourceTemplate(
-                uri_template=SCHEMA.uri,
-                name=SCHEMA.name,
-                description=SCHEMA.description,
+                uri_template=each.uri,
+                name=each.name,
+                description=each.description,
                 mime_type=_JSON,
             )
+            for each in self._resources
+            if each is SCHEMA
         ]
 
     async def read_resource(
         self, uri: object, context: object | None = None
     ) -> Iterable[ReadResourceContents]:
-        """A resource's JSON: the reply of the question behind it, errors included.
+        """Returns a resource's JSON: the reply of its tool, errors included.
 
         Raises:
-            ResourceNotFoundError: there is no such resource; the client is told so by the code
-                that the protocol has for it, -32602 (SEP-2164).
+            ResourceNotFoundError: there is no such resource; the client receives the code that the
+                protocol has for it, -32602 (SEP-2164).
         """
-        try:
-            name, given = asked_of(str(uri), self._offered)
-        except InvalidArgumentsError as error:
-            raise ResourceNotFoundError(str(error)) from error
-        reply = await self.dispatcher.read(name, given, _client(context))
+        name, arguments = _resource_call(str(uri), self._resources)
+        reply = await self.dispatcher.read(name, arguments, _client(context))
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
     async def list_prompts(self) -> list[Prompt]:
-        """The one prompt."""
-        return [Prompt(name=_PROMPT_NAME, title=_PROMPT_TITLE, description=_PROMPT_SAYS)]
+        """Returns the one prompt."""
+        return [Prompt(name=_PROMPT_NAME, title=_PROMPT_TITLE, description=_PROMPT_DESCRIPTION)]
 
     async def get_prompt(
         self,
@@ -125,7 +143,7 @@ class EpisodicServer(MCPServer[object]):
         arguments: Mapping[str, object] | None = None,
         context: object | None = None,
     ) -> GetPromptResult:
-        """What teaches a planner how to use the memory.
+        """Returns the text that teaches a planner how to use the memory.
 
         Raises:
             MCPError: there is no such prompt.
@@ -135,20 +153,33 @@ class EpisodicServer(MCPServer[object]):
             raise MCPError(code=INVALID_PARAMS, message=f"there is one prompt, {_PROMPT_NAME}")
         text = TextContent(type="text", text=self._prompt)
         return GetPromptResult(
-            description=_PROMPT_SAYS, messages=[PromptMessage(role="user", content=text)]
+            description=_PROMPT_DESCRIPTION, messages=[PromptMessage(role="user", content=text)]
         )
 
 
-def _client(context: object) -> Hashable:
-    """Who asks, as far as it can be told: a session, or else an address and a program.
+def _resource_call(uri: str, offered: Sequence[ToolResource]) -> tuple[str, dict[str, JsonValue]]:
+    """Returns the tool of a resource, and its arguments."""
+    prefix = SCHEMA.uri.removesuffix("{type}")
+    for each in offered:
+        if each is SCHEMA and uri.startswith(prefix) and uri != prefix:
+            return each.tool, {"type": unquote(uri.removeprefix(prefix))}
+        if each is not SCHEMA and uri == each.uri:
+            return each.tool, {}
+    shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
+    known = ", ".join(each.uri for each in offered)
+    raise ResourceNotFoundError(f"there is no resource {shown}; what can be read: {known}")
 
-    None over stdio, which has one client. Nothing but turns is given by it: a client may say that
-    it is another.
+
+def _client(context: object) -> Hashable:
+    """Returns an identity of the client: its session, or else its address and program.
+
+    None over stdio, which has one client. It serves to give out turns fairly, and nothing else: a
+    client may claim to be another.
     """
     request = context.request_context.request if isinstance(context, Context) else None
     if not isinstance(request, Request):
         return None
-    # It was parsed, and would be kept for as long as the call waits: up to 1 MiB for each.
+    # The body was parsed. Starlette would keep up to 1 MiB of it for as long as the call waits.
     request._body = b""
     session = request.query_params.get("session_id")
     if session is not None and request.url.path.startswith(MESSAGES_PATH):
@@ -159,9 +190,9 @@ def _client(context: object) -> Hashable:
 
 
 def _listed(tool: Tool) -> ListedTool:
-    # What only destroys or repeats itself where something is written is not said of what reads.
+    # A hint about destruction is left out of tools that only read, where it would mean nothing.
     annotations = ToolAnnotations(
-        # Clients show it where a tool has no title of its own; twice would be once too often.
+        # Clients show it where a tool has no title of its own, so a title is given only once.
         title=f"{tool.title} (blocking)" if tool.blocking else None,
         read_only_hint=not tool.writes,
         destructive_hint=False if tool.writes else None,
