@@ -119,17 +119,17 @@ def topic_range(
         raise no_data_between(view, (name,), window)
     samples, types = _samples(view, chosen, window, fields)
     if len(types) > 1:
-        view.note(f"the topic was recorded under several types: {', '.join(types)}")
+        view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
     if len(chosen) < total:
-        view.note(samples_note(len(chosen), total))
+        view.notes.add(samples_note(len(chosen), total))
     note_unread(view, window)
     note_edges(view, window)
     extremes: tuple[results.Extremes, ...] = ()
     if fields and total > MOST_MESSAGES:
-        view.note(TOO_MANY)
+        view.notes.add(TOO_MANY)
     elif fields:
         extremes = extremes_of(view, name, window, fields)
-    return results.TopicRange(name, types[-1], total, samples, view.notes, extremes)
+    return results.TopicRange(name, types[-1], total, samples, view.notes.sentences(), extremes)
 
 
 def position(
@@ -155,16 +155,16 @@ def position(
         if place is None:
             raise InvalidArgumentsError(carries_no(view, "position", found))
         if not (math.isfinite(place.latitude) and math.isfinite(place.longitude)):
-            view.note("the recorded position is not a number")
+            view.notes.add("the recorded position is not a number")
         nowhere = Pose((math.nan,) * 3, None, place.frame_id)
         return results.Position(
-            name, found.time, nowhere, view.notes, _age(found, now), geodetic=place
+            name, found.time, nowhere, view.notes.sentences(), _age(found, now), geodetic=place
         )
     if not all(map(math.isfinite, pose.position)):
-        view.note("the recorded position is not a number")
+        view.notes.add("the recorded position is not a number")
     if pose.orientation is None:
-        view.note("the recorded orientation is not a rotation")
-    return results.Position(name, found.time, pose, view.notes, _age(found, now))
+        view.notes.add("the recorded orientation is not a rotation")
+    return results.Position(name, found.time, pose, view.notes.sentences(), _age(found, now))
 
 
 def velocity(
@@ -183,7 +183,7 @@ def velocity(
     twist = memory.extractor.twist(decoded(view, found), found.record.channel.type)
     if twist is None:
         raise InvalidArgumentsError(carries_no(view, "velocity", found))
-    return results.Velocity(name, found.time, twist, view.notes, _age(found, now))
+    return results.Velocity(name, found.time, twist, view.notes.sentences(), _age(found, now))
 
 
 def transform(
@@ -195,11 +195,11 @@ def transform(
         found = frame_history.transform_at(view, parent, child, at)
     except NoDataError as error:
         note_unread(view, _around(at, TF_CACHE_NS), nothing=True)
-        raise NoDataError(error.reason, error.detail, view.notes) from error
+        raise NoDataError(error.reason, error.detail, view.notes.sentences()) from error
     note_unread(view, _around(at, found.reach))
     age = None if now is None else now - at
     return results.TransformAt(
-        parent, child, at, found.lookup.transform, found.clock, view.notes, age
+        parent, child, at, found.lookup.transform, found.clock, view.notes.sentences(), age
     )
 
 
@@ -209,7 +209,7 @@ def frames(memory: Memory, call: Call) -> results.Frames:
     require_bags(view)
     edges = frame_history.edges(view)
     note_unread(view, TimeWindow.everything(), nothing=True)
-    return results.Frames(edges, view.notes)
+    return results.Frames(edges, view.notes.sentences())
 
 
 def find_last_match(
@@ -238,9 +238,10 @@ def find_last_match(
     note_unread(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
     if counted_from is not None and found.time > counted_from + FUTURE_NS:
-        view.note(f"dated {seconds(found.time - counted_from)} after now: when it was is unknown")
+        after = seconds(found.time - counted_from)
+        view.notes.add(f"dated {after} after now: when it was is unknown")
         counted_from = None
-    return results.Match(_value(view, found, fields, counted_from), view.notes)
+    return results.Match(_value(view, found, fields, counted_from), view.notes.sentences())
 
 
 def value_when(
@@ -273,14 +274,14 @@ def value_when(
     held = _newest_beside(view, name, upto, found)
     note_unread(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
     if held is None:
-        view.note(f"{name} held no message yet at {moment(found.time)}")
-        return results.ValueWhen(matched, None, view.notes)
+        view.notes.add(f"{name} held no message yet at {moment(found.time)}")
+        return results.ValueWhen(matched, None, view.notes.sentences())
     distance = found.time - held.time
     latched = memory.limits.latching.holds(view.snapshot, held)
     if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
-        view.note(f"the value is {seconds(distance)} older than the match")
+        view.notes.add(f"the value is {seconds(distance)} older than the match")
     told = _held(view, _value(view, held, fields, None), held, found.time)
-    return results.ValueWhen(matched, told, view.notes)
+    return results.ValueWhen(matched, told, view.notes.sentences())
 
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
@@ -320,17 +321,17 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     """
     now = memory.clock.now()
     view = View(memory, call, now if memory.limits.now == "wall" else None)
-    view.count_all()
+    view.bags.track_all_sources()
     snapshot = view.snapshot
     if memory.limits.now == "latest" and snapshot.latest is not None:
         now = snapshot.latest
     if snapshot.problem:
-        view.note(snapshot.problem)
+        view.notes.add(snapshot.problem)
     if snapshot.dating.note:
-        view.note(snapshot.dating.note)
+        view.notes.add(snapshot.dating.note)
     _note_odd_bags(view)
     for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
-        view.note(sentence)
+        view.notes.add(sentence)
     undecodable = undecodable_topics(view)
     return results.DataTimeRange(
         earliest=snapshot.dating.earliest,
@@ -343,7 +344,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
         damaged=snapshot.damaged,
         unread=snapshot.unread,
         silent_topics=len(snapshot.silent_topics),
-        notes=view.notes,
+        notes=view.notes.sentences(),
         undecodable=undecodable,
         clock_faults=clock_faults(snapshot),
     )
@@ -356,15 +357,15 @@ def _newest_beside(
 
     A note says where recordings of several robots may be mixed.
     """
-    newest = view.newest(topic, window)
+    newest = view.stream.newest(topic, window)
     if newest is None or newest.bag.recording == match.bag.recording:
         return newest
     recording = match.bag.recording
     own = frame_history.own_holdings(view, topic, window, recording) or []
     if newest.bag not in {each.bag for each in own}:
-        newest = next(view.stream([topic], window, newest_first=True, among=own), None) or newest
+        newest = view.stream.first([topic], window, newest_first=True, among=own) or newest
     if not frame_history.sessions_of(view).are_joined(recording, newest.bag.recording):
-        view.note(
+        view.notes.add(
             f"the match is of recording {recording.name}, and the value of "
             f"{newest.bag.recording.name}: no handover says that both are of one robot"
         )
@@ -381,12 +382,12 @@ def trajectory_summary(
     if way is None:
         raise no_data_between(view, (name,), window)
     if len(way.frames) > 1:
-        view.note(f"poses in several frames were joined: {', '.join(way.frames)}")
+        view.notes.add(f"poses in several frames were joined: {', '.join(way.frames)}")
     note_robots(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
     return results.TrajectorySummary(
-        name, way.frames[0], way.first, way.last, way.trajectory, view.notes
+        name, way.frames[0], way.first, way.last, way.trajectory, view.notes.sentences()
     )
 
 
@@ -416,9 +417,9 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Stor
     if start <= MIN_NS:
         start, tolerance = MIN_NS, None
     stop = min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
-    found = view.newest(topic, TimeWindow(start, stop))
+    found = view.stream.newest(topic, TimeWindow(start, stop))
     if found is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
-        found = view.newest(topic, TimeWindow(MIN_NS, stop))
+        found = view.stream.newest(topic, TimeWindow(MIN_NS, stop))
         if found is None:
             tolerance = None
         elif not limits.latching.holds(view.snapshot, found):
@@ -444,7 +445,7 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
     """Says of a value that is not shown with its age that it is latched, and how old."""
     if view.memory.limits.latching.holds(view.snapshot, found):
         topic = found.record.channel.topic
-        view.note(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
+        view.notes.add(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
 
 
 def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:
@@ -466,7 +467,7 @@ def _value(
         channel.topic,
         channel.type,
         Sample(found.time, shown.value),
-        (*view.notes, *shown.notes),
+        (*view.notes.sentences(), *shown.notes),
         _age(found, now),
     )
 
@@ -491,12 +492,12 @@ def _samples(
         samples.append(Sample(found.time, shown.value))
         types[found.record.channel.type] = None
         for sentence in shown.notes:
-            view.note(sentence)
+            view.notes.add(sentence)
     if failures and not samples:
         note_unread(view, window, nothing=True)
-        raise NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)), view.notes)
+        raise NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)), view.notes.sentences())
     for detail, count in failures.items():
-        view.note(f"{count} samples left out: {detail}")
+        view.notes.add(f"{count} samples left out: {detail}")
     return tuple(samples), list(types)
 
 
@@ -531,7 +532,7 @@ def _note_odd_bags(view: View) -> None:
     """Says of the newest bags that are odd, not left open, and no fault of a clock, in what way."""
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in odd_bags(view.snapshot)]
     for sentence in by_remark(odd, _ODD_BAGS):
-        view.note(sentence)
+        view.notes.add(sentence)
 
 
 def _gaps(view: View) -> tuple[results.Gap, ...]:

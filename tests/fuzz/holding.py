@@ -95,9 +95,9 @@ def _wrong_reading(
             rng.choice(held).time + rng.choice((0, 0, 1, -1, 40_000_000)) for _ in range(2)
         )
         view = View(memory, Call())
-        records = view.read(bag, [topic], TimeWindow(start, stop), newest_first=newest_first)
+        records = view.bags.read(bag, [topic], TimeWindow(start, stop), newest_first=newest_first)
         found = [(each.record.log_time, each.record.payload) for each in records]
-        if _excused(view.notes):
+        if _excused(view.notes.sentences()):
             continue
         times = [time for time, _ in found]
         wanted = [each for each in held if start <= each.time < stop]
@@ -106,7 +106,7 @@ def _wrong_reading(
         if (plain and not same) or times != sorted(map(_time, wanted), reverse=newest_first):
             faults.append(
                 f"oracle: {topic} in [{start}, {stop}) newest_first={newest_first}: {len(found)}"
-                f" messages, not {len(wanted)}; notes {view.notes}"[:600]
+                f" messages, not {len(wanted)}; notes {view.notes.sentences()}"[:600]
             )
     return faults
 

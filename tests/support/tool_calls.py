@@ -37,4 +37,4 @@ def replied(
         answer = tool.question(given)(memory, call)
     except EpisodicError as error:
         return replies.error(error)
-    return replies.answer(answer, from_active=call.sources.active)
+    return replies.answer(answer, from_active=call.used_active)

@@ -150,7 +150,7 @@ def test_bags_that_stand_apart_stay_apart_after_a_takeover(tmp_path: Path) -> No
                 [odom(start + n * S, n, 0.0) for n in range(10)],
             )
     view = View(memory_of(tmp_path), Call())
-    sizes = [len(each.holdings) for each in groups_of(view, "/odom", TimeWindow.everything())]
+    sizes = [len(each.bags) for each in groups_of(view.stream, "/odom", TimeWindow.everything())]
     assert sizes == [1, 1, 1, 1, 1, 2, 1, 1, 1, 1, 1]
 
 

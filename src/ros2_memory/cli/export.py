@@ -87,19 +87,21 @@ def export(
         note_unread(view, window)
         with _progress(view, window) as tell:
             held = _held(view, topics, window.start) if latched else []
-            within = view.stream(topics, window)
+            within = view.stream.messages(topics, window)
             first = list(islice(within, 1))
             if held and not first:
-                view.note("no message lies in the window: what latched ones held is all there is")
+                view.notes.add(
+                    "no message lies in the window: what latched ones held is all there is"
+                )
             found = _told(chain(held, first, within), tell)
             if mcap is not None:
                 done = as_mcap(mcap, found, _profile(view, topics, window, held))
             elif parquet is not None:
                 done = _as_parquet(parquet, found, memory, robot)
     say(done)
-    for note in view.notes:
+    for note in view.notes.sentences():
         typer.echo(f"note: {note}", err=True)
-    if not view.complete or lost_in(view.snapshot, window):
+    if not view.notes.complete or lost_in(view.snapshot, window):
         raise typer.Exit(NOT_SO)
 
 
@@ -132,9 +134,9 @@ def _held(view: View, topics: Sequence[str], start: Ns) -> list[StoredMessage]:
         if any(each.endswith("/TFMessage") for each in view.snapshot.types_of(topic)):
             if not latching.is_latched(view.snapshot, topic):
                 continue
-            for found in view.stream([topic], before):
+            for found in view.stream.messages([topic], before):
                 held.update(((topic, frame), found) for frame in _frames(view.memory, found))
-        elif (newest := view.newest(topic, before)) is not None and latching.holds(
+        elif (newest := view.stream.newest(topic, before)) is not None and latching.holds(
             view.snapshot, newest
         ):
             held[topic, ""] = newest

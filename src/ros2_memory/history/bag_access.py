@@ -1,9 +1,9 @@
-"""One call's sight of single bags: what is read of them, and what is said of those that fail."""
+"""Access to single bags within one call: what is read of them, and notes on those that fail."""
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.catalogue.lookup import bags_without_entry
@@ -12,15 +12,16 @@ from ros2_memory.core.errors import (
     BagError,
     BagVanishedError,
     QueryTimeoutError,
+    UndecodableError,
 )
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.duplicates import StoredMessage
+from ros2_memory.history.notes import Note, Notes, short_name
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
-    from pathlib import Path
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.catalogue.lookup import SegmentDigests
     from ros2_memory.core.model import BagFile
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment
     from ros2_memory.storage.base import Channel, Record
 
-_CHECK_EVERY: Final = 256
+_DEADLINE_CHECK_INTERVAL: Final = 256
+"""Messages between two looks at the deadline."""
 _DELETED: Final = Reason(
     "was deleted before it could be read", "bag", many="were deleted before they could be read"
 )
@@ -38,101 +40,48 @@ _NOT_WHOLE: Final = Reason("could not be read whole", "bag")
 _NOT_TO_ITS_END: Final = Reason("could not be read to its end", "bag")
 
 
-class _Thing(NamedTuple):
-    """What is wrong with one thing, and the last log time at which it is."""
-
-    detail: str
-    last: Ns
-
-
 class BagAccess:
-    """A snapshot, what the catalogue says of it, a deadline, and notes on the way."""
+    """Reads the bags of one snapshot, with a deadline.
+
+    A bag that cannot be read raises nothing here: a note says so, and the other bags answer.
+
+    Attributes:
+        snapshot: the index as it was when the call began; the same for the whole call.
+        notes: what the reply says besides its answer.
+    """
 
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
         self.memory = memory
         self.call = call
         with call.stages.timed("index"):
             self.snapshot = memory.index.snapshot(reach)
+        self.notes = Notes()
         self._as_of: int | None = None
-        self._notes: dict[str | Reason, None] = {}
-        self._things: dict[Reason, dict[str, _Thing]] = {}
-        self._remarks: dict[str, tuple[str, ...]] = {}
-        self.complete = True
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was skipped so far: each thing once, and one sentence for each reason."""
-        # In which order bags are found damaged depends on what the catalogue knows.
-        told = {reason: self._told(reason) for reason in self._things}
-        sentences = iter(sorted(reason.sentence(those) for reason, those in told.items() if those))
-        return tuple(
-            each if isinstance(each, str) else next(sentences)
-            for each in self._notes
-            if isinstance(each, str) or told[each]
-        )
-
-    def _told(self, reason: Reason) -> dict[str, str]:
-        """By name, the details of the things that no remark on their bag gives already."""
-        return {
-            name: each.detail
-            for name, each in self._things[reason].items()
-            if each.detail not in self._remarks.get(name, ())
-        }
-
-    def note_remarks(self, bags: Iterable[BagFile]) -> None:
-        """Remembers that sentences give what the summaries of these bags remark."""
-        self._remarks |= {short_name(bag.path): bag.summary.remarks for bag in bags}
-
-    def note(self, sentence: str) -> None:
-        """Adds a sentence for the reply."""
-        self._notes.setdefault(sentence)
-
-    def note_thing(self, reason: Reason, name: str, detail: str = "", last: Ns = MAX_NS) -> None:
-        """Adds a thing to the sentence on a reason.
-
-        `last`: no part of it lies after this log time.
-        """
-        self._notes.setdefault(reason)
-        things = self._things.setdefault(reason, {})
-        known = things.get(name)
-        if known is None or known.last < last:
-            things[name] = _Thing(detail, last)
-
-    def has_noted(self, bag: BagFile) -> bool:
-        """Whether sentences on what was read of a bag give all that its summary remarks."""
-        name = short_name(bag.path)
-        if name in self._remarks:
-            return False
-        told = {things[name].detail for things in self._things.values() if name in things}
-        return told.issuperset(bag.summary.remarks)
-
-    def noted_things(self) -> frozenset[tuple[Reason, str]]:
-        """The things that sentences are on so far."""
-        return frozenset((reason, name) for reason, held in self._things.items() for name in held)
 
     def check_deadline(self) -> None:
-        """Gives up when the call's time is over.
+        """Checks that the call has time left.
 
         Raises:
-            QueryTimeoutError: it is.
+            QueryTimeoutError: it has none.
         """
         deadline = self.call.deadline
         if deadline.expired():
             raise QueryTimeoutError(
-                f"the question needs more than {deadline.budget_s:g} s; {self.behind()}"
+                f"the question needs more than {deadline.budget_s:g} s; {self.backfill_progress()}"
                 "ask about a shorter window or a single topic"
             )
 
-    def behind(self) -> str:
-        """How far the catalogue is, for a sentence on lack of time; empty where that is no cause.
+    def backfill_progress(self) -> str:
+        """Returns how many bags the catalogue has, as part of a sentence on lack of time.
 
-        Bags without an entry are read for every question, which takes long where they are many.
+        Bags without an entry are read for every question, which takes long where there are many.
+        Empty where more than 99 % of the bags have one: then the catalogue is not the cause.
         """
-        recall = self.memory.recall
+        cache = self.memory.recall
         closed = sum(bag.state is BagState.CLOSED for bag in self.snapshot.bags)
-        if recall is None or not closed:
+        if cache is None or not closed:
             return ""
-        missing = len(bags_without_entry(self.snapshot.runs, recall))
+        missing = len(bags_without_entry(self.snapshot.runs, cache))
         if missing * 100 <= closed:
             return ""
         return (
@@ -140,90 +89,84 @@ class BagAccess:
             "bags so far: wait for it, or "
         )
 
-    def recalled(self, run: Segment) -> SegmentDigests | None:
-        """What the catalogue says of a run of the snapshot; None without a catalogue."""
-        recall = self.memory.recall
-        if recall is None:
+    def digests_of(self, segment: Segment) -> SegmentDigests | None:
+        """Returns what the catalogue has of a segment of the snapshot; None without a catalogue."""
+        cache = self.memory.recall
+        if cache is None:
             return None
-        settled = recall.settled(run)
+        settled = cache.settled(segment)
         if settled is not None:
             return settled
         if self._as_of is None:
-            # Once for each question, and only where the catalogue may have come to know more.
-            self._as_of = recall.as_of()
-        return recall.notes(run, self._as_of)
+            # One state of the catalogue for the whole call, asked for only where it may have grown.
+            self._as_of = cache.as_of()
+        return cache.notes(segment, self._as_of)
 
     def entry(self, bag: BagFile) -> tuple[SegmentDigests, int] | None:
-        """The notes that speak of a bag and the number of its entry; None where it has none."""
-        notes = self.recalled(self.snapshot.run_of(bag))
-        number = None if notes is None else notes.numbers.get(bag.file)
-        return None if notes is None or number is None else (notes, number)
+        """Returns the digests that include a bag, and its number in them; None without an entry."""
+        digests = self.digests_of(self.snapshot.run_of(bag))
+        number = None if digests is None else digests.numbers.get(bag.file)
+        return None if digests is None or number is None else (digests, number)
 
-    def used(self, found: Iterator[StoredMessage]) -> Iterator[StoredMessage]:
-        """The messages; where one stands in a bag that a crash left open, they are not all.
+    def track_sources(self, messages: Iterator[StoredMessage]) -> Iterator[StoredMessage]:
+        """Yields the messages, and records what kind of bags they are from.
 
-        Remembers whether one stands in a bag that is still being written.
+        A bag that a crash left open makes the answer incomplete; of one that is still being
+        written the reply has to say that it was used.
         """
-        for each in found:
+        for each in messages:
             if each.bag.state is BagState.INCOMPLETE:
-                self.complete = False
+                self.notes.complete = False
             elif each.bag.state is BagState.ACTIVE:
-                self.call.sources.active = True
+                self.call.used_active = True
             yield each
 
-    def count_all(self) -> None:
-        """As `used` for an answer that is about all bags as the index knows them."""
+    def track_all_sources(self) -> None:
+        """Does as `track_sources` for an answer that is about all bags of the index."""
         if any(aside.until is not None for aside in self.snapshot.active):
-            self.call.sources.active = True
+            self.call.used_active = True
 
     def log_times(self, bag: BagFile, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """The log times of one bag's messages; empty, with a note, where they cannot be read."""
+        """Returns the log times of one bag's messages; none, with a note, where it is damaged."""
         self.check_deadline()
         with self.call.stages.timed("read"):
             try:
-                return self.memory.reader.log_times(bag.path, topic, _known(bag, window))
+                return self.memory.reader.log_times(bag.path, topic, _indexed_part(bag, window))
             except BagError as error:
-                self.skip(bag, error)
+                self._note_unreadable(bag, error)
                 return ()
 
     def channels(self, bag: BagFile) -> Sequence[Channel]:
-        """The channels one bag declares; none, with a note, where they cannot be read."""
+        """Returns the channels one bag declares; none, with a note, where it is damaged."""
         self.check_deadline()
         try:
             return self.memory.reader.channels(bag.path)
         except BagError as error:
-            self.skip(bag, error)
+            self._note_unreadable(bag, error)
             return ()
 
-    def skip(self, bag: BagFile, error: BagError, since: Ns = MIN_NS) -> None:
-        """Notes that a bag, or some of it, is not part of the answer, be it since a moment."""
-        self.complete &= isinstance(error, BagContradictionError)
-        last = bag.end if error.lost is None else error.lost[1]
-        if last < since:
+    def decode(self, found: StoredMessage) -> object | None:
+        """Returns the decoded message; None where its type or its bytes are not understood."""
+        try:
+            return self.memory.reader.decode(found.record)
+        except UndecodableError:
+            return None
+
+    def _note_unreadable(self, bag: BagFile, error: BagError, since: Ns = MIN_NS) -> None:
+        """Notes that a bag, or a part of it that reaches past `since`, is not in the answer."""
+        if not isinstance(error, BagContradictionError):
+            self.notes.complete = False
+        until = bag.end if error.lost is None else error.lost[1]
+        if until < since:
             return
         name = short_name(bag.path)
         if isinstance(error, BagVanishedError):
-            self.note_thing(_DELETED, name, last=last)
+            self.notes.add(Note(_DELETED, name, until=until))
         elif isinstance(error, BagContradictionError):
-            self.note_thing(_CONTRADICTS_ITSELF, name, error.reason, last)
+            self.notes.add(Note(_CONTRADICTS_ITSELF, name, error.reason, until))
         else:
-            reason = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE
-            self.note_thing(reason, name, error.reason, last)
-
-    def retract_notes_before(
-        self, moment: Ns, said: Collection[tuple[Reason, str]] = frozenset()
-    ) -> None:
-        """Takes back the notes on what could not be read where all of it lies before a moment.
-
-        For a question that did not need it: how far back is read besides what is asked for depends
-        on what the catalogue knows. What was `said` before (`noted_things`) stands.
-        """
-        for reason, things in self._things.items():
-            self._things[reason] = {
-                name: each
-                for name, each in things.items()
-                if each.last >= moment or (reason, name) in said
-            }
+            kind = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE
+            self.notes.add(Note(kind, name, error.reason, until))
 
     def read(
         self,
@@ -234,16 +177,17 @@ class BagAccess:
         newest_first: bool = False,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
-        """One bag's messages; what of it cannot be read is noted, and disturbs no other.
+        """Returns one bag's messages in log-time order; a note says what cannot be read.
 
-        Not noted is what is lost before `since` alone: what is read there is read for copies only.
+        There is no note where all that is lost lies before `since`: that part is read to recognise
+        duplicates only.
         """
         self.check_deadline()
-        kept = self._kept(bag, topics)
-        if kept is None:
-            known = _known(bag, window)
-            return self._read(bag, topics, known, newest_first=newest_first, since=since)
-        ordered = reversed(kept) if newest_first else iter(kept)
+        stored = self._stored_messages(bag, topics)
+        if stored is None:
+            part = _indexed_part(bag, window)
+            return self._read(bag, topics, part, newest_first=newest_first, since=since)
+        ordered = reversed(stored) if newest_first else iter(stored)
         return (StoredMessage(bag, each) for each in ordered if window.contains(each.log_time))
 
     def _read(
@@ -256,6 +200,7 @@ class BagAccess:
         since: Ns,
     ) -> Iterator[StoredMessage]:
         records: Iterator[Record] | None = None
+        # The time between two records is the reader's; what happens at `yield` is the caller's.
         clock, spent, count = time.perf_counter_ns, 0, 0
         while True:
             begin = clock()
@@ -266,14 +211,15 @@ class BagAccess:
                 for record in records:
                     spent += clock() - begin
                     count += 1
-                    if count % _CHECK_EVERY == 0:
+                    if count % _DEADLINE_CHECK_INTERVAL == 0:
                         self.check_deadline()
                     yield StoredMessage(bag, record)
                     begin = clock()
             except BagError as error:
-                self.skip(bag, error, since)
+                self._note_unreadable(bag, error, since)
                 if error.lost is None:
                     return
+                # Only a part of the bag is lost: the reader goes on behind it.
             else:
                 return
             finally:
@@ -281,47 +227,44 @@ class BagAccess:
                 spent = 0
 
     def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> StoredMessage | None:
-        """What `read` gives first when it reads newest first; for less."""
-        if self._kept(bag, [topic]) is not None:
+        """Returns what `read` yields first with `newest_first`, without reading more of the bag."""
+        if self._stored_messages(bag, [topic]) is not None:
             return next(self.read(bag, [topic], window, newest_first=True), None)
         self.check_deadline()
-        begin = time.perf_counter_ns()
-        try:
-            record = self.memory.reader.newest(bag.path, topic, _known(bag, window))
-        except BagVanishedError as error:
-            self.skip(bag, error)
-            return None
-        except BagError:
-            # Others of its messages may be whole.
-            return next(self.read(bag, [topic], window, newest_first=True), None)
-        finally:
-            self.call.stages.add("read", time.perf_counter_ns() - begin)
-        return None if record is None else StoredMessage(bag, record)
+        with self.call.stages.timed("read"):
+            try:
+                record = self.memory.reader.newest(bag.path, topic, _indexed_part(bag, window))
+                return None if record is None else StoredMessage(bag, record)
+            except BagVanishedError as error:
+                self._note_unreadable(bag, error)
+                return None
+            except BagError:
+                pass
+        # Others of its messages may be whole.
+        return next(self.read(bag, [topic], window, newest_first=True), None)
 
-    def _kept(self, bag: BagFile, topics: Sequence[str]) -> Sequence[Record] | None:
-        """All the bag's messages of one topic of which the catalogue keeps them; else None."""
+    def _stored_messages(self, bag: BagFile, topics: Sequence[str]) -> Sequence[Record] | None:
+        """Returns all messages of one topic in a bag, if the catalogue stores them; else None.
+
+        It does so for static transforms and other topics that are transient local.
+        """
         if self.memory.recall is None or len(topics) != 1:
             return None
         [topic] = topics
-        if is_carried(bag.path):  # of which recording a message was its channel says
-            return None
+        if is_carried(bag.path):
+            return None  # its channels say which recording each message is of, the catalogue not
         static = topic in self.memory.limits.tf_static_topics
         if not static and not self.snapshot.is_transient_local(topic):
             return None
         entry = self.entry(bag)
         if entry is None:
             return None
-        notes, number = entry
-        return notes.kept(topic).get(number)
+        digests, number = entry
+        return digests.kept(topic).get(number)
 
 
-def _known(bag: BagFile, window: TimeWindow) -> TimeWindow:
-    """The part of a window in which the index knows the bag: one being written grows meanwhile."""
+def _indexed_part(bag: BagFile, window: TimeWindow) -> TimeWindow:
+    """Returns the part of a window that the snapshot knows of: an active bag grows meanwhile."""
     if bag.state is not BagState.ACTIVE:
         return window
     return window.intersect(TimeWindow.until(bag.end))
-
-
-def short_name(path: Path) -> str:
-    """A bag as a reply names it: recording and file, never a path of the machine."""
-    return f"{path.parent.name}/{path.name}"

@@ -1,17 +1,21 @@
-"""The bags of one topic in groups: what must be ordered, and told apart, together.
+"""The bags of one topic in groups, and what the catalogue stores of a group.
 
-Most groups are one bag; where recordings overlap, or splits are out of order, they are more.
+A group is what must be ordered and cleared of duplicates together. Most groups are one bag; where
+recordings overlap, or splits are out of order, they are more.
+
+A digest of a bag is the same whether the catalogue has it or it is made here from the bag, so an
+answer that is joined from digests does not depend on what the catalogue knows.
 """
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from itertools import islice
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
+from itertools import groupby
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeAlias, TypeVar
 
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 
 if TYPE_CHECKING:
@@ -19,174 +23,154 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.catalogue.lookup import SegmentDigests
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Ns
+    from ros2_memory.core.errors import UndecodableError
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.merged_stream import MergedStream
     from ros2_memory.history.view import View
 
-
-def groups_of(view: MergedStream, topic: str, window: TimeWindow) -> list[Group]:
-    """The groups of bags that hold messages of the topic in the window, in order."""
-    holdings = view.holdings([topic], window)
-    if view.may_be_relatched([topic]) and holdings:
-        return [Group(view, topic, window, holdings, received_twice=True)]
-    groups: list[list[BagSpan]] = []
-    reach: dict[Path, Ns] = {}
-    for held in holdings:
-        recording = held.bag.recording
-        oldest = held.first - COPY_HORIZON_NS
-        if reach and min(reach.values()) < oldest:
-            reach = {each: last for each, last in reach.items() if last >= oldest}
-        if groups and _belongs(held, recording, reach):
-            groups[-1].append(held)
-        else:
-            groups.append([held])
-        reach[recording] = max(reach.get(recording, MIN_NS), held.last)
-    return [Group(view, topic, window, group, received_twice=False) for group in groups]
+T = TypeVar("T")
+Span: TypeAlias = tuple[Ns, Ns]
+"""Log times of a first and a last message, both inclusive."""
 
 
-class Group:
-    """Bags of one topic whose messages must be ordered, and told apart, together.
-
-    Attributes:
-        holdings: the bags, in order.
-        received_twice: which of the messages count depends on bags outside of the group too.
-    """
-
-    def __init__(
-        self,
-        view: MergedStream,
-        topic: str,
-        window: TimeWindow,
-        holdings: Sequence[BagSpan],
-        *,
-        received_twice: bool,
-    ) -> None:
-        self._view = view
-        self._topic = topic
-        self._window = window
-        self.holdings = holdings
-        self.may_be_relatched = received_twice
-        self._mixed = received_twice or (
-            len(holdings) > 1 and len({held.bag.recording for held in holdings}) > 1
-        )
-        self._places: list[Place] | None = None
-
-    def whole(self) -> BagFile | None:
-        """The bag that alone makes up the group and lies in the window with all of its messages."""
-        held = self.holdings[0]
-        alone = len(self.holdings) == 1 and not self._mixed
-        return held.bag if alone and self._window.covers(held.first, held.last) else None
-
-    def once(self) -> Iterator[StoredMessage]:
-        """The messages of the group in order, each one once."""
-        return self._view.stream([self._topic], self._window, among=self.holdings)
-
-    def count(self) -> int:
-        """How many messages of the window the group holds."""
-        if self._mixed:
-            return sum(1 for _ in self.once())
-        bag = self.whole()
-        if bag is not None:
-            return sum(each.count for each in bag.summary.of(self._topic))
-        return len(self._located())
-
-    def fetch(self, indices: Sequence[int]) -> Iterator[StoredMessage]:
-        """The messages at these positions of the group, which must ascend."""
-        if not indices:
-            return
-        if self._mixed:
-            wanted = set(indices)
-            yield from (each for index, each in enumerate(self.once()) if index in wanted)
-            return
-        places = self._located()
-        at_once: Iterator[StoredMessage] = iter(())
-        at: tuple[Ns, int] | None = None
-        passed = 0
-        for index in indices:
-            if index >= len(places):
-                return  # a bag was deleted since its messages were counted
-            place = places[index]
-            if at != (place.time, place.rank):
-                at, passed = (place.time, place.rank), 0
-                moment = TimeWindow(place.time, place.time + 1)
-                at_once = self._view.read(self.holdings[place.rank].bag, [self._topic], moment)
-            # Read on: any number of messages may bear one log time.
-            yield from self._view.used(islice(at_once, place.nth - passed, place.nth - passed + 1))
-            passed = place.nth + 1
-
-    def _located(self) -> list[Place]:
-        if self._places is None:
-            places = [
-                Place(moment, rank, nth)
-                for rank, held in enumerate(self.holdings)
-                for moment, nth in _numbered(
-                    self._view.log_times(held.bag, self._topic, self._window)
-                )
-            ]
-            self._places = sorted(places) if len(self.holdings) > 1 else places
-        return self._places
-
-
-class Place(NamedTuple):
-    """Where a message of a group stands: the nth of its bag at exactly that log time."""
+class MessagePosition(NamedTuple):
+    """Identifies a message of a group: the nth of its bag at exactly that log time."""
 
     time: Ns
     rank: int
     nth: int
 
 
-def _numbered(times: Iterable[Ns]) -> Iterator[tuple[Ns, int]]:
-    before, nth = None, 0
-    for moment in times:
-        nth = nth + 1 if moment == before else 0
-        before = moment
-        yield moment, nth
+class Group:
+    """Bags of one topic whose messages must be ordered, and cleared of duplicates, together.
 
-
-def _belongs(held: BagSpan, recording: Path, reach: Mapping[Path, Ns]) -> bool:
-    """Whether a bag can hold messages before, or copies of, what the bags before it hold.
-
-    `recording` is the bag's own; `reach` is the last log time so far of each recording. Splits of
-    one recording that only share a timestamp stay apart: bag order already orders them.
+    Attributes:
+        bags: in order.
+        may_be_relatched: whether bags outside of the group decide which of the messages count.
     """
+
+    def __init__(
+        self,
+        stream: MergedStream,
+        topic: str,
+        window: TimeWindow,
+        bags: Sequence[BagSpan],
+        *,
+        may_be_relatched: bool = False,
+    ) -> None:
+        self._stream = stream
+        self._topic = topic
+        self._window = window
+        self.bags = bags
+        self.may_be_relatched = may_be_relatched
+        self._has_duplicates = may_be_relatched or len({each.bag.recording for each in bags}) > 1
+        self._known_positions: list[MessagePosition] | None = None
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether all messages of the bags lie in the window."""
+        return all(self._window.covers(each.first, each.last) for each in self.bags)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all messages lie in the window, and no crash cut a bag short."""
+        return self.is_inside and all(each.bag.state is BagState.CLOSED for each in self.bags)
+
+    def messages(self) -> Iterator[StoredMessage]:
+        """Returns the messages of the group in log-time order, each one once."""
+        return self._stream.messages([self._topic], self._window, among=self.bags)
+
+    def count(self) -> int:
+        """Returns how many messages of the window the group holds."""
+        if self._has_duplicates:
+            return sum(1 for _ in self.messages())
+        if len(self.bags) == 1 and self.is_inside:
+            return sum(each.count for each in self.bags[0].bag.summary.of(self._topic))
+        return len(self._positions())
+
+    def fetch(self, indices: Sequence[int]) -> Iterator[StoredMessage]:
+        """Yields the messages at these indices of the group, which must ascend."""
+        if not indices:
+            return
+        wanted = set(indices)
+        if self._has_duplicates:
+            yield from (each for index, each in enumerate(self.messages()) if index in wanted)
+            return
+        # Fewer than were counted, where a bag was deleted since.
+        chosen = (each for index, each in enumerate(self._positions()) if index in wanted)
+        bags = self._stream.bags
+        # Any number of messages may bear one log time: these are read once.
+        for (time, rank), positions in groupby(chosen, key=lambda each: (each.time, each.rank)):
+            numbers = {each.nth for each in positions}
+            at_once = bags.read(self.bags[rank].bag, [self._topic], TimeWindow(time, time + 1))
+            found = (each for nth, each in enumerate(at_once) if nth in numbers)
+            yield from bags.track_sources(found)
+
+    def _positions(self) -> list[MessagePosition]:
+        if self._known_positions is None:
+            self._known_positions = sorted(
+                MessagePosition(time, rank, nth)
+                for rank, each in enumerate(self.bags)
+                for time, equal in groupby(
+                    self._stream.bags.log_times(each.bag, self._topic, self._window)
+                )
+                for nth, _ in enumerate(equal)
+            )
+        return self._known_positions
+
+
+def groups_of(stream: MergedStream, topic: str, window: TimeWindow) -> list[Group]:
+    """Returns the groups of bags that hold messages of the topic in the window, in order."""
+    bags = stream.overlapping_bags([topic], window)
+    if stream.may_be_relatched([topic]) and bags:
+        return [Group(stream, topic, window, bags, may_be_relatched=True)]
+    groups: list[list[BagSpan]] = []
+    latest: dict[Path, Ns] = {}
+    for each in bags:
+        oldest = each.first - COPY_HORIZON_NS
+        if latest and min(latest.values()) < oldest:
+            latest = {path: last for path, last in latest.items() if last >= oldest}
+        if groups and _belongs(each, latest):
+            groups[-1].append(each)
+        else:
+            groups.append([each])
+        recording = each.bag.recording
+        latest[recording] = max(latest.get(recording, MIN_NS), each.last)
+    return [Group(stream, topic, window, group) for group in groups]
+
+
+def _belongs(span: BagSpan, latest: Mapping[Path, Ns]) -> bool:
+    """Whether a bag can hold messages before, or duplicates of, those of the bags before it.
+
+    `latest` is the last log time so far of each recording. Splits of one recording that only share
+    a timestamp stay apart: the order of bags already orders them.
+    """
+    recording = span.bag.recording
     return any(
-        held.first < last if each == recording else held.first <= last + COPY_HORIZON_NS
-        for each, last in reach.items()
+        span.first < last if path == recording else span.first <= last + COPY_HORIZON_NS
+        for path, last in latest.items()
     )
-
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class DigestKind(Generic[T]):
-    """What is kept of a topic in a bag.
+    """A kind of digest of a topic in a bag.
 
     Attributes:
-        name: tells it from the others.
-        ask: what the catalogue has of a topic in some entries of one run of bags, by entry.
-        packed: one as text.
-        unpacked: back; a ValueError where it is none.
+        name: part of the key under which the catalogue stores one; never changes its meaning.
+        look_up: those that the catalogue has of a topic, for some entries of one segment of bags.
+        encode: a digest as text.
+        decode: the text as a digest; ValueError where it is none.
     """
 
     name: str
-    ask: Callable[[SegmentDigests, str, Sequence[int]], Mapping[int, T]]
-    packed: Callable[[T], str]
-    unpacked: Callable[[str], T]
+    look_up: Callable[[SegmentDigests, str, Sequence[int]], Mapping[int, T]]
+    encode: Callable[[T], str]
+    decode: Callable[[str], T]
 
 
-def is_whole(group: Group, window: TimeWindow) -> bool:
-    """Whether all messages of the group's bags lie in the window, and no crash cut a bag short."""
-    return all(
-        window.covers(held.first, held.last) and held.bag.state is BagState.CLOSED
-        for held in group.holdings
-    )
-
-
-class StoredPart(Generic[T]):
-    """What the catalogue keeps of one topic in a window; of one run of bags at a time."""
+class StoredDigests(Generic[T]):
+    """The digests of one topic in a window that the catalogue has."""
 
     def __init__(self, view: View, topic: str, kind: DigestKind[T], window: TimeWindow) -> None:
         self._view = view
@@ -194,53 +178,105 @@ class StoredPart(Generic[T]):
         self._kind = kind
         self._window = window
         self._question = f"{kind.name} {topic}"
-        self._notes: SegmentDigests | None = None
+        self._segment: SegmentDigests | None = None
         self._known: Mapping[int, T] = {}
 
-    def of(self, group: Group) -> tuple[T, tuple[Ns, Ns]] | None:
-        """What is kept of a group, and the times of its first and last message; None: nothing."""
+    def of(self, group: Group) -> tuple[T, Span] | None:
+        """Returns a group's digest and the times of its first and last message, if stored."""
         if group.may_be_relatched:
             return None
-        if len(group.holdings) > 1:
-            return self._remembered(group)
-        [held] = group.holdings
-        number = None if self._notes is None else self._notes.numbers.get(held.bag.file)
-        if number is None:  # not of the run that the bag before it was of
-            entry = self._view.entry(held.bag)
-            if entry is None:
+        if len(group.bags) > 1:
+            cache, numbers = self._view.memory.recall, self._numbers(group)
+            if cache is None or numbers is None:
                 return None
-            self._view.check_deadline()
-            self._notes, number = entry
-            run = self._view.snapshot.run_of(held.bag)
-            numbers = self._notes.numbers
-            inside = [each.bag.file for each in run.extents(self._topic, self._window)]
-            among = [numbers[file] for file in dict.fromkeys(inside) if file in numbers]
-            self._known = self._kind.ask(self._notes, self._topic, among)
+            return cache.remembered(self._question, numbers, self._decode)
+        [span] = group.bags
+        number = None if self._segment is None else self._segment.numbers.get(span.bag.file)
+        if number is None:
+            number = self._enter_segment(span)
         if number not in self._known:
             return None
-        return self._known[number], (held.first, held.last)
+        return self._known[number], (span.first, span.last)
 
-    def keep(self, group: Group, kept: T, span: tuple[Ns, Ns]) -> None:
-        """Keeps what bags that hold copies of each other come to, for the next time."""
-        recall, numbers = self._view.memory.recall, self._numbers(group)
-        if recall is None or numbers is None or len(numbers) < 2 or not self._view.complete:
+    def _enter_segment(self, span: BagSpan) -> int:
+        """Looks up the digests of all bags in the segment of this one; returns its number.
+
+        One query for each segment of bags: one for each bag would be thousands.
+        """
+        entry = self._view.bags.entry(span.bag)
+        if entry is None:
+            return -1
+        self._view.bags.check_deadline()
+        self._segment, number = entry
+        numbers = self._segment.numbers
+        segment = self._view.snapshot.run_of(span.bag)
+        inside = [each.bag.file for each in segment.extents(self._topic, self._window)]
+        among = [numbers[file] for file in dict.fromkeys(inside) if file in numbers]
+        self._known = self._kind.look_up(self._segment, self._topic, among)
+        return number
+
+    def store(self, group: Group, digest: T, span: Span) -> None:
+        """Stores the digest of bags that hold duplicates of each other, for the next question.
+
+        The catalogue's own entries are of single bags.
+        """
+        cache, numbers = self._view.memory.recall, self._numbers(group)
+        if cache is None or numbers is None or len(numbers) < 2 or not self._view.notes.complete:
             return
-        if group.may_be_relatched:
-            return
-        recall.remember(self._question, numbers, json.dumps([self._kind.packed(kept), *span]))
+        if not group.may_be_relatched:
+            cache.remember(self._question, numbers, json.dumps([self._kind.encode(digest), *span]))
 
-    def _remembered(self, group: Group) -> tuple[T, tuple[Ns, Ns]] | None:
-        recall, numbers = self._view.memory.recall, self._numbers(group)
-        if recall is None or numbers is None:
-            return None
-        return recall.remembered(self._question, numbers, self._parsed)
-
-    def _parsed(self, answer: str) -> tuple[T, tuple[Ns, Ns]]:
-        packed, first, last = json.loads(answer)
-        return self._kind.unpacked(packed), (int(first), int(last))
+    def _decode(self, answer: str) -> tuple[T, Span]:
+        digest, first, last = json.loads(answer)
+        return self._kind.decode(digest), (int(first), int(last))
 
     def _numbers(self, group: Group) -> list[int] | None:
-        """The entries of the group's bags; None where one has none."""
-        entries = [self._view.entry(held.bag) for held in group.holdings]
+        """Returns the numbers of the bags' entries; None where one has none."""
+        entries = [self._view.bags.entry(each.bag) for each in group.bags]
         numbers = [entry[1] for entry in entries if entry is not None]
         return numbers if len(numbers) == len(entries) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Fold(Generic[T]):
+    """How the messages of a topic and the digests of whole bags are joined into one result.
+
+    Attributes:
+        kind: the digests.
+        add: adds messages; returns the times of the first and the last of them, if any.
+        collect: makes a digest of messages, if they amount to one; their times as for `add`.
+        join: adds a digest and its times.
+        failures: where `add` and `collect` put messages that cannot be decoded; a digest without
+            these is not stored.
+    """
+
+    kind: DigestKind[T]
+    add: Callable[[Iterable[StoredMessage]], Span | None]
+    collect: Callable[[Iterable[StoredMessage]], tuple[T | None, Span | None]]
+    join: Callable[[T, Span], None]
+    failures: Sequence[UndecodableError] = ()
+
+    def over(self, view: View, topic: str, window: TimeWindow) -> Span | None:
+        """Folds a window: groups that lie in it by their digests, the others by their messages.
+
+        Returns the times of the first and the last message; None where there is none.
+        """
+        stored = StoredDigests(view, topic, self.kind, window)
+        spans: list[Span] = []
+        for group in groups_of(view.stream, topic, window):
+            span: Span | None
+            if not group.is_whole:
+                span = self.add(group.messages())
+            elif (known := stored.of(group)) is not None:
+                digest, span = known
+                self.join(digest, span)
+            else:
+                failed = len(self.failures)
+                made, span = self.collect(group.messages())
+                if made is not None and span is not None:
+                    self.join(made, span)
+                    if failed == len(self.failures):
+                        stored.store(group, made, span)
+            if span is not None:
+                spans.append(span)
+        return (spans[0][0], spans[-1][1]) if spans else None

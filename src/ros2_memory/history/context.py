@@ -119,26 +119,17 @@ class Stages:
         return {stage: round(ms_from_ns(spent), 3) for stage, spent in self._spent.items()}
 
 
-class Sources:
-    """What kind of bags one call drew on.
+@dataclass(slots=True)
+class Call:
+    """One call: when it must be over, and where its time went.
 
     Attributes:
-        active: whether one that is still being written is among them.
+        used_active: whether the answer is partly from a bag that is still being written.
     """
-
-    __slots__ = ("active",)
-
-    def __init__(self) -> None:
-        self.active = False
-
-
-@dataclass(frozen=True, slots=True)
-class Call:
-    """One call: when it must be over, where its time went, and what it drew on."""
 
     deadline: Deadline = field(default_factory=Deadline.never)
     stages: Stages = field(default_factory=Stages)
-    sources: Sources = field(default_factory=Sources)
+    used_active: bool = False
 
 
 @dataclass(frozen=True, slots=True)

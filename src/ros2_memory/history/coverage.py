@@ -32,7 +32,7 @@ from ros2_memory.core.timebase import (
     START_SLACK_NS,
     unix_rounded_up,
 )
-from ros2_memory.history.bag_access import short_name
+from ros2_memory.history.notes import short_name
 from ros2_memory.index.listed_splits import absent_files
 
 if TYPE_CHECKING:
@@ -40,13 +40,13 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.bag_access import BagAccess
+    from ros2_memory.history.view import View
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
 
 
 def note_unread(
-    view: BagAccess, window: TimeWindow, *, nothing: bool = False, search: bool = False
+    view: View, window: TimeWindow, *, nothing: bool = False, search: bool = False
 ) -> None:
     """Notes what of a window could not be read.
 
@@ -58,13 +58,13 @@ def note_unread(
     absent = _absent(view) if nothing or search else ()
     odd = [bag for bag in view.snapshot.odd(window) if not _is_noted(view, bag)]
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
-        view.note(sentence)
+        view.notes.add(sentence)
     # Of more than are named a reason is not given for each.
     if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
-        view.note_remarks(odd)
+        view.notes.add_remarks(odd)
 
 
-def note_edges(view: BagAccess, window: TimeWindow) -> None:
+def note_edges(view: View, window: TimeWindow) -> None:
     """Says where a window was asked to reach past what the memory can answer."""
     snapshot = view.snapshot
     asked_from, asked_to = window.asked()
@@ -72,13 +72,13 @@ def note_edges(view: BagAccess, window: TimeWindow) -> None:
     if earliest is not None and asked_from < earliest:
         before = TimeWindow(asked_from, earliest)
         if not any(before.overlaps(each.bag.start, each.bag.end) for each in snapshot.misdated):
-            view.note(f"the memory begins at {_moment(earliest)}")
+            view.notes.add(f"the memory begins at {_moment(earliest)}")
     if snapshot.latest is None or asked_to <= snapshot.latest:
         return
     if snapshot.active:
-        view.note(nothing_after(snapshot.active, snapshot.latest))
+        view.notes.add(nothing_after(snapshot.active, snapshot.latest))
     else:
-        view.note(f"the memory ends at {_moment(snapshot.latest)}")
+        view.notes.add(f"the memory ends at {_moment(snapshot.latest)}")
 
 
 def nothing_after(active: Sequence[SetAside], latest: Ns) -> str:
@@ -92,22 +92,22 @@ def _moment(at: Ns) -> str:
     return f"{unix_rounded_up(at):.6f}"
 
 
-def is_searched(view: BagAccess, window: TimeWindow) -> bool:
+def is_searched(view: View, window: TimeWindow) -> bool:
     """Whether a search of a window that found nothing read all that closed files hold of it.
 
     That one is being written is no reason to doubt it, or a robot that records would never be told
     that something was not there.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-    return view.complete and not lost and not any(map(_may_lack, view.snapshot.odd(window)))
+    return view.notes.complete and not lost and not any(map(_may_lack, view.snapshot.odd(window)))
 
 
-def _is_noted(view: BagAccess, bag: BagFile) -> bool:
+def _is_noted(view: View, bag: BagFile) -> bool:
     """Whether the notes have what is amiss of a bag; that it was left open they have not."""
-    return bag.state is not BagState.INCOMPLETE and view.has_noted(bag)
+    return bag.state is not BagState.INCOMPLETE and view.notes.has_remarks(bag)
 
 
-def _absent(view: BagAccess) -> Sequence[SetAside]:
+def _absent(view: View) -> Sequence[SetAside]:
     return absent_files(view.snapshot, view.memory.index.bag_dir)
 
 

@@ -7,7 +7,7 @@ does not depend on what the catalogue knows.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.analysis.odometry import TimedPosition, is_place
 from ros2_memory.analysis.sights import MotionDecoder
@@ -15,15 +15,17 @@ from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import counted, listed
-from ros2_memory.history.bag_groups import DigestKind, StoredPart, is_whole
+from ros2_memory.history.bag_groups import DigestKind, Fold
 from ros2_memory.history.no_data import topics_with, undecodable, undecodable_in
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
+    from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.core.model import Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
@@ -32,11 +34,8 @@ _MOST_AT_ONCE: Final = 1024
 _MOST_BYTES_AT_ONCE: Final = 1 << 20
 
 
-class TakesPoses(Protocol):
-    """Something to which poses are given in order."""
-
-    def add(self, time: Ns, pose: Pose, speed_mps: float | None = None, /) -> None:
-        """Takes the next pose, and the speed that its message states, if it states one."""
+AddPose: TypeAlias = "Callable[[Ns, Pose, float | None], None]"
+"""Takes the next pose (log time, pose), and the speed (m/s) that its message states, if any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +50,14 @@ class DrivenPath:
 
 POSES: Final = DigestKind(
     "poses",
-    ask=lambda notes, topic, among: notes.poses(topic, among),
-    packed=lambda digest: encode_poses(digest).hex(),
-    unpacked=lambda text: decode_poses(bytes.fromhex(text)),
+    look_up=lambda digests, topic, among: digests.poses(topic, among),
+    encode=lambda digest: encode_poses(digest).hex(),
+    decode=lambda text: decode_poses(bytes.fromhex(text)),
 )
 
 
 def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None:
-    """The way in a window by the poses of one topic; None where there is no message.
+    """Returns the path in a window by the poses of one topic; None where there is no message.
 
     Messages that cannot be decoded are left out, with a note.
 
@@ -66,38 +65,31 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None
         InvalidArgumentsError: a message of the topic carries no position.
         NoDataError: no message can be decoded.
     """
+    fastest = view.memory.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []
-    builder = TrajectoryBuilder(max_plausible_speed_mps=view.memory.limits.max_plausible_speed_mps)
-    digests = StoredPart(view, topic, POSES, window)
-    sights = MotionDecoder(view.memory.reader, view.memory.extractor)
-    first: Ns | None = None
-    last: Ns | None = None
-    for group in view.groups(topic, window):
-        span: tuple[Ns, Ns] | None
-        if not is_whole(group, window):
-            span = add_poses(view, builder, sights, group.once(), failures)
-        elif (known := digests.of(group)) is not None:
-            digest, span = known
-            builder.join(digest)
-        else:
-            collector = PoseCollector(view.memory.limits.max_plausible_speed_mps)
-            failed = len(failures)
-            span = add_poses(view, collector, sights, group.once(), failures)
-            digest = collector.digest()
-            builder.join(digest)
-            if span is not None and failed == len(failures):
-                digests.keep(group, digest, span)
-        if span is not None:
-            first, last = (span[0] if first is None else first), span[1]
+    builder = TrajectoryBuilder(fastest)
+    decoder = MotionDecoder(view.memory.reader, view.memory.extractor)
+
+    def collect(messages: Iterable[StoredMessage]) -> tuple[PoseDigest, Span | None]:
+        collector = PoseCollector(fastest)
+        span = add_poses(view, collector.add, decoder, messages, failures)
+        return collector.digest(), span
+
+    span = Fold(
+        POSES,
+        add=lambda messages: add_poses(view, builder.add, decoder, messages, failures),
+        collect=collect,
+        join=lambda digest, _span: builder.join(digest),
+        failures=failures,
+    ).over(view, topic, window)
     if failures:
         error = failures[0]
-        if first is None:
+        if span is None:
             raise undecodable_in(view, window, error.topic, error.type_name, error) from error
-        view.complete = False
-        view.note(f"poses left out, since they cannot be decoded: {len(failures)} ({error.reason})")
-    if first is None or last is None:
-        return None
-    return DrivenPath(builder.result(), builder.frames, first, last)
+        view.notes.complete = False
+        count = len(failures)
+        view.notes.add(f"poses left out, since they cannot be decoded: {count} ({error.reason})")
+    return None if span is None else DrivenPath(builder.result(), builder.frames, *span)
 
 
 def length_notes(way: Trajectory) -> Iterator[str]:
@@ -135,8 +127,8 @@ def length_notes(way: Trajectory) -> Iterator[str]:
 
 def add_poses(
     view: View,
-    to: TakesPoses,
-    sights: MotionDecoder,
+    add: AddPose,
+    decoder: MotionDecoder,
     messages: Iterable[StoredMessage],
     failures: list[UndecodableError],
 ) -> tuple[Ns, Ns] | None:
@@ -150,16 +142,16 @@ def add_poses(
     first: Ns | None = None
     last: Ns | None = None
     for some in _batches(messages):
-        for found, sight in zip(some, sights.of([each.record for each in some]), strict=True):
+        for found, sight in zip(some, decoder.of([each.record for each in some]), strict=True):
             if isinstance(sight, UndecodableError):
                 failures.append(sight)
                 continue
             if sight.pose is None:
                 raise InvalidArgumentsError(carries_no(view, "position", found))
-            to.add(found.time, sight.pose, sight.speed_mps)
+            add(found.time, sight.pose, sight.speed_mps)
             first = found.time if first is None else first
             last = found.time
-        view.check_deadline()
+        view.bags.check_deadline()
     return None if first is None or last is None else (first, last)
 
 
@@ -195,8 +187,8 @@ def stops(view: View, messages: Iterable[StoredMessage]) -> Iterator[TimedPositi
 
 def leave_out(view: View, error: UndecodableError) -> None:
     """Says that there are poses which cannot be decoded, and why."""
-    view.complete = False
-    view.note(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")
+    view.notes.complete = False
+    view.notes.add(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")
 
 
 def decoded(view: View, found: StoredMessage) -> object:

@@ -61,7 +61,7 @@ def copy_key(record: Record) -> Copy:
     return Copy(record.channel.topic, record.publish_time, len(payload), hash(payload))
 
 
-def is_overlapped(holdings: Iterable[BagSpan]) -> list[tuple[Ns, Ns]]:
+def bag_overlaps(holdings: Iterable[BagSpan]) -> list[tuple[Ns, Ns]]:
     """The half-open spans in which bags of different recordings can hold copies, merged.
 
     Two bags contest the time that both hold, widened by the horizon at both ends.
@@ -70,7 +70,7 @@ def is_overlapped(holdings: Iterable[BagSpan]) -> list[tuple[Ns, Ns]]:
 
 
 def overlap_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
-    """As `is_overlapped`, of first and last log time (inclusive) and recording."""
+    """As `bag_overlaps`, of first and last log time (inclusive) and recording."""
     spans: list[tuple[Ns, Ns]] = []
     open_ones: list[tuple[Ns, Path]] = []
     for first, last, recording in sorted(held, key=lambda each: each[0]):

@@ -16,16 +16,15 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S
-from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.duplicates import (
     COPY_HORIZON_NS,
     BagSpan,
     Copy,
     StoredMessage,
+    bag_overlaps,
     copy_key,
     deduplicate_backward,
     deduplicate_forward,
-    is_overlapped,
     overlap_spans,
     united,
 )
@@ -36,48 +35,43 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.sessions import Sessions
+    from ros2_memory.history.bag_access import BagAccess
     from ros2_memory.index.segment import Segment
 
 RELATCHED_NS: Final[Ns] = NS_PER_S
 """A latched message logged this long after it was published may have been received before."""
-_FEW_SOUGHT: Final = 8
+_MAX_SEARCHES: Final = 8
 
 
-class MergedStream(BagAccess):
-    """One call's sight of all bags together.
+class MergedStream:
+    """Reads all bags of one call together."""
 
-    Attributes:
-        sessions: which recordings belong together, once that is asked (see `frames`).
-    """
-
-    def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
-        super().__init__(memory, call, reach)
-        self.sessions: Sessions | None = None
+    def __init__(self, bags: BagAccess) -> None:
+        self.bags = bags
+        self._snapshot = bags.snapshot
         self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
-        self._sought: Counter[str] = Counter()
+        self._searches: Counter[str] = Counter()
 
-    def holdings(self, topics: Collection[str], window: TimeWindow) -> list[BagSpan]:
+    def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[BagSpan]:
         """The bags that hold messages of these topics in the window, in order.
 
         Each with the times of its first and last message of these topics, in the window or not.
         """
         names = tuple(topics)
-        if len(names) == 1 and len(self.snapshot.types_of(names[0])) == 1:
+        if len(names) == 1 and len(self._snapshot.types_of(names[0])) == 1:
             # The entry of a bag is then all that it holds of these topics.
-            extents = self.snapshot.extents(names[0], window)
+            extents = self._snapshot.extents(names[0], window)
             return sorted(
                 [BagSpan(first, last, bag) for bag, first, last in extents], key=_in_order
             )
         found: dict[str, BagSpan] = {}
         for topic in names:
-            for bag, *_ in self.snapshot.extents(topic, window):
+            for bag, *_ in self._snapshot.extents(topic, window):
                 if bag.file not in found:
                     found[bag.file] = bag_span_of(bag, names)
         return sorted(found.values(), key=_in_order)
 
-    def stream(
+    def messages(
         self,
         topics: Sequence[str],
         window: TimeWindow,
@@ -92,42 +86,55 @@ class MergedStream(BagAccess):
         Raises:
             QueryTimeoutError: the deadline passed on the way.
         """
-        if among is not None:
-            return self.used(self._part(topics, window, among, newest_first=newest_first))
-        parts = self._parts(topics, window)
-        return self.used(
+        parts = self._parts(topics, window) if among is None else [window]
+        return self.bags.track_sources(
             chain.from_iterable(
-                self._part(topics, part, None, newest_first=newest_first)
+                self._part(topics, part, among, newest_first=newest_first)
                 for part in (reversed(parts) if newest_first else parts)
             )
         )
 
-    def last_of(self, topic: str, window: TimeWindow) -> StoredMessage | None:
-        """What `stream` gives first of the topic when it is newest first."""
+    def first(
+        self,
+        topics: Sequence[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+        among: Sequence[BagSpan] | None = None,
+    ) -> StoredMessage | None:
+        """Returns what `messages` yields first."""
+        return next(self.messages(topics, window, newest_first=newest_first, among=among), None)
+
+    def newest(self, topic: str, window: TimeWindow) -> StoredMessage | None:
+        """What `messages` gives first of the topic when it is newest first."""
         if len(self._parts([topic], window)) == 1 and not self.may_be_relatched([topic]):
-            holdings = self.holdings([topic], _with_horizon(window))
-            if not is_overlapped(holdings):
+            holdings = self.overlapping_bags([topic], _with_horizon(window))
+            if not bag_overlaps(holdings):
                 inside = [held for held in holdings if window.overlaps(held.first, held.last)]
                 if not inside:
                     return None
                 if len(inside) == 1:
-                    found = self.newest_in(inside[0].bag, topic, window)
-                    return None if found is None else next(self.used(iter((found,))))
-        return next(self.stream([topic], window, newest_first=True), None)
+                    found = self.bags.newest_in(inside[0].bag, topic, window)
+                    return None if found is None else next(self.bags.track_sources(iter((found,))))
+        return self.first([topic], window, newest_first=True)
 
-    def spans_of_copies(self, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
+    def duplicate_spans(self, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
         """Where in the window the topic's messages may stand in two recordings, widened."""
-        recordings = self.snapshot.recordings(topic)
+        recordings = self._snapshot.recordings(topic)
         if len(recordings) < 2:
             return []
         # First by whole recordings, which are few; then by bags, where these overlap.
         coarse = overlap_spans((*span, folder) for folder, span in recordings.items())
-        near = [TimeWindow(*span) for span in coarse if window.overlaps(span[0], span[1] - 1)]
-        return united(span for each in near for span in is_overlapped(self.holdings([topic], each)))
+        near = [
+            self.overlapping_bags([topic], TimeWindow(*span))
+            for span in coarse
+            if window.overlaps(span[0], span[1] - 1)
+        ]
+        return united(span for bags in near for span in bag_overlaps(bags))
 
     def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """The window cut where runs of bags begin: a stream then holds few of them at a time."""
-        runs = self.snapshot.runs
+        runs = self._snapshot.runs
         begin = bisect_right(runs, window.start, key=_begins)
         end = bisect_left(runs, window.stop, begin, key=_begins)
         cuts = [
@@ -145,8 +152,8 @@ class MergedStream(BagAccess):
         newest_first: bool,
     ) -> Iterator[StoredMessage]:
         wider = _with_horizon(window)
-        holdings = self.holdings(topics, wider) if among is None else among
-        spans = is_overlapped(holdings)
+        holdings = self.overlapping_bags(topics, wider) if among is None else among
+        spans = bag_overlaps(holdings)
         found: Iterator[StoredMessage]
         if spans:
             merged = self.merged(
@@ -157,52 +164,53 @@ class MergedStream(BagAccess):
         else:
             found = self.merged(holdings, topics, window, newest_first=newest_first)
         if self.may_be_relatched(topics):
-            return (each for each in found if not self._received_again(each))
+            return (each for each in found if not self._is_relatched(each))
         return found
 
     def may_be_relatched(self, topics: Iterable[str]) -> bool:
         """Whether a latched message of these topics may have been received by two recordings."""
         return any(
-            self.snapshot.is_transient_local(topic) and len(self.snapshot.recordings(topic)) > 1
+            self._snapshot.is_transient_local(topic) and len(self._snapshot.recordings(topic)) > 1
             for topic in topics
         )
 
-    def seek_first(self, found: StoredMessage) -> None:
+    def find_first_copy(self, found: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
         if _is_late(found) and self.may_be_relatched([found.record.channel.topic]):
             record = found.record
             window = TimeWindow(record.publish_time, found.time)
-            self._seek(record.channel.topic, copy_key(record), window)
+            self._find_first_copy(record.channel.topic, copy_key(record), window)
 
-    def _received_again(self, found: StoredMessage) -> bool:
+    def _is_relatched(self, found: StoredMessage) -> bool:
         record = found.record
         if not _is_late(found):
             return False
         topic, key = record.channel.topic, copy_key(record)
         if key not in self._first_copies:
-            self._sought[topic] += 1
-            if self._sought[topic] > _FEW_SOUGHT:
-                self._seek_all(topic)
+            self._searches[topic] += 1
+            if self._searches[topic] > _MAX_SEARCHES:
+                self._find_all_first_copies(topic)
             else:
-                self._seek(topic, key, TimeWindow(record.publish_time, found.time))
+                self._find_first_copy(topic, key, TimeWindow(record.publish_time, found.time))
         first = self._first_copies.get(key, (found.time, found.bag.recording))
         return found.time > first[0] and found.bag.recording != first[1]
 
-    def _seek(self, topic: str, key: Copy, window: TimeWindow) -> None:
+    def _find_first_copy(self, topic: str, key: Copy, window: TimeWindow) -> None:
         """Remembers where a message was received first, from its publish time on."""
         wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop + 1)
-        for each in self.merged(self.holdings([topic], wider), [topic], wider, newest_first=False):
+        bags = self.overlapping_bags([topic], wider)
+        for each in self.merged(bags, [topic], wider, newest_first=False):
             if copy_key(each.record) == key:
                 self._first_copies[key] = (each.time, each.bag.recording)
                 return
 
-    def _seek_all(self, topic: str) -> None:
+    def _find_all_first_copies(self, topic: str) -> None:
         """The same for every message of a topic that has many: one pass in place of one for each.
 
         So it is where publish times say nothing, such as those of a simulated clock.
         """
         everything = TimeWindow.everything()
-        holdings = self.holdings([topic], everything)
+        holdings = self.overlapping_bags([topic], everything)
         for each in self.merged(holdings, [topic], everything, newest_first=False):
             first = (each.time, each.bag.recording)
             self._first_copies.setdefault(copy_key(each.record), first)
@@ -221,7 +229,7 @@ class MergedStream(BagAccess):
         What cannot be read is noted where it was asked for: not all of it lies before `since`.
         """
         read = partial(
-            self.read, topics=topics, window=window, newest_first=newest_first, since=since
+            self.bags.read, topics=topics, window=window, newest_first=newest_first, since=since
         )
         if len(holdings) == 1:
             yield from read(holdings[0].bag)

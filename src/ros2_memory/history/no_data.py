@@ -162,7 +162,7 @@ def not_recorded(view: View, name: str) -> NoDataError:
         close = [topic for topic in snapshot.topics() if stem and stem in topic][:5]
     hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
     note_unread(view, TimeWindow.everything(), nothing=True)
-    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}", view.notes)
+    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}", view.notes.sentences())
 
 
 def no_data_at(
@@ -176,8 +176,8 @@ def no_data_at(
 
     The sentence names the nearest older and newer message with their distances, and what to do.
     """
-    older = next(view.stream(topics, TimeWindow.until(at), newest_first=True), None)
-    newer = next(view.stream(topics, TimeWindow(at + 1, TimeWindow.everything().stop)), None)
+    older = view.stream.first(topics, TimeWindow.until(at), newest_first=True)
+    newer = view.stream.first(topics, TimeWindow(at + 1, MAX_NS))
     names = " or ".join(topics)
     when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
     if around is not None:
@@ -199,13 +199,13 @@ def no_data_at(
     acceptable = older.time if older and tolerance is not None else None
     told.append(_advice(view, reason, at, acceptable))
     note_unread(view, window, nothing=True)
-    return NoDataError(reason, "; ".join(told), view.notes)
+    return NoDataError(reason, "; ".join(told), view.notes.sentences())
 
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
     """No message of these topics in a window."""
-    older = next(view.stream(topics, TimeWindow.until(window.start - 1), newest_first=True), None)
-    newer = next(view.stream(topics, TimeWindow(window.stop, TimeWindow.everything().stop)), None)
+    older = view.stream.first(topics, TimeWindow.until(window.start - 1), newest_first=True)
+    newer = view.stream.first(topics, TimeWindow(window.stop, MAX_NS))
     names = " or ".join(topics)
     start, end = window.asked()
     told = [f"no message of {names} between {moment(start)} and {moment(end)}"]
@@ -216,7 +216,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     reason = between(view, window) if older and newer else beyond(view, end)
     told.append(_advice(view, reason, window.start, None))
     note_unread(view, window, nothing=True)
-    return NoDataError(reason, "; ".join(told), view.notes)
+    return NoDataError(reason, "; ".join(told), view.notes.sentences())
 
 
 def between(view: View, window: TimeWindow) -> NoDataReason:
@@ -251,7 +251,7 @@ def undecodable_in(
     """As `undecodable`, of all that a window holds, with the notes on what else was not read."""
     note_unread(view, window, nothing=True)
     told = undecodable(topic, type_name, error)
-    return NoDataError(told.reason, told.detail, view.notes)
+    return NoDataError(told.reason, told.detail, view.notes.sentences())
 
 
 def _answering(view: View) -> bool:

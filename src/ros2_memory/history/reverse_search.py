@@ -14,6 +14,7 @@ from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.coverage import is_searched, note_unread
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import matching_topics, moment, undecodable_in
+from ros2_memory.history.notes import Note
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -63,13 +64,13 @@ class Search:
     def newest(self, until: Ns) -> StoredMessage | None:
         """The newest match before a moment, as `last_match` gives it."""
         candidates = self.candidates(until)
-        said = self._view.noted_things()
+        said = self._view.notes.keys()
         try:
             for stretch in candidates.stretches():
                 for found in self._messages(stretch):
                     if self.matches(found):
-                        self._view.retract_notes_before(found.time, said)
-                        self._view.seek_first(found)
+                        self._view.notes.retract_before(found.time, said)
+                        self._view.stream.find_first_copy(found)
                         self.note_undecodable()
                         return found
                     self._back_to = found.time
@@ -114,7 +115,7 @@ class Search:
         raise InvalidArgumentsError(f"{self.topics[0]}: {first}")
 
     def _refusal(self, topic: str) -> str | None:
-        found = self._view.newest(topic, TimeWindow.everything())
+        found = self._view.stream.newest(topic, TimeWindow.everything())
         if found is None:
             return None
         try:
@@ -134,10 +135,10 @@ class Search:
         wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
         among = [
             held
-            for held in self._view.holdings(stretch.topics, wider)
+            for held in self._view.stream.overlapping_bags(stretch.topics, wider)
             if held.bag.file in stretch.bags or stretch.recordings != {held.bag.recording}
         ]
-        return self._view.stream(stretch.topics, window, newest_first=True, among=among)
+        return self._view.stream.messages(stretch.topics, window, newest_first=True, among=among)
 
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
@@ -162,15 +163,16 @@ class Search:
         for (topic, type_name), (error, newest) in self._failures.items():
             if newest < since:
                 continue
-            self._view.complete = False
+            self._view.notes.complete = False
             reason = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
-            self._view.note_thing(reason, f"{topic} ({type_name})")
+            self._view.notes.add(Note(reason, f"{topic} ({type_name})"))
 
     def _out_of_time(self, back_to: Ns) -> QueryTimeoutError:
         budget_s = self._view.call.deadline.budget_s
         return QueryTimeoutError(
             f"no match back to {moment(back_to)}, and {budget_s:g} s are over; "
-            f"{self._view.behind()}to go on from there, ask again with before={moment(back_to)}",
+            f"{self._view.bags.backfill_progress()}to go on from there, ask again with "
+            f"before={moment(back_to)}",
             searched_back_to=back_to,
         )
 
@@ -184,7 +186,7 @@ def unsearched(view: View, window: TimeWindow | None = None) -> tuple[str, ...]:
     if is_searched(view, searched):
         return ()
     note_unread(view, searched, nothing=True)
-    return view.notes
+    return view.notes.sentences()
 
 
 class SearchWindow(NamedTuple):
@@ -246,7 +248,7 @@ class CandidateBags:
         while runs or waiting:
             if runs and (not waiting or runs[0][0] <= waiting[0][0]):
                 *_, topic, run = heapq.heappop(runs)
-                self._view.check_deadline()
+                self._view.bags.check_deadline()
                 for each in self._in_run(run, topic):
                     count += 1
                     heapq.heappush(waiting, (-each.last, count, each))
@@ -254,7 +256,7 @@ class CandidateBags:
                 yield heapq.heappop(waiting)[2]
 
     def _in_run(self, run: Segment, topic: str) -> Iterator[_Candidate]:
-        notes = self._view.recalled(run)
+        notes = self._view.bags.digests_of(run)
         known = {} if notes is None else notes.numbers
         possible: Collection[int] = ()
         if notes is not None and known:

@@ -37,7 +37,7 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
     if view.snapshot.is_transient_local(topic):
         return
     apart: set[Path] = set()
-    said = view.noted_things()
+    said = view.notes.keys()
     try:
         for pair, both in _at_once(view, topic, window):
             if not apart.issuperset(pair) and _are_apart(view, topic, pair, both):
@@ -46,10 +46,10 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
         return
     finally:
         # The answer itself needed nothing of what was read here.
-        view.retract_notes_before(MAX_NS, said)
+        view.notes.retract_before(MAX_NS, said)
     if apart:
         names = sorted(each.name for each in apart)
-        view.note(
+        view.notes.add(
             f"{len(names)} recordings hold messages of their own on {topic} at the same time, "
             f"as of several robots, and the answer does not tell them apart: {listed(names)}"
         )
@@ -98,5 +98,6 @@ def _stands_in(view: View, topic: str, recording: Path, found: StoredMessage) ->
 def _messages(
     view: View, topic: str, recording: Path, window: TimeWindow
 ) -> Iterator[StoredMessage]:
-    held = [each for each in view.holdings([topic], window) if each.bag.recording == recording]
-    return view.merged(held, [topic], window, newest_first=False)
+    bags = view.stream.overlapping_bags([topic], window)
+    held = [each for each in bags if each.bag.recording == recording]
+    return view.stream.merged(held, [topic], window, newest_first=False)

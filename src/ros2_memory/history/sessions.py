@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile
-    from ros2_memory.history.bag_access import BagAccess
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.view import View
     from ros2_memory.index.timeline import Timeline
 
 Session: TypeAlias = frozenset[str]
@@ -56,7 +56,7 @@ class Sessions:
 
     def __init__(
         self,
-        view: BagAccess,
+        view: View,
         moving: Sequence[str],
         static: Sequence[str],
         poses: str,

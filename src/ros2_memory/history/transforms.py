@@ -7,6 +7,7 @@ away, up to tf2's cache length; a static one however far back it was recorded.
 from __future__ import annotations
 
 import time
+from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.transform_tree import (
@@ -43,6 +44,7 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
+from ros2_memory.history.notes import Note
 from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:
@@ -114,13 +116,13 @@ def transform_at(
         raise failure
     session, found = answers[0]
     if not all(_alike(found, other) for _, other in answers):
-        view.note(
+        view.notes.add(
             f"{len(answers)} sessions that were recorded then hold different transforms; "
             f"this is that of {sessions.names(session, at)}"
         )
     parts = sessions.parts_of(session)
     if parts and not any(connected(view, (parent, child), among=each) for each in parts):
-        view.note(
+        view.notes.add(
             f"transforms of {sessions.names(session, at)} are joined, as of one robot: they were "
             "recorded at the same time, and no handover says whether they are of one"
         )
@@ -143,7 +145,7 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
         sessions.chosen[key] = session if borrows else own
         if borrows:
             lender = sessions.names(session - own, at)
-            view.note_thing(_BORROWED, sessions.names(own, at), f"those of {lender}")
+            view.notes.add(Note(_BORROWED, sessions.names(own, at), f"those of {lender}"))
     return sessions.chosen[key]
 
 
@@ -257,7 +259,7 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     for pair in refused:
         del pairs[pair]
     if refused:
-        view.note(f"pairs left out, since a frame has no name: {len(refused)}")
+        view.notes.add(f"pairs left out, since a frame has no name: {len(refused)}")
     return tuple(
         FrameEdge(parent, child, static) for (parent, child), static in sorted(pairs.items())
     )
@@ -300,7 +302,7 @@ def _known_pairs(
     view: View, run: Segment, topic: str, window: TimeWindow, among: Session | None
 ) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
     """The pairs that the catalogue has of a run of bags, and the time of bags it has none of."""
-    notes = view.recalled(run) if topic in run.spans else None
+    notes = view.bags.digests_of(run) if topic in run.spans else None
     if notes is not None and among is None and window.covers(*run.spans[topic]):
         every = notes.pairs(topic)
         if every is not None:
@@ -360,7 +362,7 @@ def _explained(
     if failure.reason not in {NoDataReason.OUTSIDE_RANGE, NoDataReason.GAP}:
         return failure
     inside = topics and all(
-        next(view.stream(topics, side, newest_first=newest_first), None)
+        view.stream.first(topics, side, newest_first=newest_first)
         for side, newest_first in (
             (TimeWindow.until(at), True),
             (TimeWindow(at + 1, MAX_NS), False),
@@ -432,13 +434,13 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
     for held in _holdings(view, topics, everything, among):
         ends = _stamps_at_ends(view, held.bag, topics)
         if ends and min(ends) - TF_CACHE_NS <= at <= max(ends) + TF_CACHE_NS:
-            for found in view.used(view.read(held.bag, topics, everything)):
+            for found in view.bags.track_sources(view.bags.read(held.bag, topics, everything)):
                 yield from _decoded(view, found, static=False)
 
 
 def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]:
     """The stamps in the bag's first and last message; of several topics in any order."""
-    entry = view.entry(bag) if len(topics) == 1 else None
+    entry = view.bags.entry(bag) if len(topics) == 1 else None
     edges = None if entry is None else entry[0].edges(topics[0]).get(entry[1])
     if edges is not None:
         return [each for each in (edges.first_stamp, edges.last_stamp) if each is not None]
@@ -446,16 +448,11 @@ def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]
     return [
         transform.stamp
         for newest_first in (False, True)
-        for found in _first(
-            view.used(view.read(bag, topics, everything, newest_first=newest_first))
+        for found in view.bags.track_sources(
+            islice(view.bags.read(bag, topics, everything, newest_first=newest_first), 1)
         )
         for transform in _decoded(view, found, static=False)
     ]
-
-
-def _first(found: Iterator[StoredMessage]) -> Iterable[StoredMessage]:
-    first = next(found, None)
-    return () if first is None else (first,)
 
 
 def _around(at: Ns, half_width: Ns) -> TimeWindow:
@@ -475,14 +472,15 @@ def _transforms(
     if not recorded:
         return
     if among is None:
-        found = view.stream(recorded, window)
+        found = view.stream.messages(recorded, window)
     else:
         # A latched message that was received again counts in the recording that received it, too.
         holdings = _holdings(view, recorded, window, among)
         sessions = sessions_of(view)
-        merged = view.used(view.merged(holdings, recorded, window, newest_first=False))
+        merged = view.stream.merged(holdings, recorded, window, newest_first=False)
         several = any(sessions.is_carried(held.bag) for held in holdings)
-        found = (each for each in merged if not several or sessions.has(among, each))
+        tracked = view.bags.track_sources(merged)
+        found = (each for each in tracked if not several or sessions.has(among, each))
     for each in found:
         yield from _decoded(view, each, static=static)
 
@@ -490,7 +488,7 @@ def _transforms(
 def _holdings(
     view: View, topics: Sequence[str], window: TimeWindow, among: Session
 ) -> list[BagSpan]:
-    held = view.holdings(topics, window)
+    held = view.stream.overlapping_bags(topics, window)
     sessions = sessions_of(view)
     recordings = {each.bag.recording for each in held}
     chosen = {each for each in recordings if sessions.folder(each) in among}
@@ -507,8 +505,8 @@ def _decoded(view: View, found: StoredMessage, *, static: bool) -> tuple[Stamped
         message = view.memory.reader.decode(found.record)
         return view.memory.extractor.transforms(message, found.time, static=static)
     except UndecodableError as error:
-        view.complete = False
-        view.note(f"messages of {error.topic} could not be decoded: {error.reason}")
+        view.notes.complete = False
+        view.notes.add(f"messages of {error.topic} could not be decoded: {error.reason}")
         return ()
     finally:
         view.call.stages.add("extract", time.perf_counter_ns() - begin)

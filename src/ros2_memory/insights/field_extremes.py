@@ -43,7 +43,7 @@ def extremes_of(
     """
     found: dict[str, Extremes] = {}
     looked_at = 0
-    for each in view.stream([topic], window):
+    for each in view.stream.messages([topic], window):
         channel = each.record.channel
         try:
             message = view.memory.reader.decode(each.record)
@@ -56,7 +56,7 @@ def extremes_of(
             if numbers:
                 _take(found, field, each.time, numbers)
         if looked_at > MOST_NUMBERS:
-            view.note(TOO_MANY)
+            view.notes.add(TOO_MANY)
             return ()
     return tuple(found[field] for field in dict.fromkeys(fields) if field in found)
 

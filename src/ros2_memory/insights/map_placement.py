@@ -17,6 +17,7 @@ from ros2_memory.core.geometry import alike, invert, rotate
 from ros2_memory.core.model import TimeWindow, Transform
 from ros2_memory.core.text import Reason, abbreviate
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
+from ros2_memory.history.notes import Note
 from ros2_memory.history.transforms import (
     children_moving,
     connected,
@@ -156,7 +157,7 @@ class MapPlacement:
         """Whose transforms place the poses of a recording; a note says where none do."""
         session = lending_to(self.view, recording, (self.frame_id, self.pose_frame), at)
         if not session:
-            self.view.note_thing(_NOWHERE_IN, recording.name)
+            self.view.notes.add(Note(_NOWHERE_IN, recording.name))
         return session
 
     def _of(self, session: Session) -> _Known:

@@ -44,10 +44,11 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_from_ns,
 )
-from ros2_memory.history.bag_groups import DigestKind, StoredPart, is_whole
+from ros2_memory.history.bag_groups import DigestKind, Fold
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import add_poses, driven_path, length_notes
 from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.notes import Note
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.time_arguments import open_span
 from ros2_memory.results import Event, Recap
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.topic_events import ReportedError
     from ros2_memory.core.model import Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.duplicates import StoredMessage
@@ -132,11 +134,11 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
         there_still |= dict.fromkeys(story.seen.at_end(story.last, known_to), story.last)
         if story.undecodable:
             messages = counted(story.undecodable, "message")
-            view.note_thing(_UNDECODED, f"{messages} of {topic}")
+            view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
         if story.left_out:
-            view.note(f"{topic} changes too often to tell each: {story.left_out} more")
+            view.notes.add(f"{topic} changes too often to tell each: {story.left_out} more")
         if story.beyond:
-            view.note(
+            view.notes.add(
                 f"{topic} has too many booleans or things in one message: {story.beyond} more are "
                 "not followed"
             )
@@ -156,10 +158,10 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     way = None if drive is None else drive.way
     trajectory = None if way is None else way.trajectory
     for note in () if trajectory is None else length_notes(trajectory):
-        view.note(note)
+        view.notes.add(note)
     stood = None if drive is None else drive.stood(end - start)
     if stood is None and trajectory is not None and trajectory.is_known:
-        view.note(_UNTOLD)
+        view.notes.add(_UNTOLD)
     known = trajectory if trajectory is not None and trajectory.is_known else None
     return Recap(
         start=start,
@@ -173,7 +175,7 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
         events=tuple(told),
         throughout=tuple(sorted(throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
-        notes=view.notes,
+        notes=view.notes.sentences(),
         path_sum_m=trajectory.path_sum_m
         if trajectory is not None and trajectory.is_noisy
         else None,
@@ -187,11 +189,11 @@ def _drive(view: View, window: TimeWindow) -> _Drive | None:
         topic = resolve_pose_topic(view)
         way = driven_path(view, topic, window)
         note_robots(view, topic, window)
-        stops = standstills_in(view, topic, window)
+        stops = _standstills_in(view, topic, window)
         if way is None:
-            view.note(f"{topic} has no poses in this time: nothing is known of the way")
+            view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
     except (InvalidArgumentsError, NoDataError) as error:
-        view.note(f"nothing is known of the way: {error}")
+        view.notes.add(f"nothing is known of the way: {error}")
         return None
     return None if way is None and not stops else _Drive(way, stops)
 
@@ -199,7 +201,7 @@ def _drive(view: View, window: TimeWindow) -> _Drive | None:
 def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, TopicEvents]]:
     for topic in view.snapshot.topics():
         if any(map(has_events, view.snapshot.types_of(topic))):
-            story = events_in(view, topic, window)
+            story = _events_in(view, topic, window)
             if story is not None and not story.says_nothing:
                 yield topic, story
 
@@ -271,40 +273,28 @@ def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -
             for kind in _KINDS
             if left_out[kind]
         )
-        view.note(f"left out, since they are too many: {named}; ask for a shorter time")
+        view.notes.add(f"left out, since they are too many: {named}; ask for a shorter time")
     return sorted(told, key=lambda each: (each.start, _KINDS.index(each.kind)))
 
 
 _STANDSTILLS: Final = DigestKind(
     "standstills",
-    ask=lambda notes, topic, among: notes.standstills(topic, among),
-    packed=lambda digest: packed_standstills(digest).hex(),
-    unpacked=lambda text: unpacked_standstills(bytes.fromhex(text)),
+    look_up=lambda digests, topic, among: digests.standstills(topic, among),
+    encode=lambda digest: packed_standstills(digest).hex(),
+    decode=lambda text: unpacked_standstills(bytes.fromhex(text)),
 )
-_STORIES: Final = DigestKind(
+_TOPIC_EVENTS: Final = DigestKind(
     "story",
-    ask=lambda notes, topic, among: notes.stories(topic, among),
-    packed=lambda story: "" if story is None else encode_topic_events(story).hex(),
-    unpacked=lambda text: decode_topic_events(bytes.fromhex(text)) if text else None,
+    look_up=lambda digests, topic, among: digests.stories(topic, among),
+    encode=lambda events: "" if events is None else encode_topic_events(events).hex(),
+    decode=lambda text: decode_topic_events(bytes.fromhex(text)) if text else None,
 )
 
 
-class _Standing:
-    """Takes poses for what only asks where they are."""
-
-    def __init__(self, to: StandstillBuilder | StandstillCollector) -> None:
-        self._to = to
-
-    def add(self, time: Ns, pose: Pose, _speed_mps: float | None = None) -> None:
-        """Takes the next pose, if it is one."""
-        if is_place(pose.position):
-            self._to.add(time, pose.position)
-
-
-def standstills_in(
+def _standstills_in(
     view: View, topic: str, window: TimeWindow
 ) -> tuple[tuple[Standstill, bool], ...]:
-    """Return where the poses of a topic stand still, in order, as far as it is in a window.
+    """Returns where the poses of a topic stand still, in order, as far as it is in a window.
 
     With each comes whether it goes on after the window, or up to the last pose that is known.
 
@@ -315,66 +305,73 @@ def standstills_in(
         InvalidArgumentsError: a message of the topic carries no position.
     """
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    window = window.widened(CONTEXT_NS)
     builder = StandstillBuilder()
-    kept: StoredPart[StandstillDigest] = StoredPart(view, topic, _STANDSTILLS, window)
-    sights = MotionDecoder(view.memory.reader, view.memory.extractor)
-    for group in view.groups(topic, window):
-        failures: list[UndecodableError] = []
-        if not is_whole(group, window):
-            add_poses(view, _Standing(builder), sights, group.once(), failures)
-        elif (known := kept.of(group)) is not None:
-            builder.join(known[0])
-        else:
-            collector = StandstillCollector()
-            span = add_poses(view, _Standing(collector), sights, group.once(), failures)
-            digest = collector.digest()
-            if digest is not None:
-                builder.join(digest)
-                if span is not None and not failures:
-                    kept.keep(group, digest, span)
-    found = builder.standstills()
+    decoder = MotionDecoder(view.memory.reader, view.memory.extractor)
+    failures: list[UndecodableError] = []
+
+    def add(
+        to: StandstillBuilder | StandstillCollector, messages: Iterable[StoredMessage]
+    ) -> Span | None:
+        def add_place(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
+            if is_place(pose.position):
+                to.add(time, pose.position)
+
+        return add_poses(view, add_place, decoder, messages, failures)
+
+    def collect(
+        messages: Iterable[StoredMessage],
+    ) -> tuple[StandstillDigest | None, Span | None]:
+        collector = StandstillCollector()
+        span = add(collector, messages)
+        return collector.digest(), span
+
+    Fold(
+        _STANDSTILLS,
+        add=lambda messages: add(builder, messages),
+        collect=collect,
+        join=lambda digest, _span: builder.join(digest),
+        failures=failures,
+    ).over(view, topic, window.widened(CONTEXT_NS))
     return tuple(
         (
             each._replace(start=max(each.start, start), end=min(each.end, end)),
             each.end > end or each.end == builder.last,
         )
-        for each in found
+        for each in builder.standstills()
         if each.start < end and each.end > start
     )
 
 
-def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
-    """What the messages of a topic say in a window; None where there is no message."""
+def _events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
+    """Returns what the messages of a topic report in a window; None where there is no message."""
     builder = TopicEventsBuilder()
-    kept: StoredPart[TopicEvents | None] = StoredPart(view, topic, _STORIES, window)
-    for group in view.groups(topic, window):
-        if not is_whole(group, window):
-            _hear(view, builder, group.once())
-            continue
-        known = kept.of(group)
-        if known is None:
-            collector = TopicEventsBuilder()
-            _hear(view, collector, group.once())
-            story = collector.story(MOST_TOLD)
-            if story is not None:
-                kept.keep(group, story, (story.first, story.last))
-        else:
-            story, span = known
-            story = TopicEvents(*span) if story is NO_EVENTS else story
-        if story is not None:
-            builder.join(story)
+
+    def collect(messages: Iterable[StoredMessage]) -> tuple[TopicEvents | None, Span | None]:
+        collector = TopicEventsBuilder()
+        _add_events(view, collector, messages)
+        events = collector.story(MOST_TOLD)
+        return events, None if events is None else (events.first, events.last)
+
+    def join(events: TopicEvents | None, span: Span) -> None:
+        if events is not None:
+            builder.join(TopicEvents(*span) if events is NO_EVENTS else events)
+
+    Fold(
+        _TOPIC_EVENTS,
+        add=lambda messages: _add_events(view, builder, messages),
+        collect=collect,
+        join=join,
+    ).over(view, topic, window)
     return builder.story()
 
 
-def _hear(view: View, builder: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:
-    """Adds what messages say."""
+def _add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:
     for found in messages:
         channel = found.record.channel
         try:
             message = view.memory.reader.decode(found.record)
         except UndecodableError:
-            builder.miss()
+            to.miss()
             continue
         value = view.memory.extractor.exact(message, channel.type)
-        builder.add(found.time, state_of(value, channel.type))
+        to.add(found.time, state_of(value, channel.type))

@@ -106,7 +106,7 @@ def find_matches(
     runs = _Runs(limit, oldest_first=oldest_first)
     _gather(view, topic, condition, window, runs)
     searched = TimeWindow(runs.told[-1].first, window.stop) if runs.cut and runs.told else window
-    view.retract_notes_before(searched.start)
+    view.notes.retract_before(searched.start)
     pose_topic = memory.limits.pose_topic
     found = tuple(_told(view, condition, run, pose_topic) for run in runs.told)
     note_unread(view, searched, nothing=not found, search=True)
@@ -121,7 +121,7 @@ def find_matches(
         start=start,
         end=end,
         now=now,
-        notes=view.notes,
+        notes=view.notes.sentences(),
     )
 
 
@@ -164,7 +164,7 @@ def _gather(
             _pass_over(view, runs, TimeWindow(part.stop, max(before, part.stop)))
             # There may be thousands of topics: read are those that can begin a row or end one.
             bearing = sorted({*topics, *runs.under_way()})
-            for found in view.stream(bearing, part, newest_first=True):
+            for found in view.stream.messages(bearing, part, newest_first=True):
                 before = found.time
                 runs.end_silent(found.time)
                 matches = search.matches(found)
@@ -182,8 +182,10 @@ def _gather(
         if not runs.count:
             raise
         runs.cut = True
-        view.complete = False
-        view.note(f"the search ran out of time at {moment(before)}: to go on, ask with end there")
+        view.notes.complete = False
+        view.notes.add(
+            f"the search ran out of time at {moment(before)}: to go on, ask with end there"
+        )
         return
     for topic in runs.under_way():
         runs.end(topic)
@@ -283,7 +285,7 @@ def _parts(
     view: View, topics: Sequence[str], stretches: Iterator[SearchWindow], window: TimeWindow
 ) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
     """The parts of a window in which topics may have matches, and these, newest first."""
-    if view.may_be_relatched(topics):
+    if view.stream.may_be_relatched(topics):
         # What ends a row may be a copy of a message in a bag that is ruled out.
         yield window, topics
         return
@@ -299,12 +301,12 @@ def _any_between(view: View, topic: str, gap: TimeWindow) -> bool:
     """Whether the topic has a message in a time that holds no match."""
     if gap.empty:
         return False
-    held = view.holdings([topic], gap)
+    held = view.stream.overlapping_bags([topic], gap)
     if len({each.bag.recording for each in held}) == 1 and any(
         gap.contains(each.first) or gap.contains(each.last) for each in held
     ):
         return True
-    return bool(held) and view.oldest(topic, gap) is not None
+    return bool(held) and view.stream.first([topic], gap) is not None
 
 
 def _told(view: View, condition: Condition, run: _Run, pose_topic: str) -> Sighting:
@@ -328,9 +330,9 @@ def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
     """
     window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
     own = own_holdings(view, topic, window, seen.bag.recording)
-    found = view.newest(topic, window)
+    found = view.stream.newest(topic, window)
     if own is not None and (found is None or found.bag not in {held.bag for held in own}):
-        found = next(view.stream([topic], window, newest_first=True, among=own), None)
+        found = view.stream.first([topic], window, newest_first=True, among=own)
     if found is None:
         return None
     try:

@@ -33,7 +33,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     """What the recorder does, how old the newest data is, what fell silent, what is amiss."""
     wall = memory.clock.now()
     view = View(memory, call, wall)
-    view.count_all()
+    view.bags.track_all_sources()
     snapshot, heartbeat = view.snapshot, memory.heartbeat()
     latest = snapshot.dating.latest
     now = wall if memory.limits.now == "wall" or latest is None else latest
@@ -52,7 +52,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot, heartbeat, wall),
         problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
-        notes=(*view.notes, *_age_held(heartbeat, wall)),
+        notes=(*view.notes.sentences(), *_age_held(heartbeat, wall)),
     )
 
 
@@ -211,13 +211,13 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     bag = view.snapshot.first_with(topic, type_name)
-    entry = view.entry(bag)
+    entry = view.bags.entry(bag)
     known = None if entry is None else entry[0].undecodable(topic, entry[1])
     if known is not None:
         return known.get(type_name)
     reasons = [
         view.memory.reader.undecodable(channel)
-        for channel in view.channels(bag)
+        for channel in view.bags.channels(bag)
         if channel.topic == topic and channel.type == type_name
     ]
     return next(filter(None, reversed(reasons)), None)

@@ -39,7 +39,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         )
     failure = ""
     for topic in topics:
-        found = view.newest(topic, TimeWindow.everything())
+        found = view.stream.newest(topic, TimeWindow.everything())
         if found is None or found.record.channel.type != type_name:
             continue
         try:
@@ -50,9 +50,9 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         value = memory.extractor.exact(message, type_name)
         fields = dict(_fields(value, ""))
         if len(fields) > MOST_FIELDS:
-            view.note(f"{MOST_FIELDS} of {len(fields)} fields")
+            view.notes.add(f"{MOST_FIELDS} of {len(fields)} fields")
         told = tuple(fields.items())[:MOST_FIELDS]
-        return TypeFields(type_name, tuple(topics), told, view.notes)
+        return TypeFields(type_name, tuple(topics), told, view.notes.sentences())
     raise NoDataError(
         NoDataReason.UNDECODABLE,
         f"no newest message of this type can be read: {failure or 'others came after it'}",

@@ -27,7 +27,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
-from ros2_memory.history.bag_groups import StoredPart, groups_of, is_whole
+from ros2_memory.history.bag_groups import StoredDigests, groups_of
 from ros2_memory.history.coverage import note_unread
 from ros2_memory.history.driven_path import (
     POSES,
@@ -114,12 +114,12 @@ def visits(
         for stay, closest in found
     )
     if newest is not None and any(visit.departed == newest for visit in told):
-        view.note(
+        view.notes.add(
             f"the newest pose, of {moment(newest)}, is too old to know whether the robot is there "
             "now: departed is that pose"
         )
     if any(visit.restarts for visit in told):
-        view.note(
+        view.notes.add(
             "visits with restarts_since are of before odometry began anew: "
             "the same coordinates may have been another place"
         )
@@ -132,7 +132,7 @@ def visits(
         more=total > len(told),
         total=total,
         now=now,
-        notes=view.notes,
+        notes=view.notes.sentences(),
     )
 
 
@@ -141,8 +141,8 @@ def _restarts(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
     try:
         return odometry_resets(view, topic, since)
     except QueryTimeoutError:
-        view.complete = False
-        view.note("the time was over before it was known whether odometry began anew since")
+        view.notes.complete = False
+        view.notes.add("the time was over before it was known whether odometry began anew since")
         return ()
 
 
@@ -153,14 +153,14 @@ def _pose_frame(view: View, topic: str) -> str:
         InvalidArgumentsError: the topic's messages carry no position.
         UndecodableError: none of the newest ones can be decoded.
     """
-    found = view.newest(topic, TimeWindow.everything())
+    found = view.stream.newest(topic, TimeWindow.everything())
     if found is None:
         return ""
     try:
         return _frame_of(view, found)
     except UndecodableError as error:
         leave_out(view, error)
-        older = view.stream([topic], TimeWindow.until(found.time), newest_first=True)
+        older = view.stream.messages([topic], TimeWindow.until(found.time), newest_first=True)
         for each in islice(older, _MOST_TRIED):
             with suppress(UndecodableError):
                 return _frame_of(view, each)
@@ -175,20 +175,6 @@ def _frame_of(view: View, found: StoredMessage) -> str:
     return pose.frame_id
 
 
-class _Nearest:
-    """Takes poses, and remembers the closest approach; the earliest of equals."""
-
-    def __init__(self, here: tuple[float, float], approach: Approach | None) -> None:
-        self._here = here
-        self.approach = approach
-
-    def add(self, time: Ns, pose: Pose, _speed_mps: float | None = None, /) -> None:
-        """Takes the next pose."""
-        if is_place(pose.position):
-            near = Approach(_away(pose.position, self._here), time)
-            self.approach = near if self.approach is None else min(near, self.approach)
-
-
 class _Looking:
     """Goes through the poses of a topic from the newest on, but for bags that are ruled out."""
 
@@ -200,7 +186,8 @@ class _Looking:
         self._place = place
         self._x, self._y, self._radius = wanted
         self._one = place.is_one(topic)
-        self._kept: StoredPart[PoseDigest] = StoredPart(view, topic, POSES, TimeWindow.everything())
+        self._digests = StoredDigests(view, topic, POSES, TimeWindow.everything())
+        self._decoder = MotionDecoder(view.memory.reader, view.memory.extractor)
         self._counting: Deadline | None = None
 
     @property
@@ -227,10 +214,12 @@ class _Looking:
         except QueryTimeoutError:
             if not stays.all:
                 raise
-            self._view.complete = False
+            self._view.notes.complete = False
             if self._counting is None:
-                self._view.note(f"the search ran out of time at {moment(before)}")
-            self._view.note(f"total counts the visits back to {moment(before)}: there may be more")
+                self._view.notes.add(f"the search ran out of time at {moment(before)}")
+            self._view.notes.add(
+                f"total counts the visits back to {moment(before)}: there may be more"
+            )
         return [(stay, self._closest(stay)) for stay in stays.all[:limit]], len(stays.all)
 
     def _check_counting(self) -> None:
@@ -248,31 +237,40 @@ class _Looking:
         Whole bags within the radius are read only where one of their poses may be closer.
         """
         closest = stay.closest
-        sights = MotionDecoder(self._view.memory.reader, self._view.memory.extractor)
         for bound, window, here in sorted(stay.unread, key=attrgetter("bound")):
             if closest is not None and closest <= bound:
                 break
-            nearest = _Nearest(here, closest)
+            approaches = [] if closest is None else [closest]
             try:
-                add_poses(self._view, nearest, sights, self._view.stream([self._topic], window), [])
+                self._add_approaches(approaches, window, here)
             except QueryTimeoutError:
-                self._view.complete = False
-                self._view.note(
+                self._view.notes.complete = False
+                self._view.notes.add(
                     f"closest_m of the visit until {moment(stay.departed)} is not the least: "
                     "the time was over before all of its poses were read"
                 )
-                return nearest.approach or bound
-            closest = nearest.approach
+                return min(approaches, default=bound)
+            closest = min(approaches, default=None)
         # Where the bags of the visit are gone meanwhile, what is known of them serves.
         return closest or min(each.bound for each in stay.unread)
 
+    def _add_approaches(
+        self, approaches: list[Approach], window: TimeWindow, here: tuple[float, float]
+    ) -> None:
+        def add(time: Ns, pose: Pose, _speed_mps: float | None) -> None:
+            if is_place(pose.position):
+                approaches.append(Approach(_away(pose.position, here), time))
+
+        messages = self._view.stream.messages([self._topic], window)
+        add_poses(self._view, add, self._decoder, messages, [])
+
     def _parts(self) -> Iterator[TimeWindow]:
         """The times in which the robot may have been near, newest first."""
-        if self._view.may_be_relatched([self._topic]):
+        if self._view.stream.may_be_relatched([self._topic]):
             # What ends a visit may be a copy of a pose in a bag that is ruled out.
             yield TimeWindow.everything()
             return
-        holdings = self._view.holdings([self._topic], TimeWindow.everything())
+        holdings = self._view.stream.overlapping_bags([self._topic], TimeWindow.everything())
         here = self._here_in(holdings[0]) if self._one and holdings else None
         if here is None:  # the place is another one in some bags: none is ruled out
             near = Condition(NearPosition(0.0, 0.0, None, math.inf))
@@ -290,11 +288,11 @@ class _Looking:
                 return
 
     def _look(self, stays: DwellBuilder, part: TimeWindow) -> None:
-        groups = groups_of(self._view, self._topic, part)
-        alone = len(groups) == 1 and is_whole(groups[0], part) and not self._contested(part)
-        here = self._here_in(groups[0].holdings[0]) if alone else None
+        groups = groups_of(self._view.stream, self._topic, part)
+        alone = len(groups) == 1 and groups[0].is_whole and not self._contested(part)
+        here = self._here_in(groups[0].bags[0]) if alone else None
         if here is not None:
-            known = self._kept.of(groups[0])
+            known = self._digests.of(groups[0])
             if known is not None and self._sum_up(stays, groups[0], *known, here):
                 return
         self._place.look_at(part)
@@ -339,10 +337,10 @@ class _Looking:
         first, last = span
         if last - first <= SILENCE_NS:
             return True
-        if len(group.holdings) > 1:
+        if len(group.bags) > 1:
             return False
-        bag, window = group.holdings[0].bag, TimeWindow(first, last + 1)
-        times = self._view.log_times(bag, self._topic, window)
+        bag, window = group.bags[0].bag, TimeWindow(first, last + 1)
+        times = self._view.bags.log_times(bag, self._topic, window)
         return len(times) == digest.poses and all(
             after - before <= SILENCE_NS for before, after in pairwise(times)
         )
@@ -350,7 +348,15 @@ class _Looking:
     def _contested(self, part: TimeWindow) -> bool:
         """Whether another recording may hold the original of a pose in a part."""
         wider = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
-        return len({each.bag.recording for each in self._view.holdings([self._topic], wider)}) > 1
+        return (
+            len(
+                {
+                    each.bag.recording
+                    for each in self._view.stream.overlapping_bags([self._topic], wider)
+                }
+            )
+            > 1
+        )
 
     def _here_in(self, held: BagSpan) -> tuple[float, float] | None:
         """Where the place is in the poses' frame of a bag; None where that is not one place."""
@@ -365,7 +371,7 @@ class _Looking:
 
     def _positions_in(self, part: TimeWindow) -> Iterator[tuple[Path, Ns, Vector3]]:
         """As `_positions`, each with its recording."""
-        messages = self._view.stream([self._topic], part, newest_first=True)
+        messages = self._view.stream.messages([self._topic], part, newest_first=True)
         at: list[Path] = []
 
         def noted() -> Iterator[StoredMessage]:
@@ -378,7 +384,7 @@ class _Looking:
 
     def _positions(self, part: TimeWindow) -> Iterator[TimedPosition]:
         """The positions of a part that are places, newest first."""
-        return stops(self._view, self._view.stream([self._topic], part, newest_first=True))
+        return stops(self._view, self._view.stream.messages([self._topic], part, newest_first=True))
 
 
 def _away(position: Vector3, here: tuple[float, float]) -> float:

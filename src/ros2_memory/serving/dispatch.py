@@ -218,7 +218,7 @@ class Dispatcher:
     def _told(self, question: Question, call: Call, waits: _Waits) -> tuple[str, Reply]:
         try:
             answer = question(self._memory, call)
-            return "ok", self._replies.answer(answer, from_active=call.sources.active)
+            return "ok", self._replies.answer(answer, from_active=call.used_active)
         except NoDataError as error:
             return f"{error.code}: {error.reason}", self._replies.error(error)
         except QueryTimeoutError as error:

@@ -15,7 +15,7 @@ import anyio.to_thread
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import Ns, unix_from_ns, unix_rounded_up
-from ros2_memory.history.bag_access import short_name
+from ros2_memory.history.notes import short_name
 from ros2_memory.insights.status import clock_faults, left_open, problems_of
 from ros2_memory.serving.fair_queue import FairQueue
 

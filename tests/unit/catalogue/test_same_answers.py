@@ -215,8 +215,8 @@ def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed
                 assume(asked.snapshot.topics())  # not where each bag was spoilt
                 topic = draw.choice(asked.snapshot.topics())
                 window = TimeWindow(start, stop)
-                first = next(View(memory, Call()).stream([topic], window, newest_first=True), None)
-                assert asked.newest(topic, window) == first, (seed, topic, window)
+                first = View(memory, Call()).stream.first([topic], window, newest_first=True)
+                assert asked.stream.newest(topic, window) == first, (seed, topic, window)
 
 
 def test_a_latched_message_received_again_is_no_event_with_a_catalogue_either(

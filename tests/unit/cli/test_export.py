@@ -309,7 +309,7 @@ class TestMcap:
     def test_an_interrupted_export_leaves_nothing(self, bag_dir: Path, tmp_path: Path) -> None:
         def interrupted() -> Iterator[StoredMessage]:
             view = View(memory_of(bag_dir), Call())
-            yield from view.stream(["/odom"], TimeWindow.everything())
+            yield from view.stream.messages(["/odom"], TimeWindow.everything())
             raise KeyboardInterrupt
 
         folder = tmp_path / "out"

@@ -47,7 +47,7 @@ def recorded(
 
 
 def times(view: View, topic: str, *, newest_first: bool = False) -> list[int]:
-    found = view.stream([topic], TimeWindow.everything(), newest_first=newest_first)
+    found = view.stream.messages([topic], TimeWindow.everything(), newest_first=newest_first)
     return [each.time for each in found]
 
 
@@ -91,7 +91,7 @@ def test_a_copy_just_inside_a_window_whose_original_lies_outside_does_not_count(
     recorded(tmp_path, "b", [shifted(original, 500_000), odom(T0 + S, 2.0, 0.0)])
     view = view_of(tmp_path)
     window = TimeWindow(T0 + 1, T0 + 2 * S)
-    assert [each.time for each in view.stream(["/odom"], window)] == [T0 + S]
+    assert [each.time for each in view.stream.messages(["/odom"], window)] == [T0 + S]
 
 
 def test_alike_messages_inside_one_recording_are_not_copies(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_latched_message_received_again_counts_when_it_was_first_received(
     view = view_of(tmp_path)
     assert times(view, "/dock") == [T0, T0 + 700 * S]
     assert times(view, "/dock", newest_first=True) == [T0 + 700 * S, T0]
-    found = view.newest("/dock", TimeWindow.until(T0 + 650 * S))
+    found = view.stream.newest("/dock", TimeWindow.until(T0 + 650 * S))
     assert found is not None
     assert found.time == T0
     census = view.census("/dock")["std_msgs/msg/String"]
@@ -139,7 +139,7 @@ def test_several_topics_are_one_stream(tmp_path: Path) -> None:
         "a",
         [text(T0 + n * S, str(n), "/a" if n % 2 else "/b") for n in range(10)],
     )
-    found = list(view_of(tmp_path).stream(["/a", "/b"], TimeWindow.everything()))
+    found = list(view_of(tmp_path).stream.messages(["/a", "/b"], TimeWindow.everything()))
     assert [each.time for each in found] == [T0 + n * S for n in range(10)]
 
 
@@ -162,8 +162,9 @@ def test_a_bag_that_fails_is_named_and_the_others_still_answer(tmp_path: Path) -
 
     view = View(memory_of(tmp_path, reader=Failing()), Call())
     assert times(view, "/odom") == [T0 + 60 * S]
-    assert view.notes == ("a/a_0.mcap could not be read to its end: the disk returned an error",)
-    assert not view.complete
+    [note] = view.notes.sentences()
+    assert note == "a/a_0.mcap could not be read to its end: the disk returned an error"
+    assert not view.notes.complete
 
 
 def test_a_bag_deleted_under_a_question_is_named(tmp_path: Path) -> None:
@@ -172,7 +173,7 @@ def test_a_bag_deleted_under_a_question_is_named(tmp_path: Path) -> None:
     view = view_of(tmp_path)
     gone.unlink()
     assert times(view, "/odom") == [T0 + 60 * S]
-    assert view.notes == ("a/a_0.mcap was deleted before it could be read",)
+    assert view.notes.sentences() == ("a/a_0.mcap was deleted before it could be read",)
 
 
 def test_a_question_past_its_deadline_gives_up(tmp_path: Path) -> None:
@@ -180,7 +181,7 @@ def test_a_question_past_its_deadline_gives_up(tmp_path: Path) -> None:
     over = Deadline.after(0.0, monotonic=lambda: 5.0)
     view = View(memory_of(tmp_path), Call(over))
     with pytest.raises(QueryTimeoutError, match="shorter window"):
-        view.newest("/odom", TimeWindow.everything())
+        view.stream.newest("/odom", TimeWindow.everything())
 
 
 def test_picked_samples_are_evenly_spaced_over_the_messages_of_many_splits(

@@ -127,7 +127,7 @@ class Tail:
 
     def ticks(self, view: View | None = None) -> list[int]:
         """Which messages a question about all of time finds, by their publish times."""
-        found = (view or View(self.memory, Call())).stream(["/odom"], EVERYTHING)
+        found = (view or View(self.memory, Call())).stream.messages(["/odom"], EVERYTHING)
         return [round((each.record.publish_time - T0) / TENTH) for each in found]
 
     def states(self) -> list[BagState]:
@@ -150,7 +150,7 @@ def told(memory: Memory, name: str, **arguments: object) -> Any:
         answer = tools()[name].question(arguments)(memory, call)
     except EpisodicError as error:
         return json.loads(replies.error(error).text)
-    return json.loads(replies.answer(answer, from_active=call.sources.active).text)
+    return json.loads(replies.answer(answer, from_active=call.used_active).text)
 
 
 @pytest.fixture

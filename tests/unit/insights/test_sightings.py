@@ -263,7 +263,7 @@ def grouped(
     search = Search(view, topic, condition)
     rows: list[list[tuple[str, int]]] = []
     under_way: dict[str, list[tuple[str, int]]] = {}
-    backwards = view.stream(search.topics, TimeWindow.everything(), newest_first=True)
+    backwards = view.stream.messages(search.topics, TimeWindow.everything(), newest_first=True)
     for each in reversed(list(backwards)):
         name = each.record.channel.topic
         row = under_way.get(name)

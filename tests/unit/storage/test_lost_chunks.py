@@ -93,10 +93,10 @@ def test_the_newest_message_stands_before_the_damaged_chunk_where_that_is_the_la
 ) -> None:
     path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
     view = View(memory_of(tmp_path), Call())
-    found = view.newest("/chatter", TimeWindow.until(lost[-1]))
+    found = view.stream.newest("/chatter", TimeWindow.until(lost[-1]))
     assert found is not None
     assert found.time == lost[0] - 1
-    [told] = view.notes
+    [told] = view.notes.sentences()
     assert told.startswith(f"rec/{path.name} could not be read whole: ")
 
 
@@ -159,11 +159,11 @@ def test_what_is_read_for_copies_alone_is_not_told_when_it_is_damaged(
 ) -> None:
     memory = overlapping(tmp_path)
     view = View(memory, Call())
-    found = view.stream(["/chatter"], TimeWindow(2 * S, 4 * S), newest_first=newest_first)
+    found = view.stream.messages(["/chatter"], TimeWindow(2 * S, 4 * S), newest_first=newest_first)
     assert len(list(found)) == 2
-    assert view.notes == ()
-    list(view.stream(["/chatter"], TimeWindow(S, 4 * S), newest_first=newest_first))
-    assert len(view.notes) == 1
+    assert view.notes.sentences() == ()
+    list(view.stream.messages(["/chatter"], TimeWindow(S, 4 * S), newest_first=newest_first))
+    assert len(view.notes.sentences()) == 1
 
 
 def test_sightings_tell_what_is_damaged_in_the_time_that_they_span(tmp_path: Path) -> None:
@@ -184,8 +184,8 @@ def test_damaged_bags_are_told_in_one_order_whichever_was_found_first(tmp_path: 
     told = []
     for newest_first in (False, True):
         view = View(memory_of(tmp_path), Call())
-        list(view.stream(["/chatter"], EVERYTHING, newest_first=newest_first))
-        told.append(view.notes)
+        list(view.stream.messages(["/chatter"], EVERYTHING, newest_first=newest_first))
+        told.append(view.notes.sentences())
     assert told[0] == told[1]
     [told_once] = told[0]
     assert told_once.startswith("2 bags could not be read whole: a/a_0.mcap (")
