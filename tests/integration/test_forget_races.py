@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import cli
+from ros2_memory.bag_dir.directory_identity import identity_of
 from ros2_memory.bag_dir.moment_file import stored_moments_in
-from ros2_memory.bag_dir.own_recordings import OwnRecordings, identity_of
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.request_queue import PendingRequest
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import size_of
@@ -143,7 +144,7 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
         }
         assert files.items() <= robot.content.items()
         assert len(files) >= each.bags
-        assert not held.keepsake.pending
+        assert not held.moment.pending
     out = capsys.readouterr()
     assert "Traceback" not in out.err
     assert "still lists what was deleted" not in out.out

@@ -48,7 +48,7 @@ def complete(bag_dir: Path) -> StoredMoment:
 
     def is_complete() -> StoredMoment | None:
         [held] = stored_moments_in(bag_dir)
-        return None if held.keepsake.pending else held
+        return None if held.moment.pending else held
 
     return until(is_complete)
 
@@ -85,7 +85,7 @@ def keeps_a_moment(site: Site, served: Served) -> None:
     told = answer(served, "remember_moment", label="Küche", seconds_before=2.5)
     assert (told["label"], told["bags"] >= 2) == ("Küche", True), told
     held = complete(site.bag_dir)
-    assert (held.folder.name, held.keepsake.missing) == (told["moment"], ())
+    assert (held.folder.name, held.moment.missing) == (told["moment"], ())
     recorded = originals(held, site.bag_dir)
     assert len(recorded) >= 3
     before = until(lambda: _whole(about(served, told)))
@@ -112,7 +112,7 @@ def test_a_recorder_that_is_killed_while_a_moment_waits_goes_on_with_it_when_it_
     assert refused["error"] == "refused", refused
     following = site.run()
     held = complete(site.bag_dir)
-    assert held.keepsake.missing == ()
+    assert held.moment.missing == ()
     kept = {path.name for path in held.folder.rglob("*.mcap")}
     assert len(kept) == len(held.files) > told["bags"]
     assert following.stop() == 0

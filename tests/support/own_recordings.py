@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from mcap.writer import Writer
 
+from ros2_memory.bag_dir.directory_identity import identity_of
 from ros2_memory.bag_dir.layout import LIST_FILE
-from ros2_memory.bag_dir.own_recordings import (
-    OwnRecordings,
-    folders_with_bags,
-    identity_of,
-)
+from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

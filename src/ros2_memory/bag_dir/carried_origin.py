@@ -1,4 +1,4 @@
-"""The recordings that a carried message stood in, as the metadata of its channel says."""
+"""Where a carried latched message came from, as metadata of its channel."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Origin:
     """Where a carried message came from.
 
     Attributes:
-        recordings: the folders, from the bag directory on, of the recordings that received it: the
-            first of them, and those that still had bags when theirs of this message was deleted.
-        often: whether the first one had messages of the topic often: then it is not latched.
+        recordings: folders, relative to the bag directory, of the recordings that received it: the
+            first one, and those that still had bags when their own copy was deleted.
+        often: whether the first one had messages of the topic often, so that it is not latched.
     """
 
     recordings: tuple[str, ...]
@@ -28,20 +28,20 @@ class Origin:
 
 
 def with_origin(record: Record, origin: Origin) -> Record:
-    """The message with its origin in place of what its channel said of that before."""
+    """Returns the message with its origin in place of any that its channel names."""
     channel = record.channel
     rest = tuple(each for each in channel.metadata if each[0] not in {_RECORDINGS, _OFTEN})
-    said = ((_RECORDINGS, json.dumps(origin.recordings)), (_OFTEN, json.dumps(origin.often)))
-    return record._replace(channel=replace(channel, metadata=(*rest, *said)))
+    new = ((_RECORDINGS, json.dumps(origin.recordings)), (_OFTEN, json.dumps(origin.often)))
+    return record._replace(channel=replace(channel, metadata=(*rest, *new)))
 
 
 def origin_of(channel: Channel) -> Origin | None:
-    """The origin of a carried message; None where its channel does not say."""
-    said = dict(channel.metadata)
+    """Returns the origin of a carried message; None where its channel names none."""
+    metadata = dict(channel.metadata)
     try:
-        recordings = json.loads(said.get(_RECORDINGS, "null"))
+        recordings = json.loads(metadata.get(_RECORDINGS, "null"))
     except ValueError:
         return None
     if not isinstance(recordings, list) or not recordings:
         return None
-    return Origin(tuple(map(str, recordings)), said.get(_OFTEN) == "true")
+    return Origin(tuple(map(str, recordings)), metadata.get(_OFTEN) == "true")

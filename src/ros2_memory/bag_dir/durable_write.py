@@ -1,6 +1,7 @@
-"""Small files that are replaced at once and survive a power cut, and closed bags that do.
+"""Writing files so that they survive a power cut, and reading files that anybody may have written.
 
-A file is on the disk when it was flushed itself, and its name when its directory was.
+A file's content is on the disk once the file was flushed, and its name once its directory was.
+No symbolic link is followed: what is written or read lies in the bag directory itself.
 """
 
 from __future__ import annotations
@@ -17,74 +18,96 @@ if TYPE_CHECKING:
 
 MAX_SMALL_FILE: Final = 1 << 20
 
-# Never through a symbolic link: what is written or read lies in the bag directory itself.
-_ANEW: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
-_AT_THE_END: Final = (
-    os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
-)
-_AS_IT_IS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW
+# O_NONBLOCK: opening a FIFO would wait for its other end.
+_COMMON: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+_REPLACE: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _COMMON
+_APPEND: Final = os.O_RDWR | os.O_APPEND | os.O_CREAT | _COMMON
+_READ: Final = os.O_RDONLY | _COMMON
 
 
-def write_durably(target: Path, text: str) -> None:
-    """Replaces the file at once: a reader sees what was there, or all of the new text.
+def write_durably(target: Path, text: str, *, mode: int | None = None) -> None:
+    """Replaces a file atomically: a reader sees the old content, or all of the new text.
+
+    `mode` are its permissions, whatever the umask; None leaves them to the umask.
 
     Raises:
-        OSError: it cannot be written; what was there stands.
+        OSError: the file cannot be written; the old one remains.
     """
-    write_all_durably({target: text})
+    write_all_durably({target: text}, mode=mode)
 
 
-def write_all_durably(texts: Mapping[Path, str]) -> None:
-    """Replaces the files one after the other, each at once, and none before all texts are on disk.
+def write_all_durably(texts: Mapping[Path, str], *, mode: int | None = None) -> None:
+    """Replaces files one after the other, each atomically, once all texts are on disk.
 
     So a full disk leaves all of them as they are; a power cut may come between two of them.
 
     Raises:
-        OSError: a text cannot be written, and `filename` says which.
+        OSError: a text cannot be written; `filename` says which.
     """
-    waiting = {target: target.with_name(f".{target.name}.tmp") for target in texts}
+    temporary = {target: target.with_name(f".{target.name}.tmp") for target in texts}
     try:
-        for target, beside in waiting.items():
-            with os.fdopen(os.open(beside, _ANEW, 0o666), "w", encoding="utf-8") as stream:
+        for target, beside in temporary.items():
+            descriptor = os.open(beside, _REPLACE, 0o666)
+            with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+                if mode is not None:
+                    os.fchmod(descriptor, mode)
                 stream.write(texts[target])
                 stream.flush()
-                os.fsync(stream.fileno())
-        for target, beside in waiting.items():
+                os.fsync(descriptor)
+        for target, beside in temporary.items():
             beside.replace(target)
             flush(target.parent)
     except OSError:
-        for beside in waiting.values():
+        for beside in temporary.values():
             with suppress(OSError):
                 beside.unlink(missing_ok=True)
         raise
 
 
 def append_durably(target: Path, text: str) -> None:
-    """Adds text to a regular file, which is made where there is none; on the disk on return.
+    """Appends lines to a regular file, which is created where there is none, and flushes it.
 
     Raises:
-        OSError: it cannot be written; a part of the text may have been.
+        OSError: the lines cannot be written, and nothing is appended.
     """
-    descriptor = os.open(target, _AT_THE_END, 0o666)
+    descriptor = os.open(target, _APPEND, 0o666)
     try:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "it is not a regular file", str(target))
-        data = memoryview(text.encode())
-        while data:
-            data = data[os.write(descriptor, data) :]
-        os.fsync(descriptor)
+        append_lines(descriptor, text)
     finally:
         os.close(descriptor)
     if not status.st_size:
         flush(target.parent)
 
 
-def own_folder(folder: Path) -> None:
-    """Makes a folder of this program where there is none, and none above it.
+def append_lines(descriptor: int, text: str) -> None:
+    """Appends all lines or none to a file open for reading and appending, and flushes it.
+
+    A last line that a crash cut short is ended first, so that it spoils no line but itself.
 
     Raises:
-        OSError: it cannot be made, or a symbolic link stands there, which is not followed.
+        OSError: the lines cannot be written.
+    """
+    size = os.fstat(descriptor).st_size
+    is_cut = size and os.pread(descriptor, 1, size - 1) != b"\n"
+    data = memoryview((f"\n{text}" if is_cut else text).encode())
+    try:
+        while data:
+            data = data[os.write(descriptor, data) :]
+        os.fsync(descriptor)
+    except OSError:
+        with suppress(OSError):
+            os.ftruncate(descriptor, size)
+        raise
+
+
+def make_folder(folder: Path) -> None:
+    """Makes a folder of this program where there is none, but none above it.
+
+    Raises:
+        OSError: the folder cannot be made, or is a symbolic link.
     """
     folder.mkdir(exist_ok=True)
     if folder.is_symlink():
@@ -93,13 +116,13 @@ def own_folder(folder: Path) -> None:
 
 
 def open_plain(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
-    """Opens a regular file for reading. Never waits, as opening a FIFO would; follows no link.
+    """Opens a regular file for reading; never waits, and follows no link.
 
     Raises:
-        OSError: it cannot be opened.
-        ValueError: it is no regular file.
+        OSError: the file cannot be opened.
+        ValueError: it is not a regular file.
     """
-    descriptor = os.open(path, _AS_IT_IS, dir_fd=dir_fd)
+    descriptor = os.open(path, _READ, dir_fd=dir_fd)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise ValueError("it is not a regular file")
@@ -107,11 +130,11 @@ def open_plain(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
 
 
 def read_small_file(path: Path | str) -> str:
-    """The text of a small regular file. Never waits, as opening a FIFO would.
+    """Returns the text of a regular file of at most `MAX_SMALL_FILE` bytes; never waits.
 
     Raises:
-        OSError: it cannot be read.
-        ValueError: it is no regular file, no text, or larger than `MAX_SMALL_FILE`.
+        OSError: the file cannot be read.
+        ValueError: it is not a regular file, not UTF-8, or too large.
     """
     with open_plain(path) as stream:
         data = stream.read(MAX_SMALL_FILE + 1)
@@ -120,11 +143,21 @@ def read_small_file(path: Path | str) -> str:
     return data.decode("utf-8")
 
 
+def is_open_file(path: Path, descriptor: int) -> bool:
+    """Returns whether a path still names the file that is open; True where that is unknown."""
+    try:
+        return os.path.samestat(path.lstat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+
+
 def flush(path: Path) -> None:
-    """Waits until a file's content, or a directory's names, are on the disk.
+    """Waits until a file's content, or the names in a directory, are on the disk.
 
     Raises:
-        OSError: they are not.
+        OSError: they cannot be flushed.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
@@ -134,9 +167,10 @@ def flush(path: Path) -> None:
 
 
 def flush_bags(directory: Path, names: Iterable[str]) -> list[str]:
-    """Flushes closed splits and then the directory that names them.
+    """Flushes closed splits, then the directory that names them.
 
-    Returns a sentence for each that could not be flushed; one that has been deleted is none.
+    Returns:
+        A sentence for each that could not be flushed; a split deleted meanwhile is none.
     """
     faults: list[str] = []
     for path in [*(directory / name for name in names), directory]:

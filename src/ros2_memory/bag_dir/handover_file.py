@@ -1,11 +1,11 @@
 """`handover.json` in a recording's directory: which of its messages count.
 
-While one recording takes over from another both run for some seconds, and what arrives then stands
-in both. The recorder, which alone knows that they overlapped, writes down a cut in publish time: a
-message published before it counts in the old recording, any other in the new one. Publish time is
-the same in both, to the nanosecond; log time is not. Nothing may be inferred from times alone,
-since clocks step: so a cut holds only in the files that were open, and for messages whose log time
-lies in the overlap. Everywhere else every message counts.
+While one recording takes over from another both run for some seconds, and record the same messages.
+The recorder, which alone knows that they overlapped, writes down a cut in publish time: a message
+published before it counts in the old recording, any other in the new one. Publish time is the same
+in both, to the nanosecond; log time is not. Clocks step, so times alone prove nothing: a cut
+applies only in the files that were open, to messages with a log time in the overlap. Everywhere
+else every message counts.
 
     rec_A: {"format": 1, "state": "counts", "clock": "publish", "next": "rec_B",
             "counts_until_ns": 1795150000500000000,
@@ -14,9 +14,9 @@ lies in the overlap. Everywhere else every message counts.
             "counts_from_ns": 1795150000500000000,
             "begin": {"log_from_ns": ..., "log_until_ns": ..., "files": ["rec_B_0.mcap"]}, ...}
 
-Latched messages are received again by every recording, long after they were published. A cut does
-not tell them apart; they are recognised by what they are (topic, publish time, payload), so do not
-apply `Exclusion` to a latched channel.
+Every recording receives latched messages again, long after they were published. A cut cannot
+separate them; they are recognised by topic, publish time and payload, so do not apply `Exclusion`
+to a latched channel.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_all_durably
+from ros2_memory.bag_dir.json_fields import is_integer, strings
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -49,12 +50,12 @@ class Counting(StrEnum):
     """Whether a recording counts."""
 
     COUNTS = "counts"
-    PENDING = "pending"  # its handover is under way: until then the previous one has all of it
-    VOID = "void"  # its handover failed: the previous one, which went on, has all of it
+    PENDING = "pending"  # its handover is not finished: the previous recording still has everything
+    VOID = "void"  # its handover failed: the previous recording went on, and has everything
 
 
 class CutClock(StrEnum):
-    """What the cut was made by. The rule is one: where the two are equal, so are their cuts."""
+    """The clock of the cut; where publish and log times are equal, both give the same cut."""
 
     PUBLISH = "publish"
     LOG = "log"
@@ -62,9 +63,9 @@ class CutClock(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Overlap:
-    """Where a cut holds: in these files, for log times in the half-open `[log_from, log_until)`.
+    """Where a cut applies: in these files, to log times in the half-open `[log_from, log_until)`.
 
-    A bound that is None does not bind: log times of a simulated clock cannot be foreseen.
+    None leaves a side open: log times of a simulated clock cannot be foreseen.
     """
 
     log_from: Ns | None
@@ -74,11 +75,11 @@ class Overlap:
 
 @dataclass(frozen=True, slots=True)
 class Handover:
-    """What `handover.json` says. The default says that everything counts.
+    """The content of `handover.json`; by default everything counts.
 
     `previous` and `next` are names of recordings beside this one. Messages published before
     `counts_from` (in `begin`), and at or after `counts_until` (in `end`), count elsewhere. A
-    `next` without `counts_until` is a handover that was begun and not brought to its end.
+    `next` without `counts_until` is a handover that was begun and not finished.
     """
 
     state: Counting = Counting.COUNTS
@@ -93,11 +94,11 @@ class Handover:
 
     @property
     def hides_all(self) -> bool:
-        """Whether no message of the recording counts."""
+        """Returns whether no message of the recording counts."""
         return self.state is not Counting.COUNTS
 
     def exclusions(self, file_name: str) -> tuple[Exclusion, ...]:
-        """What of one bag file does not count, where `hides_all` is not so; mostly nothing."""
+        """Returns what does not count in one bag file, if not `hides_all`; mostly nothing."""
         found: list[Exclusion] = []
         if self.begin is not None and self.counts_from is not None:
             found += _exclusion(self.begin, file_name, MIN_NS, self.counts_from)
@@ -115,26 +116,26 @@ class Exclusion(NamedTuple):
     log_until: Ns
 
     def excludes(self, publish_time: Ns, log_time: Ns) -> bool:
-        """Whether a message with these times counts in another recording."""
+        """Returns whether a message with these times counts in another recording."""
         return (
             self.publish_from <= publish_time < self.publish_until
             and self.log_from <= log_time < self.log_until
         )
 
 
-_LASTING: Final = frozenset({errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG})
-"""Of a sidecar that cannot be read because of what it is, however often that is tried."""
+_PERMANENT: Final = frozenset({errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG})
+"""Errors that another attempt would meet again."""
 
 
 class HandoverReading(NamedTuple):
-    """What was read, and what was wrong with it: then everything counts."""
+    """The content of a sidecar, and what is wrong with it; then everything counts."""
 
     handover: Handover
     problem: str | None
 
 
 def read_handover(recording: Path) -> HandoverReading:
-    """What the sidecar of a recording says; without one everything counts. Raises nothing."""
+    """Returns the sidecar of a recording; without one everything counts. Raises nothing."""
     try:
         return sure_handover(recording)
     except OSError as error:
@@ -142,18 +143,18 @@ def read_handover(recording: Path) -> HandoverReading:
 
 
 def sure_handover(recording: Path) -> HandoverReading:
-    """As `read_handover`, where it must not be taken for missing because a disk fails.
+    """Returns the sidecar of a recording, as `read_handover`, unless the disk fails.
 
     Raises:
-        OSError: the disk fails, or the machine lacks something.
+        OSError: the disk fails, or a resource is exhausted: there may be a sidecar.
     """
     try:
         text = read_small_file(recording / HANDOVER_FILE)
-        return HandoverReading(_parsed(text), None)
+        return HandoverReading(_parse(text), None)
     except (FileNotFoundError, NotADirectoryError):
         return HandoverReading(Handover(), None)
     except OSError as error:
-        if error.errno not in _LASTING:
+        if error.errno not in _PERMANENT:
             raise
         reason = _unreadable(error)
     # json raises RecursionError for a file of nothing but brackets.
@@ -162,11 +163,11 @@ def sure_handover(recording: Path) -> HandoverReading:
     return HandoverReading(Handover(), reason)
 
 
-def standing_handover(recording: Path) -> Handover:
-    """What the sidecar of a recording says, to be written anew with a change.
+def handover_to_change(recording: Path) -> Handover:
+    """Returns the sidecar of a recording, to be written again with a change.
 
     Raises:
-        RecorderError: the disk fails: what would be written would lose what stands there.
+        RecorderError: the disk fails, so that writing would lose what is there.
     """
     try:
         return sure_handover(recording).handover
@@ -179,16 +180,16 @@ def _unreadable(error: OSError) -> str:
 
 
 def write_handover(recording: Path, handover: Handover) -> None:
-    """Replaces the sidecar at once, and has it on disk when it returns.
+    """Replaces the sidecar atomically and flushes it.
 
     Raises:
-        RecorderError: it cannot be written; the one before stands.
+        RecorderError: it cannot be written; the old one remains.
     """
     write_handovers({recording: handover})
 
 
 def write_handovers(handovers: Mapping[Path, Handover]) -> None:
-    """Replaces the sidecars of recordings, in this order; where the disk is full none of them.
+    """Replaces the sidecars of recordings, in this order; on a full disk none of them.
 
     Raises:
         RecorderError: one cannot be written.
@@ -210,10 +211,10 @@ def _text(handover: Handover) -> str:
         "clock": handover.clock,
         "previous": handover.previous,
         "counts_from_ns": handover.counts_from,
-        "begin": _written(handover.begin),
+        "begin": _overlap_json(handover.begin),
         "next": handover.next,
         "counts_until_ns": handover.counts_until,
-        "end": _written(handover.end),
+        "end": _overlap_json(handover.end),
         "notes": list(handover.notes),
     }
     return json.dumps(content, indent=1) + "\n"
@@ -227,7 +228,7 @@ def _exclusion(overlap: Overlap, file_name: str, start: Ns, stop: Ns) -> list[Ex
     return [Exclusion(start, stop, log_from, log_until)]
 
 
-def _written(overlap: Overlap | None) -> dict[str, object] | None:
+def _overlap_json(overlap: Overlap | None) -> dict[str, object] | None:
     if overlap is None:
         return None
     return {
@@ -237,7 +238,7 @@ def _written(overlap: Overlap | None) -> dict[str, object] | None:
     }
 
 
-def _parsed(text: str) -> Handover:
+def _parse(text: str) -> Handover:
     fields = _object(json.loads(text), "it")
     if fields.get("format") != FORMAT:
         raise ValueError(f"its format is {fields.get('format')!r}, and {FORMAT} is what is known")
@@ -245,12 +246,12 @@ def _parsed(text: str) -> Handover:
         state=Counting(str(fields.get("state"))),
         clock=CutClock(str(fields.get("clock"))),
         previous=_name(fields, "previous"),
-        counts_from=_moment(fields, "counts_from_ns"),
+        counts_from=_nanoseconds(fields, "counts_from_ns"),
         begin=_overlap(fields, "begin"),
         next=_name(fields, "next"),
-        counts_until=_moment(fields, "counts_until_ns"),
+        counts_until=_nanoseconds(fields, "counts_until_ns"),
         end=_overlap(fields, "end"),
-        notes=_strings(fields, "notes"),
+        notes=strings(fields, "notes"),
     )
 
 
@@ -269,20 +270,11 @@ def _name(fields: dict[object, object], key: str) -> str | None:
     return value
 
 
-def _moment(fields: dict[object, object], key: str) -> Ns | None:
+def _nanoseconds(fields: dict[object, object], key: str) -> Ns | None:
     value = fields.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int) or not MIN_NS <= value <= MAX_NS:
-        raise ValueError(f"{key} must be nanoseconds, or null")
-    return value
-
-
-def _strings(fields: dict[object, object], key: str) -> tuple[str, ...]:
-    value = fields.get(key)
-    if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
-        raise ValueError(f"{key} must be a list of strings")
-    return tuple(value)
+    if value is None or is_integer(value):
+        return value
+    raise ValueError(f"{key} must be nanoseconds, or null")
 
 
 def _overlap(fields: dict[object, object], key: str) -> Overlap | None:
@@ -291,5 +283,7 @@ def _overlap(fields: dict[object, object], key: str) -> Overlap | None:
         return None
     inner = _object(value, key)
     return Overlap(
-        _moment(inner, "log_from_ns"), _moment(inner, "log_until_ns"), _strings(inner, "files")
+        _nanoseconds(inner, "log_from_ns"),
+        _nanoseconds(inner, "log_until_ns"),
+        strings(inner, "files"),
     )

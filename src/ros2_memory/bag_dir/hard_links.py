@@ -1,6 +1,6 @@
-"""Which paths are names of one bag: where it was recorded, and the moments that keep it.
+"""Which paths are hard links of one bag: where it was recorded, and the moments that save it.
 
-A moment has a bag under the name that it has in the bag directory, so one name tells the others:
+A saved moment has a bag under its path in the bag directory, so one path gives the others:
 
     rec_A/rec_A_7.mcap
     moments/20261120T043012Z-charging/rec_A/rec_A_7.mcap
@@ -18,52 +18,55 @@ if TYPE_CHECKING:
 
 
 class HardLinks:
-    """The names in moments that are known below one root. Paths are texts, as a scan has them."""
+    """The known links in saved moments of one bag directory. Paths are strings, as scans have them.
 
-    def __init__(self, root: Path) -> None:
-        self._root = f"{str(root).rstrip('/')}/"
+    Attributes:
+        known: the links that were added.
+    """
+
+    def __init__(self, bag_dir: Path) -> None:
+        self._root = f"{str(bag_dir).rstrip('/')}/"
         self._moments = f"{self._root}{MOMENTS_FOLDER}/"
-        self._kept: dict[str, set[str]] = {}
+        self._links: dict[str, set[str]] = {}
         self.known: set[str] = set()
-        """Those in moments."""
 
-    def is_kept(self, path: str) -> bool:
-        """Whether a path lies in the folder of the moments."""
+    def is_saved(self, path: str) -> bool:
+        """Returns whether a path lies in the folder of the saved moments."""
         return path.startswith(self._moments)
 
-    def kept_among(self, paths: Iterable[str]) -> list[str]:
-        """As `is_kept`, of 60,000 at once."""
+    def saved_among(self, paths: Iterable[str]) -> list[str]:
+        """Returns the paths that `is_saved` is true of; for 60,000 at once."""
         moments = self._moments
         return [path for path in paths if path.startswith(moments)]
 
     def recorded_as(self, path: str) -> str:
-        """Where the bag of a moment was recorded; any other path is its own."""
-        if not self.is_kept(path):
+        """Returns where the bag of a saved moment was recorded; any other path as it is."""
+        if not self.is_saved(path):
             return path
         _, slash, name = path[len(self._moments) :].partition("/")
         return f"{self._root}{name}" if slash else path
 
-    def enter(self, path: str) -> None:
-        """A file was found; only those in moments are noted."""
-        if self.is_kept(path):
+    def add(self, path: str) -> None:
+        """Adds a file that was found, if it lies in a saved moment."""
+        if self.is_saved(path):
             self.known.add(path)
-            self._kept.setdefault(self.recorded_as(path), set()).add(path)
+            self._links.setdefault(self.recorded_as(path), set()).add(path)
 
-    def leave(self, path: str) -> None:
-        """A file has gone."""
+    def discard(self, path: str) -> None:
+        """Removes a file that has gone."""
         if path in self.known:
             self.known.discard(path)
             recorded = self.recorded_as(path)
-            self._kept[recorded].discard(path)
-            if not self._kept[recorded]:
-                del self._kept[recorded]
+            self._links[recorded].discard(path)
+            if not self._links[recorded]:
+                del self._links[recorded]
 
     def of(self, path: str) -> Collection[str]:
-        """The names in moments that a bag has, whichever of its names is given."""
-        return self._kept.get(self.recorded_as(path), ()) if self._kept else ()
+        """Returns the links in moments of a bag, given by any of its paths."""
+        return self._links.get(self.recorded_as(path), ()) if self._links else ()
 
     def before(self, path: str) -> list[str]:
-        """The other names that answer rather than this one: where it was recorded, then by name."""
+        """Returns the paths preferred to this link: where the bag was recorded, then by name."""
         if path not in self.known:
             return []
         others = sorted(name for name in self.of(path) if name < path)

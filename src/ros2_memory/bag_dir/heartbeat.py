@@ -1,9 +1,9 @@
-"""`recorder.json` in the bag directory: what the recorder says of itself every few seconds.
+"""`recorder.json` in the bag directory: the recorder's state, written every few seconds.
 
-The recorder writes it, the query server reads it. A reader must expect anything: another version's
-file, half a file, a file of the operator's. So reading never fails; it says why there is nothing.
-A recorder names a recording here before it creates its first file: with a live heartbeat, an open
-file of a recording that is not named counts as left behind by a crash.
+The recorder writes it, the query server reads it. The file may be of another version, cut short, or
+the operator's own, so reading never fails: it returns the reason why there is no heartbeat. The
+recorder lists a recording here before it creates its first file: while the heartbeat is live, an
+open file of a recording that is not listed counts as left behind by a crash.
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
+from ros2_memory.bag_dir.json_fields import is_integer, strings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, ns_from_unix
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 HEARTBEAT_FILE: Final = "recorder.json"
 MAX_INTERVAL_S: Final = 3600.0
-"""A heartbeat that claims to come more rarely is not believed: it would count as live for days."""
+"""A longer interval is refused: such a heartbeat would count as live for days."""
 
-_NO_ROOM: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-_BLOCK: Final = 512  # that is what `st_blocks` counts, whatever the file system
-_PATIENCE_INTERVALS: Final = 3
-_PATIENCE_AT_LEAST_NS: Final[Ns] = 15 * NS_PER_S
+_DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+_BLOCK_BYTES: Final = 512  # the unit of `st_blocks` on every file system
+_LIVE_INTERVALS: Final = 3
+_MIN_LIVE_NS: Final[Ns] = 15 * NS_PER_S
 
 
 class RecorderState(StrEnum):
@@ -38,23 +40,29 @@ class RecorderState(StrEnum):
 
     STARTING = "starting"
     RECORDING = "recording"
-    PAUSED = "paused"  # alive, and not recording on purpose: the disk is nearly full, or gone
+    PAUSED = "paused"  # running, but not recording: the disk is nearly full, or missing
     STOPPING = "stopping"
     STOPPED = "stopped"
 
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """One heartbeat.
+    """One heartbeat of the recorder.
 
-    `updated` and `since` (the start of this state) are wall clock time; it comes every
-    `interval_s` seconds. `recordings` are the recordings being written, as directories relative to
-    the bag directory with forward slashes; at a rotation there are two. `subscribed` are the
-    topics subscribed to, `silent` those among them that have brought no message; `bytes_written`
-    counts all recordings since the recorder started, `restarts` how often it had to start
-    `ros2 bag record` anew. `missing` are the topics that are to be recorded, by name, and that no
-    publisher has offered since then. `age_held` says which bags stay although they are too old by
-    their dates, since the clock is not known to be right; None where there are none.
+    Attributes:
+        pid: process id of the recorder.
+        updated: wall clock time of this heartbeat.
+        state: what the recorder is doing, `since` (wall clock time).
+        recordings: what is being written, as directories relative to the bag directory with
+            forward slashes; two during a rotation.
+        bytes_written: by all recordings since the recorder started.
+        subscribed: topics subscribed to; `silent` ones of them have brought no message.
+        last_error: the last fault, as a sentence.
+        interval_s: seconds between two heartbeats.
+        restarts: how often `ros2 bag record` had to be started again.
+        missing: topics configured by name that no publisher has offered since the start.
+        age_held: which bags stay though their dates are too old, because the clock may be wrong;
+            None where there are none.
     """
 
     pid: int
@@ -72,13 +80,13 @@ class Heartbeat:
     age_held: str | None = None
 
     def is_live(self, now: Ns) -> bool:
-        """Whether the recorder that wrote this is likely to be there still.
+        """Returns whether the recorder that wrote this is likely to be running still.
 
-        That is, it was updated within three intervals (at least 15 s) of `now`, on either side: a
-        heartbeat from the future comes from before the clock was set back.
+        That is within three intervals (at least 15 s) of `updated`, on either side: a heartbeat
+        from the future was written before the clock was set back.
         """
-        patience = max(ns_from_unix(_PATIENCE_INTERVALS * self.interval_s), _PATIENCE_AT_LEAST_NS)
-        return abs(now - self.updated) <= patience
+        limit = max(ns_from_unix(_LIVE_INTERVALS * self.interval_s), _MIN_LIVE_NS)
+        return abs(now - self.updated) <= limit
 
 
 class HeartbeatReading(NamedTuple):
@@ -89,10 +97,10 @@ class HeartbeatReading(NamedTuple):
 
 
 def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
-    """What the recorder last wrote into `recorder.json`, live or not. Raises nothing."""
+    """Returns the last heartbeat in `recorder.json`, live or not. Raises nothing."""
     try:
         text = read_small_file(f"{bag_dir}/{HEARTBEAT_FILE}")
-        return HeartbeatReading(_parsed(text), None)
+        return HeartbeatReading(_parse(text), None)
     except FileNotFoundError:
         return HeartbeatReading(None, f"there is no {HEARTBEAT_FILE}: no recorder has written here")
     except OSError as error:
@@ -103,108 +111,92 @@ def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
 
 
 def write_heartbeat(bag_dir: Path, heartbeat: Heartbeat) -> None:
-    """Replaces `recorder.json` at once: a reader sees the old one or this one, never a part.
+    """Replaces `recorder.json` atomically: a reader sees the old heartbeat or this one.
 
-    On a full disk it is overwritten where it lies, which needs no room: whoever reads it at that
-    very moment may find no heartbeat, and finds this one when it looks again.
+    On a full disk the file is overwritten in place, which needs no free block: a reader at that
+    moment may find no heartbeat, and finds this one at its next look.
 
     Raises:
-        RecorderError: the disk is full, whether it could be overwritten or not; or it cannot be
-            written, and the old one stands.
+        RecorderError: the disk is full, whether the file could be overwritten or not; or the file
+            cannot be written, and the old one remains.
     """
     target = bag_dir / HEARTBEAT_FILE
     text = json.dumps(asdict(heartbeat), allow_nan=False, separators=(",", ":"))
     try:
         write_durably(target, text)
     except OSError as error:
-        if error.errno in _NO_ROOM:
-            _overwritten(target, text.encode())
+        if error.errno in _DISK_FULL:
+            _overwrite_in_place(target, text.encode())
         raise RecorderError(
             f"{target} cannot be written: {error.strerror or error}; "
             "free disk space or correct the permissions of the bag directory"
         ) from error
 
 
-def _overwritten(target: Path, data: bytes) -> bool:
-    """Whether the file could take the text without a further block of the disk."""
+def _overwrite_in_place(target: Path, data: bytes) -> None:
+    """Overwrites a file where its blocks have room for the data; else leaves it as it is."""
     try:
         descriptor = os.open(target, os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
-        return False
+        return
     try:
         status = os.fstat(descriptor)
-        if len(data) > status.st_blocks * _BLOCK:
-            return False
-        # Blanks behind it, in the same write, cover what was there before.
-        return os.pwrite(descriptor, data.ljust(status.st_size), 0) >= len(data)
+        if len(data) <= status.st_blocks * _BLOCK_BYTES:
+            # Padded with blanks, so that one write covers whatever was there before.
+            os.pwrite(descriptor, data.ljust(status.st_size), 0)
     except OSError:
-        return False
+        return
     finally:
         os.close(descriptor)
 
 
-# Read for every question about now, and written every few seconds.
+# Read for every question about the present, and written every few seconds.
 @lru_cache(4)
-def _parsed(text: str) -> Heartbeat:
-    """The heartbeat in the text; a ValueError or TypeError names the key that is wrong."""
+def _parse(text: str) -> Heartbeat:
+    """Returns the heartbeat in a text; a ValueError or TypeError names the wrong key."""
     value: object = json.loads(text)
     if not isinstance(value, dict):
         raise TypeError("it is not a JSON object")
-    fields: dict[object, object] = value
+    # Older recorders did not write these three.
+    fields: dict[object, object] = {"restarts": 0, "missing": [], "age_held": None, **value}
+    for key in Heartbeat.__slots__:
+        if key not in fields:
+            raise ValueError(f"it has no {key}")
+    state = fields["state"]
+    if state not in list(RecorderState):
+        raise ValueError(f"state must be one of {', '.join(RecorderState)}")
     return Heartbeat(
-        pid=_int(fields, "pid", least=1),
-        updated=_int(fields, "updated"),
-        state=_state(fields),
-        recordings=_strings(fields, "recordings"),
-        since=_int(fields, "since"),
-        bytes_written=_int(fields, "bytes_written", least=0),
-        subscribed=_strings(fields, "subscribed"),
-        silent=_strings(fields, "silent"),
+        pid=_integer(fields, "pid", least=1),
+        updated=_integer(fields, "updated"),
+        state=RecorderState(str(state)),
+        recordings=strings(fields, "recordings"),
+        since=_integer(fields, "since"),
+        bytes_written=_integer(fields, "bytes_written", least=0),
+        subscribed=strings(fields, "subscribed"),
+        silent=strings(fields, "silent"),
         last_error=_text_or_null(fields, "last_error"),
-        interval_s=_interval(fields),
-        # Those of an older recorder do not have them.
-        restarts=_int(fields, "restarts", least=0) if "restarts" in fields else 0,
-        missing=_strings(fields, "missing") if "missing" in fields else (),
-        age_held=_text_or_null(fields, "age_held") if "age_held" in fields else None,
+        interval_s=_interval(fields["interval_s"]),
+        restarts=_integer(fields, "restarts", least=0),
+        missing=strings(fields, "missing"),
+        age_held=_text_or_null(fields, "age_held"),
     )
 
 
-def _get(fields: dict[object, object], key: str) -> object:
-    if key not in fields:
-        raise ValueError(f"it has no {key}")
-    return fields[key]
-
-
-def _int(fields: dict[object, object], key: str, *, least: int = MIN_NS) -> int:
-    value = _get(fields, key)
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= MAX_NS:
+def _integer(fields: Mapping[object, object], key: str, *, least: int = MIN_NS) -> int:
+    value = fields[key]
+    if not is_integer(value, least):
         raise ValueError(f"{key} must be an integer from {least} to {MAX_NS}")
     return value
 
 
-def _strings(fields: dict[object, object], key: str) -> tuple[str, ...]:
-    value = _get(fields, key)
-    if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
-        raise ValueError(f"{key} must be a list of strings")
-    return tuple(value)
-
-
-def _text_or_null(fields: dict[object, object], key: str) -> str | None:
-    value = _get(fields, key)
+def _text_or_null(fields: Mapping[object, object], key: str) -> str | None:
+    value = fields[key]
     if value is not None and not isinstance(value, str):
         raise ValueError(f"{key} must be a string or null")
     return value
 
 
-def _state(fields: dict[object, object]) -> RecorderState:
-    value = _get(fields, "state")
-    if value not in list(RecorderState):
-        raise ValueError(f"state must be one of {', '.join(RecorderState)}")
-    return RecorderState(str(value))
-
-
-def _interval(fields: dict[object, object]) -> float:
-    value = _get(fields, "interval_s")
+def _interval(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError("interval_s must be a number of seconds")
     if not 0 < value <= MAX_INTERVAL_S:

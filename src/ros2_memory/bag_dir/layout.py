@@ -1,32 +1,32 @@
-"""What the recorder puts into the bag directory, by name.
+"""The names of files and folders in the bag directory.
 
     bag_dir/
-      recorder.json                heartbeat
-      recorder.lock                who records here
+      recorder.json                heartbeat (see `heartbeat`)
+      recorder.lock                who records here (see `lock`)
       recorder.qos.yaml            how latched topics are subscribed to
       recorder.storage.yaml        how MCAP files are written
-      .ros_log/                    what `ros2` logs of itself: the newest few runs
+      .ros_log/                    logs of `ros2`: the newest few runs
       rec_20261120T043000Z/        one recording: what one `ros2 bag record` wrote
-        rec_20261120T043000Z_0.mcap, ...   its splits (distributions differ in the names)
-        metadata.yaml                      written by it at a clean end
-        handover.json                      which of it counts (see `handover`)
-      latched/carried.mcap         latched messages of bags that were deleted (see `latched`)
-      moments/                     bags that were asked to be kept (see `keepsake`)
-        20261120T043012Z-charging/         one moment
-          moment.json                      what it is called, and when it was
+        rec_20261120T043000Z_0.mcap, ...   its splits (ROS distributions name them differently)
+        metadata.yaml                      written by rosbag2 at a clean end
+        handover.json                      which messages count (see `handover_file`)
+      latched/carried.mcap         latched messages of deleted bags (see `retention.latched_carry`)
+      moments/                     bags that were asked to be saved (see `moment_file`)
+        20261120T043012Z-charging/         one saved moment
+          moment.json                      its label and its time
           rec_20261120T043000Z/            hard links, under the names that the bags have above
-      .episodic/recorded.jsonl     how long was recorded when each recording ended (`recorded_time`)
-      .episodic/requests/          what the query server asks of the recorder (see `mailbox`)
-      .episodic/recordings.jsonl   which recordings the recorder made (see `ownership`)
+      .episodic/recorded.jsonl     recorded time when each recording ended
+      .episodic/requests/          requests of the query server (see `request_queue`)
+      .episodic/recordings.jsonl   recordings that the recorder made (see `own_recordings`)
 
-The two YAML files stand beside the recordings, since a recording's own directory must not exist
-before `ros2 bag record` creates it, and it reads one of them again at every split. They say the
-same for every recording, so there is one pair.
-No name here ends as a bag file's does, so the index passes them by.
+The two YAML files lie beside the recordings: a recording's own directory must not exist before
+`ros2 bag record` creates it, and `ros2 bag record` reads one of them again at every split.
+No name here has the suffix of a bag, so the index ignores these files.
 """
 
 from __future__ import annotations
 
+import re
 import stat
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
@@ -54,18 +54,21 @@ REQUESTS_FOLDER: Final = f"{OWN_FOLDER}/requests"
 LIST_FILE: Final = f"{OWN_FOLDER}/recordings.jsonl"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
-"""What may be deleted from the bag directory itself, besides bags: it is written anew."""
+"""Files in the bag directory itself that may be deleted: the recorder writes them again."""
 RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE})
-"""What stands in a recording's directory besides its bags, and has no meaning without them."""
+"""Files beside the bags of a recording, which mean nothing without them."""
 BAG_KINDS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-"""How the names of bag files end, whichever reader reads them."""
+"""Suffixes of bag files, whichever adapter reads them."""
 COMPRESSED: Final = ".zstd"
+
+_TIME_FORMAT: Final = "%Y%m%dT%H%M%SZ"
+_RECORDING_NAME: Final = re.compile(r"rec_(\d{8}T\d{6}Z)(?:_\d+)?")
 
 
 def has_recorded(bag_dir: Path) -> bool:
-    """Whether a recorder of this program has been at work in a directory, by its own files.
+    """Returns whether a recorder of this program has been at work here, by its own files.
 
-    Only there anything is written beside bags. Nothing behind a link counts.
+    Only there is anything written beside bags. Nothing behind a link counts.
     """
     return any(_is_file(bag_dir / name) for name in (HEARTBEAT_FILE, LIST_FILE))
 
@@ -79,20 +82,32 @@ def _is_file(path: Path) -> bool:
 
 
 def is_carried(bag: Path) -> bool:
-    """Whether a bag file is that of carried messages: it says nothing of what was recorded when."""
+    """Returns whether a bag holds carried messages: it shows nothing of what was recorded when."""
     return bag.name == CARRY_FILE and bag.parent.name == CARRY_FOLDER
 
 
-def recording_name(now: Ns, bag_dir: Path) -> str:
-    """A name for a recording that begins `now`: its UTC time, and a number where that is taken.
+def is_kept_apart(name: str) -> bool:
+    """Returns whether a path in the bag directory is of saved moments or carried messages.
 
-    It is taken where two begin within one second, or where the clock was set back.
+    Those are in no list of recordings.
+    """
+    return name.partition("/")[0] in {MOMENTS_FOLDER, CARRY_FOLDER}
+
+
+def utc_stamp(at: Ns) -> str:
+    """Returns a time as names have it: `20261120T043000Z`."""
+    return datetime.fromtimestamp(at // NS_PER_S, tz=UTC).strftime(_TIME_FORMAT)
+
+
+def recording_name(now: Ns, bag_dir: Path) -> str:
+    """Returns a free name for a recording that begins now: its UTC time, numbered where taken.
+
+    Names are taken when two recordings begin within a second, or the clock was set back.
 
     Raises:
-        RecorderError: what is in the bag directory cannot be told, as on a disk that fails.
+        RecorderError: the bag directory cannot be read, as on a disk that fails.
     """
-    moment = datetime.fromtimestamp(now // NS_PER_S, tz=UTC)
-    stem = f"rec_{moment:%Y%m%dT%H%M%SZ}"
+    stem = f"rec_{utc_stamp(now)}"
     name, number = stem, 1
     try:
         while (bag_dir / name).exists():
@@ -103,16 +118,33 @@ def recording_name(now: Ns, bag_dir: Path) -> str:
     return name
 
 
-def node_name(recording: str) -> str:
-    """A ROS node name of its own for each recording.
+def has_own_name(name: str) -> bool:
+    """Returns whether a directory is named as `recording_name` names recordings."""
+    return _RECORDING_NAME.fullmatch(name) is not None
 
-    Two recorders of one name, as at a handover, would make their services ambiguous.
+
+def named_start(recording: str) -> Ns | None:
+    """Returns when a recording of this program began, by its name; None for any other name."""
+    named = _RECORDING_NAME.fullmatch(recording)
+    if named is None:
+        return None
+    try:
+        start = datetime.strptime(named[1], _TIME_FORMAT).replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return int(start.timestamp()) * NS_PER_S
+
+
+def node_name(recording: str) -> str:
+    """Returns a ROS node name for each recording.
+
+    Two recorders of one name, as during a handover, would make their services ambiguous.
     """
     return f"ros2_memory_{recording}"
 
 
 def bag_kind(name: str) -> str | None:
-    """The kind of bag that a file name claims, one of `BAG_KINDS`, or None, as of hidden files."""
+    """Returns the suffix of a bag's file name, one of `BAG_KINDS`; None for others and hidden."""
     lowered = name.lower()
     if not lowered.endswith(BAG_KINDS) or lowered.startswith("."):
         return None
@@ -120,5 +152,5 @@ def bag_kind(name: str) -> str | None:
 
 
 def other_form(path: str) -> str:
-    """The name of the same bag compressed as a whole, or no longer so."""
+    """Returns the name of the same bag compressed as a whole, or decompressed."""
     return path.removesuffix(COMPRESSED) if path.endswith(COMPRESSED) else path + COMPRESSED

@@ -1,7 +1,7 @@
-"""One recorder for one bag directory: a lock that the system lets go of when its holders die.
+"""One recorder for one bag directory: a lock that the system releases when its holders die.
 
-The recorder's child inherits the lock. A daemon that was killed leaves a child that needs a moment
-to close its files, and nobody may repair or record there before it has.
+The recorder's child inherits the lock. A recorder that was killed leaves a child that needs time to
+close its files, and nobody may repair or record there before it has.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.bag_dir.durable_write import is_open_file
+from ros2_memory.bag_dir.json_fields import is_integer
 from ros2_memory.bag_dir.layout import LOCK_FILE
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-CHILD_PATIENCE_S: Final = 15.0
-"""How long the child of a recorder that died is waited for."""
+CHILD_EXIT_S: Final = 15.0
+"""How long to wait for the child of a recorder that died."""
 _POLL_S: Final = 0.1
 _FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _MAX_TEXT: Final = 1000
@@ -35,12 +37,12 @@ class BagDirLock:
         self._path = path
 
     @classmethod
-    def acquire(cls, bag_dir: Path, patience_s: float = CHILD_PATIENCE_S) -> BagDirLock:
-        """Takes the lock.
+    def acquire(cls, bag_dir: Path, patience_s: float = CHILD_EXIT_S) -> BagDirLock:
+        """Acquires the lock.
 
         Raises:
-            RecorderError: another recorder holds it, and the sentence says who; or there can be
-                no lock in this directory.
+            RecorderError: another recorder holds it, which the sentence names; or no file can be
+                locked in this directory.
         """
         path = bag_dir / LOCK_FILE
         try:
@@ -51,53 +53,55 @@ class BagDirLock:
                 "into recording.bag_dir"
             ) from error
         try:
-            _take(descriptor, path, patience_s)
+            _lock(descriptor, path, patience_s)
         except BaseException:
             os.close(descriptor)
             raise
-        _sign(descriptor)
+        _write_holder(descriptor)
         return cls(descriptor, path)
 
     def renew(self) -> bool:
-        """Takes the lock anew where its file is not in the bag directory any more.
+        """Acquires the lock again where its file is not in the bag directory any more.
 
-        Somebody emptied the directory, moved it, or mounted another: what is locked then keeps
-        nobody out. The descriptor stays the same number, so that children inherit what it holds.
-        Gives whether it was taken anew. Where that cannot be done, this time nothing is. On another
-        disk than before no file is made: it may be what lies below the one that was unmounted.
+        Somebody emptied the directory, moved it, or mounted another: the locked file then keeps
+        nobody out. The number of the descriptor stays, so that children inherit the new lock. On
+        another disk than before no file is made: it may be the mount point of an unmounted disk.
+
+        Returns:
+            Whether the lock was acquired again; also False where that is not possible this time.
 
         Raises:
-            RecorderError: another recorder has taken it since, and the sentence says who.
+            RecorderError: another recorder has acquired it since, which the sentence names.
         """
         try:
-            if not self._path.parent.is_dir() or _is_file(self._path, self.descriptor):
+            if not self._path.parent.is_dir() or is_open_file(self._path, self.descriptor):
                 return False
-            at_home = self._path.parent.stat().st_dev == os.fstat(self.descriptor).st_dev
-            flags = _FLAGS if at_home else _FLAGS & ~os.O_CREAT
+            is_same_disk = self._path.parent.stat().st_dev == os.fstat(self.descriptor).st_dev
+            flags = _FLAGS if is_same_disk else _FLAGS & ~os.O_CREAT
             descriptor = os.open(self._path, flags, 0o644)
         except OSError:
             return False
         try:
-            _take(descriptor, self._path, 0.0)
+            _lock(descriptor, self._path, 0.0)
             os.dup2(descriptor, self.descriptor, inheritable=False)
         finally:
             os.close(descriptor)
-        _sign(self.descriptor)
+        _write_holder(self.descriptor)
         return True
 
     def release(self) -> None:
-        """Lets go of it; the file stays, since deleting it would let two in."""
+        """Releases the lock; the file stays, since deleting it would let two recorders in."""
         with suppress(OSError):
             os.close(self.descriptor)
 
 
-def _take(descriptor: int, path: Path, patience_s: float) -> None:
+def _lock(descriptor: int, path: Path, patience_s: float) -> None:
     give_up = time.monotonic() + patience_s
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            pid, host = _holder(descriptor)
+            pid, host = _read_holder(descriptor)
             alive = host != socket.gethostname() or pid is None or _is_alive(pid)
             if alive or time.monotonic() >= give_up:
                 raise RecorderError(_refusal(path, pid, host, alive=alive)) from None
@@ -121,43 +125,29 @@ def _refusal(path: Path, pid: int | None, host: str | None, *, alive: bool) -> s
     )
 
 
-def _sign(descriptor: int) -> None:
-    """Says in the file who holds it. A full disk keeps nobody from that who may make room."""
+def _write_holder(descriptor: int) -> None:
+    """Writes into the file who holds the lock; a full disk must not stop who may free space."""
     text = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
     with suppress(OSError):
-        # In place, and shortened then: what is there already needs no room.
+        # Written in place and truncated afterwards: existing blocks need no free space.
         written = os.pwrite(descriptor, text.encode(), 0)
         os.ftruncate(descriptor, written)
 
 
-def _is_file(path: Path, descriptor: int) -> bool:
-    """Whether the path still names the open file; also where that cannot be told."""
-    try:
-        return os.path.samestat(path.lstat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
-    except OSError:
-        return True
-
-
-def _holder(descriptor: int) -> tuple[int | None, str | None]:
-    """Who says to hold the lock."""
+def _read_holder(descriptor: int) -> tuple[int | None, str | None]:
+    """Returns the process id and host in the file; None for both where there are none."""
     try:
         value: object = json.loads(os.pread(descriptor, _MAX_TEXT, 0))
     except (OSError, ValueError):
         return None, None
-    if not isinstance(value, dict):
-        return None, None
-    fields: dict[object, object] = value
+    fields: dict[object, object] = value if isinstance(value, dict) else {}
     pid, host = fields.get("pid"), fields.get("host")
-    if not isinstance(pid, int) or isinstance(pid, bool) or not isinstance(host, str):
-        return None, None
-    return pid, host
+    return (pid, host) if is_integer(pid) and isinstance(host, str) else (None, None)
 
 
 def _is_alive(pid: int) -> bool:
     if pid == os.getpid():
-        return False  # a container that was started anew: the one before it had the same number
+        return False  # a restarted container: the process before had the same number
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

@@ -1,12 +1,11 @@
-"""What is asked of the recorder to keep, and what it keeps: `moment.json` in a moment's folder.
+"""Saved moments: a request to save a span of time, and `moment.json` in the moment's folder.
 
-A moment is a span of time with a label. Its bags are hard links: retention may delete where they
-were recorded, and what they hold stays until somebody deletes the moment's folder. Each stands
-under the name that it has in the bag directory (`rec_A/rec_A_7.mcap`), beside a link to the sidecar
-of its recording.
+The bags of a saved moment are hard links: retention may delete the paths where they were recorded,
+and their content stays until somebody deletes the moment's folder. Each lies under the path that it
+has in the bag directory (`rec_A/rec_A_7.mcap`), beside a link to the sidecar of its recording.
 
-`moment.json` is there before the first link. While bags of the moment are still being written it
-says `pending`, so whatever stops the recorder, the next one goes on with it.
+`moment.json` exists before the first link. While bags of the moment are still being written it says
+`pending`, so that a restarted recorder goes on with it.
 """
 
 from __future__ import annotations
@@ -16,13 +15,13 @@ import re
 import unicodedata
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, bag_kind
+from ros2_memory.bag_dir.json_fields import is_integer
+from ros2_memory.bag_dir.layout import MOMENT_FILE, MOMENTS_FOLDER, bag_kind, utc_stamp
 from ros2_memory.core import directories
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -31,16 +30,19 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
 
 FORMAT: Final = 1
-LONGEST_LABEL: Final = 120
-MOST_MOMENTS: Final = 1000
-"""More than an operator would look through, and each is a folder that every look lists."""
-_LONGEST_SLUG: Final = 40
-_UNSEEN: Final = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
-"""Unicode's categories of what controls text or is none: line ends, directions, half characters."""
+MAX_LABEL_CHARS: Final = 120
+MAX_MOMENTS: Final = 1000
+"""More than an operator would look through, and each is a folder that every scan lists."""
+_MAX_SLUG_CHARS: Final = 40
+_INVISIBLE: Final = frozenset({"Cc", "Cf", "Co", "Cs", "Cn", "Zl", "Zp"})
+"""Unicode categories of line ends, directions, surrogates and other controls."""
 
 
 class SaveRequest(NamedTuple):
-    """What is asked for: to keep what was recorded from `start` to `end` (inclusive)."""
+    """A request to save what was recorded from `start` to `end` (log times, inclusive).
+
+    `number` is its random id, `asked` the wall clock time of the request.
+    """
 
     number: str
     label: str
@@ -48,13 +50,24 @@ class SaveRequest(NamedTuple):
     end: Ns
     asked: Ns
 
+    def to_json(self) -> dict[str, object]:
+        """Returns the request as both kinds of file hold it."""
+        return {
+            "format": FORMAT,
+            "request": self.number,
+            "label": self.label,
+            "start_ns": self.start,
+            "end_ns": self.end,
+            "requested_ns": self.asked,
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class SavedMoment:
-    """A moment, as its file says.
+    """A moment as its file describes it.
 
-    `number` is that of the wish. `pending`: it waits for bags that are still being written.
-    `missing` are sentences on what of it is not kept.
+    `pending`: it waits for bags that are still being written. `missing` are sentences on parts that
+    were not saved. The other fields are those of its request.
     """
 
     number: str
@@ -66,39 +79,40 @@ class SavedMoment:
     missing: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, wish: SaveRequest) -> SavedMoment:
-        """A moment of which nothing is kept yet."""
-        return cls(*wish)
+    def of(cls, request: SaveRequest) -> SavedMoment:
+        """Returns a moment of which nothing is saved yet."""
+        return cls(*request)
 
 
 class StoredMoment(NamedTuple):
-    """A moment in its folder; `files` are its bags' links: by inode their sizes."""
+    """A saved moment and its folder; `files` are the sizes of its bags by inode."""
 
     folder: Path
-    keepsake: SavedMoment
+    moment: SavedMoment
     files: Mapping[int, int]
 
 
 def fault_of_label(label: str) -> str | None:
-    """What is wrong with a label: `is ...`; None where nothing is."""
+    """Returns what is wrong with a label, as `is ...`; None where it is valid."""
     if not label.strip():
         return "is empty"
-    if len(label) > LONGEST_LABEL:
-        return f"is longer than {LONGEST_LABEL} characters"
-    if any(unicodedata.category(char) in _UNSEEN for char in label):
+    if len(label) > MAX_LABEL_CHARS:
+        return f"is longer than {MAX_LABEL_CHARS} characters"
+    if any(unicodedata.category(char) in _INVISIBLE for char in label):
         return "has characters that cannot be seen, such as line ends"
     return None
 
 
-def folder_name(wish: SaveRequest) -> str:
-    """What a moment's folder is called: when it was asked for (UTC), and its label in ASCII."""
-    plain = unicodedata.normalize("NFKD", wish.label).encode("ascii", "ignore").decode().lower()
-    slug = "-".join(re.findall(r"[a-z0-9]+", plain))[:_LONGEST_SLUG].strip("-") or "moment"
-    return f"{datetime.fromtimestamp(wish.asked // NS_PER_S, tz=UTC):%Y%m%dT%H%M%SZ}-{slug}"
+def folder_name(request: SaveRequest) -> str:
+    """Returns the name of a moment's folder: the time of the request (UTC), and its label."""
+    ascii_label = unicodedata.normalize("NFKD", request.label).encode("ascii", "ignore").decode()
+    words = re.findall(r"[a-z0-9]+", ascii_label.lower())
+    slug = "-".join(words)[:_MAX_SLUG_CHARS].strip("-") or "moment"
+    return f"{utc_stamp(request.asked)}-{slug}"
 
 
-def make_folder(bag_dir: Path, wish: SaveRequest) -> Path:
-    """A new folder for a moment, with a number behind its name where that is taken.
+def make_moment_folder(bag_dir: Path, request: SaveRequest) -> Path:
+    """Makes a folder for a moment, numbered where its name is taken.
 
     Raises:
         OSError: it cannot be made.
@@ -107,8 +121,8 @@ def make_folder(bag_dir: Path, wish: SaveRequest) -> Path:
     if moments.is_symlink():
         raise OSError(f"{moments} is a symbolic link, which is not followed: remove it")
     moments.mkdir(exist_ok=True)
-    name = folder_name(wish)
-    for number in range(1, MOST_MOMENTS + 2):
+    name = folder_name(request)
+    for number in range(1, MAX_MOMENTS + 2):
         folder = moments / (name if number == 1 else f"{name}_{number}")
         try:
             folder.mkdir()
@@ -119,46 +133,42 @@ def make_folder(bag_dir: Path, wish: SaveRequest) -> Path:
 
 
 def moments_of(bag_dir: Path) -> Path:
-    """The folder of the moments."""
+    """Returns the folder of the saved moments."""
     return bag_dir / MOMENTS_FOLDER
 
 
-def write_saved_moment(folder: Path, keepsake: SavedMoment) -> None:
-    """Replaces a moment's file at once, and has it on the disk.
+def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
+    """Replaces a moment's file atomically and flushes it.
 
     Raises:
         OSError: it cannot be written.
     """
+    request = SaveRequest(moment.number, moment.label, moment.start, moment.end, moment.asked)
     content = {
-        "format": FORMAT,
-        "request": keepsake.number,
-        "label": keepsake.label,
-        "start_ns": keepsake.start,
-        "end_ns": keepsake.end,
-        "requested_ns": keepsake.asked,
-        "pending": keepsake.pending,
-        "complete": not (keepsake.pending or keepsake.missing),
-        "missing": list(keepsake.missing),
+        **request.to_json(),
+        "pending": moment.pending,
+        "complete": not (moment.pending or moment.missing),
+        "missing": list(moment.missing),
     }
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
     write_durably(folder / MOMENT_FILE, text)
 
 
 def read_saved_moment(folder: Path) -> SavedMoment | None:
-    """What a moment's file says; None where there is none, or it says something else."""
+    """Returns the moment of a folder; None where there is no file, or no valid one."""
     try:
         fields = json_object(read_small_file(folder / MOMENT_FILE))
-        wish = save_request_from(fields)
+        request = save_request_from(fields)
         pending, missing = fields.get("pending"), fields.get("missing")
         if not isinstance(pending, bool) or not isinstance(missing, list):
             return None
-        return SavedMoment(*wish, pending, tuple(str(each) for each in missing))
+        return SavedMoment(*request, pending, tuple(str(each) for each in missing))
     except (OSError, ValueError, RecursionError):
         return None
 
 
 def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
-    """The moments that are kept, in the order of their folders' names.
+    """Yields the saved moments in the order of their folders' names.
 
     Raises:
         OSError: the folder of the moments cannot be listed.
@@ -171,16 +181,16 @@ def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
     except (FileNotFoundError, NotADirectoryError):
         return
     for folder in folders:
-        keepsake = None if folder.is_symlink() else read_saved_moment(folder)
-        if keepsake is not None:
-            yield StoredMoment(folder, keepsake, _files_in(folder))
+        moment = None if folder.is_symlink() else read_saved_moment(folder)
+        if moment is not None:
+            yield StoredMoment(folder, moment, _bag_sizes(folder))
 
 
 def json_object(text: str) -> dict[object, object]:
-    """The object that a JSON text says, of a format that is known.
+    """Returns the JSON object in a text.
 
     Raises:
-        ValueError: it says none.
+        ValueError: there is none, or it is of an unknown format.
     """
     value: object = json.loads(text)
     if not isinstance(value, dict) or value.get("format") != FORMAT:
@@ -189,36 +199,36 @@ def json_object(text: str) -> dict[object, object]:
 
 
 def save_request_from(fields: Mapping[object, object]) -> SaveRequest:
-    """The wish in an object.
+    """Returns the request in an object.
 
     Raises:
-        ValueError: it is none.
+        ValueError: a key is missing or wrong.
     """
     number, label = fields.get("request"), fields.get("label")
     if not isinstance(number, str) or not re.fullmatch(r"[0-9a-f]{32}", number):
         raise ValueError("request must be 32 hexadecimal digits")
     if not isinstance(label, str) or fault_of_label(label):
         raise ValueError("label must be a text of one line")
-    start, end, asked = (_moment(fields, f"{key}_ns") for key in ("start", "end", "requested"))
+    start, end, asked = (_nanoseconds(fields, f"{key}_ns") for key in ("start", "end", "requested"))
     if end < start:
         raise ValueError("end_ns must not be before start_ns")
     return SaveRequest(number, label, start, end, asked)
 
 
-def _moment(fields: Mapping[object, object], key: str) -> Ns:
+def _nanoseconds(fields: Mapping[object, object], key: str) -> Ns:
     value = fields.get(key)
-    if isinstance(value, bool) or not isinstance(value, int) or not MIN_NS < value < MAX_NS:
+    if not is_integer(value, MIN_NS + 1, MAX_NS - 1):
         raise ValueError(f"{key} must be nanoseconds")
     return value
 
 
-def _files_in(folder: Path) -> dict[int, int]:
-    """The bags below a moment's folder, by inode, with their sizes."""
-    files: dict[int, int] = {}
+def _bag_sizes(folder: Path) -> dict[int, int]:
+    """Returns the sizes of the bags below a folder, by inode."""
+    sizes: dict[int, int] = {}
     for _, entries in directories.walk(folder):
         for entry in entries:
-            if bag_kind(entry.name) and not entry.name.startswith("."):
+            if bag_kind(entry.name):
                 with suppress(FileNotFoundError):
                     status = entry.stat(follow_symlinks=False)
-                    files[status.st_ino] = status.st_size
-    return files
+                    sizes[status.st_ino] = status.st_size
+    return sizes

@@ -1,6 +1,6 @@
 """Which recordings in a bag directory its recorder made: `.episodic/recordings.jsonl`.
 
-Only those are deleted. One JSON object a line:
+Only those are ever deleted. The file has one JSON object a line:
 
     {"bag_dir_id": "5f0c..."}                                       random, of this bag directory
     {"recording": "rec_A"}                                          before its child is started
@@ -8,15 +8,12 @@ Only those are deleted. One JSON object a line:
     {"recording": "old/run1", "inode": 8, "adopted": true}          `ros2-memory adopt`, or an
                                                                     upgrade from before the list
 
-The last line on a name counts. A directory is the recorder's own while it lies under its name and
-is the very directory that was listed. An inode number alone does not prove that: ext4 gives a
-directory that was deleted and restored the number that it had. So the inode's generation is listed
-too, which ext4, XFS, Btrfs and F2FS choose anew for each (FS_IOC_GETVERSION); elsewhere the number
-has to do. No clock is asked.
+The last line of a recording counts. A directory is the recorder's own while it lies under its name
+and is the very directory that was listed (see `directory_identity`).
 
-Lines are appended and flushed, so that a power cut leaves at most a part of the last one, which no
-reader takes for a line and the next writer ends. Writers take turns by `flock`. Once most lines are
-of recordings that have gone the list is written anew without them.
+Lines are appended and flushed, so a power cut leaves at most a part of the last line, which readers
+ignore and the next writer ends. Writers take turns by `flock`. Once most lines are of recordings
+that have gone, the list is written again without them.
 """
 
 from __future__ import annotations
@@ -26,7 +23,6 @@ import json
 import os
 import re
 import stat
-import struct
 import threading
 import time
 import uuid
@@ -37,10 +33,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
-from ros2_memory.bag_dir.durable_write import flush, open_plain, write_durably
+from ros2_memory.bag_dir.directory_identity import Identity, identity_of
+from ros2_memory.bag_dir.durable_write import (
+    append_lines,
+    flush,
+    is_open_file,
+    open_plain,
+    write_durably,
+)
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import CARRY_FOLDER, LIST_FILE, MOMENTS_FOLDER, bag_kind
+from ros2_memory.bag_dir.json_fields import is_integer
+from ros2_memory.bag_dir.layout import LIST_FILE, bag_kind, has_own_name
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
@@ -48,7 +52,7 @@ if TYPE_CHECKING:
     from typing import TypeAlias
 
     CustomDataOf: TypeAlias = Callable[[Path], Mapping[str, str] | None]
-    """What `ros2 bag record` embedded in a bag file; None where that cannot be known.
+    """Returns what `ros2 bag record` embedded in a bag file; None where that is unreadable.
 
     May raise OSError.
     """
@@ -57,80 +61,26 @@ RECORDED_BY: Final = "recorded_by"
 BAG_DIR_ID: Final = "bag_dir_id"
 PROGRAM: Final = "ros2-memory"
 
-_NAMED_BY_TIME: Final = re.compile(r"rec_\d{8}T\d{6}Z(_\d+)?")
-_GETVERSION: Final = 0x80087601  # _IOR('v', 1, long), linux/fs.h
-_GENERATION: Final = struct.Struct("=I4x")  # it fills the first 4 bytes of that long
-_LARGEST: Final = 64 << 20
+_MAX_BYTES: Final = 64 << 20
 _SPARE_LINES: Final = 1000
-_NAMED: Final = 5
-_PATIENCE_S: Final = 2.0
+_MAX_NAMED: Final = 5
+_LOCK_WAIT_S: Final = 2.0
 _POLL_S: Final = 0.01
 _APPEND: Final = os.O_RDWR | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-def has_own_name(name: str) -> bool:
-    """Whether a directory is named as this program names a recording."""
-    return _NAMED_BY_TIME.fullmatch(name) is not None
-
-
-class Identity(NamedTuple):
-    """Which directory a name means on its disk; `generation` is None where none is known."""
-
-    inode: int
-    generation: int | None = None
-
-    def is_that_of(self, listed: Identity | None) -> bool:
-        """Whether this is the directory that was listed."""
-        if listed is None or self.inode != listed.inode:
-            return False
-        return listed.generation is None or self.generation == listed.generation
-
-
-def identity_of(directory: Path | str) -> Identity | None:
-    """The identity of a directory; None where there is none of that name, or a link.
-
-    Raises:
-        OSError: it cannot be looked at.
-    """
-    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
-    try:
-        if stat.S_ISLNK(os.lstat(directory).st_mode):
-            return None
-        descriptor = os.open(directory, flags)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    try:
-        return identity_at(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def identity_at(descriptor: int) -> Identity:
-    """The identity of an open directory."""
-    return Identity(os.fstat(descriptor).st_ino, _generation(descriptor))
-
-
-def _generation(descriptor: int) -> int | None:
-    try:
-        (generation,) = _GENERATION.unpack(fcntl.ioctl(descriptor, _GETVERSION, bytes(8)))
-    except OSError:  # a file system that has none, as tmpfs
-        return None
-    return int(generation)
-
-
 class _Entry(NamedTuple):
-    """One line on a recording."""
+    """What the list holds of one recording; `identity` is None until its child has made it."""
 
-    name: str
     identity: Identity | None = None
     adopted: bool = False
 
 
 @dataclass(slots=True)
-class _Content:
-    """What the lines of a list say. `damaged` counts lines that say nothing."""
+class _List:
+    """The content of a list. `damaged` counts lines that mean nothing."""
 
     bag_dir_id: str | None = None
     entries: dict[str, _Entry] = field(default_factory=dict)
@@ -138,8 +88,8 @@ class _Content:
     damaged: int = 0
 
     @classmethod
-    def of(cls, data: bytes) -> _Content:
-        """The content of a file, whatever stands in it."""
+    def parse(cls, data: bytes) -> _List:
+        """Returns the content of a file, whatever it holds."""
         content = cls()
         for line in filter(None, data.split(b"\n")):
             content.lines += 1
@@ -151,103 +101,97 @@ class _Content:
                 content.damaged += 1
         return content
 
-    def take(self, entry: _Entry) -> None:
-        """Takes in one entry, in place of an earlier one of that name."""
-        self.entries[entry.name] = entry
-
-    def text(self) -> str:
-        """All of it as lines, each name once."""
-        return (
-            json.dumps({BAG_DIR_ID: self.bag_dir_id})
-            + "\n"
-            + "".join(map(_line, self.entries.values()))
-        )
+    def to_text(self) -> str:
+        """Returns the content as lines, each recording once."""
+        return json.dumps({BAG_DIR_ID: self.bag_dir_id}) + "\n" + _lines(self.entries)
 
     def _take_line(self, fields: Mapping[object, object]) -> None:
-        number, name = fields.get(BAG_DIR_ID), fields.get("recording")
-        if isinstance(number, str) and re.fullmatch(r"[0-9a-f]{8,64}", number):
-            self.bag_dir_id = number
+        bag_dir_id, name = fields.get(BAG_DIR_ID), fields.get("recording")
+        if isinstance(bag_dir_id, str) and re.fullmatch(r"[0-9a-f]{8,64}", bag_dir_id):
+            self.bag_dir_id = bag_dir_id
             return
-        if not isinstance(name, str) or not _may_be_listed(name):
+        # The name must be of a directory below the bag directory.
+        if (
+            not isinstance(name, str)
+            or "\0" in name
+            or {"", ".", ".."}.intersection(name.split("/"))
+        ):
             raise ValueError("it names no recording")
         inode, generation = _number(fields, "inode"), _number(fields, "generation")
         identity = None if inode is None else Identity(inode, generation)
-        self.take(_Entry(name, identity, adopted=fields.get("adopted") is True))
+        self.entries[name] = _Entry(identity, adopted=fields.get("adopted") is True)
 
 
 def _number(fields: Mapping[object, object], key: str) -> int | None:
     value = fields.get(key)
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int)):
-        raise ValueError(f"{key} is no whole number")
-    return value
+    if value is None or is_integer(value):
+        return value
+    raise ValueError(f"{key} is no whole number")
 
 
-def _may_be_listed(name: str) -> bool:
-    """Whether a name is that of a directory below the bag directory, where recordings may lie."""
-    parts = name.split("/")
-    return "\0" not in name and not {"", ".", ".."}.intersection(parts)
-
-
-def _line(entry: _Entry) -> str:
-    fields: dict[str, str | int | bool] = {"recording": entry.name}
-    if entry.identity is not None:
-        fields["inode"] = entry.identity.inode
-        if entry.identity.generation is not None:
-            fields["generation"] = entry.identity.generation
-    if entry.adopted:
-        fields["adopted"] = True
-    return json.dumps(fields) + "\n"
+def _lines(entries: Mapping[str, _Entry]) -> str:
+    lines = []
+    for name, (identity, adopted) in entries.items():
+        fields: dict[str, str | int] = {"recording": name}
+        if identity is not None:
+            fields["inode"] = identity.inode
+            if identity.generation is not None:
+                fields["generation"] = identity.generation
+        if adopted:
+            fields["adopted"] = True
+        lines.append(json.dumps(fields) + "\n")
+    return "".join(lines)
 
 
 class OwnRecordings:
     """The list of one bag directory. Safe for several threads at once.
 
-    Whoever only asks writes nothing. The recorder's own is told of every recording, and writes the
-    list anew where it was deleted meanwhile.
+    Queries write nothing. The recorder's own object is notified of every recording, and writes the
+    list again where it was deleted meanwhile.
     """
 
     def __init__(self, bag_dir: Path) -> None:
         self._bag_dir = bag_dir
         self._path = bag_dir / LIST_FILE
         self._lock = threading.RLock()
-        self._content = _Content()
+        self._list = _List()
         self._stamp: tuple[int, ...] | None = None
-        self._most_lines = _SPARE_LINES
-        self._told_damaged = 0
+        self._max_lines = _SPARE_LINES
+        self._reported_damaged = 0
 
     def exists(self) -> bool:
-        """Whether there is a list.
+        """Returns whether there is a list.
 
         Raises:
-            OSError: it is there and cannot be read.
+            OSError: there is one that cannot be read.
         """
         with self._lock:
             return self._read()
 
     def names(self) -> Collection[str]:
-        """The recordings that are listed, whether their directories are those that were listed.
+        """Returns the listed recordings, whatever lies under their names.
 
-        What was known stays known where the list has been deleted.
+        Those that were known remain known if the list is deleted.
 
         Raises:
-            OSError: the list is there and cannot be read.
+            OSError: the list cannot be read.
         """
         with self._lock:
             self._read()
-            return self._content.entries.keys()
+            return self._list.entries.keys()
 
     def owns(self, directory: Path) -> bool:
-        """Whether a directory is a recording of this bag directory's recorder.
+        """Returns whether a directory is a recording of this bag directory's recorder.
 
-        One that may not be looked into is none.
+        One that must not be opened is none.
 
         Raises:
-            OSError: the list is there and cannot be read.
+            OSError: the list cannot be read.
         """
         with self._lock:
             self._read()
             name = self.name_of(directory)
-            if name not in self._content.entries:
+            if name not in self._list.entries:
                 return False
             try:
                 identity = identity_of(directory)
@@ -256,132 +200,80 @@ class OwnRecordings:
             return self.lists(name, identity)
 
     def lists(self, name: str, identity: Identity | None) -> bool:
-        """Whether the list, as it was last read, has a directory of this identity by this name."""
-        entry = self._content.entries.get(name)
-        return entry is not None and identity is not None and identity.is_that_of(entry.identity)
+        """Returns whether the list, as last read, has a directory of this name and identity."""
+        entry = self._list.entries.get(name)
+        if entry is None or entry.identity is None or identity is None:
+            return False
+        return identity.matches(entry.identity)
 
     def name_of(self, directory: Path | str) -> str:
-        """The name of a directory in the list; empty where it lies elsewhere."""
+        """Returns the name of a directory in the list; empty where it lies elsewhere."""
         root, path = f"{self._bag_dir}/", str(directory)
         return path.removeprefix(root) if path.startswith(root) else ""
 
     @property
     def stamp(self) -> object:
-        """Another one when the list has been read anew."""
+        """A value that changes when the list is read again."""
         return self._stamp
 
     @property
     def bag_dir_id(self) -> str | None:
         """The random id of this bag directory, which recordings carry; None before there is one."""
-        return self._content.bag_dir_id
-
-    def former(self, custom_data: CustomDataOf) -> tuple[dict[str, Identity], dict[str, str]]:
-        """The recordings that a version from before the list made here, which are adopted once.
-
-        Those lie in the bag directory itself, under a name that this program gives, and either
-        `recorder.json` or a `handover.json` names them, or every file of them that holds a byte
-        carries what our child embedded. One that carries an id is of a version with the list: it
-        was restored or copied, or the list has gone. So one is not adopted either of which a file
-        cannot be read so far: it may carry an id.
-
-        Returns:
-            The directories of those, by name, and why others of such a name are not among them.
-
-        Raises:
-            OSError: the bag directory cannot be listed.
-        """
-        folders = [
-            each
-            for each in sorted(self._bag_dir.iterdir())
-            if has_own_name(each.name) and not each.is_symlink() and each.is_dir()
-        ]
-        heartbeat = read_heartbeat(self._bag_dir).heartbeat
-        named = set(heartbeat.recordings if heartbeat else ())
-        for folder in folders:
-            handover = read_handover(folder).handover
-            named.update(name for name in (handover.previous, handover.next) if name)
-        found: dict[str, Identity] = {}
-        left: dict[str, str] = {}
-        for folder in folders:
-            try:
-                identity = identity_of(folder)
-                reason = _why_not_former(folder, custom_data, is_named=folder.name in named)
-            except OSError as error:
-                left[folder.name] = f"it cannot be looked into: {error.strerror or error}"
-                continue
-            if reason is not None:
-                left[folder.name] = reason
-            elif identity is not None:
-                found[folder.name] = identity
-        return found, left
+        return self._list.bag_dir_id
 
     def suppose(self, custom_data: CustomDataOf) -> None:
-        """Knows, where there is no list yet, the recordings that `claim` would adopt.
+        """Assumes, where there is no list yet, the recordings that `claim` would adopt.
 
         Raises:
             OSError: the list cannot be read, or the bag directory cannot be listed.
         """
         with self._lock:
             if not self._read():
-                found, _ = self.former(custom_data)
-                for name, identity in found.items():
-                    self._content.take(_Entry(name, identity, adopted=True))
+                self._list.entries.update(_adopted(_find_former(self._bag_dir, custom_data)[0]))
 
     # What follows is for the recorder, which holds the lock of the bag directory, and for
     # `ros2-memory adopt`.
 
     def claim(self, custom_data: CustomDataOf) -> None:
-        """Puts the list in order before anything is recorded.
+        """Brings the list up to date before anything is recorded.
 
-        Where there is none it is made, with the recordings of versions before it. Else entries of
-        recordings that have gone are dropped, and those that a kill left without a directory are
-        completed where every file that holds a byte carries what our child embedded, with the id of
-        this bag directory. What cannot be written is known all the same, so that room can be made
-        on a full disk; the next recording writes it.
+        Without a list it makes one, with the recordings of versions from before lists. Else it
+        drops entries of recordings that have gone, and completes those that a kill left without a
+        directory, if every file there that holds a byte carries what our child embeds, with the id
+        of this bag directory. What cannot be written is known all the same, so that space can be
+        freed on a full disk; the next recording writes it.
 
         Raises:
             RecorderError: the list cannot be read, or the bag directory cannot be listed.
         """
         with self._lock:
             try:
-                there = self._read()
-                adopted, left = ({}, {}) if there else self.former(custom_data)
+                exists = self._read()
+                former, left = ({}, {}) if exists else _find_former(self._bag_dir, custom_data)
             except OSError as error:
-                raise _unwritable(self._path, error, "read") from error
-            content = self._content
-            completed = self._completed(custom_data)
-            for name, identity in adopted.items():
-                content.take(_Entry(name, identity, adopted=True))
-            for name, identity in completed.items():
-                content.take(_Entry(name, identity))
-            if adopted:
-                names = sorted(adopted)[:_NAMED]
-                _log.info("recordings_adopted", recordings=len(adopted), names=names)
-            if left:
-                reasons = [f"{name}: {left[name]}" for name in sorted(left)[:_NAMED]]
-                _log.warning(
-                    "recordings_not_adopted", recordings=len(left), reasons=reasons, advice=_ADVICE
-                )
-            for name, entry in content.entries.items():
-                if entry.identity is None and (self._bag_dir / name).is_dir():
-                    _log.warning("recording_not_claimed", recording=name, reason=_UNCLAIMED)
-            if there and not completed and not self._gone(content.entries) and content.bag_dir_id:
+                raise self._failure(error, "read") from error
+            completed = self._find_completed(custom_data)
+            self._list.entries.update(_adopted(former))
+            self._list.entries.update(completed)
+            self._report_claim(former, left)
+            entries = self._list.entries
+            if exists and not completed and not self._gone(entries) and self.bag_dir_id:
                 return
             try:
                 self._rewrite()
             except OSError as error:
-                _log.error("recordings_not_listed", reason=str(_unwritable(self._path, error)))
+                _log.error("recordings_not_listed", reason=str(self._failure(error)))
 
     def begin(self, name: str) -> None:
-        """Lists a recording that is about to be begun; that is on the disk when this returns.
+        """Lists a recording that is about to begin, and flushes the list.
 
         Raises:
-            RecorderError: it cannot be listed: then it must not be begun.
+            RecorderError: it cannot be listed: then it must not begin.
         """
-        self._list([_Entry(name)])
+        self._add({name: _Entry()})
 
     def complete(self, name: str) -> bool:
-        """Adds to its entry which directory the child made; False while it has made none.
+        """Lists which directory the child made for a recording; False while there is none.
 
         Raises:
             RecorderError: it cannot be written.
@@ -392,7 +284,7 @@ class OwnRecordings:
             raise RecorderError(f"{self._bag_dir / name}: {error.strerror or error}") from error
         if identity is None:
             return False
-        self._list([_Entry(name, identity)])
+        self._add({name: _Entry(identity)})
         return True
 
     def adopt(self, identities: Mapping[str, Identity]) -> None:
@@ -401,32 +293,39 @@ class OwnRecordings:
         Raises:
             RecorderError: they cannot be listed.
         """
-        self._list([_Entry(name, each, adopted=True) for name, each in sorted(identities.items())])
+        self._add(_adopted(dict(sorted(identities.items()))))
 
-    def _list(self, entries: Collection[_Entry]) -> None:
-        try:
-            with self._lock:
-                self._append(entries)
-        except OSError as error:
-            raise _unwritable(self._path, error) from error
+    def _report_claim(self, former: Collection[str], left: Mapping[str, str]) -> None:
+        if former:
+            names = sorted(former)[:_MAX_NAMED]
+            _log.info("recordings_adopted", recordings=len(former), names=names)
+        if left:
+            reasons = [f"{name}: {left[name]}" for name in sorted(left)[:_MAX_NAMED]]
+            _log.warning(
+                "recordings_not_adopted", recordings=len(left), reasons=reasons, advice=_ADVICE
+            )
+        for name, entry in self._list.entries.items():
+            if entry.identity is None and (self._bag_dir / name).is_dir():
+                _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
 
-    def _completed(self, custom_data: CustomDataOf) -> dict[str, Identity]:
-        """Of the entries without a directory those of which one is there that our child made."""
-        found: dict[str, Identity] = {}
-        for name, entry in self._content.entries.items():
-            if entry.identity is None:
-                with suppress(OSError):
-                    identity = identity_of(self._bag_dir / name)
-                    if identity is None:
-                        continue
-                    files = _held(self._bag_dir / name)
-                    embedded = [custom_data(path) or {} for path in files]
-                    if _all_ours(embedded, self._content.bag_dir_id):
-                        found[name] = identity
+    def _find_completed(self, custom_data: CustomDataOf) -> dict[str, _Entry]:
+        """Returns the entries without a directory whose directory our child made after all."""
+        ours = {RECORDED_BY: PROGRAM, BAG_DIR_ID: self.bag_dir_id}
+        found: dict[str, _Entry] = {}
+        for name, entry in self._list.entries.items():
+            with suppress(OSError):
+                identity = None if entry.identity else identity_of(self._bag_dir / name)
+                if identity is None:
+                    continue
+                embedded = [
+                    custom_data(path) or {} for path in _files_with_data(self._bag_dir / name)
+                ]
+                if embedded and all(ours.items() <= each.items() for each in embedded):
+                    found[name] = _Entry(identity)
         return found
 
     def _gone(self, names: Iterable[str]) -> list[str]:
-        """The recordings of which nothing lies in the bag directory any more."""
+        """Returns the recordings of which nothing lies in the bag directory any more."""
         gone = []
         for name in names:
             try:
@@ -438,7 +337,7 @@ class OwnRecordings:
         return gone
 
     def _read(self) -> bool:
-        """Takes in what the file says, where it changed; whether there is one."""
+        """Reads the file if it has changed; returns whether there is one."""
         if self._path.parent.is_symlink():
             raise OSError(f"{self._path.parent} is a symbolic link, which is not followed")
         try:
@@ -447,67 +346,73 @@ class OwnRecordings:
             if stamp == self._stamp:
                 return True
             with open_plain(self._path) as stream:
-                data = stream.read(_LARGEST)
+                data = stream.read(_MAX_BYTES)
         except (FileNotFoundError, NotADirectoryError):
             self._stamp = None
             return False
         except ValueError as error:
             raise OSError(f"{self._path}: {error}") from error
-        self._content, self._stamp = _Content.of(data), stamp
-        if self._content.damaged > self._told_damaged:
-            self._told_damaged = self._content.damaged
-            _log.warning("recordings_list_damaged", path=str(self._path), lines=self._told_damaged)
+        self._list, self._stamp = _List.parse(data), stamp
+        if self._list.damaged > self._reported_damaged:
+            self._reported_damaged = self._list.damaged
+            _log.warning(
+                "recordings_list_damaged", path=str(self._path), lines=self._reported_damaged
+            )
         return True
 
-    def _append(self, entries: Collection[_Entry]) -> None:
-        """Adds entries, to a list of everything that is known where there is none."""
-        there = self._read()
-        if not there or self._content.lines > self._most_lines or self.bag_dir_id is None:
-            self._rewrite(entries)
-            return
-        with self._alone() as descriptor:
-            _append_whole(descriptor, "".join(map(_line, entries)).encode())
-        for entry in entries:
-            self._content.take(entry)
-
-    def _rewrite(self, entries: Collection[_Entry] = ()) -> None:
-        """Writes the list anew with these entries, and without what has gone."""
-        known = self._content
+    def _add(self, entries: Mapping[str, _Entry]) -> None:
+        """Appends entries, or writes the whole list where there is none or most of it is gone."""
         try:
-            with self._alone() as descriptor:
+            with self._lock:
+                exists = self._read()
+                if not exists or self._list.lines > self._max_lines or self.bag_dir_id is None:
+                    self._rewrite(entries)
+                    return
+                with self._locked() as descriptor:
+                    if descriptor is None:
+                        raise FileNotFoundError("the list of recordings has gone")
+                    append_lines(descriptor, _lines(entries))
+                self._list.entries.update(entries)
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def _rewrite(self, entries: Mapping[str, _Entry] | None = None) -> None:
+        """Writes the list again with these entries, and without recordings that have gone."""
+        known = self._list
+        try:
+            with self._locked() as descriptor:
                 if descriptor is not None:
-                    # What another program appended meanwhile.
+                    # Another program may have appended meanwhile.
                     self._stamp = None
                     self._read()
-                content = _Content(self._content.bag_dir_id or known.bag_dir_id or uuid.uuid4().hex)
-                for entry in (*known.entries.values(), *self._content.entries.values()):
-                    if entry.identity or entry.name not in content.entries:
-                        content.take(entry)
+                content = _List(self.bag_dir_id or known.bag_dir_id or uuid.uuid4().hex)
+                for name, entry in (*known.entries.items(), *self._list.entries.items()):
+                    if entry.identity or name not in content.entries:
+                        content.entries[name] = entry
                 for name in self._gone(content.entries):
                     del content.entries[name]
-                for entry in entries:
-                    content.take(entry)
+                content.entries.update(entries or {})
                 folder = self._path.parent
                 if not folder.is_dir():
                     folder.mkdir(exist_ok=True)
-                    _belongs_to_owner_of(self._bag_dir, folder)
+                    _give_to_owner(folder, self._bag_dir)
                     flush(folder.parent)
-                write_durably(self._path, content.text())
-                _belongs_to_owner_of(self._bag_dir, self._path)
+                write_durably(self._path, content.to_text())
+                _give_to_owner(self._path, self._bag_dir)
         except OSError:
-            self._content = known
+            self._list = known
             raise
-        self._most_lines = 2 * len(content.entries) + _SPARE_LINES
-        self._content, self._stamp = content, None
+        self._max_lines = 2 * len(content.entries) + _SPARE_LINES
+        self._list, self._stamp = content, None
 
     @contextmanager
-    def _alone(self) -> Iterator[int | None]:
-        """The list, open and locked; None where there is none.
+    def _locked(self) -> Iterator[int | None]:
+        """Yields a descriptor of the list, locked; None where there is none.
 
         Raises:
-            OSError: it cannot be opened, or another program holds it.
+            OSError: it cannot be opened, or another program holds the lock.
         """
-        give_up = time.monotonic() + _PATIENCE_S
+        give_up = time.monotonic() + _LOCK_WAIT_S
         while True:
             try:
                 descriptor = os.open(self._path, _APPEND)
@@ -515,17 +420,26 @@ class OwnRecordings:
                 yield None
                 return
             try:
-                if _locked(descriptor) and _is_file(self._path, descriptor):
-                    yield descriptor
-                    return
+                with suppress(BlockingIOError):
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    # Another program may have replaced the file before it was locked.
+                    if is_open_file(self._path, descriptor):
+                        yield descriptor
+                        return
             finally:
                 os.close(descriptor)
             if time.monotonic() >= give_up:
                 raise BlockingIOError(f"another program holds {self._path}")
             time.sleep(_POLL_S)
 
+    def _failure(self, error: OSError, verb: str = "written") -> RecorderError:
+        return RecorderError(
+            f"{self._path} cannot be {verb}: {error.strerror or error}; the recorder notes there "
+            "which recordings are its own, and must be able to write into recording.bag_dir"
+        )
 
-_UNCLAIMED: Final = (
+
+_NOT_CLAIMED: Final = (
     "its recorder was killed before it noted which directory it had made, and what lies there does "
     "not carry the id of this bag directory; it is kept until `ros2-memory adopt` takes it"
 )
@@ -533,7 +447,7 @@ _ADVICE: Final = "they are kept until `ros2-memory adopt` takes them"
 
 
 def folders_with_bags(folder: Path) -> Iterator[Path]:
-    """A directory and those below it in which bag files lie. Links are no files, nor followed.
+    """Yields a directory and those below it that hold bag files; follows no link.
 
     Raises:
         OSError: one of them cannot be listed.
@@ -549,10 +463,10 @@ def folders_with_bags(folder: Path) -> Iterator[Path]:
 
 
 def is_regular(path: Path) -> bool:
-    """Whether it is a regular file, and no link to one.
+    """Returns whether a path is a regular file, and no link to one.
 
     Raises:
-        OSError: it cannot be looked at.
+        OSError: it cannot be looked up.
     """
     try:
         return stat.S_ISREG(path.lstat().st_mode)
@@ -560,30 +474,55 @@ def is_regular(path: Path) -> bool:
         return False
 
 
-def is_kept_apart(name: str) -> bool:
-    """Whether a name in the bag directory is that of moments or carried messages, in no list."""
-    return name.partition("/")[0] in {MOMENTS_FOLDER, CARRY_FOLDER}
+def _find_former(
+    bag_dir: Path, custom_data: CustomDataOf
+) -> tuple[dict[str, Identity], dict[str, str]]:
+    """Finds the recordings that a version from before the list made here, to be adopted once.
 
+    They lie in the bag directory itself, under a name that this program gives, and either
+    `recorder.json` or a `handover.json` names them, or every file of them that holds a byte carries
+    what our child embedded. A file that carries an id is of a version with the list: it was
+    restored or copied, or the list has gone. A file that cannot be read so far may carry one.
 
-def _held(folder: Path) -> Iterator[Path]:
-    """The bag files in a directory that hold a byte.
+    Returns:
+        The identities of those directories by name, and why others of such a name are not adopted.
 
     Raises:
-        OSError: the directory cannot be listed, or a file not be looked at.
+        OSError: the bag directory cannot be listed.
     """
-    for path in sorted(folder.iterdir()):
-        if bag_kind(path.name) and (path.is_symlink() or path.stat().st_size):
-            yield path
+    folders = [
+        each
+        for each in sorted(bag_dir.iterdir())
+        if has_own_name(each.name) and not each.is_symlink() and each.is_dir()
+    ]
+    heartbeat = read_heartbeat(bag_dir).heartbeat
+    named = set(heartbeat.recordings if heartbeat else ())
+    for folder in folders:
+        handover = read_handover(folder).handover
+        named.update(name for name in (handover.previous, handover.next) if name)
+    found: dict[str, Identity] = {}
+    left: dict[str, str] = {}
+    for folder in folders:
+        try:
+            identity = identity_of(folder)
+            reason = _why_not_former(folder, custom_data, is_named=folder.name in named)
+        except OSError as error:
+            identity, reason = None, f"it cannot be looked into: {error.strerror or error}"
+        if reason is not None:
+            left[folder.name] = reason
+        elif identity is not None:
+            found[folder.name] = identity
+    return found, left
 
 
 def _why_not_former(folder: Path, custom_data: CustomDataOf, *, is_named: bool) -> str | None:
-    """Why a directory is not taken for a recording of a version from before the list.
+    """Returns why a directory is not of a version from before the list; None where it is.
 
     Raises:
         OSError: it cannot be listed, or a file cannot be read.
     """
-    without_proof = not is_named
-    for path in _held(folder):
+    is_proven = is_named
+    for path in _files_with_data(folder):
         embedded = custom_data(path)
         if embedded is None:
             return f"{path.name} cannot be read as far as to know which bag directory it is of"
@@ -596,63 +535,28 @@ def _why_not_former(folder: Path, custom_data: CustomDataOf, *, is_named: bool) 
                 f"{path.name} does not carry {RECORDED_BY}={PROGRAM}, and no recorder.json or "
                 "handover.json names the recording"
             )
-        without_proof = False
-    return "no file of it holds a byte" if without_proof else None
+        is_proven = True
+    return None if is_proven else "no file of it holds a byte"
 
 
-def _all_ours(embedded: Collection[Mapping[str, str]], bag_dir_id: str | None) -> bool:
-    return bool(embedded) and all(
-        each.get(RECORDED_BY) == PROGRAM and each.get(BAG_DIR_ID) == bag_dir_id for each in embedded
-    )
-
-
-def _append_whole(descriptor: int | None, data: bytes) -> None:
-    """Appends all of it or nothing, on a line of its own, and has it on the disk.
+def _files_with_data(folder: Path) -> Iterator[Path]:
+    """Yields the bag files in a directory that hold a byte.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the directory cannot be listed, or a file cannot be looked up.
     """
-    if descriptor is None:
-        raise FileNotFoundError("the list of recordings has gone")
-    size = os.fstat(descriptor).st_size
-    if size and os.pread(descriptor, 1, size - 1) != b"\n":
-        data = b"\n" + data
-    try:
-        while data:
-            data = data[os.write(descriptor, data) :]
-        os.fsync(descriptor)
-    except OSError:
-        with suppress(OSError):
-            os.ftruncate(descriptor, size)
-        raise
+    for path in sorted(folder.iterdir()):
+        if bag_kind(path.name) and (path.is_symlink() or path.stat().st_size):
+            yield path
 
 
-def _belongs_to_owner_of(bag_dir: Path, path: Path) -> None:
-    """Where root ran a command, the recorder must be able to write what it made."""
+def _adopted(identities: Mapping[str, Identity]) -> dict[str, _Entry]:
+    return {name: _Entry(identity, adopted=True) for name, identity in identities.items()}
+
+
+def _give_to_owner(path: Path, bag_dir: Path) -> None:
+    """Gives a file that root made to the owner of the bag directory, as whom the recorder runs."""
     with suppress(OSError):
         owner = bag_dir.stat()
         if path.lstat().st_uid != owner.st_uid:
             os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
-
-
-def _locked(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
-def _is_file(path: Path, descriptor: int) -> bool:
-    """Whether the path still names the open file, which another program may have replaced."""
-    try:
-        return os.path.samestat(path.lstat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
-
-
-def _unwritable(path: Path, error: OSError, verb: str = "written") -> RecorderError:
-    return RecorderError(
-        f"{path} cannot be {verb}: {error.strerror or error}; the recorder notes there which "
-        "recordings are its own, and must be able to write into recording.bag_dir"
-    )

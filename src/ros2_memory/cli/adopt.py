@@ -9,16 +9,10 @@ from typing import Annotated
 
 import typer
 
-from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.bag_dir.directory_identity import Identity, identity_of
+from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.own_recordings import (
-    Identity,
-    OwnRecordings,
-    folders_with_bags,
-    identity_of,
-    is_kept_apart,
-    is_regular,
-)
+from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
 from ros2_memory.bootstrap import claim
 from ros2_memory.cli.running import NOT_SO, BagDir, Sets, reporting, say
 from ros2_memory.cli.settling import settings_for

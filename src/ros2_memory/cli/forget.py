@@ -10,10 +10,10 @@ from typing import Annotated
 import typer
 
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import METADATA_FILE, MOMENTS_FOLDER, other_form
+from ros2_memory.bag_dir.layout import METADATA_FILE, MOMENTS_FOLDER, is_kept_apart, other_form
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
-from ros2_memory.bag_dir.own_recordings import OwnRecordings, is_kept_apart
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_reader, supposed_own
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.cli.opening import opened

@@ -241,7 +241,7 @@ def _files(path: Path, clock: Clock) -> tuple[list[Path], int]:
         raise RecorderError(f"{path} cannot be listed: {walked.problem}")
     # What a moment keeps is a second name of a bag that was whole.
     kept = HardLinks(path)
-    found = sorted(Path(each) for each in walked.looked_at if not kept.is_kept(each))
+    found = sorted(Path(each) for each in walked.looked_at if not kept.is_saved(each))
     files = [file for file in found if file.suffix == _MCAP]
     return files, len(found) - len(files)
 

@@ -164,7 +164,7 @@ class BagTable:
         if self._all_awake or not known:
             return []
         # Which of a bag's names answers is to be weighed.
-        kept = {path: stamps.pop(path) for path in self._names.kept_among(stamps)}
+        kept = {path: stamps.pop(path) for path in self._names.saved_among(stamps)}
         bags = self._dormant.take(stamps, known, self._reader, scene)
         stamps.update(kept)
         return bags
@@ -194,7 +194,7 @@ class BagTable:
         for path in paths:
             self._watched.discard(path)
             self._files.pop(path, None)
-            self._names.leave(path)
+            self._names.discard(path)
             if self._verdicts.drop(path):
                 forgotten.add(path)
         return forgotten
@@ -209,7 +209,7 @@ class BagTable:
             if notes is None:
                 notes = FileNotes.first(Path(path), stamp, scene.now)
                 self._files[path] = notes
-                self._names.enter(path)
+                self._names.add(path)
                 file = known.get(path)
                 if file is not None and notes.trusted and file.looks_like(stamp):
                     notes.recall(file.summary)

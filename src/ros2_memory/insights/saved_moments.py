@@ -77,17 +77,17 @@ def list_moments(memory: Memory, call: Call) -> KeptMoments:
             f"the moments cannot be listed: {error.strerror or error}; this server must be allowed "
             "to read moments/ of the bag directory"
         ) from error
-    newest = sorted(held, key=lambda each: (each.keepsake.end, each.folder.name), reverse=True)
+    newest = sorted(held, key=lambda each: (each.moment.end, each.folder.name), reverse=True)
     listed = (
         KeptMoment(
             each.folder.name,
-            each.keepsake.label,
-            each.keepsake.start,
-            each.keepsake.end,
+            each.moment.label,
+            each.moment.start,
+            each.moment.end,
             len(each.files),
             sum(each.files.values()),
-            each.keepsake.pending,
-            each.keepsake.missing,
+            each.moment.pending,
+            each.moment.missing,
         )
         for each in newest[:MOST_LISTED]
     )

@@ -17,8 +17,8 @@ import structlog
 
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import METADATA_FILE
-from ros2_memory.bag_dir.own_recordings import OwnRecordings, has_own_name
+from ros2_memory.bag_dir.layout import METADATA_FILE, has_own_name
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import BagState
@@ -253,7 +253,7 @@ class Housekeeping(Housekeeper):
         except OSError:
             return False
         tried = (path, status.st_size, status.st_mtime_ns) in self._tried
-        if tried or self._names.is_kept(str(path)):
+        if tried or self._names.is_saved(str(path)):
             return False
         if self._keeps_foreign:
             return self._own.owns(path.parent)

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.bag_dir.directory_identity import identity_at
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
     METADATA_FILE,
@@ -24,8 +25,8 @@ from ros2_memory.bag_dir.layout import (
     OWN_FILES,
     RECORDING_FILES,
     bag_kind,
+    is_kept_apart,
 )
-from ros2_memory.bag_dir.own_recordings import identity_at, is_kept_apart
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:

@@ -7,17 +7,15 @@ import stat
 from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.bag_dir.own_recordings import (
-    OwnRecordings,
-    identity_of,
-    is_kept_apart,
-)
+from ros2_memory.bag_dir.directory_identity import identity_of
+from ros2_memory.bag_dir.layout import is_kept_apart
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 if TYPE_CHECKING:
     from collections.abc import Collection
     from pathlib import Path
 
-    from ros2_memory.bag_dir.own_recordings import Identity
+    from ros2_memory.bag_dir.directory_identity import Identity
     from ros2_memory.core.model import SetAside
     from ros2_memory.index.snapshot import Snapshot
 

@@ -13,19 +13,16 @@ from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.bag_dir.directory_identity import identity_of
 from ros2_memory.bag_dir.layout import (
     LOCK_FILE,
     MOMENT_FILE,
     MOMENTS_FOLDER,
     OWN_FILES,
     ROS_LOG_DIR,
+    has_own_name,
     is_carried,
     other_form,
-)
-from ros2_memory.bag_dir.own_recordings import (
-    OwnRecordings,
-    has_own_name,
-    identity_of,
 )
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.file_state import FileState
@@ -37,7 +34,8 @@ from ros2_memory.retention.policy import RetentionStock, Span, StoredBag, Stored
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from ros2_memory.bag_dir.own_recordings import Identity
+    from ros2_memory.bag_dir.directory_identity import Identity
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.file_state import Classification

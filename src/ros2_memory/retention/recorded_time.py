@@ -19,8 +19,8 @@ import structlog
 
 from ros2_memory.bag_dir.durable_write import (
     append_durably,
+    make_folder,
     open_plain,
-    own_folder,
     write_durably,
 )
 from ros2_memory.bag_dir.layout import OWN_FOLDER, RECORDED_FILE
@@ -138,7 +138,7 @@ class RecordedTime:
     def _save(self) -> None:
         names = sorted(self._unsaved)
         try:
-            own_folder(self._path.parent)
+            make_folder(self._path.parent)
             if self._lines + len(names) > _MOST_LINES:
                 write_durably(self._path, self._text(self._seen_s))
                 self._lines = len(self._seen_s)

@@ -20,10 +20,10 @@ from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
 from ros2_memory.bag_dir.moment_file import (
-    MOST_MOMENTS,
+    MAX_MOMENTS,
     SavedMoment,
     StoredMoment,
-    make_folder,
+    make_moment_folder,
     moments_of,
     stored_moments_in,
     write_saved_moment,
@@ -78,7 +78,7 @@ class MomentKeeper:
 
     def has_work(self) -> bool:
         """Whether somebody asks, or a moment waits for bags; also before the first look."""
-        return not self._looked or self._waiting or self._mailbox.has_mail()
+        return not self._looked or self._waiting or self._mailbox.has_requests()
 
     def keep(self, snapshot: Snapshot) -> None:
         """Does what is asked, and goes on with what is pending. Nothing may be deleted meanwhile.
@@ -91,14 +91,14 @@ class MomentKeeper:
         now = self._clock.now()
         book = {held.folder.name: held for held in stored_moments_in(self._bag_dir)}
         for name, held in book.items():
-            if held.keepsake.pending:
+            if held.moment.pending:
                 book[name] = self._advance(held, _all_files(book), snapshot)
-        numbers = {held.keepsake.number: held for held in book.values()}
-        for wish in self._mailbox.take(now) if self._mailbox.has_mail() else ():
+        numbers = {held.moment.number: held for held in book.values()}
+        for wish in self._mailbox.take(now) if self._mailbox.has_requests() else ():
             known = numbers.get(wish.number)
             done = _outcome_of(known) if known else self._grant(wish, book, snapshot)
             self._mailbox.answer(wish, done)
-        self._waiting = any(held.keepsake.pending for held in book.values())
+        self._waiting = any(held.moment.pending for held in book.values())
         self._looked = True
 
     def follow(self) -> None:
@@ -141,7 +141,7 @@ class MomentKeeper:
     def _refusal(
         self, wish: SaveRequest, need: Needed, book: dict[str, StoredMoment], snapshot: Snapshot
     ) -> str | None:
-        if len(book) >= MOST_MOMENTS:
+        if len(book) >= MAX_MOMENTS:
             return (
                 f"there are {len(book)} moments, which is as many as are kept; delete folders in "
                 "moments/ of the bag directory"
@@ -157,7 +157,7 @@ class MomentKeeper:
         return None
 
     def _begin(self, wish: SaveRequest, need: Needed) -> StoredMoment:
-        folder = make_folder(self._bag_dir, wish)
+        folder = make_moment_folder(self._bag_dir, wish)
         try:
             write_saved_moment(folder, SavedMoment.of(wish))
             missing, files = self._link(folder, need.bags, None)
@@ -174,7 +174,7 @@ class MomentKeeper:
         self, held: StoredMoment, files: dict[int, int], snapshot: Snapshot
     ) -> StoredMoment:
         """Goes on with a moment; what of it cannot be kept it says in its file."""
-        before = held.keepsake
+        before = held.moment
         need = self._needed(before, snapshot)
         try:
             missing, linked = self._link(held.folder, need.bags, files)
@@ -277,7 +277,7 @@ def _all_files(book: dict[str, StoredMoment]) -> dict[int, int]:
 
 
 def _outcome_of(held: StoredMoment) -> Outcome:
-    keepsake = held.keepsake
+    keepsake = held.moment
     return Outcome(held.folder.name, len(held.files), keepsake.pending)
 
 

@@ -329,7 +329,7 @@ class TestDeletions:
             PendingRequest(bags, "label", 0, 1, 2).post()
         mailbox = RequestQueue(bags)
         mailbox.open()
-        assert not mailbox.has_mail()
+        assert not mailbox.has_requests()
         assert contents(outside) == before
 
     def test_no_bag_of_a_moment_is_linked_behind_a_link(self, bags: Path, outside: Path) -> None:

@@ -35,16 +35,16 @@ class TestNames:
             for name in ("r/r_0.mcap", "moments/a/r/r_0.mcap", "moments/b/r/r_0.mcap")
         )
         for path in (second, recorded, first):
-            names.enter(path)
+            names.add(path)
         assert names.before(recorded) == []
         assert names.before(first) == [recorded]
         assert names.before(second) == [recorded, first]
         assert names.of(recorded) == names.of(first) == {first, second}
-        names.leave(first)
-        names.leave(first)
+        names.discard(first)
+        names.discard(first)
         assert names.before(second) == [recorded]
         assert names.known == {second}
-        names.leave(second)
+        names.discard(second)
         assert list(names.of(recorded)) == []
 
     def test_what_lies_in_no_moment_is_its_own_name(self, tmp_path: Path) -> None:

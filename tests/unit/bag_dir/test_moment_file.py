@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.moment_file import (
     SaveRequest,
     fault_of_label,
     folder_name,
-    make_folder,
+    make_moment_folder,
     read_saved_moment,
     stored_moments_in,
     write_saved_moment,
@@ -60,7 +60,7 @@ class TestLabels:
 
 class TestFolders:
     def test_two_of_one_label_and_second_have_their_own(self, tmp_path: Path) -> None:
-        names = [make_folder(tmp_path, wish()).name for _ in range(3)]
+        names = [make_moment_folder(tmp_path, wish()).name for _ in range(3)]
         assert names == [f"20261120T050000Z-charger-found{end}" for end in ("", "_2", "_3")]
 
     def test_none_is_made_through_a_link(self, tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ class TestFolders:
         elsewhere.mkdir()
         (tmp_path / "moments").symlink_to(elsewhere)
         with pytest.raises(OSError, match="symbolic link"):
-            make_folder(tmp_path, wish())
+            make_moment_folder(tmp_path, wish())
         assert list(stored_moments_in(tmp_path)) == []
 
 
@@ -111,7 +111,7 @@ class TestMomentFiles:
         ],
     )
     def test_what_says_something_else_is_no_moment(self, tmp_path: Path, text: str) -> None:
-        folder = make_folder(tmp_path, wish())
+        folder = make_moment_folder(tmp_path, wish())
         (folder / MOMENT_FILE).write_text(text)
         assert read_saved_moment(folder) is None
         assert list(stored_moments_in(tmp_path)) == []

@@ -10,7 +10,7 @@ import structlog
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.request_queue import (
-    MOST_AT_ONCE,
+    MAX_AT_ONCE,
     STALE_NS,
     Outcome,
     PendingRequest,
@@ -37,16 +37,16 @@ def names(bag_dir: Path) -> list[str]:
 
 def test_a_wish_is_taken_and_answered_and_nothing_is_left(tmp_path: Path) -> None:
     slot, mailbox = asked(tmp_path), RequestQueue(tmp_path)
-    assert mailbox.has_mail()
+    assert mailbox.has_requests()
     [wish] = mailbox.take(T0)
-    assert wish == slot.wish
+    assert wish == slot.request
     assert slot.outcome() is None
     outcome = Outcome("20261120T050000Z-here", 3, pending=True)
     mailbox.answer(wish, outcome)
     assert slot.outcome() == outcome
     slot.close()
     assert names(tmp_path) == []
-    assert not mailbox.has_mail()
+    assert not mailbox.has_requests()
 
 
 def test_a_refusal_is_an_answer(tmp_path: Path) -> None:
@@ -59,16 +59,16 @@ def test_a_refusal_is_an_answer(tmp_path: Path) -> None:
 def test_a_wish_can_be_withdrawn_until_it_is_taken(tmp_path: Path) -> None:
     first, second, mailbox = asked(tmp_path), asked(tmp_path), RequestQueue(tmp_path)
     assert first.withdraw()
-    assert [wish.number for wish in mailbox.take(T0)] == [second.wish.number]
+    assert [wish.number for wish in mailbox.take(T0)] == [second.request.number]
     assert not second.withdraw()
 
 
 def test_a_wish_that_was_taken_and_not_answered_is_taken_again(tmp_path: Path) -> None:
     slot = asked(tmp_path)
-    assert [wish.number for wish in RequestQueue(tmp_path).take(T0)] == [slot.wish.number]
+    assert [wish.number for wish in RequestQueue(tmp_path).take(T0)] == [slot.request.number]
     again = RequestQueue(tmp_path)
-    assert again.has_mail()
-    assert [wish.number for wish in again.take(T0 + S)] == [slot.wish.number]
+    assert again.has_requests()
+    assert [wish.number for wish in again.take(T0 + S)] == [slot.request.number]
 
 
 def test_a_wish_whose_server_died_is_forgotten(tmp_path: Path) -> None:
@@ -78,11 +78,11 @@ def test_a_wish_whose_server_died_is_forgotten(tmp_path: Path) -> None:
 
 
 def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
-    for _ in range(MOST_AT_ONCE + 2):
+    for _ in range(MAX_AT_ONCE + 2):
         asked(tmp_path)
     mailbox = RequestQueue(tmp_path)
     first = list(mailbox.take(T0))
-    assert len(first) == MOST_AT_ONCE
+    assert len(first) == MAX_AT_ONCE
     for wish in first:
         mailbox.answer(wish, Outcome(refused="no"))
     assert len(list(mailbox.take(T0))) == 2
@@ -139,7 +139,7 @@ def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path)
         mailbox.answer(wish, Outcome(refused="no"))
     assert [event["event"] for event in captured] == ["request_ignored"] * 3
     assert slot.outcome() is not None
-    assert not mailbox.has_mail()
+    assert not mailbox.has_requests()
 
 
 def test_other_files_are_left_alone_and_counted(tmp_path: Path) -> None:
@@ -189,10 +189,10 @@ def test_no_folder_is_made_where_the_bag_directory_is_away(tmp_path: Path) -> No
     with pytest.raises(OSError, match=r"\.episodic"):
         asked(away)
     assert not away.exists()
-    assert not RequestQueue(away).has_mail()
+    assert not RequestQueue(away).has_requests()
 
 
 def test_an_answer_that_is_none_is_not_believed(tmp_path: Path) -> None:
     slot = asked(tmp_path)
-    (tmp_path / REQUESTS_FOLDER / f"{slot.wish.number}.answer").write_text("[]")
+    (tmp_path / REQUESTS_FOLDER / f"{slot.request.number}.answer").write_text("[]")
     assert slot.outcome() is None

@@ -13,7 +13,7 @@ from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
     SavedMoment,
     SaveRequest,
-    make_folder,
+    make_moment_folder,
     write_saved_moment,
 )
 from ros2_memory.bag_dir.request_queue import PendingRequest
@@ -198,7 +198,7 @@ class TestTheList:
     def keep(self, bag_dir: Path, number: int, **more: Any) -> None:
         end = T0 + number * S
         wish = SaveRequest(f"{number:032x}", f"number {number}", end - S, end, NOW)
-        write_saved_moment(make_folder(bag_dir, wish), replace(SavedMoment.of(wish), **more))
+        write_saved_moment(make_moment_folder(bag_dir, wish), replace(SavedMoment.of(wish), **more))
 
     def test_it_has_the_newest_first_and_counts_the_others(self, tmp_path: Path) -> None:
         for number in range(MOST_LISTED + 3):

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 import pytest
 from rosbags.rosbag2 import Reader as RosbagsReader
 
-from ros2_memory.bag_dir.layout import bag_kind, recording_name
-from ros2_memory.bag_dir.own_recordings import has_own_name
+from ros2_memory.bag_dir.layout import bag_kind, has_own_name, recording_name
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.retention.repair import Repairer, open_files

@@ -13,7 +13,7 @@ from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
     SavedMoment,
     SaveRequest,
-    make_folder,
+    make_moment_folder,
     stored_moments_in,
     write_saved_moment,
 )
@@ -131,7 +131,7 @@ class TestKeeping:
         """As where the recorder was killed after it kept a moment, and before it answered."""
         recording(tmp_path, A, 0)
         slot = asked(tmp_path, 15, 25)
-        request = tmp_path / REQUESTS_FOLDER / f"{slot.wish.number}.json"
+        request = tmp_path / REQUESTS_FOLDER / f"{slot.request.number}.json"
         text = request.read_text()
         house_of(tmp_path).keep_moments()
         first = slot.outcome()
@@ -239,8 +239,8 @@ class TestCrashes:
     ) -> None:
         recording(tmp_path, A, 0)
         slot = asked(tmp_path, 15, 25)
-        folder = make_folder(tmp_path, slot.wish)
-        write_saved_moment(folder, SavedMoment.of(slot.wish))
+        folder = make_moment_folder(tmp_path, slot.request)
+        write_saved_moment(folder, SavedMoment.of(slot.request))
         house_of(tmp_path).keep_moments()
         outcome = slot.outcome()
         assert outcome is not None
@@ -279,7 +279,7 @@ class TestCrashes:
         self, tmp_path: Path
     ) -> None:
         wish = SaveRequest("0" * 32, "here", T0, T0, NOW)
-        begun = make_folder(tmp_path, wish)
+        begun = make_moment_folder(tmp_path, wish)
         (begun / f".{MOMENT_FILE}.tmp").write_text("{")
         mine = tmp_path / "moments/mine"
         mine.mkdir()

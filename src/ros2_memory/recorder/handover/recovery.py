@@ -17,8 +17,8 @@ from ros2_memory.bag_dir.handover_file import (
     Counting,
     CutClock,
     Overlap,
+    handover_to_change,
     read_handover,
-    standing_handover,
     write_handover,
 )
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
@@ -89,11 +89,11 @@ def recover_handover(old: Path, new: Path, reader: BagReader) -> None:
 
 
 def _settle(old: Path, new: Path, reader: BagReader) -> None:
-    before = standing_handover(old)
+    before = handover_to_change(old)
     if not _is_folder(new):
         write_handover(old, withdrawn(before))
         return
-    after = standing_handover(new)
+    after = handover_to_change(new)
     if after.state is Counting.VOID:
         write_handover(old, withdrawn(before))
     elif after.state is Counting.COUNTS and after.counts_from is not None:

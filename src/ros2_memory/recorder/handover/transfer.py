@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ros2_memory.bag_dir.handover_file import (
     CutClock,
     Handover,
-    standing_handover,
+    handover_to_change,
     write_handover,
     write_handovers,
 )
@@ -71,7 +71,7 @@ class HandoverTransfer:
             RecorderError: it cannot be written.
         """
         directory = old.splits.directory
-        write_handover(directory, intended(standing_handover(directory), new_name))
+        write_handover(directory, intended(handover_to_change(directory), new_name))
 
     @staticmethod
     def withdraw(old: RecordingSession) -> None:
@@ -82,7 +82,7 @@ class HandoverTransfer:
         """
         directory = old.splits.directory
         if _is_there(directory):
-            write_handover(directory, withdrawn(standing_handover(directory)))
+            write_handover(directory, withdrawn(handover_to_change(directory)))
 
     @property
     def missing(self) -> frozenset[str]:
@@ -111,7 +111,7 @@ class HandoverTransfer:
         if bounds is None:
             return False
         sidecars = complete_sidecars(
-            standing_handover(self.old.splits.directory),
+            handover_to_change(self.old.splits.directory),
             self.old.name,
             self.new.name,
             bounds,
@@ -145,7 +145,7 @@ class HandoverTransfer:
             RecorderError: the sidecar cannot be written.
         """
         directory = self.old.splits.directory
-        handover = standing_handover(directory)
+        handover = handover_to_change(directory)
         if handover.end is not None:
             files = tuple(sorted(self._old_files() | frozenset(handover.end.files)))
             write_handover(directory, replace(handover, end=replace(handover.end, files=files)))

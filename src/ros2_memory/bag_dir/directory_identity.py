@@ -1,0 +1,60 @@
+"""Whether a directory is the very one that was seen before, and not another of its name.
+
+An inode number alone does not prove that: ext4 gives a directory that was deleted and restored its
+number again. Its generation (FS_IOC_GETVERSION) does: ext4, XFS, Btrfs and F2FS choose one anew for
+each inode. On other file systems the number has to do. Clocks play no part.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+import struct
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_GETVERSION: Final = 0x80087601  # _IOR('v', 1, long), linux/fs.h
+_GENERATION: Final = struct.Struct("=I4x")  # the first 4 bytes of that long, on every architecture
+
+
+class Identity(NamedTuple):
+    """An inode and its generation; `generation` is None where the file system has none."""
+
+    inode: int
+    generation: int | None = None
+
+    def matches(self, listed: Identity) -> bool:
+        """Returns whether this is the directory that was listed under an identity."""
+        return self.inode == listed.inode and listed.generation in {None, self.generation}
+
+
+def identity_of(directory: Path | str) -> Identity | None:
+    """Returns the identity of a directory; None where there is none of that name, or a link.
+
+    Raises:
+        OSError: the directory cannot be opened.
+    """
+    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
+    try:
+        if stat.S_ISLNK(os.lstat(directory).st_mode):
+            return None
+        descriptor = os.open(directory, flags)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    try:
+        return identity_at(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def identity_at(descriptor: int) -> Identity:
+    """Returns the identity of an open directory."""
+    inode = os.fstat(descriptor).st_ino
+    try:
+        (generation,) = _GENERATION.unpack(fcntl.ioctl(descriptor, _GETVERSION, bytes(8)))
+    except OSError:  # such as tmpfs
+        return Identity(inode)
+    return Identity(inode, int(generation))
