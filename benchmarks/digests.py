@@ -87,8 +87,10 @@ def _moved_topic(topic: TopicDigest, by: int) -> TopicDigest:
         )
     poses = None if topic.poses is None else _moved_poses(topic.poses, by)
     standstills = None if topic.standstills is None else _moved_standstills(topic.standstills, by)
-    story = None if topic.story is None else _moved_story(topic.story, by)
-    return replace(topic, poses=poses, standstills=standstills, story=story, edges=edges, kept=kept)
+    events = None if topic.events is None else _moved_events(topic.events, by)
+    return replace(
+        topic, poses=poses, standstills=standstills, events=events, edges=edges, kept=kept
+    )
 
 
 def _moved_standstills(digest: StandstillDigest, by: int) -> StandstillDigest:
@@ -123,7 +125,7 @@ def _later(poses: list[TimedPosition], by: int) -> list[TimedPosition]:
     return [pose._replace(time=pose.time + by) for pose in poses]
 
 
-def _moved_story(story: TopicEvents, by: int) -> TopicEvents:
+def _moved_events(story: TopicEvents, by: int) -> TopicEvents:
     return replace(
         story,
         first=story.first + by,

@@ -83,7 +83,7 @@ class Week:
     def text(self) -> str:
         """The searchable words of every bag's scene objects, as its digest has them."""
         words = [
-            topic.evidence.words or ""
+            topic.zone_map.words or ""
             for digest in self.digests
             for topic in digest.topics
             if topic.topic == SCENE.name
@@ -95,7 +95,9 @@ class Week:
         batch: list[tuple[BagKey, Digest]] = []
         for nth, (copy, _, later) in enumerate(self.whole.files()):
             stat = copy.stat()
-            key = BagKey(relative(copy, self.whole.folder), stat.st_size, stat.st_mtime_ns, 0)
+            key = BagKey(
+                relative(str(copy), str(self.whole.folder)), stat.st_size, stat.st_mtime_ns, 0
+            )
             batch.append((key, digests.moved(self.digests[nth % len(self.digests)], later)))
             if len(batch) == _BATCH:
                 catalogue.put_all(batch)

@@ -186,7 +186,7 @@ def build_memory(settings: Settings) -> Memory:
         clock,
         refresh_s=settings.reader.index_refresh_s,
         split_duration_s=settings.recording.split_duration_s,
-        known=partial(catalogue.summaries, bag_dir),
+        known=partial(catalogue.known_files, bag_dir),
         include_active=settings.reader.include_active,
         trusts_mtime=not isinstance(settings.recorder, NullRecorderNode),
     )

@@ -217,7 +217,7 @@ def test_a_catalogue_locked_at_the_start_is_gone_back_to(tmp_path: Path) -> None
     memory.recall.catalogue.close()
     memory, filler = served(tmp_path)
     assert memory.recall is not None
-    base = memory.recall.catalogue._base
+    base = memory.recall.catalogue
     passed = [0.0]
     base._monotonic = lambda: time.monotonic() + passed[0]
     with closing(sqlite3.connect(path, isolation_level=None)) as other:
@@ -267,18 +267,18 @@ def test_what_could_not_be_asked_once_is_asked_again(tmp_path: Path) -> None:
     memory, filler = served(tmp_path)
     fill_up(filler)
     assert memory.recall is not None
-    base = memory.recall.catalogue._base
+    base = memory.recall.catalogue
     opened = base._opened
     assert opened is not None
     recall = DigestCache(memory.recall.catalogue, tmp_path)
     [run] = memory.index.snapshot().runs
     as_of = recall.as_of()
-    base._opened = replace(opened, base=Busy(":memory:"))
-    assert not recall.notes(run, as_of).numbers
+    base._opened = replace(opened, connection=Busy(":memory:"))
+    assert not recall.digests_for(run, as_of).numbers
     base._opened = opened
-    notes = recall.notes(run, as_of)
+    notes = recall.digests_for(run, as_of)
     assert notes.whole
-    base._opened = replace(opened, base=Busy(":memory:"))
+    base._opened = replace(opened, connection=Busy(":memory:"))
     assert notes.edges("/tf_static") == {}
     base._opened = opened
     assert len(notes.edges("/tf_static")) == 12
@@ -350,8 +350,8 @@ def test_entries_that_another_program_makes_anew_are_not_taken_for_the_lost_ones
         base.commit()
     # It is noticed by the next question about the way driven, which has other bounds.
     [run] = memory.index.snapshot().runs
-    notes = memory.recall.notes(run, memory.recall.as_of())
-    notes.poses("/odom", [*notes.numbers.values()])
+    notes = memory.recall.digests_for(run, memory.recall.as_of())
+    notes.catalogue.poses("/odom", [*notes.numbers.values()])
     _, other = served(tmp_path)
     fill_up(other)
     assert told(memory) == right

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
 
-MOST_TOLD: Final = 64
+MAX_PER_BAG: Final = 64
 """Presences, flips and faults of one topic in one bag that are kept, each; the rest is counted."""
 MOST_HELD: Final = 20_000
 """Flips and faults of a topic in all bags together: what a question about a week may hold."""
@@ -160,7 +160,7 @@ class TopicEventsBuilder:
         self._undecodable = 0
         self._beyond = 0
 
-    def miss(self) -> None:
+    def add_undecodable(self) -> None:
         """Takes the next message, which cannot be decoded."""
         self._undecodable += 1
 
@@ -197,7 +197,7 @@ class TopicEventsBuilder:
         self._left_out += story.left_out
         self._beyond = max(self._beyond, story.beyond)
 
-    def story(self, at_most: int | None = None) -> TopicEvents | None:
+    def events(self, at_most: int | None = None) -> TopicEvents | None:
         """What was told so far, `at_most` of each kind; None without a message."""
         self._settle()
         if not self._parts:

@@ -83,13 +83,13 @@ class ZoneMapBuilder:
         if mould.angles:
             self._add_numbers([-180.0, 180.0])
             self._numbers = None
-        for place in mould.places:
-            points = np.array(mould.points(rows, place), dtype=np.float64)
+        for place in mould.points:
+            points = np.array(mould.coordinates(rows, place), dtype=np.float64)
             here = points[np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])]
             if here.size:
                 self._add_places(here)
 
-    def evidence(self) -> ZoneMap:
+    def zone_map(self) -> ZoneMap:
         """What the values so far can have held."""
         if self._open:
             return UNBOUNDED

@@ -17,7 +17,7 @@ from ros2_memory.analysis.odometry import Leg, Pace, PoseDigest, TimedPosition
 from ros2_memory.analysis.path_length import Creep, End
 from ros2_memory.analysis.standstills import ChainDigest, StandstillDigest
 from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
-from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
+from ros2_memory.core.bag_summary import TopicHeader, shared_schema
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -117,7 +117,7 @@ def decode_poses(packed: bytes) -> PoseDigest:
         raise ValueError(f"not a digest of poses: {error}") from error
 
 
-def packed_standstills(digest: StandstillDigest) -> bytes:
+def encode_standstills(digest: StandstillDigest) -> bytes:
     """A digest of standstills as bytes."""
     chains = [[each.start, each.end, len(each.blocks)] for each in digest.chains]
     head, tail = digest.head, digest.tail
@@ -126,7 +126,7 @@ def packed_standstills(digest: StandstillDigest) -> bytes:
     return zlib.compress(b"".join(parts))
 
 
-def unpacked_standstills(packed: bytes) -> StandstillDigest:
+def decode_standstills(packed: bytes) -> StandstillDigest:
     """The digest that these bytes are of.
 
     Raises:
@@ -309,14 +309,3 @@ def decode_schema(text: str) -> SummarySchema:
     return shared_schema(
         tuple(headings), tuple(silent), bool(complete), tuple(notes), int(set_back)
     )
-
-
-def filled(shape: SummarySchema, counts: bytes) -> BagSummary:
-    """The summary of a bag of this shape.
-
-    Raises:
-        ValueError: the counts are of another shape.
-    """
-    if len(counts) != shape.layout.size:
-        raise ValueError(f"not the counts of a bag: {len(counts)} bytes")
-    return BagSummary.packed(shape, counts)

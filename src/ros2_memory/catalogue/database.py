@@ -1,76 +1,156 @@
-"""The open base of the catalogue, whatever becomes of its file while it is open.
+"""The catalogue's SQLite connection, which repairs itself.
 
-The file may be deleted, replaced, overwritten, locked or on a full disk at any moment. Nothing is
-raised because of it: what cannot be asked is unknown, and the file is gone back to by itself.
+The file may be deleted, replaced, overwritten, locked or on a full disk at any moment. None of that
+raises here: a file that is damaged or of another version is renamed and made anew, one that is busy
+or full is tried again later, and meanwhile nothing is known.
 """
 
 from __future__ import annotations
 
+import errno
+import os
 import sqlite3
 import threading
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from ros2_memory.catalogue.file import (
-    BUSY_S,
-    VERSION,
-    fault_of,
-    in_memory,
-    is_busy,
-    is_passing,
-    open_file,
-    set_aside,
-)
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.catalogue.file import OpenDatabase
+VERSION: Final = 4
+"""Version of the tables below and of their content; a file of any other version is set aside."""
 
+BUSY_S: Final = 1.0
+"""How long a write waits for another program that holds the file."""
 RETRY_S: Final = 10.0
-"""How often a file is tried again that could not be opened."""
+"""How often a file that could not be opened is tried again."""
 
+_SHORT_MS: Final = 20
+"""How long SQLite waits in one attempt: whoever asks a question waits for it too."""
 _PAUSE_S: Final = 0.02
-_BASE_BITS: Final = 40
-"""The low bits of a number are the row's in its base, the others say which base that was."""
+_ROW_ID_BITS: Final = 40
+"""An entry's number is the row's id in these low bits, and in the others which database it is of.
+
+So the number of an entry in a file that was lost never means a row of the file that replaced it.
+"""
+_TRANSIENT: Final = frozenset(
+    {
+        sqlite3.SQLITE_BUSY,
+        sqlite3.SQLITE_LOCKED,
+        sqlite3.SQLITE_FULL,
+        sqlite3.SQLITE_IOERR,
+        sqlite3.SQLITE_CANTOPEN,
+        sqlite3.SQLITE_READONLY,
+        sqlite3.SQLITE_PERM,
+        sqlite3.SQLITE_NOMEM,
+        sqlite3.SQLITE_PROTOCOL,
+    }
+)
+"""Errors of the machine or of the moment: the file itself may be intact."""
+_SUFFIXES: Final = ("-wal", "-shm")
+"""The files that SQLite keeps beside one in WAL mode: the write-ahead log and its index."""
+_FIRST_ROWS: Final = """
+SELECT (SELECT 1 FROM bags), (SELECT 1 FROM held), (SELECT 1 FROM tales), (SELECT 1 FROM kept),
+  (SELECT 1 FROM payloads), (SELECT 1 FROM channels), (SELECT 1 FROM edges), (SELECT 1 FROM shapes)
+"""
+_TABLES: Final = """
+CREATE TABLE bags (id INTEGER PRIMARY KEY AUTOINCREMENT, config TEXT NOT NULL, path TEXT NOT NULL,
+  size INTEGER NOT NULL, mtime INTEGER NOT NULL, sidecar INTEGER NOT NULL,
+  shape INTEGER NOT NULL, counts BLOB NOT NULL, UNIQUE (config, path));
+CREATE TABLE shapes (id INTEGER PRIMARY KEY, text TEXT NOT NULL UNIQUE);
+CREATE TABLE topics (id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
+CREATE TABLE held (topic INTEGER NOT NULL, bag INTEGER NOT NULL, flags INTEGER NOT NULL,
+  words TEXT, low REAL NOT NULL, high REAL NOT NULL, numbers TEXT,
+  min_x REAL, max_x REAL, min_y REAL, max_y REAL, min_z REAL, max_z REAL,
+  poses BLOB, edges INTEGER, first_stamp INTEGER, last_stamp INTEGER, kept INTEGER,
+  undecodable TEXT,
+  PRIMARY KEY (topic, bag)) WITHOUT ROWID;
+CREATE TABLE tales (topic INTEGER NOT NULL, bag INTEGER NOT NULL, rests BLOB, story BLOB,
+  PRIMARY KEY (topic, bag)) WITHOUT ROWID;
+CREATE TABLE edges (id INTEGER PRIMARY KEY, pairs TEXT NOT NULL UNIQUE);
+CREATE TABLE kept (bag INTEGER NOT NULL, topic INTEGER NOT NULL, nth INTEGER NOT NULL,
+  log_time INTEGER NOT NULL, publish_time INTEGER NOT NULL, channel INTEGER NOT NULL,
+  payload INTEGER NOT NULL, PRIMARY KEY (topic, bag, nth)) WITHOUT ROWID;
+CREATE TABLE channels (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, topic TEXT NOT NULL,
+  encoding TEXT NOT NULL, latched INTEGER NOT NULL, schema_name TEXT NOT NULL,
+  schema_encoding TEXT NOT NULL, schema_text BLOB NOT NULL);
+CREATE TABLE remembered (question TEXT PRIMARY KEY, oldest INTEGER NOT NULL, answer TEXT NOT NULL);
+CREATE TABLE payloads (id INTEGER PRIMARY KEY, hash BLOB NOT NULL UNIQUE, bytes BLOB NOT NULL);
+"""
 
 T = TypeVar("T")
 
 log = get_logger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class OpenDatabase:
+    """An open connection, and the path of its file; None in memory.
+
+    `identities` are device and inode of the file, of its write-ahead log and of the log's index:
+    they tell these files from others of the same names.
+    """
+
+    connection: sqlite3.Connection
+    path: Path | None
+    identities: tuple[tuple[int, int] | None, ...] = ()
+
+    def is_in_place(self) -> bool:
+        """Whether the path still leads to the file that is open; True where that is not known."""
+        if self.path is None:
+            return True
+        try:
+            return self.identities == _identities(self.path)
+        except OSError:
+            return True
+
+    def is_mixed(self) -> bool:
+        """Whether the file is in place but its write-ahead log is another's, or gone.
+
+        What several programs write to such files is no database.
+        """
+        if self.path is None:
+            return False
+        file, *log_files = _identities(self.path)
+        return file == self.identities[0] and log_files != [*self.identities[1:]]
+
+
 class CatalogueDatabase:
-    """One base after the other, and the numbers of rows told apart by base. Safe for threads.
+    """One SQLite database after the other, as files are lost and made anew. Thread-safe.
 
     Args:
-        places: where the file may lie, in order of preference; memory where none can be written.
-            Where that may change, a function that gives the places of the moment.
+        paths: where the file may lie, in order of preference; a database in memory serves where
+            none can be written. Where the candidates may change, a function that returns those
+            of the moment.
         waits_for: a directory; while it does not exist, nothing is opened or made.
         monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
         self,
-        places: Sequence[Path] | Callable[[], Sequence[Path]],
+        paths: Sequence[Path] | Callable[[], Sequence[Path]],
         *,
         waits_for: Path | None = None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._places = places if callable(places) else lambda: places
+        self._candidate_paths = paths if callable(paths) else lambda: paths
         self._waits_for = waits_for
         self._monotonic = monotonic
         self._lock = threading.Lock()
         self._opened: OpenDatabase | None = None
-        self._bases = 0
+        self._databases = 0
         self._closed = False
         self._tried_s = 0.0
         self._trouble: str | None = None
         self._failing = False
         self.failures = 0
-        """How often it could not be asked: what was read meanwhile may lack something."""
+        """How often it could not be read: answers of meanwhile may lack something."""
 
     @property
     def path(self) -> Path | None:
@@ -81,7 +161,7 @@ class CatalogueDatabase:
 
     @property
     def trouble(self) -> str | None:
-        """What is amiss, as the end of a sentence about it, or None. Waits for nothing."""
+        """What is wrong, as the end of a sentence about the catalogue, or None. Never blocks."""
         return self._trouble
 
     @property
@@ -90,43 +170,47 @@ class CatalogueDatabase:
         return self._failing
 
     @property
-    def first(self) -> int:
-        """What is added to a row's number in the open base: rows of no other base are like it."""
-        return self._bases << _BASE_BITS
+    def offset(self) -> int:
+        """What is added to a row's id in the open database to give the number of its entry."""
+        return self._databases << _ROW_ID_BITS
 
-    def here(self, numbers: Sequence[int]) -> Sequence[int]:
-        """The rows of these numbers in the open base; of those of an earlier base nothing."""
-        first, base = self.first, self._bases
-        return [number - first for number in numbers if number >> _BASE_BITS == base]
+    def row_ids(self, numbers: Sequence[int]) -> Sequence[int]:
+        """Returns the row ids of these entries, without those of a database that was lost."""
+        offset = self.offset
+        return [number - offset for number in numbers if self.is_same_database(number, offset)]
 
-    def is_same(self, number: int, other: int) -> bool:
-        """Whether two numbers are of one base."""
-        return number >> _BASE_BITS == other >> _BASE_BITS
+    def is_same_database(self, number: int, other: int) -> bool:
+        """Returns whether two entries are of one database."""
+        return number >> _ROW_ID_BITS == other >> _ROW_ID_BITS
+
+    def is_current(self, number: int) -> bool:
+        """Returns whether an entry is of the open database, and of none that was lost."""
+        return self.is_same_database(number, self.offset)
 
     def close(self) -> None:
-        """Ends; afterwards everything is unknown."""
+        """Closes the connection for good; afterwards nothing is known."""
         with self._lock:
             self._closed = True
             if self._opened is not None:
-                self._opened.base.close()
+                self._opened.connection.close()
                 self._opened = None
 
     def read(self, ask: Callable[[sqlite3.Connection], T], unknown: T) -> T:
-        """What the base says; `unknown` where it cannot be asked."""
+        """Returns what `ask` reads; `unknown` where the database cannot be read."""
         with self._lock:
             opened = self._ready()
             if opened is None:
                 self.failures += 1
                 return unknown
             try:
-                return ask(opened.base)
-            # Rows of a damaged file hold anything.
+                return ask(opened.connection)
+            # Rows of a damaged file can hold anything, so decoding them can raise any of these.
             except (sqlite3.Error, ValueError, TypeError, LookupError, MemoryError) as error:
                 self._failed(error)
                 return unknown
 
     def write(self, write: Callable[[sqlite3.Connection], None]) -> bool:
-        """Writes all or nothing; whether it was written."""
+        """Writes all or nothing; returns whether it was written."""
         give_up_s = self._monotonic() + BUSY_S
         while True:
             with self._lock:
@@ -134,30 +218,31 @@ class CatalogueDatabase:
                 if opened is None:
                     return False
                 try:
-                    _transact(opened.base, write, probing=self._failing)
+                    _transact(opened.connection, write, probing=self._failing)
                 except (sqlite3.Error, MemoryError) as error:
                     if not is_busy(error) or self._monotonic() >= give_up_s:
                         self._failed(error)
                         return False
-                # A number or text that SQLite does not hold: the bags stay without an entry.
+                # A number or text that SQLite cannot store: the bags stay without an entry.
                 except (ValueError, OverflowError) as error:
                     log.warning("catalogue_refused", reason=str(error))
                     return False
                 else:
-                    self._works()
+                    if self._failing:
+                        self._trouble, self._failing = None, False
+                        log.info("catalogue_works_again")
                     return True
-            # Those who only ask do not wait for who else writes.
+            # Outside the lock, so that readers do not wait for another program's writes.
             time.sleep(_PAUSE_S)
 
     def look_after(self, *, thorough: bool = False) -> None:
-        """Goes on with the file where it was deleted, replaced, or could not be opened before.
+        """Reopens the file where it was deleted, replaced, or could not be opened before.
 
-        Where a better place for it has come up since, it moves there, with all that it holds.
-
-        It may take a while, so no question should wait for it.
+        Where a preferred path has become available since, the catalogue moves there with all of
+        its content. This may take a while, so no question should wait for it.
 
         Args:
-            thorough: whether all of the file is read to see that it is whole.
+            thorough: whether the whole file is read to check that it is intact.
         """
         with self._lock:
             opened = self._opened
@@ -166,73 +251,61 @@ class CatalogueDatabase:
             if not opened.is_in_place():
                 self._lose("its file was deleted or replaced", aside=opened.is_mixed())
                 return
-        if self._is_due():
-            self._go_on_at_a_better_place(opened)
+        if self._monotonic() - self._tried_s >= RETRY_S:
+            self._move_to_preferred_path(opened)
         if opened.path is None or self._opened is not opened:
             return
-        # What is kept in memory of a file hides that it was overwritten.
-        fault = fault_of(opened.path, thorough=thorough)
-        if fault is not None and not is_passing(fault):
+        # SQLite's page cache hides that the file was overwritten, so another connection looks.
+        fault = _fault_of(opened.path, thorough=thorough)
+        if fault is not None and not is_transient(fault):
             with self._lock:
                 if self._opened is opened:
                     self._failed(fault)
 
-    # What follows runs under the lock, but for `_go_on_at_a_better_place`.
+    # The methods below run under the lock, except `_move_to_preferred_path`.
 
     def _may_open(self) -> bool:
         return not self._closed and (self._waits_for is None or self._waits_for.is_dir())
 
     def _ready(self) -> OpenDatabase | None:
-        """The open base; None where there is none yet, or no more."""
+        """Returns the open database, opening one first if need be; None where it may not."""
         if self._opened is None and self._may_open():
             self._tried_s = self._monotonic()
-            places = self._places()
-            found = open_file(places)
-            self._opened = in_memory() if isinstance(found, str) else found
+            paths = self._candidate_paths()
+            found = open_file(paths)
+            self._opened = _in_memory() if isinstance(found, str) else found
             self._trouble = None
-            if isinstance(found, str) and places:
+            if isinstance(found, str) and paths:
                 self._trouble = f"is kept in memory: {found}"
         return self._opened
 
-    def _is_due(self) -> bool:
-        return self._monotonic() - self._tried_s >= RETRY_S
+    def _move_to_preferred_path(self, before: OpenDatabase) -> None:
+        """Opens the file at a path that is preferred to the present one, where one works now.
 
-    def _go_on_at_a_better_place(self, before: OpenDatabase) -> None:
-        """Opens the file at a place that is preferred to the present one, where there is one now.
-
-        What a file held is copied there before; what memory held is found again.
+        The content of a file is copied there first; that of memory is digested again.
         """
         self._tried_s = self._monotonic()
-        places = tuple(self._places())
-        # It is not moved away from where it may no longer be made.
+        paths = tuple(self._candidate_paths())
+        # It does not move away from a path that is no longer a candidate.
         if before.path is not None:
-            places = places[: places.index(before.path)] if before.path in places else ()
-        found = open_file(places, again=True, former=before.path) if places else ""
+            paths = paths[: paths.index(before.path)] if before.path in paths else ()
+        found = open_file(paths, again=True, previous=before.path) if paths else ""
         if isinstance(found, str):
             return
         with self._lock:
             if self._closed or self._opened is not before:
-                found.base.close()
+                found.connection.close()
                 return
-            before.base.close()
+            before.connection.close()
             self._opened = found
-            self._bases += 1
+            self._databases += 1
             self._trouble, self._failing = None, False
-            if before.path is None:
-                log.info("catalogue_in_file_again", path=str(found.path))
-            else:
-                log.info("catalogue_moved", path=str(found.path))
-
-    def _works(self) -> None:
-        """It could be written: nothing is amiss any more."""
-        if self._failing:
-            self._failing = False
-            self._trouble = None
-            log.info("catalogue_works_again")
+            event = "catalogue_in_file_again" if before.path is None else "catalogue_moved"
+            log.info(event, path=str(found.path))
 
     def _failed(self, error: Exception) -> None:
-        """A base that is only busy or full is asked again; any other is set aside."""
-        if not is_passing(error):
+        """Sets a damaged database aside; one that is only busy or full is asked again."""
+        if not is_transient(error):
             self._lose(f"it is damaged: {error}", aside=True)
             return
         self.failures += 1
@@ -243,37 +316,263 @@ class CatalogueDatabase:
         self._trouble, self._failing = trouble, True
 
     def _lose(self, reason: str, *, aside: bool) -> None:
-        """Gives the open base up; whoever asks next opens or makes another."""
+        """Gives the open database up; the next read or write opens or makes another."""
         opened, self._opened = self._opened, None
         self.failures += 1
-        self._bases += 1
+        self._databases += 1
         if opened is None:
             return
         with suppress(sqlite3.Error):
-            opened.base.close()
+            opened.connection.close()
         if opened.path is None or not aside:
             log.warning("catalogue_lost", path=str(opened.path), reason=reason)
             return
         try:
-            set_aside(opened.path, reason)
+            _set_aside(opened.path, reason)
         except OSError as error:
             log.warning("catalogue_not_set_aside", path=str(opened.path), reason=str(error))
 
 
 def _transact(
-    base: sqlite3.Connection, write: Callable[[sqlite3.Connection], None], *, probing: bool
+    connection: sqlite3.Connection,
+    write: Callable[[sqlite3.Connection], None],
+    *,
+    probing: bool,
 ) -> None:
-    """Writes in one transaction; `probing`: one page at least, where `write` may have nothing to.
+    """Writes in one transaction; `probing` makes sure that it writes a page at least.
 
-    A transaction without a change touches no disk, and says nothing of it.
+    A transaction without a change touches no disk, and so does not show that the disk works.
     """
-    base.execute("BEGIN IMMEDIATE")
+    connection.execute("BEGIN IMMEDIATE")
     try:
-        write(base)
+        write(connection)
         if probing:
-            base.execute(f"PRAGMA user_version = {VERSION:d}")
-        base.execute("COMMIT")
+            connection.execute(f"PRAGMA user_version = {VERSION:d}")
+        connection.execute("COMMIT")
     except BaseException:
         with suppress(sqlite3.Error):
-            base.execute("ROLLBACK")
+            connection.execute("ROLLBACK")
         raise
+
+
+def open_file(
+    paths: Sequence[Path], *, again: bool = False, previous: Path | None = None
+) -> OpenDatabase | str:
+    """Opens the database at the first path that can be written; else returns the reason.
+
+    Args:
+        paths: where it may lie, in order of preference.
+        again: whether this was tried before, so that what is logged already is logged at debug.
+        previous: where it lay until now. That file, or else the one at the next path, is copied
+            to a path that has none yet.
+    """
+    reason = ""
+    for nth, path in enumerate(paths, start=1):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _refuse_links(path)
+            if not path.exists():
+                _copy_first_valid((previous,) if previous else paths[nth:], path)
+            connection = _connect_and_check(path)
+            connection.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
+            return OpenDatabase(connection, path, _identities(path))
+        except (OSError, sqlite3.Error) as error:
+            if is_busy(error):
+                tell = log.debug if again else log.warning
+                tell("catalogue_locked", path=str(path), instead="memory")
+                return "another program holds its file"
+            tell = log.debug if again else log.info
+            tell("catalogue_place_refused", path=str(path), reason=str(error))
+            reason = str(error.strerror if isinstance(error, OSError) else error)
+    return f"no file can be written for it ({reason})"
+
+
+def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
+    """Copies the first of these files that is a catalogue of this version; none where none is.
+
+    The copy appears as a whole, by a hard link, and never replaces a file of another program.
+    """
+    for source in sources:
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            if not source.is_file():
+                continue
+            temporary.unlink(missing_ok=True)
+            _refuse_links(source)
+            address = f"{source.absolute().as_uri()}?mode=ro"
+            with (
+                closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
+                closing(sqlite3.connect(temporary)) as copy,
+            ):
+                if original.execute("PRAGMA user_version").fetchone()[0] != VERSION:
+                    continue
+                original.backup(copy)
+            with suppress(FileExistsError):
+                os.link(temporary, path)
+        except (OSError, sqlite3.Error) as error:
+            log.debug("catalogue_not_copied", path=str(source), reason=str(error))
+        else:
+            return
+        finally:
+            for each in _files_of(temporary):
+                with suppress(OSError):
+                    each.unlink(missing_ok=True)
+
+
+def _refuse_links(path: Path) -> None:
+    """Refuses a file that lies elsewhere: it would be written, or set aside, where it lies.
+
+    Raises:
+        OSError: the file, its write-ahead log or its folder is a symbolic link.
+    """
+    for each in (path.parent, *_files_of(path)):
+        if each.is_symlink():
+            raise OSError(errno.ELOOP, f"{each.name} is a symbolic link, which is not followed")
+
+
+def _fault_of(path: Path, *, thorough: bool) -> sqlite3.Error | None:
+    """Returns what is wrong with a file that is open here, as another program would find it.
+
+    Args:
+        path: the file.
+        thorough: whether all of it is read; else only where its tables begin.
+    """
+    # rw and not rwc: a file that has just gone is not made again.
+    address = f"{path.absolute().as_uri()}?mode=rw"
+    try:
+        with closing(sqlite3.connect(address, uri=True, timeout=_SHORT_MS / 1000)) as connection:
+            connection.execute(_FIRST_ROWS).fetchall()
+            if not thorough:
+                return None
+            found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+    except sqlite3.Error as error:
+        return error
+    return None if found == "ok" else sqlite3.DatabaseError(found)
+
+
+def _in_memory() -> OpenDatabase:
+    """Returns an empty database in memory."""
+    connection = _connect(":memory:")
+    connection.executescript(_TABLES)
+    return OpenDatabase(connection, None)
+
+
+def is_transient(error: Exception) -> bool:
+    """Returns whether the database may work again as it is."""
+    return isinstance(error, MemoryError) or _code(error) in _TRANSIENT
+
+
+def is_busy(error: Exception) -> bool:
+    """Returns whether another program holds the database."""
+    return _code(error) in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}
+
+
+def _code(error: Exception) -> int:
+    """Returns SQLite's primary result code; 0 where the error is not SQLite's."""
+    code: object = getattr(error, "sqlite_errorcode", 0)
+    return code & 0xFF if isinstance(code, int) else 0
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Returns the file itself, its write-ahead log and the log's index."""
+    return [path, *(path.with_name(path.name + suffix) for suffix in _SUFFIXES)]
+
+
+def _identities(path: Path) -> tuple[tuple[int, int] | None, ...]:
+    """Returns device and inode of each of the database's files; None where there is none."""
+    found: list[tuple[int, int] | None] = []
+    for each in _files_of(path):
+        try:
+            status = each.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            found.append(None)
+        else:
+            found.append((status.st_dev, status.st_ino))
+    return tuple(found)
+
+
+def _connect_and_check(path: Path) -> sqlite3.Connection:
+    """Connects to a file that can be written and has the tables of this version.
+
+    Raises:
+        OSError: it cannot be set aside, or another version of this program uses it: each setting
+            the other's file aside, they would digest all bags for ever.
+        sqlite3.Error: it is busy, or cannot be opened or written.
+    """
+    for _ in range(2):
+        connection = _connect(str(path))
+        try:
+            other = _create_or_compare_tables(connection)
+            if other is None:
+                return connection
+            in_use = _is_used_elsewhere(connection)
+        except sqlite3.DatabaseError as error:
+            connection.close()
+            # Operational errors are those of the moment or of the disk, not of the content.
+            if isinstance(error, sqlite3.OperationalError):
+                raise
+            _set_aside(path, f"it is damaged: {error}")
+            continue
+        connection.close()
+        if in_use:
+            raise OSError(errno.EBUSY, f"another version of this program uses it: {other}")
+        _set_aside(path, other)
+    raise sqlite3.OperationalError("another program replaces it again and again")
+
+
+def _connect(target: str) -> sqlite3.Connection:
+    return sqlite3.connect(target, timeout=BUSY_S, isolation_level=None, check_same_thread=False)
+
+
+def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
+    """Creates the tables of a new database; returns how an old one is of another version."""
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = NORMAL")
+    connection.execute("BEGIN IMMEDIATE")
+    version = connection.execute("PRAGMA user_version").fetchone()[0]
+    tables = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+    if version == 0 and tables == 0:
+        for statement in _TABLES.split(";"):
+            connection.execute(statement)
+        connection.execute(f"PRAGMA user_version = {VERSION:d}")
+    connection.execute("COMMIT")
+    if tables and version != VERSION:
+        return f"it is of version {version}, and {VERSION} is what is known"
+    if tables and _declared_tables(connection) != _expected_tables():
+        return "its tables are not those of this version"
+    connection.execute(_FIRST_ROWS).fetchall()
+    return None
+
+
+def _declared_tables(connection: sqlite3.Connection) -> dict[str, str]:
+    """Returns the SQL that each table was declared with."""
+    query = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
+    return {
+        name: " ".join(str(sql).split())
+        for name, sql in connection.execute(query).fetchall()
+        if not name.startswith("sqlite_")
+    }
+
+
+@cache
+def _expected_tables() -> dict[str, str]:
+    with closing(_in_memory().connection) as connection:
+        return _declared_tables(connection)
+
+
+def _is_used_elsewhere(connection: sqlite3.Connection) -> bool:
+    """Returns whether another connection is open to the file: only the last may leave WAL mode."""
+    try:
+        mode = connection.execute("PRAGMA journal_mode = DELETE").fetchone()[0]
+    except sqlite3.OperationalError:
+        return True
+    return bool(mode != "delete")
+
+
+def _set_aside(path: Path, reason: str) -> None:
+    """Renames a file so that a new one can be made; the old one stays for whoever wants to look."""
+    aside = path.with_name(f"{path.name}.aside")
+    log.warning("catalogue_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
+    for each in _files_of(path)[1:]:
+        each.unlink(missing_ok=True)
+    path.rename(aside)

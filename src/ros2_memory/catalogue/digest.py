@@ -64,23 +64,20 @@ class Digester:
         """
         summary = self._reader.summarize(path)
         latched: dict[str, bool] = {}
-        counts: dict[str, int] = {}
         for each in summary.topics:
             latched[each.topic] = latched.get(each.topic, False) or each.latched
-            counts[each.topic] = counts.get(each.topic, 0) + each.count
         collectors = {
             topic: TopicCollector(
                 topic,
                 self._reader,
                 self._extractor,
                 self._max_plausible_speed_mps,
-                latched=latched[topic],
-                count=count,
+                latched=is_latched,
             )
-            for topic, count in counts.items()
+            for topic, is_latched in latched.items()
         }
         left = _ALWAYS_READ_BYTES + _MOST_TIMES_PACKED * _size(path)
-        for record in self._reader.records(path, tuple(counts), TimeWindow.everything()):
+        for record in self._reader.records(path, tuple(latched), TimeWindow.everything()):
             left -= len(record.payload) + _MESSAGE_BYTES
             if left < 0:
                 raise BagError(str(path), "its messages unpack to more than they can be worth")

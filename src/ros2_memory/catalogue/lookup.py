@@ -1,7 +1,8 @@
-"""What the catalogue says of the bags of a snapshot, worked out once for each run of bags.
+"""What the catalogue knows of the bags of a snapshot, computed once for each segment of bags.
 
-A run never changes, and no entry of the catalogue does, so what is said here of a run holds for as
-long as somebody has it; only a run with bags that have no entry yet is looked at again.
+A segment never changes, and neither does an entry of the catalogue, so what is computed here is
+valid for as long as the segment is in use. Only a segment with bags that have no entry yet is
+looked up again.
 """
 
 from __future__ import annotations
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.odometry import PoseDigest
-    from ros2_memory.analysis.standstills import StandstillDigest
-    from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.catalogue.store import Catalogue
     from ros2_memory.catalogue.topic_digest import EdgeDigest
@@ -31,214 +29,196 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_MOST_KEPT: Final = 64
-"""Runs of which the messages that the catalogue keeps are held: two days of splits."""
-_IN_DOUBT: Final = -1
-"""The state of a catalogue that could not be asked."""
+_MAX_WITH_MESSAGES: Final = 64
+"""Segments whose stored messages stay in memory: two days of 10 s splits."""
+_UNKNOWN_STATE: Final = -1
+"""Stands for the state of a catalogue that could not be read."""
 
 
 class SegmentDigests:
-    """What the catalogue says of one run. Bags without an entry are not spoken of.
+    """What the catalogue knows of one segment, leaving out bags without an entry.
 
     Attributes:
+        catalogue: where the rest of the entries is read from.
         numbers: by file, the number of its entry.
-        whole: whether every bag of the run has one.
+        whole: whether every bag of the segment has an entry.
+        as_of: the state of the catalogue when the entries were looked up.
     """
 
     def __init__(
-        self,
-        catalogue: Catalogue,
-        run: Segment,
-        bag_dir: Path,
-        as_of: int,
-        lately: RecordLru | None = None,
+        self, catalogue: Catalogue, segment: Segment, bag_dir: Path, as_of: int, recent: RecordLru
     ) -> None:
-        self._catalogue = catalogue
-        self._lately = RecordLru() if lately is None else lately
-        before = catalogue.failures
-        closed = [bag for bag in run.bags if bag.state is BagState.CLOSED]
+        self.catalogue = catalogue
+        self._recent = recent
+        failures = catalogue.failures
+        closed = [bag for bag in segment.bags if bag.state is BagState.CLOSED]
         numbers = catalogue.find([BagKey.of(bag, bag_dir) for bag in closed])
-        self.as_of = as_of if catalogue.failures == before else _IN_DOUBT
+        self.as_of = as_of if catalogue.failures == failures else _UNKNOWN_STATE
         self.numbers: dict[str, int] = {
             bag.file: number
             for bag, number in zip(closed, numbers, strict=True)
             if number is not None
         }
-        self.whole = len(self.numbers) == len(run.bags)
+        self.whole = len(self.numbers) == len(segment.bags)
         every = [*self.numbers.values()]
-        self._holding: dict[str, list[int]] = {
-            topic: every if held is run.bags else self._numbers_of(held)
-            for topic in run.spans
-            for held in (run.bags_with(topic),)
+        self._with_topic: dict[str, list[int]] = {
+            # Most topics are in all bags: these share one list.
+            topic: every if bags is segment.bags else self._numbers_of(bags)
+            for topic in segment.spans
+            for bags in (segment.bags_with(topic),)
         }
-        self._evidence: dict[str, ZoneMap] = {}
+        self._zone_map: dict[str, ZoneMap] = {}
         self._boxes: dict[str, Boxes] = {}
         self._edges: dict[str, dict[int, EdgeDigest]] = {}
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
-        self._kept: dict[str, dict[int, tuple[Record, ...]]] = {}
+        self._messages: dict[str, dict[int, tuple[Record, ...]]] = {}
 
-    def evidence_of_all(self, topic: str) -> ZoneMap:
-        """What can have stood in any message of the topic in the bags with an entry."""
-        return self._kept_as(self._evidence, topic, lambda: united(self.evidence(topic).values()))
+    def zone_map(self, topic: str) -> ZoneMap:
+        """Returns what can be in any message of the topic in the bags with an entry."""
+        return self._cached(self._zone_map, topic, lambda: united(self.zone_maps(topic).values()))
 
-    def evidence(self, topic: str) -> Mapping[int, ZoneMap]:
-        """For each entry that holds the topic what can have stood in it."""
-        numbers = self._of(topic)
-        known = self._catalogue.evidence(topic, numbers)
+    def zone_maps(self, topic: str) -> Mapping[int, ZoneMap]:
+        """Returns what can be in the messages of the topic, for each entry that has the topic."""
+        numbers = self._entries_with(topic)
+        known = self.catalogue.zone_maps(topic, numbers)
         # Where the catalogue failed since the entries were found, nothing is ruled out.
         return {number: known.get(number, UNBOUNDED) for number in numbers}
 
     def boxes(self, topic: str) -> Boxes:
-        """The places in the evidence; kept, since they are few numbers and asked for often."""
-        return self._kept_as(self._boxes, topic, lambda: Boxes(self.evidence(topic)))
-
-    def poses(self, topic: str, among: Sequence[int]) -> Mapping[int, PoseDigest]:
-        """For each of these entries that has it the digest of its poses."""
-        return self._catalogue.poses(topic, among)
-
-    def standstills(self, topic: str, among: Sequence[int]) -> Mapping[int, StandstillDigest]:
-        """For each of these entries that has it where its poses stand still."""
-        return self._catalogue.standstills(topic, among)
-
-    def stories(self, topic: str, among: Sequence[int]) -> Mapping[int, TopicEvents | None]:
-        """For each of these entries what the messages of the topic say, as the catalogue has it."""
-        return self._catalogue.stories(topic, among)
+        """Returns the boxes of the zone maps; cached, since they are small and often asked for."""
+        return self._cached(self._boxes, topic, lambda: Boxes(self.zone_maps(topic)))
 
     def edges(self, topic: str) -> Mapping[int, EdgeDigest]:
-        """For each entry that has them the frame edges."""
-        return self._kept_as(
-            self._edges, topic, lambda: self._catalogue.edges(topic, self._of(topic))
+        """Returns the frame edges, for each entry that has them."""
+        return self._cached(
+            self._edges, topic, lambda: self.catalogue.edges(topic, self._entries_with(topic))
         )
 
     def pairs(self, topic: str) -> frozenset[tuple[str, str]] | None:
-        """The frame pairs of all the run's bags; None where those of some are not known."""
-        return self._kept_as(self._pairs, topic, lambda: self._pairs_of(topic))
+        """Returns the frame pairs of all bags; None where those of some are not known."""
+        return self._cached(self._pairs, topic, lambda: self._all_pairs(topic))
 
-    def _pairs_of(self, topic: str) -> frozenset[tuple[str, str]] | None:
+    def _all_pairs(self, topic: str) -> frozenset[tuple[str, str]] | None:
         edges = self.edges(topic)
-        if not self.whole or len(edges) < len(self._of(topic)):
+        if not self.whole or len(edges) < len(self._entries_with(topic)):
             return None
         return frozenset(pair for edge in edges.values() for pair in edge.pairs)
 
-    def kept(self, topic: str) -> Mapping[int, tuple[Record, ...]]:
-        """For each entry that keeps them all messages of the topic.
+    def messages(self, topic: str) -> Mapping[int, tuple[Record, ...]]:
+        """Returns all messages of the topic, for each entry that stores them.
 
-        They are many, so they are held of the runs that were asked lately.
+        They are many, so they are cached for the segments that were asked for last.
         """
-        self._lately.used(self)
-        return self._kept_as(
-            self._kept, topic, lambda: self._catalogue.kept(topic, self._of(topic))
+        self._recent.touch(self)
+        return self._cached(
+            self._messages, topic, lambda: self.catalogue.messages(topic, self._entries_with(topic))
         )
 
     def undecodable(self, topic: str, number: int) -> Mapping[str, str] | None:
-        """By message type, why messages of the topic in an entry cannot be decoded.
+        """Returns, by message type, why messages of an entry cannot be decoded.
 
-        None where the entry does not say. Not kept: one bag is asked about for each type.
+        None where the entry is gone. Not cached: each bag is asked about once for each type.
         """
-        return self._catalogue.undecodable(topic, [number]).get(number)
+        return self.catalogue.undecodable(topic, [number]).get(number)
 
-    def _kept_as(self, known: dict[str, T], topic: str, ask: Callable[[], T]) -> T:
-        """What was worked out before, or is now; kept unless the catalogue failed meanwhile."""
-        there = known.get(topic)
-        if there is not None:
-            return there
-        before = self._catalogue.failures
-        found = ask()
-        if self._catalogue.failures == before:
-            known[topic] = found
-        return found
+    def _cached(self, cache: dict[str, T], topic: str, compute: Callable[[], T]) -> T:
+        """Computes a value at most once for each topic, unless the catalogue failed meanwhile."""
+        known = cache.get(topic)
+        if known is not None:
+            return known
+        failures = self.catalogue.failures
+        value = compute()
+        if self.catalogue.failures == failures:
+            cache[topic] = value
+        return value
 
-    def release(self) -> None:
-        """Lets go of the messages that are held; who has them still has them."""
-        self._kept = {}
+    def release_messages(self) -> None:
+        """Drops the cached messages."""
+        self._messages = {}
 
     def _numbers_of(self, bags: Sequence[BagFile]) -> list[int]:
         return [self.numbers[bag.file] for bag in bags if bag.file in self.numbers]
 
-    def _of(self, topic: str) -> list[int]:
-        return self._holding.get(topic, [])
+    def _entries_with(self, topic: str) -> list[int]:
+        return self._with_topic.get(topic, [])
 
 
 class RecordLru:
-    """The notes whose messages are held. Safe for several threads at once."""
+    """Bounds how many segments keep their messages in memory. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._notes: OrderedDict[SegmentDigests, None] = OrderedDict()
+        self._recent: OrderedDict[SegmentDigests, None] = OrderedDict()
 
-    def used(self, notes: SegmentDigests) -> None:
-        """Puts notes first; those that were used longest ago let go of their messages."""
+    def touch(self, digests: SegmentDigests) -> None:
+        """Marks a segment as used; the least recently used one drops its messages."""
         with self._lock:
-            self._notes[notes] = None
-            self._notes.move_to_end(notes)
-            if len(self._notes) > _MOST_KEPT:
-                self._notes.popitem(last=False)[0].release()
+            self._recent[digests] = None
+            self._recent.move_to_end(digests)
+            if len(self._recent) > _MAX_WITH_MESSAGES:
+                self._recent.popitem(last=False)[0].release_messages()
 
 
 class DigestCache:
-    """Gives the notes on runs. Safe for several threads at once."""
+    """Caches what the catalogue knows, by segment. Thread-safe."""
 
     def __init__(self, catalogue: Catalogue, bag_dir: Path) -> None:
         self.catalogue = catalogue
         self._bag_dir = bag_dir
         self._lock = threading.Lock()
-        self._lately = RecordLru()
-        self._runs: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
+        self._recent = RecordLru()
+        self._segments: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
 
     def as_of(self) -> int:
-        """The state of the catalogue that one question should be answered by."""
+        """Returns the state of the catalogue that one question should be answered by."""
         return self.catalogue.newest()
 
-    def notes(self, run: Segment, as_of: int) -> SegmentDigests:
-        """What is known of a run, at that state of the catalogue or a later one."""
+    def digests_for(self, segment: Segment, as_of: int) -> SegmentDigests:
+        """Returns what is known of a segment, at that state of the catalogue or a later one."""
         with self._lock:
-            known = self._runs.get(run)
-        if known is None or not self._holds(known, as_of):
-            known = SegmentDigests(self.catalogue, run, self._bag_dir, as_of, self._lately)
+            known = self._segments.get(segment)
+        if known is None or not self._is_up_to_date(known, as_of):
+            known = SegmentDigests(self.catalogue, segment, self._bag_dir, as_of, self._recent)
             with self._lock:
-                self._runs[run] = known
+                self._segments[segment] = known
         return known
 
-    def settled(self, run: Segment) -> SegmentDigests | None:
-        """The notes on a run that speak of all its bags: no state of the catalogue adds to them.
+    def complete_digests(self, segment: Segment) -> SegmentDigests | None:
+        """Returns the digests of a segment all of whose bags have one; None where not yet.
 
-        None where there are none yet. Asks nothing of the catalogue's file.
+        No later state of the catalogue adds to them, so its file is not read for this.
         """
         with self._lock:
-            known = self._runs.get(run)
+            known = self._segments.get(segment)
         if known is None or not known.whole or not self.catalogue.is_current(known.as_of):
             return None
         return known
 
-    def remembered(
-        self, question: str, numbers: Sequence[int], parsed: Callable[[str], T]
+    def cached_answer(
+        self, question: str, numbers: Sequence[int], parse: Callable[[str], T]
     ) -> T | None:
-        """What was once worked out from these entries; None where nothing that can be parsed."""
-        answer = self.catalogue.remembered(question, numbers)
+        """Returns what was computed from these entries before; None where nothing can be parsed."""
+        answer = self.catalogue.cached_answer(question, numbers)
         try:
-            return None if answer is None else parsed(answer)
-        # A damaged file holds anything.
+            return None if answer is None else parse(answer)
+        # A damaged file can hold anything.
         except (ValueError, TypeError, LookupError, AttributeError):
             return None
 
-    def remember(self, question: str, numbers: Sequence[int], answer: str) -> None:
-        """Keeps what was worked out from these entries, for as long as they stand."""
-        self.catalogue.remember(question, numbers, answer)
-
-    def _holds(self, known: SegmentDigests, as_of: int) -> bool:
-        """Whether another look would say no more."""
+    def _is_up_to_date(self, known: SegmentDigests, as_of: int) -> bool:
+        """Whether a new look-up would find no more."""
         if known.as_of == as_of:
             return True
-        return known.whole and self.catalogue.is_same_base(known.as_of, as_of)
+        return known.whole and self.catalogue.is_same_database(known.as_of, as_of)
 
 
-def bags_without_entry(runs: Sequence[Segment], recall: DigestCache) -> list[BagFile]:
-    """The closed bags of which the catalogue knows nothing, in order."""
-    as_of = recall.as_of()
+def bags_without_entry(segments: Sequence[Segment], cache: DigestCache) -> list[BagFile]:
+    """Returns the closed bags that the catalogue does not know, in order."""
+    as_of = cache.as_of()
     return [
         bag
-        for run in runs
-        if not (notes := recall.notes(run, as_of)).whole
-        for bag in run.bags
-        if bag.state is BagState.CLOSED and bag.file not in notes.numbers
+        for segment in segments
+        if not (digests := cache.digests_for(segment, as_of)).whole
+        for bag in segment.bags
+        if bag.state is BagState.CLOSED and bag.file not in digests.numbers
     ]

@@ -1,7 +1,7 @@
-"""What is asked of the catalogue's tables, and written to them, in SQL.
+"""Reads, writes and deletes rows of the catalogue's tables.
 
-Statements are put together from constants of this room; values are always parameters. Raises what
-sqlite3 raises.
+Statements are put together from constants of this room; values are always parameters. Everything
+raises what sqlite3 raises.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from ros2_memory.analysis.zone_map import UNBOUNDED, Box, ZoneMap
 from ros2_memory.catalogue.codec import (
     encode_poses,
     encode_schema,
+    encode_standstills,
     encode_topic_events,
-    packed_standstills,
 )
 
 if TYPE_CHECKING:
@@ -28,97 +28,106 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import Record
 
-_OPEN, _TEXTS, _FALSE, _TRUE = 1, 2, 4, 8
-EVIDENCE: Final = "flags, words, low, high, numbers, min_x, max_x, min_y, max_y, min_z, max_z"
-TOPIC: Final = "(SELECT id FROM topics WHERE name = ?)"
-AMONG: Final = "IN (SELECT value FROM json_each(?))"
+_UNBOUNDED, _TEXTS, _FALSE, _TRUE = 1, 2, 4, 8
+QUIET: Final = 0
+"""Stands in `EVENTS` for messages without an event: `tales` has no row of these."""
+_TALES: Final = "FROM tales WHERE tales.topic = held.topic AND tales.bag = held.bag"
+_TOPIC: Final = "(SELECT id FROM topics WHERE name = ?)"
+_AMONG: Final = "IN (SELECT value FROM json_each(?))"
+
+# Columns for `topic_rows`.
+ZONE_MAP: Final = "flags, words, low, high, numbers, min_x, max_x, min_y, max_y, min_z, max_z"
+STANDSTILLS: Final = f"(SELECT rests {_TALES})"
+EVENTS: Final = f"coalesce((SELECT story {_TALES}), {QUIET})"
+EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
+UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 
 
-def numbers_of(base: sqlite3.Connection, config: str, paths: Sequence[str]) -> list[int]:
-    """The numbers of the entries of these files."""
-    rows = base.execute(
-        f"SELECT id FROM bags WHERE config = ? AND path {AMONG}", (config, json.dumps(paths))
-    )
-    return [row[0] for row in rows.fetchall()]
-
-
-def keys_rows(base: sqlite3.Connection, config: str, paths: Sequence[str]) -> list[sqlite3.Row]:
-    """Number, path, size, mtime and sidecar's mtime of the entries of these files."""
-    return base.execute(
-        f"SELECT id, path, size, mtime, sidecar FROM bags WHERE config = ? AND path {AMONG}",
+def entry_rows(
+    connection: sqlite3.Connection, config: str, paths: Sequence[str]
+) -> list[sqlite3.Row]:
+    """Returns row id, path, size, mtime and sidecar's mtime of the entries of these files."""
+    return connection.execute(
+        f"SELECT id, path, size, mtime, sidecar FROM bags WHERE config = ? AND path {_AMONG}",
         (config, json.dumps(paths)),
     ).fetchall()
 
 
-def kept_rows(base: sqlite3.Connection, topic: str, numbers: Sequence[int]) -> list[sqlite3.Row]:
-    """Entry, channel, log time, publish time and payload of the messages kept, in order."""
-    return base.execute(
+def topic_rows(
+    connection: sqlite3.Connection, columns: str, topic: str, row_ids: Sequence[int]
+) -> list[sqlite3.Row]:
+    """Returns the row id and these columns of what entries hold of a topic."""
+    return connection.execute(
+        f"SELECT bag, {columns} FROM held WHERE topic = {_TOPIC} AND bag {_AMONG}",
+        (topic, json.dumps(row_ids)),
+    ).fetchall()
+
+
+def message_rows(
+    connection: sqlite3.Connection, topic: str, row_ids: Sequence[int]
+) -> list[sqlite3.Row]:
+    """Returns row id, channel, log time, publish time and payload of stored messages, in order."""
+    return connection.execute(
         "SELECT bag, channel, log_time, publish_time, payloads.bytes FROM kept"
         " JOIN payloads ON payloads.id = kept.payload"
-        f" WHERE topic = {TOPIC} AND bag {AMONG} ORDER BY bag, nth",
-        (topic, json.dumps(numbers)),
+        f" WHERE topic = {_TOPIC} AND bag {_AMONG} ORDER BY bag, nth",
+        (topic, json.dumps(row_ids)),
     ).fetchall()
 
 
-def held_rows(
-    base: sqlite3.Connection, columns: str, topic: str, numbers: Sequence[int]
-) -> list[sqlite3.Row]:
-    """The entry and these columns of what entries hold of a topic."""
-    return base.execute(
-        f"SELECT bag, {columns} FROM held WHERE topic = {TOPIC} AND bag {AMONG}",
-        (topic, json.dumps(numbers)),
-    ).fetchall()
-
-
-def drop(base: sqlite3.Connection, numbers: Sequence[int]) -> None:
-    """Deletes entries."""
-    if not numbers:
+def delete_entries(connection: sqlite3.Connection, row_ids: Sequence[int]) -> None:
+    """Deletes entries with all that belongs to them, and the cached answers that used them."""
+    if not row_ids:
         return
-    listed = json.dumps(numbers)
-    for (topic,) in base.execute("SELECT id FROM topics").fetchall():
+    listed = json.dumps(row_ids)
+    # Topic by topic: the primary keys begin with the topic.
+    for (topic,) in connection.execute("SELECT id FROM topics").fetchall():
         for table in ("held", "tales", "kept"):
-            base.execute(f"DELETE FROM {table} WHERE topic = ? AND bag {AMONG}", (topic, listed))
-    base.execute(f"DELETE FROM bags WHERE id {AMONG}", (listed,))
-    base.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
+            connection.execute(
+                f"DELETE FROM {table} WHERE topic = ? AND bag {_AMONG}", (topic, listed)
+            )
+    connection.execute(f"DELETE FROM bags WHERE id {_AMONG}", (listed,))
+    connection.execute("DELETE FROM remembered WHERE oldest NOT IN (SELECT id FROM bags)")
 
 
-def put(
-    base: sqlite3.Connection, config: str, key: tuple[str, int, int, int], digest: Digest
+def insert_entry(
+    connection: sqlite3.Connection, config: str, key: tuple[str, int, int, int], digest: Digest
 ) -> None:
     """Inserts an entry; `key` is path, size, mtime and sidecar's mtime."""
-    shape = _number(base, "shapes", "text", encode_schema(digest.summary.shape))
-    cursor = base.execute(
+    schema = _id_of(connection, "shapes", "text", encode_schema(digest.summary.shape))
+    cursor = connection.execute(
         "INSERT INTO bags (config, path, size, mtime, sidecar, shape, counts)"
         " VALUES (?, ?, ?, ?, ?, ?, ?)",
-        (config, *key, shape, digest.summary.numbers),
+        (config, *key, schema, digest.summary.numbers),
     )
-    number = int(cursor.lastrowid or 0)
+    bag = int(cursor.lastrowid or 0)
     for topic in digest.topics:
-        _put_topic(base, number, topic)
-        _put_tale(base, number, topic, digest.summary)
+        number = _id_of(connection, "topics", "name", topic.topic)
+        _insert_topic(connection, (number, bag), topic)
+        _insert_events(connection, (number, bag), topic, digest.summary)
+        for nth, record in enumerate(topic.kept or ()):
+            _insert_record(connection, (bag, number, nth), record)
 
 
-def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
-    evidence, edges = topic.evidence, topic.edges
-    number = _number(base, "topics", "name", topic.topic)
+def _insert_topic(connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest) -> None:
+    zones, edges = topic.zone_map, topic.edges
     flags = (
-        evidence.open * _OPEN
-        | evidence.texts * _TEXTS
-        | (False in evidence.booleans) * _FALSE
-        | (True in evidence.booleans) * _TRUE
+        zones.open * _UNBOUNDED
+        | zones.texts * _TEXTS
+        | (False in zones.booleans) * _FALSE
+        | (True in zones.booleans) * _TRUE
     )
-    pairs = None if edges is None else _number(base, "edges", "pairs", json.dumps(edges.pairs))
-    base.execute(
+    pairs = None if edges is None else _id_of(connection, "edges", "pairs", json.dumps(edges.pairs))
+    connection.execute(
         f"INSERT INTO held VALUES ({', '.join('?' * 19)})",
         (
-            number,
-            bag,
+            *key,
             flags,
-            evidence.words,
-            evidence.low,
-            evidence.high,
-            None if evidence.numbers is None else json.dumps(evidence.numbers),
-            *(evidence.box or (None,) * 6),
+            zones.words,
+            zones.low,
+            zones.high,
+            None if zones.numbers is None else json.dumps(zones.numbers),
+            *(zones.box or (None,) * 6),
             None if topic.poses is None else encode_poses(topic.poses),
             pairs,
             None if edges is None else edges.first_stamp,
@@ -127,45 +136,36 @@ def _put_topic(base: sqlite3.Connection, bag: int, topic: TopicDigest) -> None:
             json.dumps(dict(topic.undecodable)) if topic.undecodable else None,
         ),
     )
-    for nth, record in enumerate(topic.kept or ()):
-        _put_record(base, (bag, number, nth), record)
 
 
-def _put_tale(base: sqlite3.Connection, bag: int, topic: TopicDigest, summary: BagSummary) -> None:
-    """Inserts where a topic's poses stand still and what its messages say, if there is any."""
-    story = b"" if topic.story is None else encode_topic_events(topic.story)
+def _insert_events(
+    connection: sqlite3.Connection, key: tuple[int, int], topic: TopicDigest, summary: BagSummary
+) -> None:
+    """Inserts the topic's standstills and events; no row where there are none."""
     spans = [(each.first, each.last) for each in summary.of(topic.topic)]
     quiet = TopicEvents(min(first for first, _ in spans), max(last for _, last in spans))
-    if topic.standstills is None and topic.story == quiet:
+    if topic.standstills is None and topic.events == quiet:
         return
-    base.execute(
-        f"INSERT INTO tales VALUES ({TOPIC}, ?, ?, ?)",
+    # Empty bytes stand for messages that cannot be decoded, NULL for messages without an event.
+    events = b"" if topic.events is None else encode_topic_events(topic.events)
+    connection.execute(
+        "INSERT INTO tales VALUES (?, ?, ?, ?)",
         (
-            topic.topic,
-            bag,
-            None if topic.standstills is None else packed_standstills(topic.standstills),
-            None if topic.story == quiet else story,
+            *key,
+            None if topic.standstills is None else encode_standstills(topic.standstills),
+            None if topic.events == quiet else events,
         ),
     )
 
 
-def tale_rows(
-    base: sqlite3.Connection, column: str, topic: str, numbers: Sequence[int]
-) -> list[sqlite3.Row]:
-    """The entry and a column of what is told of a topic, where there is something in it."""
-    return base.execute(
-        f"SELECT bag, {column} FROM tales"
-        f" WHERE topic = {TOPIC} AND bag {AMONG} AND {column} IS NOT NULL",
-        (topic, json.dumps(numbers)),
-    ).fetchall()
-
-
-def _put_record(base: sqlite3.Connection, place: tuple[int, int, int], record: Record) -> None:
-    channel, payload = record.channel, record.payload
-    schema = channel.schema
+def _insert_record(
+    connection: sqlite3.Connection, key: tuple[int, int, int], record: Record
+) -> None:
+    """Inserts a message; equal channels and payloads of all bags are stored once."""
+    channel, schema = record.channel, record.channel.schema
     described = repr((channel.topic, channel.encoding, channel.latched, schema)).encode()
     channel_hash = hashlib.sha256(described).digest()
-    base.execute(
+    connection.execute(
         "INSERT OR IGNORE INTO channels (hash, topic, encoding, latched, schema_name,"
         " schema_encoding, schema_text) VALUES (?, ?, ?, ?, ?, ?, ?)",
         (
@@ -178,28 +178,29 @@ def _put_record(base: sqlite3.Connection, place: tuple[int, int, int], record: R
             schema.text,
         ),
     )
-    payload_hash = hashlib.sha256(payload).digest()
-    base.execute(
-        "INSERT OR IGNORE INTO payloads (hash, bytes) VALUES (?, ?)", (payload_hash, payload)
+    payload_hash = hashlib.sha256(record.payload).digest()
+    connection.execute(
+        "INSERT OR IGNORE INTO payloads (hash, bytes) VALUES (?, ?)",
+        (payload_hash, record.payload),
     )
-    base.execute(
+    connection.execute(
         "INSERT INTO kept VALUES (?, ?, ?, ?, ?, (SELECT id FROM channels WHERE hash = ?),"
         " (SELECT id FROM payloads WHERE hash = ?))",
-        (*place, record.log_time, record.publish_time, channel_hash, payload_hash),
+        (*key, record.log_time, record.publish_time, channel_hash, payload_hash),
     )
 
 
-def _number(base: sqlite3.Connection, table: str, column: str, text: str) -> int:
-    """The number of a text that many entries share."""
-    base.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
-    row = base.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()
+def _id_of(connection: sqlite3.Connection, table: str, column: str, text: str) -> int:
+    """Returns the id of a text that many entries share, which is inserted where it is new."""
+    connection.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
+    row = connection.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()
     return int(row[0])
 
 
-def evidence_of(row: sqlite3.Row) -> ZoneMap:
-    """The evidence in the columns `EVIDENCE` of a row."""
+def zone_map(row: sqlite3.Row) -> ZoneMap:
+    """Decodes the columns `ZONE_MAP` of a row."""
     _, flags, words, low, high, numbers, *box = row
-    if flags & _OPEN:
+    if flags & _UNBOUNDED:
         return UNBOUNDED
     return ZoneMap(
         words=words,

@@ -94,13 +94,13 @@ class BagAccess:
         cache = self.memory.recall
         if cache is None:
             return None
-        settled = cache.settled(segment)
+        settled = cache.complete_digests(segment)
         if settled is not None:
             return settled
         if self._as_of is None:
             # One state of the catalogue for the whole call, asked for only where it may have grown.
             self._as_of = cache.as_of()
-        return cache.notes(segment, self._as_of)
+        return cache.digests_for(segment, self._as_of)
 
     def entry(self, bag: BagFile) -> tuple[SegmentDigests, int] | None:
         """Returns the digests that include a bag, and its number in them; None without an entry."""
@@ -260,7 +260,7 @@ class BagAccess:
         if entry is None:
             return None
         digests, number = entry
-        return digests.kept(topic).get(number)
+        return digests.messages(topic).get(number)
 
 
 def _indexed_part(bag: BagFile, window: TimeWindow) -> TimeWindow:

@@ -189,7 +189,7 @@ class StoredDigests(Generic[T]):
             cache, numbers = self._view.memory.recall, self._numbers(group)
             if cache is None or numbers is None:
                 return None
-            return cache.remembered(self._question, numbers, self._decode)
+            return cache.cached_answer(self._question, numbers, self._decode)
         [span] = group.bags
         number = None if self._segment is None else self._segment.numbers.get(span.bag.file)
         if number is None:
@@ -224,7 +224,9 @@ class StoredDigests(Generic[T]):
         if cache is None or numbers is None or len(numbers) < 2 or not self._view.notes.complete:
             return
         if not group.may_be_relatched:
-            cache.remember(self._question, numbers, json.dumps([self._kind.encode(digest), *span]))
+            cache.catalogue.cache_answer(
+                self._question, numbers, json.dumps([self._kind.encode(digest), *span])
+            )
 
     def _decode(self, answer: str) -> tuple[T, Span]:
         digest, first, last = json.loads(answer)

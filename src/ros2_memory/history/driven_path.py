@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
+from ros2_memory.analysis.bulk_decode import MotionDecoder
 from ros2_memory.analysis.odometry import TimedPosition, is_place
-from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
@@ -50,7 +50,7 @@ class DrivenPath:
 
 POSES: Final = DigestKind(
     "poses",
-    look_up=lambda digests, topic, among: digests.poses(topic, among),
+    look_up=lambda digests, topic, among: digests.catalogue.poses(topic, among),
     encode=lambda digest: encode_poses(digest).hex(),
     decode=lambda text: decode_poses(bytes.fromhex(text)),
 )
@@ -142,7 +142,7 @@ def add_poses(
     first: Ns | None = None
     last: Ns | None = None
     for some in _batches(messages):
-        for found, sight in zip(some, decoder.of([each.record for each in some]), strict=True):
+        for found, sight in zip(some, decoder.decode([each.record for each in some]), strict=True):
             if isinstance(sight, UndecodableError):
                 failures.append(sight)
                 continue

@@ -260,7 +260,7 @@ class CandidateBags:
         known = {} if notes is None else notes.numbers
         possible: Collection[int] = ()
         if notes is not None and known:
-            if self._condition.can_match(notes.evidence_of_all(topic)):
+            if self._condition.can_match(notes.zone_map(topic)):
                 possible = self._possible(notes, topic)
             if notes.whole and not possible:
                 self.ruled_out = True
@@ -280,7 +280,7 @@ class CandidateBags:
         if place is not None:
             boxes = notes.boxes(topic)
             return boxes.meeting(place.x, place.y, place.z, place.tolerance_m)
-        said = notes.evidence(topic)
+        said = notes.zone_maps(topic)
         return {number for number, each in said.items() if self._condition.can_match(each)}
 
 

@@ -98,7 +98,7 @@ class View:
         if cache is None or len(numbers) < len(bags):
             return self._count_overlap(topic, window, bags)
         question = json.dumps(["contest", topic, window.start, window.stop])
-        known = cache.remembered(question, numbers, _decode_overlap)
+        known = cache.cached_answer(question, numbers, _decode_overlap)
         if known is not None:
             return known
         counted = self._count_overlap(topic, window, bags)
@@ -107,7 +107,7 @@ class View:
                 type_name: [astuple(stored), astuple(once)]
                 for type_name, (stored, once) in counted.items()
             }
-            cache.remember(question, numbers, json.dumps(answer))
+            cache.catalogue.cache_answer(question, numbers, json.dumps(answer))
         return counted
 
     def _count_overlap(

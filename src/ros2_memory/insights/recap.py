@@ -11,9 +11,9 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.bulk_decode import MotionDecoder
 from ros2_memory.analysis.intervals import united
 from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.analysis.standstills import (
     CONTEXT_NS,
     CREEP_MPS,
@@ -23,7 +23,7 @@ from ros2_memory.analysis.standstills import (
     StandstillDigest,
 )
 from ros2_memory.analysis.topic_events import (
-    MOST_TOLD,
+    MAX_PER_BAG,
     NO_EVENTS,
     TopicEvents,
     TopicEventsBuilder,
@@ -31,10 +31,10 @@ from ros2_memory.analysis.topic_events import (
     state_of,
 )
 from ros2_memory.catalogue.codec import (
+    decode_standstills,
     decode_topic_events,
+    encode_standstills,
     encode_topic_events,
-    packed_standstills,
-    unpacked_standstills,
 )
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.text import Reason, counted
@@ -279,13 +279,13 @@ def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -
 
 _STANDSTILLS: Final = DigestKind(
     "standstills",
-    look_up=lambda digests, topic, among: digests.standstills(topic, among),
-    encode=lambda digest: packed_standstills(digest).hex(),
-    decode=lambda text: unpacked_standstills(bytes.fromhex(text)),
+    look_up=lambda digests, topic, among: digests.catalogue.standstills(topic, among),
+    encode=lambda digest: encode_standstills(digest).hex(),
+    decode=lambda text: decode_standstills(bytes.fromhex(text)),
 )
 _TOPIC_EVENTS: Final = DigestKind(
     "story",
-    look_up=lambda digests, topic, among: digests.stories(topic, among),
+    look_up=lambda digests, topic, among: digests.catalogue.topic_events(topic, among),
     encode=lambda events: "" if events is None else encode_topic_events(events).hex(),
     decode=lambda text: decode_topic_events(bytes.fromhex(text)) if text else None,
 )
@@ -349,7 +349,7 @@ def _events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None
     def collect(messages: Iterable[StoredMessage]) -> tuple[TopicEvents | None, Span | None]:
         collector = TopicEventsBuilder()
         _add_events(view, collector, messages)
-        events = collector.story(MOST_TOLD)
+        events = collector.events(MAX_PER_BAG)
         return events, None if events is None else (events.first, events.last)
 
     def join(events: TopicEvents | None, span: Span) -> None:
@@ -362,7 +362,7 @@ def _events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None
         collect=collect,
         join=join,
     ).over(view, topic, window)
-    return builder.story()
+    return builder.events()
 
 
 def _add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMessage]) -> None:
@@ -371,7 +371,7 @@ def _add_events(view: View, to: TopicEventsBuilder, messages: Iterable[StoredMes
         try:
             message = view.memory.reader.decode(found.record)
         except UndecodableError:
-            to.miss()
+            to.add_undecodable()
             continue
         value = view.memory.extractor.exact(message, channel.type)
         to.add(found.time, state_of(value, channel.type))

@@ -13,11 +13,11 @@ from itertools import chain, islice, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.bulk_decode import MotionDecoder
 from ros2_memory.analysis.conditions import Condition, NearPosition
 from ros2_memory.analysis.dwell import Approach, DwellBuilder, Unread
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.odometry import is_place
-from ros2_memory.analysis.sights import MotionDecoder
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,

@@ -45,7 +45,7 @@ def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]
     return tuple(_things(value, frame_id, _DEEPEST))
 
 
-def hangs_on_numbers(value: JsonValue) -> bool:
+def depends_on_numbers(value: JsonValue) -> bool:
     """Whether other scores in the same message may give things other names."""
     waiting = [value]
     while waiting:

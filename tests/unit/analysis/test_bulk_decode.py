@@ -66,7 +66,7 @@ def assert_alike(path: Path) -> None:
         assert at_once.poses == singly.poses
         assert at_once.edges == singly.edges
         assert at_once.kept == singly.kept
-        one, other = at_once.evidence, singly.evidence
+        one, other = at_once.zone_map, singly.zone_map
         assert (one.words, one.texts, one.booleans, one.box, one.open) == (
             other.words,
             other.texts,
@@ -122,7 +122,7 @@ def test_whole_numbers_that_change_are_seen(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "bag.mcap", messages)
     assert_alike(path)
     [topic] = both(path)[0].topics
-    assert all(Equals(n).can_match(topic.evidence) for n in range(60))
+    assert all(Equals(n).can_match(topic.zone_map) for n in range(60))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -144,7 +144,7 @@ def test_what_a_message_of_a_mould_holds_is_never_ruled_out(tmp_path: Path, seed
             for field in (None, "position", "position.x"):
                 condition = Condition(test, field)
                 if condition.matches(value):
-                    assert condition.can_match(topic.evidence)
+                    assert condition.can_match(topic.zone_map)
 
 
 def first_record(tmp_path: Path, *messages: Msg) -> tuple[McapReader, Record]:
@@ -155,24 +155,24 @@ def first_record(tmp_path: Path, *messages: Msg) -> tuple[McapReader, Record]:
 
 def test_the_numbers_of_an_odometry_are_found_where_they_lie(tmp_path: Path) -> None:
     reader, record = first_record(tmp_path, odom(T0, 1.5, -2.5, 0.5, vx=0.25))
-    mould = template_for(reader, extractor(), record)
-    assert mould is not None
-    _, rows = mould.matching(record, [record], [0])
-    assert mould.frame_id == "odom"
-    [pose] = mould.poses(rows)
+    template = template_for(reader, extractor(), record)
+    assert template is not None
+    _, rows = template.matching(record, [record], [0])
+    assert template.frame_id == "odom"
+    [pose] = template.poses(rows)
     assert pose is not None
     assert pose.position == (1.5, -2.5, 0.0)
     assert pose.orientation == pytest.approx((0.0, 0.0, math.sin(0.25), math.cos(0.25)), abs=1e-12)
-    assert mould.velocities(rows) == [(0.25, 0.0, 0.0)]
+    assert template.speeds(rows) == [0.25]
 
 
 def test_messages_that_differ_in_more_than_numbers_are_not_of_one_mould(tmp_path: Path) -> None:
     reader, record = first_record(tmp_path, odom(T0, 1.0, 0.0))
-    mould = template_for(reader, extractor(), record)
-    assert mould is not None
+    template = template_for(reader, extractor(), record)
+    assert template is not None
     payload = record.payload.replace(b"odom", b"abcd")
     others = [record, record._replace(payload=payload), record._replace(payload=payload[:-8])]
-    chosen, rows = mould.matching(record, others, [0, 1, 2])
+    chosen, rows = template.matching(record, others, [0, 1, 2])
     assert (chosen, len(rows)) == ([0], 1)
 
 
@@ -202,8 +202,8 @@ def test_a_pose_array_has_every_place_in_its_box(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "bag.mcap", [poses(n) for n in range(60)])
     assert_alike(path)
     [topic] = both(path)[0].topics
-    assert topic.evidence.box is not None
-    assert topic.evidence.box[:4] == (0.0, 59.0, 0.0, 2.0)
+    assert topic.zone_map.box is not None
+    assert topic.zone_map.box[:4] == (0.0, 59.0, 0.0, 2.0)
 
 
 def test_a_message_without_numbers_is_a_mould_too(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from ros2_memory.analysis.standstills import (
     StandstillBuilder,
     StandstillCollector,
 )
-from ros2_memory.catalogue.codec import packed_standstills, unpacked_standstills
+from ros2_memory.catalogue.codec import decode_standstills, encode_standstills
 from ros2_memory.core.timebase import NS_PER_S
 
 Poses = list[tuple[int, tuple[float, float, float]]]
@@ -83,7 +83,7 @@ def from_bags(poses: Poses, cuts: list[int]) -> tuple[Standstill, ...]:
             collector.add(time, position)
         digest = collector.digest()
         if digest is not None:
-            again = unpacked_standstills(packed_standstills(digest))
+            again = decode_standstills(encode_standstills(digest))
             assert again == digest
             builder.join(again)
     return builder.standstills()
@@ -339,7 +339,7 @@ def test_bytes_that_are_no_digest_are_refused() -> None:
         collector.add(time, position)
     digest = collector.digest()
     assert digest is not None
-    packed = packed_standstills(digest)
+    packed = encode_standstills(digest)
     for wrong in (b"", packed[:-5], packed[:9] + b"x" + packed[10:]):
         with pytest.raises(ValueError, match="not a digest of standstills"):
-            unpacked_standstills(wrong)
+            decode_standstills(wrong)

@@ -27,7 +27,7 @@ def told(messages: Messages, at_most: int | None = None) -> TopicEvents | None:
     builder = TopicEventsBuilder()
     for time, state in messages:
         builder.add(time, state)
-    return builder.story(at_most)
+    return builder.events(at_most)
 
 
 def seeing(*labels: str) -> State:
@@ -90,7 +90,7 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
         part = told(messages[begin:end])
         if part is not None:
             builder.join(part)
-    assert _comparable(builder.story()) == _comparable(told(messages))
+    assert _comparable(builder.events()) == _comparable(told(messages))
 
 
 def test_a_boolean_that_flips_is_told_with_its_new_value() -> None:
@@ -137,7 +137,7 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
                 faults=(ReportedError(f"error {nth}", at, at, 1),),
             )
         )
-    story = builder.story()
+    story = builder.events()
     assert story is not None
     assert story.seen.size == len(story.flips) == len(story.faults) == 10
     assert story.seen.presences()[0].label == "cup 0"

@@ -71,7 +71,7 @@ def test_evidence_never_rules_out_what_matches(
     collector = ZoneMapBuilder()
     for each in (*others, value):
         collector.add(each)
-    evidence = collector.evidence()
+    evidence = collector.zone_map()
     if condition.matches(value):
         assert condition.can_match(evidence)
-        assert condition.can_match(united([ZoneMapBuilder().evidence(), evidence]))
+        assert condition.can_match(united([ZoneMapBuilder().zone_map(), evidence]))

@@ -24,7 +24,7 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.request_queue import PendingRequest, RequestQueue
 from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
-from ros2_memory.catalogue.file import open_file
+from ros2_memory.catalogue.database import open_file
 from ros2_memory.cli.recovery import recover
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories

@@ -14,7 +14,7 @@ import anyio
 import pytest
 
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
-from ros2_memory.catalogue.file import VERSION
+from ros2_memory.catalogue.database import VERSION
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.config import load_settings
 from tests.support.memories import ROOT

@@ -24,10 +24,9 @@ from ros2_memory.catalogue.codec import (
     decode_schema,
     encode_poses,
     encode_schema,
-    filled,
 )
 from ros2_memory.catalogue.digest import Digester
-from ros2_memory.catalogue.topic_digest import MOST_KEPT
+from ros2_memory.catalogue.topic_digest import MAX_STORED
 from ros2_memory.core.model import Pose
 from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform
 from tests.support.fakes import FakeReader
@@ -72,14 +71,14 @@ def topic_of(messages: list[Msg]) -> TopicDigest:
 )
 def test_evidence_rules_out_what_was_never_there(condition_type: str, value: JsonValue) -> None:
     seen = topic_of([detections(T0, ["cup", "Person 2"]), detections(T0 + S, ["chair"])])
-    assert not parse_condition(condition_type, value, 0.5).can_match(seen.evidence)
+    assert not parse_condition(condition_type, value, 0.5).can_match(seen.zone_map)
 
 
 def test_evidence_rules_out_a_number_beyond_all_that_were_there() -> None:
     seen = topic_of([detections(T0, ["cup"])])
     for limit, above in ((1e6, True), (-1e6, False)):
-        assert not Beyond(limit, above=above).can_match(seen.evidence)
-        assert Beyond(-limit, above=above).can_match(seen.evidence)
+        assert not Beyond(limit, above=above).can_match(seen.zone_map)
+        assert Beyond(-limit, above=above).can_match(seen.zone_map)
 
 
 @pytest.mark.parametrize(
@@ -88,19 +87,19 @@ def test_evidence_rules_out_a_number_beyond_all_that_were_there() -> None:
 )
 def test_evidence_lets_through_what_was_there(condition_type: str, value: JsonValue) -> None:
     seen = topic_of([detections(T0, ["cup", "Person 2"])])
-    assert parse_condition(condition_type, value, 0.5).can_match(seen.evidence)
+    assert parse_condition(condition_type, value, 0.5).can_match(seen.zone_map)
 
 
 def test_a_topic_of_too_many_words_is_not_ruled_out_by_words_but_still_by_numbers() -> None:
     seen = topic_of([text(T0 + n, f"word{n}") for n in range(MOST_WORDS + 1)])
-    assert Contains("scissors").can_match(seen.evidence)
-    assert not Equals(3).can_match(seen.evidence)
+    assert Contains("scissors").can_match(seen.zone_map)
+    assert not Equals(3).can_match(seen.zone_map)
 
 
 def test_one_message_that_cannot_be_decoded_leaves_everything_open() -> None:
     broken = Msg("/chatter", "std_msgs/msg/String", T0 + S, b"\x00\x01\x00\x00\xff\xff\xff\x7f")
     seen = topic_of([text(T0, "hello"), broken])
-    assert seen.evidence.open
+    assert seen.zone_map.open
     assert seen.poses is None
     assert seen.edges is None
 
@@ -200,25 +199,20 @@ def test_edges_are_all_pairs_and_the_stamps_of_the_ends() -> None:
 
 def test_few_latched_messages_are_kept_whole_and_many_are_not() -> None:
     fixed = transform(T0, "base_link", "laser", (0.1, 0, 0))
-    sent = [tf(T0 + n, fixed, topic="/tf_static") for n in range(MOST_KEPT + 1)]
-    few = topic_of(sent[:MOST_KEPT])
+    sent = [tf(T0 + n, fixed, topic="/tf_static") for n in range(MAX_STORED + 1)]
+    few = topic_of(sent[:MAX_STORED])
     assert few.kept is not None
-    assert [record.log_time for record in few.kept] == [T0 + n for n in range(MOST_KEPT)]
+    assert [record.log_time for record in few.kept] == [T0 + n for n in range(MAX_STORED)]
     assert (
-        topic_of([tf(T0 + n, fixed, topic="/tf_static") for n in range(MOST_KEPT + 1)]).kept is None
+        topic_of([tf(T0 + n, fixed, topic="/tf_static") for n in range(MAX_STORED + 1)]).kept
+        is None
     )
     assert topic_of([text(T0, "not latched")]).kept is None
 
 
-def test_a_summary_is_the_same_after_it_was_packed() -> None:
+def test_a_summary_schema_is_the_same_after_it_was_encoded() -> None:
     summary = digest_of([odom(T0, 0, 0), text(T0 + S, "a"), text(T0 + 2 * S, "b")]).summary
-    assert filled(decode_schema(encode_schema(summary.shape)), summary.numbers) == summary
-
-
-def test_numbers_of_another_shape_are_refused() -> None:
-    summary = digest_of([odom(T0, 0, 0)]).summary
-    with pytest.raises(ValueError, match="not the counts"):
-        filled(summary.shape, summary.numbers[:-1])
+    assert decode_schema(encode_schema(summary.shape)) == summary.shape
 
 
 def test_bytes_that_are_no_digest_are_refused() -> None:

@@ -39,29 +39,29 @@ def test_a_run_of_which_every_bag_has_an_entry_is_settled_once_it_was_looked_at(
     memory, run = recorded(tmp_path)
     recall = recalling(memory, tmp_path).recall
     assert recall is not None
-    notes = recall.notes(run, recall.as_of())
+    notes = recall.digests_for(run, recall.as_of())
     assert len(notes.numbers) == 2
-    assert recall.settled(run) is notes
+    assert recall.complete_digests(run) is notes
 
 
 def test_a_run_with_a_bag_without_an_entry_is_not_settled(tmp_path: Path) -> None:
     memory, run = recorded(tmp_path)
     recall = recalling(memory, tmp_path, part=0.5).recall
     assert recall is not None
-    assert len(recall.notes(run, recall.as_of()).numbers) == 1
-    assert recall.settled(run) is None
+    assert len(recall.digests_for(run, recall.as_of()).numbers) == 1
+    assert recall.complete_digests(run) is None
 
 
 def test_what_a_catalogue_said_that_is_no_more_does_not_settle_anything(tmp_path: Path) -> None:
     memory, run = recorded(tmp_path)
     recall = recalling(memory, tmp_path).recall
     assert recall is not None
-    recall.notes(run, recall.as_of())
+    recall.digests_for(run, recall.as_of())
     (tmp_path / FOLDER / FILE).unlink()
     recall.catalogue.look_after()
     recall.as_of()
-    assert recall.settled(run) is None
-    assert not recall.notes(run, recall.as_of()).numbers
+    assert recall.complete_digests(run) is None
+    assert not recall.digests_for(run, recall.as_of()).numbers
 
 
 @pytest.mark.parametrize("answer", ["", "x", "7", "[]", '["zz", 1, 2]', '{"a": [[1], 2]}'])

@@ -74,29 +74,31 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     [number] = again.find([KEY])
     assert number is not None
     path = str(tmp_path / KEY.path)
-    assert again.summaries(tmp_path) == {
+    assert again.known_files(tmp_path) == {
         path: (*KEY[1:], DIGEST.summary, DIGEST.summary.start, DIGEST.summary.end)
     }
     for held in DIGEST.topics:
-        evidence = again.evidence(held.topic, [number])[number]
-        assert set(evidence.numbers or ()) == set(held.evidence.numbers or ())
+        evidence = again.zone_maps(held.topic, [number])[number]
+        assert set(evidence.numbers or ()) == set(held.zone_map.numbers or ())
         assert (evidence.words, evidence.box, evidence.low, evidence.high, evidence.booleans) == (
-            held.evidence.words,
-            held.evidence.box,
-            held.evidence.low,
-            held.evidence.high,
-            held.evidence.booleans,
+            held.zone_map.words,
+            held.zone_map.box,
+            held.zone_map.low,
+            held.zone_map.high,
+            held.zone_map.booleans,
         )
         assert again.poses(held.topic, [number]).get(number) == held.poses
         assert again.standstills(held.topic, [number]).get(number) == held.standstills
-        assert again.stories(held.topic, [number]) == {
-            number: NO_EVENTS if held.story is not None and held.story.says_nothing else held.story
+        assert again.topic_events(held.topic, [number]) == {
+            number: NO_EVENTS
+            if held.events is not None and held.events.says_nothing
+            else held.events
         }
         assert again.edges(held.topic, [number]).get(number) == held.edges
-        assert again.kept(held.topic, [number]).get(number) == held.kept
+        assert again.messages(held.topic, [number]).get(number) == held.kept
     assert topic(DIGEST, "/odom").poses is not None
     assert topic(DIGEST, "/tf_static").kept is not None
-    standstills, story = topic(DIGEST, "/odom").standstills, topic(DIGEST, "/bumper").story
+    standstills, story = topic(DIGEST, "/odom").standstills, topic(DIGEST, "/bumper").events
     assert standstills is not None
     assert standstills.head
     assert story is not None
@@ -108,13 +110,13 @@ def test_a_topic_that_cannot_be_decoded_has_no_story_and_is_not_taken_for_a_quie
 ) -> None:
     catalogue = catalogue_in(tmp_path)
     quiet, unknown = topic(DIGEST, "/tf_static"), topic(DIGEST, "/bumper")
-    catalogue.put(KEY, replace(DIGEST, topics=(quiet, replace(unknown, story=None))))
+    catalogue.put(KEY, replace(DIGEST, topics=(quiet, replace(unknown, events=None))))
     [number] = catalogue.find([KEY])
     assert number is not None
-    assert catalogue.stories("/tf_static", [number]) == {number: NO_EVENTS}
-    assert catalogue.stories("/bumper", [number]) == {number: None}
+    assert catalogue.topic_events("/tf_static", [number]) == {number: NO_EVENTS}
+    assert catalogue.topic_events("/bumper", [number]) == {number: None}
     catalogue.close()
-    assert catalogue.stories("/tf_static", [number]) == {}
+    assert catalogue.topic_events("/tf_static", [number]) == {}
 
 
 def test_what_is_told_of_topics_comes_back_from_a_file_that_took_another_ones_place(
@@ -133,8 +135,8 @@ def test_what_is_told_of_topics_comes_back_from_a_file_that_took_another_ones_pl
     assert catalogue.standstills("/odom", [former, number]) == {
         number: topic(DIGEST, "/odom").standstills
     }
-    story = topic(DIGEST, "/bumper").story
-    assert catalogue.stories("/bumper", [former, number]) == {number: story}
+    story = topic(DIGEST, "/bumper").events
+    assert catalogue.topic_events("/bumper", [former, number]) == {number: story}
 
 
 def test_an_entry_that_was_dropped_is_not_taken_for_one_of_a_quiet_topic(tmp_path: Path) -> None:
@@ -145,7 +147,7 @@ def test_an_entry_that_was_dropped_is_not_taken_for_one_of_a_quiet_topic(tmp_pat
     for later in ("another configuration", "a third"):
         catalogue_in(tmp_path, later).put(KEY, DIGEST)
     catalogue_in(tmp_path, "a third").forget_older_configurations()
-    assert catalogue.stories("/bumper", [number]) == {}
+    assert catalogue.topic_events("/bumper", [number]) == {}
 
 
 @pytest.mark.parametrize(
@@ -203,7 +205,7 @@ def test_a_changed_file_takes_the_place_of_its_entry_under_a_new_number(tmp_path
     assert after > before
     assert catalogue.newest() == after
     assert not holds(catalogue)
-    assert catalogue.evidence("/odom", [before, after]) == {}
+    assert catalogue.zone_maps("/odom", [before, after]) == {}
 
 
 def test_what_is_forgotten_leaves_nothing_behind(tmp_path: Path) -> None:
@@ -263,7 +265,7 @@ def test_a_file_of_a_newer_version_is_set_aside(tmp_path: Path) -> None:
 def test_a_locked_file_is_left_alone_and_memory_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ros2_memory.catalogue.file.BUSY_S", 0.01)
+    monkeypatch.setattr("ros2_memory.catalogue.database.BUSY_S", 0.01)
     made(tmp_path)
     path = tmp_path / FOLDER / FILE
     with closing(sqlite3.connect(path, isolation_level=None)) as other:
@@ -325,7 +327,7 @@ def test_a_closed_catalogue_knows_nothing_and_complains_of_nothing(tmp_path: Pat
 
 def test_a_name_that_is_no_text_can_be_kept(tmp_path: Path) -> None:
     odd = tmp_path / "rec" / "bag\udcff.mcap"
-    key = KEY._replace(path=relative(odd, tmp_path))
+    key = KEY._replace(path=relative(str(odd), str(tmp_path)))
     catalogue = catalogue_in(tmp_path)
     assert catalogue.put(key, DIGEST)
     assert holds(catalogue, key)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from ros2_memory.analysis.sights import MotionDecoder
+from ros2_memory.analysis.bulk_decode import MotionDecoder
 from ros2_memory.catalogue.digest import Digester
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -215,7 +215,7 @@ class TestMessages:
         known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
         reader = McapReader()
         record = Record(known, 1, 1, b"\0\1\0\0" + bytes([255] * 20))
-        [error] = MotionDecoder(reader, extractor()).of([record])
+        [error] = MotionDecoder(reader, extractor()).decode([record])
         assert isinstance(error, UndecodableError)
         assert error.__traceback__ is None
         assert error.__cause__ is None
@@ -360,5 +360,5 @@ class TestDigests:
         path = write_mcap(tmp_path / "bag.mcap", [text(1, "ab " * MB)])
         digest = Digester(McapReader(), extractor(), 10.0).digest(path)
         [topic] = digest.topics
-        assert topic.evidence.words is None
-        assert topic.evidence.texts
+        assert topic.zone_map.words is None
+        assert topic.zone_map.texts

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.analysis.sights import MotionDecoder, MotionSample
+from ros2_memory.analysis.bulk_decode import MotionDecoder, MotionSample
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
@@ -50,9 +50,9 @@ def assert_seen_as_alone(tmp_path: Path, messages: list[Msg]) -> None:
     topic = messages[0].topic
     records = list(reader.records(path, [topic], TimeWindow.everything()))
     assert len(records) == len(messages)
-    sights = MotionDecoder(reader, extractor())
+    decoder = MotionDecoder(reader, extractor())
     half = len(records) // 2
-    seen = [*sights.of(records[:half]), *sights.of(records[half:])]
+    seen = [*decoder.decode(records[:half]), *decoder.decode(records[half:])]
     expected = [alone(reader, record) for record in records]
     # By their text, since NaN is not equal to itself.
     assert [repr(None if isinstance(s, UndecodableError) else s) for s in seen] == [
@@ -95,7 +95,7 @@ def test_poses_of_another_type_are_found_by_the_same_paths(tmp_path: Path) -> No
 def test_of_many_alike_few_are_decoded(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "bag.mcap", [odom(T0 + n, n / 9, 1.0) for n in range(500)])
     reader = Counting()
-    sights = MotionDecoder(reader, extractor())
+    decoder = MotionDecoder(reader, extractor())
     records = list(reader.records(path, ["/odom"], TimeWindow.everything()))
-    assert len(sights.of(records)) == 500
+    assert len(decoder.decode(records)) == 500
     assert reader.decoded < 10
