@@ -439,4 +439,23 @@ class KeptMoments:
     now: Ns
 
 
-Account: TypeAlias = Sightings | Recap | Status | Visits | TypeFields | Remembered | KeptMoments
+Answer: TypeAlias = (
+    tuple[TopicRow, ...]
+    | DataTimeRange
+    | TopicValue
+    | TopicRange
+    | Position
+    | Velocity
+    | TransformAt
+    | Frames
+    | Match
+    | ValueWhen
+    | TrajectorySummary
+    | Sightings
+    | Recap
+    | Status
+    | Visits
+    | TypeFields
+    | Remembered
+    | KeptMoments
+)

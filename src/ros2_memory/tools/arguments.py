@@ -1,235 +1,354 @@
-"""The arguments of the tools, one declaration for each question.
+"""The arguments of the tools: a model for each query, with the bounds and what planners read.
 
-A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) shares one declaration, in
-which a `moment` or a `span` stands for the arguments that differ; a `TimeArgument` unfolds it.
+A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) shares one model, in which
+`moment` or `span` is a placeholder for the arguments that differ; a `TimeArgument` replaces it.
+Types are strict: `true` is not a number and `"10"` is not a duration.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from functools import partial
+from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, JsonValue
-
-from ros2_memory.history.time_arguments import AtTime, TimeRange
-from ros2_memory.tools.argument_types import (
-    Before,
-    Child,
-    ConditionType,
-    ConditionValue,
-    Coordinate,
-    End,
-    Fields,
-    FrameOfPlace,
-    Label,
-    Limit,
-    MaxSamples,
-    OldestFirst,
-    Parent,
-    Pattern,
-    PoseTopic,
-    Radius,
-    SearchField,
-    SearchTopic,
-    Seconds,
-    SecondsAfter,
-    SecondsAgo,
-    SecondsBefore,
-    Since,
-    Start,
-    Timestamp,
-    Tolerance,
-    Topic,
-    TypeName,
-    Until,
-    ValueTopic,
-    Within,
-    from_json,
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+    ValidationInfo,
+    WithJsonSchema,
 )
+
+from ros2_memory.bag_dir.moment_file import fault_of_label
+from ros2_memory.history.time_arguments import AtTime, TimeRange
+
+LATEST_UNIX_S: Final = 9_223_372_036.0
+"""The last second that int64 nanoseconds can represent; a larger number is in another unit."""
+LONGEST_NAME: Final = 500
+"""Characters: twice what DDS allows for a topic."""
+LONGEST_VALUE: Final = 2_000
+MOST_FIELDS: Final = 100
+LONGEST_BEFORE_S: Final = 3600.0
+LONGEST_AFTER_S: Final = 600.0
+"""Of a moment that is to be saved."""
+
+
+def _as_list(value: object) -> object:
+    """Returns a list of names, which planners also send as JSON text or as one bare name."""
+    if isinstance(value, str):
+        parsed = _parse_json(value)
+        value = parsed if isinstance(parsed, list) else [value]
+    if isinstance(value, list) and len(value) > MOST_FIELDS:
+        raise ValueError(f"has more than {MOST_FIELDS} elements")
+    return value
+
+
+def _parse_json(text: str) -> object:
+    """Returns the value of a JSON text; None if it is invalid or longer than any argument."""
+    if len(text) > MOST_FIELDS * LONGEST_NAME:
+        return None
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _as_integer(value: object) -> object:
+    """Returns 100.0 as an int, since JSON does not distinguish the two."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _check_text(value: str, longest: int) -> str:
+    if len(value) > longest:
+        raise ValueError(f"is longer than {longest} characters")
+    if not value.isascii() and any("\ud800" <= char <= "\udfff" for char in value):
+        raise ValueError("has half a character (a lone surrogate), which no recorded text has")
+    return value
+
+
+def _check_name(value: str) -> str:
+    if not value.strip():
+        raise ValueError("is empty")
+    if "\0" in value:
+        raise ValueError("has a NUL character, which no name has")
+    return _check_text(value, LONGEST_NAME)
+
+
+def _check_unix(seconds: float) -> float:
+    if seconds > LATEST_UNIX_S:
+        raise ValueError("is too large for Unix seconds; is it in milliseconds or nanoseconds?")
+    return seconds
+
+
+def _check_label(value: str) -> str:
+    fault = fault_of_label(value)
+    if fault is not None:
+        raise ValueError(fault)
+    return value
+
+
+def _check_most(most: float, seconds: float) -> float:
+    if seconds > most:
+        raise ValueError(f"is more than {most:g}")
+    return seconds
+
+
+def _check_condition_value(value: JsonValue, info: ValidationInfo[object]) -> JsonValue:
+    if value is None:
+        raise ValueError("is null")
+    if isinstance(value, str):
+        # Planners tend to send an object as JSON text.
+        is_point = info.data.get("condition_type") == "near_position"
+        parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if is_point else None
+        return parsed if isinstance(parsed, dict) else value
+    for part in (value, *(value.values() if isinstance(value, dict) else ())):
+        if isinstance(part, float) and not math.isfinite(part):
+            raise ValueError("is not a finite number")
+    return value
+
+
+_Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
+_Duration: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+_Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+# Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
+_Unix: TypeAlias = Annotated[
+    float, Field(strict=True, allow_inf_nan=False), AfterValidator(_check_unix)
+]
+_UnixBound: TypeAlias = Annotated[_Unix, Field(description="Unix seconds.")]
+_Before: TypeAlias = Annotated[_Unix, Field(description="Unix seconds; nothing after.")]
+_Tolerance: TypeAlias = Annotated[
+    _Duration, Field(description="How old the message may be then, in s.")
+]
+_Topic: TypeAlias = Annotated[_Name, Field(examples=["/odom"])]
+_PoseTopic: TypeAlias = Annotated[_Name, Field(description="Not the default.")]
+_SearchTopic: TypeAlias = Annotated[
+    _Name,
+    Field(description="Topic, or glob over topics.", examples=["/vision/*/scene_objects"]),
+]
+_Fields: TypeAlias = Annotated[
+    tuple[_Name, ...],
+    BeforeValidator(_as_list),
+    Field(description='Parts of value, e.g. ["position.x"].'),
+]
+_Coordinate: TypeAlias = Annotated[
+    float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")
+]
+_Limit: TypeAlias = Annotated[
+    Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)
+]
+_ConditionType: TypeAlias = Annotated[
+    Literal["contains", "equals", "above", "below", "near_position"], Field(examples=["contains"])
+]
+_ConditionValue: TypeAlias = Annotated[
+    JsonValue,
+    AfterValidator(_check_condition_value),
+    WithJsonSchema(
+        {
+            "anyOf": [{"type": kind} for kind in ("string", "number", "boolean", "object")],
+            "examples": ["scissors"],
+        }
+    ),
+]
+_SearchField: TypeAlias = Annotated[
+    _Name, Field(description="Dot-path in value that alone is tested.")
+]
 
 
 class Arguments(BaseModel):
-    """The arguments of one question. Unknown ones are refused before a model sees them."""
+    """The arguments of one query. Unknown ones are refused before a model sees them."""
 
     model_config = ConfigDict(frozen=True)
 
 
 class TimeArgument(Arguments, ABC):
-    """Arguments that unfold a `moment` or a `span`; `stands_for` names which."""
+    """The arguments that replace a placeholder: `replaces` is `moment` or `span`."""
 
-    stands_for: ClassVar[str]
+    replaces: ClassVar[str]
 
     @abstractmethod
-    def folded(self) -> AtTime | TimeRange:
-        """The moment or span that they mean."""
+    def to_query_time(self) -> AtTime | TimeRange:
+        """Returns the value of the placeholder."""
 
 
 class At(TimeArgument):
     """A moment in Unix seconds."""
 
-    stands_for = "moment"
-    timestamp: Timestamp
+    replaces = "moment"
+    timestamp: Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023200.5])]
 
-    def folded(self) -> AtTime:
-        """The moment itself."""
+    def to_query_time(self) -> AtTime:
+        """Returns the moment."""
         return AtTime(at_s=self.timestamp)
 
 
 class Ago(TimeArgument):
     """A moment counted back from now."""
 
-    stands_for = "moment"
-    seconds_ago: SecondsAgo
+    replaces = "moment"
+    seconds_ago: Annotated[_Duration, Field(description="Seconds before now.", examples=[10])]
 
-    def folded(self) -> AtTime:
-        """The moment, relative to now."""
+    def to_query_time(self) -> AtTime:
+        """Returns the moment, relative to now."""
         return AtTime(ago_s=self.seconds_ago)
 
 
 class Between(TimeArgument):
     """A window in Unix seconds."""
 
-    stands_for = "span"
-    start: Start
-    end: End
+    replaces = "span"
+    start: Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023200])]
+    end: Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023260])]
 
-    def folded(self) -> TimeRange:
-        """The window itself."""
+    def to_query_time(self) -> TimeRange:
+        """Returns the window."""
         return TimeRange(start_s=self.start, end_s=self.end)
 
 
 class Last(TimeArgument):
     """A window that ends now."""
 
-    stands_for = "span"
-    seconds: Seconds
+    replaces = "span"
+    seconds: Annotated[_Positive, Field(description="Before now.", examples=[60])]
 
-    def folded(self) -> TimeRange:
-        """The window, relative to now."""
+    def to_query_time(self) -> TimeRange:
+        """Returns the window, relative to now."""
         return TimeRange(last_s=self.seconds)
 
 
-class Nothing(Arguments):
+class NoArguments(Arguments):
     """No arguments."""
 
 
-class Listing(Arguments):
+class TopicListArguments(Arguments):
     """Which topics are listed."""
 
-    pattern: Pattern | None = None
+    pattern: (
+        Annotated[_Name, Field(description="Only topics that match this glob, e.g. /vision/*.")]
+        | None
+    ) = None
 
 
-class TopicAt(Arguments):
-    """One message of a topic."""
+class TopicAtArguments(Arguments):
+    """A topic at a moment."""
 
-    topic: Topic
+    topic: _Topic
     moment: AtTime
-    tolerance_s: Tolerance | None = None
-    fields: Fields = ()
+    tolerance_s: _Tolerance | None = None
+    fields: _Fields = ()
 
 
-class TopicOver(Arguments):
-    """Messages of a topic over a window."""
+class TopicRangeArguments(Arguments):
+    """A topic over a window."""
 
-    topic: Topic
+    topic: _Topic
     span: TimeRange
-    max_samples: MaxSamples = 100
-    fields: Fields = ()
+    max_samples: Annotated[
+        Annotated[int, Field(strict=True, ge=1, le=10_000)], BeforeValidator(_as_integer)
+    ] = 100
+    fields: _Fields = ()
 
 
-class MotionAt(Arguments):
-    """Pose or twist at a moment."""
+class MotionArguments(Arguments):
+    """A pose or twist at a moment."""
 
     moment: AtTime
-    topic: PoseTopic | None = None
-    tolerance_s: Tolerance | None = None
+    topic: _PoseTopic | None = None
+    tolerance_s: _Tolerance | None = None
 
 
-class TransformAt(Arguments):
+class TransformArguments(Arguments):
     """A pair of frames at a moment."""
 
-    parent: Parent
-    child: Child
+    parent: Annotated[_Name, Field(description="Reference frame.", examples=["odom"])]
+    child: Annotated[_Name, Field(description="Frame whose pose is asked.", examples=["laser"])]
     moment: AtTime
 
 
-class Search(Arguments):
+class LastMatchArguments(Arguments):
     """A condition on a topic."""
 
-    topic: SearchTopic
-    condition_type: ConditionType
-    value: ConditionValue
-    field: SearchField | None = None
-    fields: Fields = ()
-    before: Before | None = None
+    topic: _SearchTopic
+    condition_type: _ConditionType
+    value: _ConditionValue
+    field: _SearchField | None = None
+    fields: _Fields = ()
+    before: _Before | None = None
 
 
-class Correlation(Arguments):
-    """A condition on one topic, and another to read then."""
+class ValueWhenArguments(Arguments):
+    """A condition on one topic, and another topic to read at the match."""
 
-    value_topic: ValueTopic
-    condition_topic: SearchTopic
-    condition_type: ConditionType
-    value: ConditionValue
-    field: SearchField | None = None
-    fields: Fields = ()
-    before: Before | None = None
+    value_topic: Annotated[
+        _Name, Field(description="Topic to read at the match.", examples=["/odom"])
+    ]
+    condition_topic: _SearchTopic
+    condition_type: _ConditionType
+    value: _ConditionValue
+    field: _SearchField | None = None
+    fields: _Fields = ()
+    before: _Before | None = None
 
 
-class WayOver(Arguments):
-    """The way driven over a window."""
+class TrajectoryArguments(Arguments):
+    """A path over a window."""
 
     span: TimeRange
-    topic: PoseTopic | None = None
+    topic: _PoseTopic | None = None
 
 
-class Window(Arguments):
+class WindowArguments(Arguments):
     """A window."""
 
     span: TimeRange
 
 
-class Remember(Arguments):
-    """A label, and how much around now is to be kept."""
+class SaveMomentArguments(Arguments):
+    """A label, and how much around now is to be saved."""
 
-    label: Label
-    seconds_before: SecondsBefore = 30
-    seconds_after: SecondsAfter = 0
+    label: Annotated[
+        str, Field(strict=True, examples=["charger found"]), AfterValidator(_check_label)
+    ]
+    seconds_before: Annotated[_Duration, AfterValidator(partial(_check_most, LONGEST_BEFORE_S))] = (
+        30
+    )
+    seconds_after: Annotated[_Duration, AfterValidator(partial(_check_most, LONGEST_AFTER_S))] = 0
 
 
-class OfType(Arguments):
+class TypeArguments(Arguments):
     """A message type."""
 
-    type: TypeName
+    type: Annotated[_Name, Field(examples=["nav_msgs/msg/Odometry"])]
 
 
-class Place(Arguments):
-    """A place of the plane."""
+class VisitsArguments(Arguments):
+    """A place in the plane."""
 
-    x: Coordinate
-    y: Coordinate
-    frame_id: FrameOfPlace | None = None
-    radius_m: Radius | None = None
-    limit: Limit = 10
+    x: _Coordinate
+    y: _Coordinate
+    frame_id: (
+        Annotated[_Name, Field(description="Of x and y, as replies name it; default: the map.")]
+        | None
+    ) = None
+    radius_m: Annotated[_Positive, Field(description="How near is there, m.")] | None = None
+    limit: _Limit = 10
 
 
-class Matches(Arguments):
+class MatchesArguments(Arguments):
     """A condition on a topic, in a window or in all history."""
 
-    topic: SearchTopic
-    condition_type: ConditionType
-    value: ConditionValue
-    field: SearchField | None = None
-    seconds: Within | None = None
-    start: Since | None = None
-    end: Until | None = None
-    oldest_first: OldestFirst = False
-    limit: Limit = 5
-
-
-def tested(given: Search | Correlation | Matches) -> JsonValue:
-    """The value of a condition: planners tend to send an object as JSON text."""
-    if given.condition_type == "near_position" and isinstance(given.value, str):
-        parsed = from_json(given.value)
-        return parsed if isinstance(parsed, dict) else given.value
-    return given.value
+    topic: _SearchTopic
+    condition_type: _ConditionType
+    value: _ConditionValue
+    field: _SearchField | None = None
+    seconds: Annotated[_Positive, Field(description="Only the last so many s.")] | None = None
+    start: _UnixBound | None = None
+    end: _UnixBound | None = None
+    oldest_first: Annotated[
+        bool, Field(strict=True, description="Counts all; the first are told.")
+    ] = False
+    limit: _Limit = 5

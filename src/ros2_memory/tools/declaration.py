@@ -1,4 +1,4 @@
-"""What a tool is, and how one question is declared under all its names."""
+"""What a tool is, and how one query is declared under all its names."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.results import Account
+    from ros2_memory.results import Answer
     from ros2_memory.tools.arguments import TimeArgument
-    from ros2_memory.tools.reply_json import Answer
     from ros2_memory.tools.reply_size import JsonObject
 
-Question: TypeAlias = "Callable[[Memory, Call], Answer | Account]"
+Question: TypeAlias = "Callable[[Memory, Call], Answer]"
+"""A query with its arguments bound."""
 
 A = TypeVar("A", bound=Arguments)
 
 
 @dataclass(frozen=True, slots=True)
 class Tool:
-    """One tool as clients see it; `question` checks what is given and binds it to its query.
+    """One tool as clients see it.
 
-    `writes`: it changes what is kept.
+    `question` checks a call's arguments and binds them to the query. `writes`: it changes what is
+    stored.
     """
 
     name: str
@@ -42,41 +43,41 @@ class Tool:
 
 @dataclass(frozen=True, slots=True)
 class ToolName:
-    """One name of a question.
+    """One name of a query.
 
-    `said` takes the place of {when} in the description; `more` is what the reply has besides that
-    of the question's first name.
+    `when_text` replaces {when} in the description. `extra_reply` names the keys that its reply has
+    in addition to that of the query's first name.
     """
 
     name: str
     title: str
     when: type[TimeArgument] | None = None
-    said: str = ""
-    more: str = ""
+    when_text: str = ""
+    extra_reply: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class ToolDeclaration(Generic[A]):
-    """A question and all its names."""
+    """A query and all its names."""
 
-    variants: tuple[ToolName, ...]
+    names: tuple[ToolName, ...]
     description: str
     arguments: type[A]
-    ask: Callable[[Memory, Call, A], Answer | Account]
+    query: Callable[[Memory, Call, A], Answer]
     blocking: bool = False
     writes: bool = False
 
-    def tools(self, facts: Mapping[str, object]) -> Iterator[Tool]:
-        """The tools; `facts` fill the description's placeholders."""
-        for variant in self.variants:
-            signature = Signature(self.arguments, variant.when)
-            what = self._told(variant, facts)
-            text = f"{what} Example: {to_json_text(signature.example)}"
+    def tools(self, defaults: Mapping[str, object]) -> Iterator[Tool]:
+        """Yields a tool for each name; `defaults` fill the description's placeholders."""
+        for each in self.names:
+            signature = Signature(self.arguments, each.when)
+            description = self._description(each, defaults)
+            text = f"{description} Example: {to_json_text(signature.example)}"
             if self.blocking:
-                text = f"Blocking, up to {facts['timeout']} s. {text}"
+                text = f"Blocking, up to {defaults['timeout']} s. {text}"
             yield Tool(
-                variant.name,
-                variant.title,
+                each.name,
+                each.title,
                 text,
                 signature.json_schema(),
                 self.blocking,
@@ -84,14 +85,14 @@ class ToolDeclaration(Generic[A]):
                 self.writes,
             )
 
-    def _told(self, variant: ToolName, facts: Mapping[str, object]) -> str:
-        """What it answers: in full under the first name, and under the others by that."""
-        first = self.variants[0]
-        if variant is first:
-            return self.description.format(when=variant.said, **facts)
-        also = f" Reply: the same, {variant.more}." if variant.more else ""
-        return f"As {first.name}, {variant.said}.{also}"
+    def _description(self, name: ToolName, defaults: Mapping[str, object]) -> str:
+        """Returns the full description for the first name, and a reference to it for the others."""
+        first = self.names[0]
+        if name is first:
+            return self.description.format(when=name.when_text, **defaults)
+        extra = f" Reply: the same, {name.extra_reply}." if name.extra_reply else ""
+        return f"As {first.name}, {name.when_text}.{extra}"
 
     def _question(self, signature: Signature[A], given: Mapping[str, object]) -> Question:
-        arguments = signature.read(given)
-        return lambda memory, call: self.ask(memory, call, arguments)
+        arguments = signature.parse(given)
+        return lambda memory, call: self.query(memory, call, arguments)

@@ -13,13 +13,12 @@ from ros2_memory.insights.visits import visits
 from ros2_memory.tools.arguments import (
     Between,
     Last,
-    Matches,
-    Nothing,
-    OfType,
-    Place,
-    Remember,
-    Window,
-    tested,
+    MatchesArguments,
+    NoArguments,
+    SaveMomentArguments,
+    TypeArguments,
+    VisitsArguments,
+    WindowArguments,
 )
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
@@ -29,20 +28,20 @@ if TYPE_CHECKING:
     from ros2_memory.tools.declaration import Tool
 
 
-def tools(facts: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
-    """The tools, in order; `facts` fill the placeholders of descriptions."""
-    yield from _SIGHTINGS.tools(facts)
-    yield from _RECAP.tools(facts)
-    yield from _VISITS.tools(facts)
-    yield from _STATUS.tools(facts)
-    yield from _MOMENTS.tools(facts)
+def tools(defaults: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
+    """The tools, in order; `defaults` fill the placeholders of descriptions."""
+    yield from _SIGHTINGS.tools(defaults)
+    yield from _RECAP.tools(defaults)
+    yield from _VISITS.tools(defaults)
+    yield from _STATUS.tools(defaults)
+    yield from _MOMENTS.tools(defaults)
     if writing:
-        yield from _REMEMBER.tools(facts)
+        yield from _REMEMBER.tools(defaults)
 
 
-def readable(facts: Mapping[str, object]) -> Iterator[Tool]:
+def readable(defaults: Mapping[str, object]) -> Iterator[Tool]:
     """What is asked by reading a resource, and no tool."""
-    yield from _TYPE.tools(facts)
+    yield from _TYPE.tools(defaults)
 
 
 _SIGHTINGS = ToolDeclaration(
@@ -50,13 +49,13 @@ _SIGHTINGS = ToolDeclaration(
     "When, where, how often and how long a condition (as in find_last_match) held, newest first; "
     "matches in a row are one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, robot: where it was at last_seen, place: of the thing}}], total}}.",
-    Matches,
+    MatchesArguments,
     lambda memory, call, given: find_matches(
         memory,
         call,
         given.topic,
         given.condition_type,
-        tested(given),
+        given.value,
         field=given.field,
         start_s=given.start,
         end_s=given.end,
@@ -73,7 +72,7 @@ _RECAP = ToolDeclaration(
     ),
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps. Reply: "
     "{{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], counts}}.",
-    Window,
+    WindowArguments,
     lambda memory, call, given: recap(memory, call, given.span),
     blocking=True,
 )
@@ -81,7 +80,7 @@ _STATUS = ToolDeclaration(
     (ToolName("memory_status", "How far to trust the memory"),),
     "Whether the recorder is alive, how old the newest data is, which topics fell silent, what is "
     "damaged, and for how long the disk lasts.",
-    Nothing,
+    NoArguments,
     lambda memory, call, _: memory_status(memory, call),
 )
 _VISITS = ToolDeclaration(
@@ -89,7 +88,7 @@ _VISITS = ToolDeclaration(
     "When, how long and how often the robot was near a place, newest first, in {map_frame} where "
     "transforms lead there, else in the frame of {pose_topic}. Reply: {{frame_id, there_now, "
     "visits: [{{arrived, departed, duration_s, closest_m, ago_s}}], total}}.",
-    Place,
+    VisitsArguments,
     lambda memory, call, given: visits(
         memory,
         call,
@@ -104,20 +103,20 @@ _VISITS = ToolDeclaration(
 _TYPE = ToolDeclaration(
     (ToolName("describe_type", "Fields of a message type"),),
     "The fields that replies show of a message type.",
-    OfType,
+    TypeArguments,
     lambda memory, call, given: describe_type(memory, call, given.type),
 )
 _MOMENTS = ToolDeclaration(
     (ToolName("list_moments", "Kept moments"),),
     "Moments kept by remember_moment, newest first.",
-    Nothing,
+    NoArguments,
     lambda memory, call, _: list_moments(memory, call),
 )
 _REMEMBER = ToolDeclaration(
     (ToolName("remember_moment", "Keep a moment"),),
     "Keeps what is recorded around now from deletion. Reply: {{moment, bags, pending: the rest is "
     "being written}}.",
-    Remember,
+    SaveMomentArguments,
     lambda memory, call, given: remember_moment(
         memory,
         call,

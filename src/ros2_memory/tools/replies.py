@@ -1,30 +1,30 @@
-"""Answers and errors as the one JSON text that leaves: which is what, and never too long."""
+"""Answers and errors as the JSON text that is sent: with their kind, and never too long."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from ros2_memory import results
 from ros2_memory.core.errors import (
     BagError,
     EpisodicError,
-    InvalidArgumentsError,
     NoDataError,
     NoDataReason,
     QueryTimeoutError,
     UndecodableError,
 )
 from ros2_memory.core.timebase import unix_rounded_up
-from ros2_memory.tools.extra_reply_json import shown
-from ros2_memory.tools.reply_json import file_name, fit_topics
+from ros2_memory.tools import reply_json_motion  # noqa: F401 - registers its replies
+from ros2_memory.tools.reply_json import render
+from ros2_memory.tools.reply_json_memory import file_name, time_range
+from ros2_memory.tools.reply_json_topics import fit_topics
 from ros2_memory.tools.reply_size import fit_reply, to_json_text
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.results import Account
-    from ros2_memory.tools.reply_json import Answer
     from ros2_memory.tools.reply_size import JsonObject
 
 
@@ -43,22 +43,27 @@ class Replies:
     bag_dir: Path
     max_chars: int
 
-    def answer(self, answer: Answer | Account, *, from_active: bool = False) -> Reply:
-        """An answer in the shape that the tool's description promises.
+    def answer(self, answer: results.Answer, *, from_active: bool = False) -> Reply:
+        """Returns an answer in the shape that the tool's description promises.
 
-        Where that is an object, `from_active` is said in it if it is so.
+        `from_active`: whether messages of a split that is still being written were read, which a
+        reply that is an object shows.
         """
-        value = shown(answer, self.bag_dir)
-        if isinstance(value, dict):
-            if from_active:
-                value = {**value, "from_active": True}
-            return Reply(fit_reply(value, self.max_chars))
         if isinstance(answer, tuple):
             return Reply(fit_topics(answer, self.max_chars))
-        return Reply(to_json_text(value))
+        value = (
+            time_range(answer, self.bag_dir)
+            if isinstance(answer, results.DataTimeRange)
+            else render(answer)
+        )
+        if not isinstance(value, dict):
+            return Reply(to_json_text(value))
+        if from_active:
+            value = {**value, "from_active": True}
+        return Reply(fit_reply(value, self.max_chars))
 
     def error(self, error: EpisodicError) -> Reply:
-        """An error of the tree. Having no data is an answer; the others are errors."""
+        """Returns an error of the tree. Having no data is an answer; the others are errors."""
         match error:
             case NoDataError():
                 return self._no_data(error.reason, error.detail, error.notes)
@@ -68,8 +73,6 @@ class Replies:
                 return self._failure(
                     error.code, str(error), searched_back_to=unix_rounded_up(back_to)
                 )
-            case InvalidArgumentsError() | QueryTimeoutError():
-                return self._failure(error.code, str(error))
             case BagError():
                 name = file_name(error.path, self.bag_dir)
                 return self._failure(error.code, f"{name}: {error.reason}; ask again")
@@ -77,7 +80,7 @@ class Replies:
                 return self._failure(error.code, str(error))
 
     def internal(self, correlation_id: str) -> Reply:
-        """A fault of this program: nothing of its inside leaves but the id that finds the log."""
+        """Returns the error of a fault of this program, with the id that finds its log event."""
         return self._failure(
             "internal",
             "the question failed through a fault in this server, not in the arguments; "
@@ -85,9 +88,9 @@ class Replies:
         )
 
     def _no_data(self, reason: NoDataReason, detail: str, notes: tuple[str, ...] = ()) -> Reply:
-        shown: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
-        return Reply(fit_reply({**shown, "notes": [*notes]} if notes else shown, self.max_chars))
+        reply: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
+        return Reply(fit_reply({**reply, "notes": [*notes]} if notes else reply, self.max_chars))
 
     def _failure(self, code: str, detail: str, **more: JsonValue) -> Reply:
-        shown: JsonObject = {"error": code, **more, "detail": detail}
-        return Reply(fit_reply(shown, self.max_chars), is_error=True)
+        reply: JsonObject = {"error": code, **more, "detail": detail}
+        return Reply(fit_reply(reply, self.max_chars), is_error=True)

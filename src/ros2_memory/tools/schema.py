@@ -42,7 +42,7 @@ class Signature(Generic[A]):
         self._when = when
         self._properties: dict[str, JsonObject] = {}
         for name, schema in _properties(arguments).items():
-            unfolded = when is not None and name == when.stands_for
+            unfolded = when is not None and name == when.replaces
             self._properties.update(_properties(when) if when and unfolded else {name: schema})
         self._required = [
             name for name, schema in self._properties.items() if "default" not in schema
@@ -72,7 +72,7 @@ class Signature(Generic[A]):
             closed["required"] = [*self._required]
         return {"type": "object", "properties": properties, **closed}
 
-    def read(self, given: Mapping[str, object]) -> A:
+    def parse(self, given: Mapping[str, object]) -> A:
         """The arguments, checked. A null for an optional one counts as not given.
 
         Raises:
@@ -88,7 +88,7 @@ class Signature(Generic[A]):
         own = dict(present)
         if self._when is not None:
             try:
-                own[self._when.stands_for] = self._when.model_validate(present).folded()
+                own[self._when.replaces] = self._when.model_validate(present).to_query_time()
             except ValidationError as error:
                 problems += self._wrong(error, given)
         try:

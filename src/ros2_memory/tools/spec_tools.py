@@ -16,17 +16,16 @@ from ros2_memory.tools.arguments import (
     Ago,
     At,
     Between,
-    Correlation,
     Last,
-    Listing,
-    MotionAt,
-    Nothing,
-    Search,
-    TopicAt,
-    TopicOver,
-    TransformAt,
-    WayOver,
-    tested,
+    LastMatchArguments,
+    MotionArguments,
+    NoArguments,
+    TopicAtArguments,
+    TopicListArguments,
+    TopicRangeArguments,
+    TrajectoryArguments,
+    TransformArguments,
+    ValueWhenArguments,
 )
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
@@ -47,7 +46,7 @@ def build_tools(
 
     `additions`: those beyond the specification's, too; `writing`: those among them that write.
     """
-    facts = {
+    defaults = {
         "timeout": f"{call_timeout_s:g}",
         "pose_topic": limits.pose_topic,
         "tolerance": f"{limits.time_tolerance_s:g}",
@@ -55,22 +54,24 @@ def build_tools(
         "map_frame": limits.map_frame or "no map",
     }
     return (
-        *_LIST.tools(facts),
-        *_RANGE.tools(facts),
-        *_TOPIC_AT.tools(facts),
-        *_TOPIC_OVER.tools(facts),
-        *_POSITION.tools(facts),
-        *_VELOCITY.tools(facts),
-        *_TRANSFORM.tools(facts),
-        *_FRAMES.tools(facts),
-        *_LAST_MATCH.tools(facts),
-        *_VALUE_WHEN.tools(facts),
-        *_TRAJECTORY.tools(facts),
-        *(extra_tools.tools(facts, writing=writing) if additions else ()),
+        *_LIST.tools(defaults),
+        *_RANGE.tools(defaults),
+        *_TOPIC_AT.tools(defaults),
+        *_TOPIC_OVER.tools(defaults),
+        *_POSITION.tools(defaults),
+        *_VELOCITY.tools(defaults),
+        *_TRANSFORM.tools(defaults),
+        *_FRAMES.tools(defaults),
+        *_LAST_MATCH.tools(defaults),
+        *_VALUE_WHEN.tools(defaults),
+        *_TRAJECTORY.tools(defaults),
+        *(extra_tools.tools(defaults, writing=writing) if additions else ()),
     )
 
 
-def _list_topics(memory: Memory, call: Call, given: Listing) -> tuple[results.TopicRow, ...]:
+def _list_topics(
+    memory: Memory, call: Call, given: TopicListArguments
+) -> tuple[results.TopicRow, ...]:
     rows = queries.list_recorded_topics(memory, call)
     if given.pattern is None or not rows:
         return rows
@@ -103,7 +104,7 @@ _LIST = ToolDeclaration(
     "Every recorded topic. Ask this first when a topic's name is not known. "
     "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; the busiest first where "
     "they are too many.",
-    Listing,
+    TopicListArguments,
     _list_topics,
 )
 _RANGE = ToolDeclaration(
@@ -111,7 +112,7 @@ _RANGE = ToolDeclaration(
     "What time span the memory covers, with its holes, and what time it is now. "
     "Reply: {{earliest, latest, now, bags, gaps, damaged, clock_faults, ...}}, times in Unix s and "
     "local ISO, null while the memory is empty.",
-    Nothing,
+    NoArguments,
     lambda memory, call, _: queries.data_time_range(memory, call),
 )
 _TOPIC_AT = ToolDeclaration(
@@ -119,7 +120,7 @@ _TOPIC_AT = ToolDeclaration(
     "What a topic said {when}: its newest message at or before then, no older than tolerance_s "
     "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
     "Reply: {{topic, type, timestamp, value}}.",
-    TopicAt,
+    TopicAtArguments,
     lambda memory, call, given: queries.topic_value(
         memory,
         call,
@@ -137,7 +138,7 @@ _TOPIC_OVER = ToolDeclaration(
     "What a topic said {when}: up to max_samples messages, evenly spaced over the window, first "
     "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; with "
     "fields of numbers extremes, too: {{field: {{min, min_at, max, max_at}}}} of all messages.",
-    TopicOver,
+    TopicRangeArguments,
     lambda memory, call, given: queries.topic_range(
         memory,
         call,
@@ -152,7 +153,7 @@ _POSITION = ToolDeclaration(
     "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
     "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, longitude "
     "and altitude instead of x, y, z, which are null.",
-    MotionAt,
+    MotionArguments,
     lambda memory, call, given: queries.position(
         memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
     ),
@@ -162,7 +163,7 @@ _VELOCITY = ToolDeclaration(
     "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
     "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
     "x is ahead and angular z turns left.",
-    MotionAt,
+    MotionArguments,
     lambda memory, call, given: queries.velocity(
         memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
     ),
@@ -172,7 +173,7 @@ _TRANSFORM = ToolDeclaration(
     "The pose of frame child in frame parent {when}, through any chain of frames, interpolated. "
     "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock"
     "}}.",
-    TransformAt,
+    TransformArguments,
     lambda memory, call, given: queries.transform(
         memory, call, given.parent, given.child, given.moment
     ),
@@ -180,7 +181,7 @@ _TRANSFORM = ToolDeclaration(
 _FRAMES = ToolDeclaration(
     (ToolName("list_frames", "Frames"),),
     "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, static}}]}}.",
-    Nothing,
+    NoArguments,
     lambda memory, call, _: queries.frames(memory, call),
     blocking=True,
 )
@@ -196,13 +197,13 @@ _LAST_MATCH = ToolDeclaration(
     f"Conditions: {_CONDITIONS}. Reply: {{{{timestamp, value, topic, type, "
     "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
     "read).",
-    Search,
+    LastMatchArguments,
     lambda memory, call, given: queries.find_last_match(
         memory,
         call,
         given.topic,
         given.condition_type,
-        tested(given),
+        given.value,
         field=given.field,
         fields=given.fields,
         before_s=given.before,
@@ -214,14 +215,14 @@ _VALUE_WHEN = ToolDeclaration(
     "What value_topic held when condition_topic last met a condition (as in find_last_match), "
     "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
     "value_timestamp, condition_topic, value_topic}}, or null as there.",
-    Correlation,
+    ValueWhenArguments,
     lambda memory, call, given: queries.value_when(
         memory,
         call,
         given.value_topic,
         given.condition_topic,
         condition_type=given.condition_type,
-        value=tested(given),
+        value=given.value,
         field=given.field,
         fields=given.fields,
         before_s=given.before,
@@ -240,7 +241,7 @@ _TRAJECTORY = ToolDeclaration(
     ),
     "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, avg_speed, "
     "max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], ...}}.",
-    WayOver,
+    TrajectoryArguments,
     lambda memory, call, given: queries.trajectory_summary(
         memory, call, given.span, topic=given.topic
     ),

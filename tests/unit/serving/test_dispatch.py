@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from mcp.types import CallToolResult
 
     from ros2_memory.history.context import Call
-    from ros2_memory.tools.reply_json import Answer
+    from ros2_memory.results import Answer
 
 NOBODY = cast("Memory", None)
 """The tools of these tests ask nothing of a memory."""

@@ -99,7 +99,7 @@ def test_a_thousand_unknown_arguments_are_told_in_few_words(dispatcher: Dispatch
 def test_too_many_arguments_are_told_before_any_is_looked_at(
     dispatcher: Dispatcher, given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Signature, "read", lambda *_: pytest.fail("it was looked at"))
+    monkeypatch.setattr(Signature, "parse", lambda *_: pytest.fail("it was looked at"))
     told = held(asked(dispatcher, "find_last_match", given))
     assert told["error"] == "invalid_arguments"
     assert re.search(r"^(topic|more than) .*(values|levels|arguments)", told["detail"])

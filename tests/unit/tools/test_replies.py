@@ -25,8 +25,9 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import Pose, Sample, SetAside, Transform, Twist
 from ros2_memory.core.timebase import NS_PER_S, ns_from_unix, unix_rounded_up
+from ros2_memory.results import Answer
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.reply_json import Answer, shown
+from ros2_memory.tools.reply_json import render
 
 BAGS = Path("bags")
 T0 = 1_784_023_200 * NS_PER_S
@@ -428,7 +429,7 @@ def test_no_data_tells_what_could_not_be_read() -> None:
 
 def test_what_is_no_answer_is_refused() -> None:
     with pytest.raises(TypeError, match="str is not an answer"):
-        shown("text", BAGS)
+        render("text")
 
 
 def test_having_no_data_is_an_answer_with_its_reason() -> None:

@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.history.time_arguments import AtTime
-from ros2_memory.tools.arguments import At, Search
+from ros2_memory.tools.arguments import At, LastMatchArguments
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.instructions import instructions
 from ros2_memory.tools.schema import Signature
@@ -254,8 +254,10 @@ def test_a_long_value_is_cut_in_the_refusal() -> None:
     assert len(refusal("get_position_at", timestamp="x" * 10_000)) < 300
 
 
-def read(given: dict[str, Any]) -> Search:
-    return Signature(Search).read({"topic": "/a", "condition_type": "contains"} | given)
+def read(given: dict[str, Any]) -> LastMatchArguments:
+    return Signature(LastMatchArguments).parse(
+        {"topic": "/a", "condition_type": "contains"} | given
+    )
 
 
 @pytest.mark.parametrize("given", ["position", ["position"], '["position"]', ("position",)])
@@ -273,5 +275,5 @@ def test_a_whole_number_may_be_written_with_a_point() -> None:
     )
 
 
-def test_a_when_is_folded_into_its_moment() -> None:
-    assert At(timestamp=5.0).folded() == AtTime(at_s=5.0)
+def test_a_time_argument_replaces_the_moment() -> None:
+    assert At(timestamp=5.0).to_query_time() == AtTime(at_s=5.0)

@@ -1,0 +1,172 @@
+"""Replies about the memory itself as JSON: its time range, its status, saved moments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory import results
+from ros2_memory.core.timebase import Ns, iso_local, unix_rounded_up
+from ros2_memory.retention.policy import GB
+from ros2_memory.tools.reply_json import moment, render, seconds, with_notes
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.core.model import JsonValue, SetAside
+    from ros2_memory.tools.reply_size import JsonObject
+
+_NEWEST_LISTED: Final = 20
+_MOST_TOPICS: Final = 10
+_S_PER_DAY: Final = 86_400
+
+
+def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
+    """Returns what `data_time_range` replies; files are named relative to the bag directory."""
+    notes = list(answer.notes)
+    gaps: list[JsonValue] = [
+        {
+            "start": unix_rounded_up(gap.start),
+            "end": unix_rounded_up(gap.end),
+            "duration_s": seconds(gap.end - gap.start),
+        }
+        for gap in answer.gaps
+    ]
+    lists: dict[str, list[JsonValue]] = {
+        "gaps": gaps,
+        "active": _files(answer.active, bag_dir),
+        "damaged": _files(answer.damaged, bag_dir),
+        "incomplete": _files(answer.incomplete, bag_dir),
+        "unread": _files(answer.unread, bag_dir),
+        "clock_faults": _files(answer.clock_faults, bag_dir),
+        "undecodable": [
+            {"topic": each.topic, "type": each.type, "reason": each.reason}
+            for each in answer.undecodable
+        ],
+    }
+    reply: JsonObject = {
+        "earliest": moment(answer.earliest),
+        "latest": moment(answer.latest),
+        "earliest_local": _local(answer.earliest),
+        "latest_local": _local(answer.latest),
+        "now": moment(answer.now),
+        "now_local": _local(answer.now),
+        "bags": answer.bags,
+    }
+    for name, rows in lists.items():
+        reply[name] = rows[-_NEWEST_LISTED:]
+        if len(rows) > _NEWEST_LISTED:
+            notes.append(f"{name}: the last {_NEWEST_LISTED} of {len(rows)} are listed")
+            reply[f"{name}_count"] = len(rows)
+    reply["silent_topics"] = answer.silent_topics
+    return with_notes(reply, notes)
+
+
+def _local(at: Ns | None) -> str | None:
+    return None if at is None else iso_local(at)
+
+
+def _files(files: Sequence[SetAside], bag_dir: Path) -> list[JsonValue]:
+    return [{"file": file_name(file.path, bag_dir), "reason": file.reason} for file in files]
+
+
+def file_name(path: Path | str, bag_dir: Path) -> str:
+    """Returns a bag's path below the bag directory; never an absolute path of the machine."""
+    bag = Path(path)
+    return str(bag.relative_to(bag_dir)) if bag.is_relative_to(bag_dir) else bag.name
+
+
+@render.register(results.Status)
+def _status(answer: results.Status) -> JsonObject:
+    latest = answer.latest
+    reply: JsonObject = {
+        "trust": "; ".join(answer.problems) or "nothing is known to be missing",
+        "recorder": answer.recorder,
+        "recorder_alive": answer.live,
+        "restarts": answer.restarts,
+        "now": moment(answer.now),
+        "earliest": moment(answer.earliest),
+        "latest": moment(latest),
+        "newest_age_s": None if latest is None else seconds(answer.now - latest),
+        "fell_silent": [
+            {
+                "topic": each.topic,
+                "last_ts": moment(each.last),
+                "ago_s": seconds(answer.now - each.last),
+            }
+            for each in answer.fell_silent[:_MOST_TOPICS]
+        ],
+        "never_heard": [*answer.never_heard[:_MOST_TOPICS]],
+        "missing": [*answer.missing[:_MOST_TOPICS]],
+        "damaged": answer.damaged,
+        "incomplete": answer.incomplete,
+        "unread": answer.unread,
+        "budget": _budget(answer.budget),
+    }
+    counts = {
+        "fell_silent": len(answer.fell_silent),
+        "never_heard": len(answer.never_heard),
+        "missing": len(answer.missing),
+    }
+    reply |= {f"{name}_count": count for name, count in counts.items() if count > _MOST_TOPICS}
+    return with_notes(reply, answer.notes)
+
+
+def _budget(budget: results.Budget) -> JsonObject:
+    """Returns gigabytes, and for how many days they last; older bags are deleted then.
+
+    `foreign_gb` is the size of bags that the recorder did not make; the others exclude it.
+    """
+    most, per_day = budget.most, budget.per_day
+    reply: JsonObject = {
+        "used_gb": _gigabytes(budget.used),
+        "max_gb": _gigabytes(most),
+        "foreign_gb": _gigabytes(budget.foreign),
+        "growth_gb_per_day": _gigabytes(per_day),
+    }
+    if most is not None and per_day:
+        reply["full_in_days"] = round(max(most - budget.used, 0) / per_day, 2)
+        lasting = most / per_day
+        allowed = lasting if budget.max_age is None else seconds(budget.max_age) / _S_PER_DAY
+        reply["keeps_days"] = round(min(lasting, allowed), 2)
+    return reply
+
+
+def _gigabytes(size: float | None) -> float | None:
+    return None if size is None else round(size / GB, 3)
+
+
+@render.register(results.Remembered)
+def _saved_moment(answer: results.Remembered) -> JsonObject:
+    return {
+        "moment": answer.moment,
+        "label": answer.label,
+        "start": moment(answer.start),
+        "end": moment(answer.end),
+        "bags": answer.bags,
+        "pending": answer.pending,
+    }
+
+
+@render.register(results.KeptMoments)
+def _stored_moments(answer: results.KeptMoments) -> JsonObject:
+    reply: JsonObject = {"moments": [_stored(each, answer.now) for each in answer.moments]}
+    if answer.more:
+        reply["more"] = answer.more
+    return reply
+
+
+def _stored(stored: results.KeptMoment, now: Ns) -> JsonObject:
+    reply: JsonObject = {
+        "moment": stored.moment,
+        "label": stored.label,
+        "start": moment(stored.start),
+        "end": moment(stored.end),
+        "ago_s": seconds(now - stored.end),
+        "bags": stored.bags,
+        "size_gb": round(stored.size / GB, 6),
+        "complete": not (stored.pending or stored.missing),
+    }
+    if stored.pending:
+        reply["pending"] = True
+    return with_notes(reply, stored.missing)

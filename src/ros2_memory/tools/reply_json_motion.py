@@ -1,0 +1,169 @@
+"""Replies about motion as JSON: poses, velocities, transforms, paths, visits."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory import results
+from ros2_memory.core.geometry import yaw
+from ros2_memory.core.timebase import Ns, unix_rounded_up
+from ros2_memory.history.driven_path import length_notes
+from ros2_memory.tools.reply_json import (
+    degrees,
+    metres,
+    moment,
+    planar_pose,
+    render,
+    rounded,
+    seconds,
+    with_notes,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.analysis.trajectory import Trajectory
+    from ros2_memory.core.model import Geodetic
+    from ros2_memory.tools.reply_size import JsonObject
+
+FINE_PATH_M: Final = 0.05 + 1e-9
+"""The deviation that a simplified path is expected to have; a larger one is noted."""
+
+
+@render.register(results.Position)
+def _position(answer: results.Position) -> JsonObject:
+    reply: JsonObject = {
+        **planar_pose(answer.pose),
+        **({} if answer.geodetic is None else _geodetic(answer.geodetic)),
+        "timestamp": unix_rounded_up(answer.time),
+        "topic": answer.topic,
+        "frame_id": answer.pose.frame_id or None,
+    }
+    return with_notes(reply, answer.notes, answer.age)
+
+
+def _geodetic(position: Geodetic) -> JsonObject:
+    return {
+        "latitude": rounded(position.latitude, 8),
+        "longitude": rounded(position.longitude, 8),
+        "altitude": rounded(position.altitude, 4),
+    }
+
+
+@render.register(results.Velocity)
+def _velocity(answer: results.Velocity) -> JsonObject:
+    reply: JsonObject = {
+        "linear": metres(answer.twist.linear),
+        "angular": metres(answer.twist.angular),
+        "timestamp": unix_rounded_up(answer.time),
+        "topic": answer.topic,
+        "frame_id": answer.twist.frame_id or None,
+    }
+    return with_notes(reply, answer.notes, answer.age)
+
+
+@render.register(results.TransformAt)
+def _transform(answer: results.TransformAt) -> JsonObject:
+    x, y, z, w = answer.transform.rotation
+    # Of the two quaternions of one rotation, the one with w >= 0.
+    rotation = (-x, -y, -z, -w) if w < 0 else (x, y, z, w)
+    reply: JsonObject = {
+        "translation": metres(answer.transform.translation),
+        "rotation": {name: rounded(part, 6) for name, part in zip("xyzw", rotation, strict=True)},
+        "yaw_deg": degrees(yaw(rotation)),
+        "timestamp": unix_rounded_up(answer.time),
+        "parent": answer.parent,
+        "child": answer.child,
+        "clock": answer.clock,
+    }
+    return with_notes(reply, answer.notes, answer.age)
+
+
+@render.register(results.Frames)
+def _frames(answer: results.Frames) -> JsonObject:
+    edges = sorted(answer.edges, key=lambda edge: (edge.parent, edge.child))
+    reply: JsonObject = {
+        "frames": [*sorted({name for edge in edges for name in (edge.parent, edge.child)})],
+        "transforms": [
+            {"parent": edge.parent, "child": edge.child, "static": edge.static} for edge in edges
+        ],
+    }
+    return with_notes(reply, answer.notes)
+
+
+@render.register(results.TrajectorySummary)
+def _trajectory(answer: results.TrajectorySummary) -> JsonObject:
+    path = answer.trajectory
+    known = path.is_known
+    reply: JsonObject = {
+        "distance_m": rounded(path.distance_m, 4) if known else None,
+        "avg_speed": rounded(path.avg_speed, 4) if known else None,
+        "max_speed": rounded(path.max_speed, 4) if known else None,
+        "duration_s": rounded(path.duration_s, 3) if known else None,
+        "waypoints": [
+            {
+                "timestamp": unix_rounded_up(point.time),
+                **metres(point.position),
+                "yaw_deg": degrees(point.yaw_rad),
+                **({"jump": True} if point.jump else {}),
+            }
+            for point in path.waypoints
+        ],
+        "topic": answer.topic,
+        "frame_id": answer.frame_id or None,
+        "start": unix_rounded_up(answer.start),
+        "end": unix_rounded_up(answer.end),
+        "poses": path.poses,
+        **({"path_sum_m": rounded(path.path_sum_m, 4)} if path.is_noisy else {}),
+        **({"gap_m": rounded(path.gap_m, 4)} if path.gaps else {}),
+    }
+    return with_notes(reply, (*answer.notes, *_path_notes(path)))
+
+
+def _path_notes(path: Trajectory) -> Iterator[str]:
+    yield from length_notes(path)
+    if path.jumps:
+        drawn = sum(point.jump for point in path.waypoints)
+        if drawn:
+            longest = "the longest lead" if drawn < path.jumps else "each leads"
+            yield f"of the jumps {longest} to a waypoint with jump: true; no way was driven there"
+    if path.poses and path.max_speed_from == "positions":
+        yield "max_speed is measured from positions: the messages state no speed"
+    # By more than the rounding of both.
+    if path.avg_speed > path.max_speed + 0.01:
+        yield (
+            "avg_speed, by the positions, is above max_speed, which the messages state: "
+            "one of the two is wrong"
+        )
+    if path.waypoint_error_m > FINE_PATH_M:
+        yield f"the path lies within {path.waypoint_error_m:.2f} m of the waypoints' line"
+
+
+@render.register(results.Visits)
+def _visits(answer: results.Visits) -> JsonObject:
+    reply: JsonObject = {
+        "frame_id": answer.frame_id or None,
+        "x": answer.x,
+        "y": answer.y,
+        "radius_m": answer.radius_m,
+        "there_now": any(each.departed is None for each in answer.visits),
+        "visits": [_visit(each, answer.now) for each in answer.visits],
+        "total": answer.total,
+    }
+    if answer.more:
+        reply["more"] = True
+    return with_notes(reply, answer.notes)
+
+
+def _visit(visit: results.Visit, now: Ns) -> JsonObject:
+    reply: JsonObject = {
+        "arrived": moment(visit.arrived),
+        "departed": moment(visit.departed),
+        "duration_s": seconds(visit.duration),
+        "closest_m": rounded(visit.closest_m, 3),
+        "closest_at": moment(visit.closest_at),
+        "ago_s": 0.0 if visit.departed is None else seconds(now - visit.departed),
+    }
+    if visit.restarts:
+        reply["restarts_since"] = visit.restarts
+    return reply

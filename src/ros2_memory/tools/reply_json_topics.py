@@ -1,0 +1,245 @@
+"""Replies about topics as JSON: what was recorded, when a condition held, what happened."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory import results
+from ros2_memory.core.timebase import Ns, unix_rounded_up
+from ros2_memory.tools.reply_json import (
+    metres,
+    moment,
+    planar_pose,
+    render,
+    rounded,
+    seconds,
+    with_notes,
+)
+from ros2_memory.tools.reply_size import to_json_text, without_constant_zeros
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.tools.reply_size import JsonObject
+
+ZEROS_SHOWN_BELOW_CHARS: Final = 4000
+"""A range shorter than this keeps its constant zeros: there is room, and whole values read best."""
+
+_LONGEST_LAST_ROW_CHARS: Final = 200
+"""Characters of the row that sums up those left out, whatever its numbers."""
+_MOST_ZEROS_NAMED: Final = 20
+
+
+def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
+    """Returns the list of topics as JSON text of at most `max_chars` characters.
+
+    It is always a list of rows. Where it would be longer, the busiest topics come first, and the
+    last row sums up those left out: their first and last time and all their messages. `max_chars`
+    must be at least 500.
+    """
+    text = to_json_text([_topic_row(row) for row in rows])
+    if len(text) <= max_chars:
+        return text
+    spare = max_chars - _LONGEST_LAST_ROW_CHARS
+    busiest = sorted(rows, key=lambda row: -row.count)
+    listed: list[JsonValue] = []
+    for row in busiest:
+        spare -= len(to_json_text(_topic_row(row))) + 1
+        if spare < 0:
+            break
+        listed.append(_topic_row(row))
+    rest = busiest[len(listed) :]
+    others = results.TopicRow(
+        f"({len(rest)} more: use pattern)",
+        "",
+        min(row.first for row in rest),
+        max(row.last for row in rest),
+        sum(row.count for row in rest),
+    )
+    return to_json_text([*listed, _topic_row(others)])
+
+
+def _topic_row(row: results.TopicRow) -> JsonObject:
+    return {
+        "topic": row.topic,
+        "type": row.type,
+        "first_ts": unix_rounded_up(row.first),
+        "last_ts": unix_rounded_up(row.last),
+        "count": row.count,
+    }
+
+
+@render.register(results.TopicValue)
+def _topic_value(answer: results.TopicValue) -> JsonObject:
+    reply: JsonObject = {
+        "topic": answer.topic,
+        "type": answer.type,
+        "timestamp": unix_rounded_up(answer.sample.time),
+        "value": answer.sample.value,
+    }
+    if answer.latched:
+        reply["latched"] = True
+    return with_notes(reply, answer.notes, answer.age)
+
+
+@render.register(results.TopicRange)
+def _topic_range(answer: results.TopicRange) -> JsonObject:
+    reply = _range_of(answer, [sample.value for sample in answer.samples], answer.notes)
+    if len(to_json_text(reply)) <= ZEROS_SHOWN_BELOW_CHARS:
+        return reply
+    values, zeros = without_constant_zeros([sample.value for sample in answer.samples])
+    if not zeros:
+        return reply
+    more = len(zeros) - _MOST_ZEROS_NAMED
+    named = ", ".join(zeros[:_MOST_ZEROS_NAMED]) + (f" and {more} more" if more > 0 else "")
+    note = f"0 in every sample and left out: {named}"
+    return _range_of(answer, values, (*answer.notes, note))
+
+
+def _range_of(
+    answer: results.TopicRange, values: Sequence[JsonValue], notes: Sequence[str]
+) -> JsonObject:
+    reply: JsonObject = {
+        "topic": answer.topic,
+        "type": answer.type,
+        "total": answer.total,
+        "samples": [
+            {"timestamp": unix_rounded_up(sample.time), "value": value}
+            for sample, value in zip(answer.samples, values, strict=True)
+        ],
+    }
+    if answer.extremes:
+        reply["extremes"] = {each.field: _extremes(each) for each in answer.extremes}
+    return with_notes(reply, notes)
+
+
+def _extremes(extremes: results.Extremes) -> JsonObject:
+    return {
+        "min": rounded(extremes.least, 6),
+        "min_at": unix_rounded_up(extremes.least_at),
+        "max": rounded(extremes.most, 6),
+        "max_at": unix_rounded_up(extremes.most_at),
+    }
+
+
+@render.register(results.TypeFields)
+def _type_fields(answer: results.TypeFields) -> JsonObject:
+    reply: JsonObject = {
+        "type": answer.type,
+        "topics": [*answer.topics],
+        "fields": dict(answer.fields),
+    }
+    return with_notes(reply, answer.notes)
+
+
+@render.register(results.Match)
+def _match(answer: results.Match) -> JsonObject | None:
+    if answer.found is None:
+        return _no_match(answer.notes)
+    found = answer.found
+    reply: JsonObject = {
+        "timestamp": unix_rounded_up(found.sample.time),
+        "value": found.sample.value,
+        "topic": found.topic,
+        "type": found.type,
+    }
+    return with_notes(reply, _distinct(found.notes, answer.notes), found.age)
+
+
+@render.register(results.ValueWhen)
+def _value_when(answer: results.ValueWhen) -> JsonObject | None:
+    matched, held = answer.matched, answer.value
+    if matched is None:
+        return _no_match(answer.notes)
+    reply: JsonObject = {
+        "timestamp": unix_rounded_up(matched.sample.time),
+        "matched": matched.sample.value,
+        "value": None if held is None else held.sample.value,
+        "value_timestamp": None if held is None else unix_rounded_up(held.sample.time),
+        "condition_topic": matched.topic,
+        "value_topic": None if held is None else held.topic,
+    }
+    if held is not None and held.latched:
+        reply |= {"value_latched": True, "value_age_s": seconds(held.age or 0)}
+    notes = _distinct(matched.notes, () if held is None else held.notes, answer.notes)
+    return with_notes(reply, notes, matched.age)
+
+
+def _no_match(notes: Sequence[str]) -> JsonObject | None:
+    """Returns None after a complete search, and the notes after one that could not read all."""
+    return with_notes({"timestamp": None, "value": None}, notes) if notes else None
+
+
+def _distinct(*notes: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(note for some in notes for note in some))
+
+
+@render.register(results.Sightings)
+def _sightings(answer: results.Sightings) -> JsonObject:
+    reply: JsonObject = {
+        "sightings": [_sighting(each, answer.now) for each in answer.sightings],
+        "total": answer.total,
+        "searched_from": moment(answer.start),
+        "searched_to": moment(answer.end),
+    }
+    if answer.more:
+        reply["more"] = True
+    return with_notes(reply, answer.notes)
+
+
+def _sighting(sighting: results.Sighting, now: Ns) -> JsonObject:
+    robot = sighting.robot
+    reply: JsonObject = {
+        "topic": sighting.topic,
+        "first_seen": unix_rounded_up(sighting.first),
+        "last_seen": unix_rounded_up(sighting.last),
+        "duration_s": seconds(sighting.last - sighting.first),
+        "ago_s": seconds(now - sighting.last),
+        "count": sighting.messages,
+        "robot": None
+        if robot is None
+        else {**planar_pose(robot), "frame_id": robot.frame_id or None},
+    }
+    if sighting.thing is not None:
+        spot = sighting.thing
+        reply["place"] = {**metres(spot.position), "frame_id": spot.frame_id or None}
+    if not sighting.begun:
+        reply["began_earlier"] = True
+    return reply
+
+
+@render.register(results.Recap)
+def _recap(answer: results.Recap) -> JsonObject:
+    reply: JsonObject = {
+        "start": moment(answer.start),
+        "end": moment(answer.end),
+        "duration_s": seconds(answer.end - answer.start),
+        "distance_m": None if answer.distance_m is None else rounded(answer.distance_m, 3),
+        "max_speed": None if answer.max_speed is None else rounded(answer.max_speed, 3),
+        "stood_s": None if answer.stood is None else seconds(answer.stood),
+        "shortest_stop_s": seconds(answer.shortest_stop),
+        "frame_id": answer.frame_id or None,
+        "events": [_event(each, answer.now) for each in answer.events],
+    }
+    if answer.throughout:
+        reply["seen_throughout"] = [*answer.throughout]
+    reply["counts"] = dict(answer.counts)
+    if answer.path_sum_m is not None:
+        reply["path_sum_m"] = rounded(answer.path_sum_m, 3)
+    if answer.gap_m is not None:
+        reply["gap_m"] = rounded(answer.gap_m, 3)
+    return with_notes(reply, answer.notes)
+
+
+def _event(event: results.Event, now: Ns) -> JsonObject:
+    reply: JsonObject = {
+        "timestamp": moment(event.start),
+        "ago_s": round(seconds(now - event.start), 1),
+        "text": event.text,
+    }
+    if event.end is not None:
+        reply["duration_s"] = seconds(event.end - event.start)
+    if event.goes_on:
+        reply["goes_on"] = True
+    return reply
