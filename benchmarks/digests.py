@@ -20,7 +20,7 @@ from ros2_memory.analysis.standstills import (
 )
 from ros2_memory.bootstrap import build_backfill
 from ros2_memory.catalogue.digest import Digester
-from ros2_memory.cli.index import fill
+from ros2_memory.cli.index import fill_catalogue
 
 if TYPE_CHECKING:
     from benchmarks.questions import Case
@@ -43,7 +43,7 @@ def digester_of(memory: Memory, settings: Settings) -> Digester:
 
 def made_known(memory: Memory, settings: Settings) -> None:
     """Has the memory's catalogue know every bag, as `ros2-memory index` does."""
-    fill(build_backfill(settings, memory), None, lambda: False)
+    fill_catalogue(build_backfill(settings, memory))
 
 
 def cost(case: Case, runs: int) -> Figure:

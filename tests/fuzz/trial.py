@@ -17,8 +17,8 @@ import structlog
 
 from ros2_memory import cli
 from ros2_memory.bootstrap import build_backfill, build_memory, build_server
-from ros2_memory.cli.index import Bar, fill
-from ros2_memory.cli.recovery import recover
+from ros2_memory.cli.index import fill_catalogue
+from ros2_memory.cli.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import BagState, TimeWindow
@@ -266,7 +266,7 @@ def _count(memory: Memory, bag: Path, notes: tuple[str, ...], verdict: Verdict) 
 
 def _digested(world: World, memory: Memory, verdict: Verdict) -> None:
     begun = time.process_time()
-    fill(build_backfill(world.settings, memory), Bar(io.StringIO()), lambda: False)
+    fill_catalogue(build_backfill(world.settings, memory))
     verdict.digest_s = time.process_time() - begun
     if verdict.digest_s > MOST_S:
         verdict.faults.append(f"slow: digesting took {verdict.digest_s:.1f} s")
@@ -275,7 +275,7 @@ def _digested(world: World, memory: Memory, verdict: Verdict) -> None:
 def _recovered(world: World, verdict: Verdict) -> None:
     begun = time.process_time()
     with suppress(EpisodicError):
-        recover(world.bag_dir, _quiet, force=True, stream=io.StringIO())
+        recover_files(world.bag_dir, _quiet, force=True)
     verdict.recover_s = time.process_time() - begun
     if verdict.recover_s > MOST_S:
         verdict.faults.append(f"slow: recovering took {verdict.recover_s:.1f} s")

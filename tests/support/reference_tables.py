@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import yaml
 from pydantic import TypeAdapter
 
-from ros2_memory.cli.app import COMMANDS
-from ros2_memory.cli.exits import EVERYWHERE, EXITS
+from ros2_memory.cli.app import COMMANDS, COMMON_EXIT_CODES
 from ros2_memory.config import Ros2BagNode, Rosbag2Node, Settings
 from ros2_memory.recorder import event_log
 from ros2_memory.recorder.process.output import LineKind
@@ -70,10 +69,10 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def told_exits() -> str:
     """Each command, what it is for, and what its exit codes say."""
-    common = "; ".join(f"{code}: {why}" for code, why in EVERYWHERE.items())
+    common = "; ".join(f"{code}: {why}" for code, why in COMMON_EXIT_CODES.items())
     rows = [
-        (f"`{name}`", purpose, "; ".join(f"{code}: {why}" for code, why in EXITS[name].items()))
-        for name, (_, purpose) in COMMANDS.items()
+        (f"`{name}`", purpose, "; ".join(f"{code}: {why}" for code, why in codes.items()))
+        for name, (_, purpose, codes) in COMMANDS.items()
     ]
     columns = ("command", "what it is for", "exit code")
     return f"{table(columns, rows)}\n\nWhere nothing else is said, {common}."

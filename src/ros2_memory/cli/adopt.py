@@ -14,8 +14,14 @@ from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
 from ros2_memory.bootstrap import claim
-from ros2_memory.cli.running import NOT_SO, BagDir, Sets, reporting, say
-from ros2_memory.cli.settling import settings_for
+from ros2_memory.cli.options import (
+    EXIT_NEGATIVE,
+    BagDir,
+    Sets,
+    load_for,
+    print_line,
+    reported_errors,
+)
 from ros2_memory.config import NullRecorderNode
 from ros2_memory.core.errors import (
     ConfigError,
@@ -43,8 +49,8 @@ def adopt(
     programs. From then on retention counts them in its budget and deletes them by its limits, and
     `forget` deletes them too. Nothing is deleted or changed here.
     """
-    with reporting("adopt"):
-        settings = settings_for(bag_dir, sets)
+    with reported_errors("adopt"):
+        settings = load_for(bag_dir, sets)
         if isinstance(settings.recorder, NullRecorderNode):
             raise ConfigError(
                 "recorder=none: nothing is deleted here, so there is nothing to adopt; choose the "
@@ -59,17 +65,21 @@ def adopt(
         own.adopt({name: _identity(path) for name, path in new.items()})
     for name, path in new.items():
         files, size = _taken(path)
-        say(f"adopted: {name} ({counted(files, 'bag file')}, {size / _MB:.1f} MB)")
+        print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size / _MB:.1f} MB)")
     already = len(found) - len(new)
     if already:
-        say(f"{counted(already, 'directory is', 'directories are')} the recorder's own already")
+        print_line(
+            f"{counted(already, 'directory is', 'directories are')} the recorder's own already"
+        )
     if new:
-        say("retention deletes them from now on, by its limits, oldest first")
+        print_line("retention deletes them from now on, by its limits, oldest first")
     if not found:
-        say("no bag files lie there")
+        print_line("no bag files lie there")
         for link in islice(_links(places), _NAMED):
-            say(f"{link.relative_to(root)} is a symbolic link, which is not followed: {_INSTEAD}")
-        raise typer.Exit(NOT_SO)
+            print_line(
+                f"{link.relative_to(root)} is a symbolic link, which is not followed: {_INSTEAD}"
+            )
+        raise typer.Exit(EXIT_NEGATIVE)
 
 
 def _place(directory: Path, root: Path) -> Path:

@@ -1,24 +1,117 @@
-"""The program `ros2-memory`: which commands there are, and how it ends."""
+"""The program `ros2-memory`: its commands, their exit codes, and how signals end them.
 
+A command's module is imported when the command is run, so that `--help` and shell completion do not
+wait for the libraries of all of them.
+"""
+
+import gc
 import signal
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Final, cast
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, cast
 
 import typer
-from typer.main import get_command
+from typer.core import TyperCommand
+from typer.main import get_command, get_group
 
 from ros2_memory import package_version
-from ros2_memory.cli.deferred import Deferred
-from ros2_memory.core.text import counted, listed
-from ros2_memory.core.withheld import withheld_warnings
 
 if TYPE_CHECKING:
+    from typer._click import Command, Context  # Typer has no public names for these
     from typer.core import TyperGroup
 
 INTERRUPTED: Final = 130
+
+
+class CommandEntry(NamedTuple):
+    """One row of the list of commands.
+
+    `path` is where the command's function, or the Typer application of a group, is in this package.
+    """
+
+    path: str
+    purpose: str
+    exit_codes: Mapping[int, str]
+
+
+COMMANDS: Final[Mapping[str, CommandEntry]] = {
+    "ask": CommandEntry(
+        "ask.ask",
+        "ask any tool of the server, in process",
+        {
+            0: "there is an answer, also that it was never so (null)",
+            1: "there is none: the reply is an error, which says why",
+        },
+    ),
+    "topics": CommandEntry(
+        "info.topics",
+        "every recorded topic, with its rate",
+        {0: "there are some", 1: "nothing is recorded"},
+    ),
+    "info": CommandEntry(
+        "info.info",
+        "range, gaps, budget and how long it lasts",
+        {0: "it was told", 1: "there is nothing to tell of"},
+    ),
+    "watch": CommandEntry(
+        "watch.watch",
+        "what is being recorded just now",
+        {0: "it was ended, by --count or Ctrl-C, whatever it saw"},
+    ),
+    "doctor": CommandEntry(
+        "doctor.doctor",
+        "look for what is wrong, and say what to do",
+        {0: "all is in order", 1: "something wants attention", 2: "something does not work"},
+    ),
+    "export": CommandEntry(
+        "export.export",
+        "a time window as MCAP or Parquet",
+        {
+            0: "all of the window was copied",
+            1: "what could be read of it was; stderr says what could not",
+        },
+    ),
+    "forget": CommandEntry(
+        "forget.forget",
+        "delete a time window, after asking",
+        {
+            0: "all that lies in the window is deleted (with --dry-run: would be), or there is "
+            "nothing",
+            1: "something in the window stays and is named, or the question was answered with no",
+        },
+    ),
+    "adopt": CommandEntry(
+        "adopt.adopt",
+        "let the recorder delete bags that it did not make",
+        {0: "the bags are the recorder's own now, or were before", 1: "no bag files lie there"},
+    ),
+    "demo": CommandEntry(
+        "app.demo",
+        "a simulated robot, asked questions with known answers",
+        {0: "all answers were right", 1: "one was wrong"},
+    ),
+    "index": CommandEntry(
+        "index.index",
+        "look into every bag once, so that answers take milliseconds",
+        {0: "every bag was looked into, or was found to be one that cannot be"},
+    ),
+    "recover": CommandEntry(
+        "recover.recover",
+        "repair MCAP files that were left unfinished",
+        {0: "every file is whole", 1: "a file could not be repaired"},
+    ),
+    "config": CommandEntry(
+        "config.config", "the configuration as it is composed", {0: "it was shown"}
+    ),
+}
+COMMON_EXIT_CODES: Final[Mapping[int, str]] = {
+    2: "it could not run, and stderr says why",
+    INTERRUPTED: "it was interrupted before it was done",
+}
+"""The exit codes of every command, unless its own entry gives a code another meaning."""
 
 app = typer.Typer(
     name="ros2-memory",
@@ -27,76 +120,72 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
-    "ask": ("ask.ask", "ask any tool of the server, in process"),
-    "topics": ("info.topics", "every recorded topic, with its rate"),
-    "info": ("info.info", "range, gaps, budget and how long it lasts"),
-    "watch": ("watch.watch", "what is being recorded just now"),
-    "doctor": ("doctor.doctor", "look for what is wrong, and say what to do"),
-    "export": ("export.export", "a time window as MCAP or Parquet"),
-    "forget": ("forget.forget", "delete a time window, after asking"),
-    "adopt": ("adopt.adopt", "let the recorder delete bags that it did not make"),
-    "demo": ("demo.demo", "a simulated robot, asked questions with known answers"),
-    "index": ("fill.index", "look into every bag once, so that answers take milliseconds"),
-    "recover": ("recover.recover", "repair MCAP files that were left unfinished"),
-    "config": ("config_show.config", "the configuration as it is composed"),
-}
-"""By name: where it is in this package, imported when it is asked for, and what it is for."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line (`sys.argv` unless given) and returns the exit code.
 
-    0: done and right; 1: an answer was wrong or missing, or something was left undone; 2: it could
-    not run, and stderr says why; 130: interrupted before it was done.
+    0: done, and the answer is yes; 1: an answer was wrong or missing, or something was left undone;
+    2: it could not run, and stderr says why; 130: interrupted before it was done.
     """
     try:
-        with _ended_like_ctrl_c(signal.SIGTERM, signal.SIGHUP):
+        with _as_keyboard_interrupt(signal.SIGTERM, signal.SIGHUP):
             # An application with a callback is a group.
-            program = cast("TyperGroup", get_command(app))
-            for name, (place, purpose) in COMMANDS.items():
-                program.add_command(Deferred(name, f"{__package__}.{place}", purpose))
-            program(args=None if argv is None else [*argv], prog_name="ros2-memory")
+            group = cast("TyperGroup", get_command(app))
+            for name in COMMANDS:
+                group.add_command(LazyCommand(name))
+            group(args=None if argv is None else [*argv], prog_name="ros2-memory")
     except KeyboardInterrupt:
         return INTERRUPTED
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
-    finally:
-        _say_withheld()
     return 0
 
 
-def _say_withheld() -> None:
-    """One sentence on stderr, where warnings were not shown: how many, and how to see them."""
-    events = withheld_warnings()
-    if events:
-        warnings = counted(events.total(), "warning")
-        which = listed([each if n == 1 else f"{n} x {each}" for each, n in events.items()])
-        print(
-            f"ros2-memory: {warnings} logged ({which}); -v shows the log, `ros2-memory doctor` "
-            "says what to do",
-            file=sys.stderr,
-        )
+class LazyCommand(TyperCommand):
+    """A command of `COMMANDS` whose module is imported when the command is run or completed."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, short_help=COMMANDS[name].purpose)
+        self._name = name
+
+    def make_context(
+        self,
+        info_name: str | None,
+        args: list[str],
+        parent: "Context | None" = None,
+        **extra: object,
+    ) -> "Context":
+        """Returns the context of the real command, which runs, completes and shows its help."""
+        return self._load().make_context(info_name, args, parent, **extra)
+
+    def _load(self) -> "Command":
+        module, _, attribute = COMMANDS[self._name].path.rpartition(".")
+        # Modules live as long as the process. Collecting garbage among them while they are imported
+        # finds nothing, and takes about a tenth of the processor time of a command's start.
+        gc.disable()
+        try:
+            loaded: object = getattr(import_module(f"{__package__}.{module}"), attribute)
+        finally:
+            gc.freeze()
+            gc.enable()
+        parent = typer.Typer(add_completion=False, rich_markup_mode=None)
+        if isinstance(loaded, typer.Typer):
+            parent.add_typer(loaded, name=self._name, epilog=epilog(self._name))
+        elif callable(loaded):
+            parent.command(self._name, epilog=epilog(self._name))(loaded)
+        return get_group(parent).commands[self._name]
 
 
-def _version(asked: bool) -> None:
-    if asked:
-        print(f"ros2-memory {package_version()}")
-        raise typer.Exit
-
-
-@app.callback()
-def _program(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show it.")
-    ] = False,
-) -> None:
-    del version
+def epilog(command: str) -> str:
+    """Returns the last lines of a command's help: what its exit codes mean."""
+    codes = {**COMMON_EXIT_CODES, **COMMANDS[command].exit_codes}
+    return f"Exit code: {'; '.join(f'{code}: {codes[code]}' for code in sorted(codes))}."
 
 
 @contextmanager
-def _ended_like_ctrl_c(*signals: signal.Signals) -> Iterator[None]:
-    """Within the block each of these signals is a KeyboardInterrupt, so that all is closed."""
+def _as_keyboard_interrupt(*signals: signal.Signals) -> Iterator[None]:
+    """Raises KeyboardInterrupt for these signals within the block, so that files are closed."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -107,3 +196,53 @@ def _ended_like_ctrl_c(*signals: signal.Signals) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        print(f"ros2-memory {package_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options_of_all(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show it.")
+    ] = False,
+) -> None:
+    del version
+
+
+def demo(
+    once: Annotated[
+        bool, typer.Option("--once", help="Leave after the answers; exit code 1: one was wrong.")
+    ] = False,
+    port: Annotated[int, typer.Option(help="On 127.0.0.1; 0: any that is free.")] = 9203,
+    bag_dir: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="A new or empty folder, kept (a temporary one, removed at the end)."
+        ),
+    ] = None,
+    duration: Annotated[
+        float,
+        typer.Option(metavar="S", help="Seconds of history when the questions are asked."),
+    ] = 120.0,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Show the server's log on stderr.")
+    ] = False,
+) -> None:
+    """A simulated robot, its bags, the query server and a client that asks it questions.
+
+    Every answer is held against what the robot did. Needs no ROS and no configuration.
+    """
+    # Imported here, so that no other command waits for the demo's libraries.
+    from ros2_memory.cli.options import print_line, reported_errors  # noqa: PLC0415
+    from ros2_memory.demo.run import DemoOptions, run_demo  # noqa: PLC0415
+
+    options = DemoOptions(
+        once=once, port=port, bag_dir=bag_dir, duration_s=duration, verbose=verbose
+    )
+    with reported_errors("demo"):
+        code = run_demo(options, print_line)
+    raise typer.Exit(code)

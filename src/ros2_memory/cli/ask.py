@@ -8,36 +8,35 @@ import anyio
 import typer
 
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.cli.opening import opened
-from ros2_memory.cli.output import show
-from ros2_memory.cli.running import (
-    NOT_SO,
+from ros2_memory.cli.options import (
+    EXIT_NEGATIVE,
     AsJson,
     BagDir,
     Sets,
     Verbose,
-    busy,
-    output,
-    reporting,
-    say,
+    load_for,
+    open_memory,
+    present,
+    print_line,
+    reported_errors,
+    spinner,
+    stdout_console,
 )
-from ros2_memory.cli.settling import settings_for
+from ros2_memory.cli.output import print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Memory, QuerySettings
+from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.replies import Reply
 from ros2_memory.tools.spec_tools import build_tools
 
 NEVER: Final = "never: no recorded message meets the condition"
-"""What `null` says, the reply of tools that look for the last match."""
-Schemas = Mapping[str, Mapping[str, object]]
-"""By tool, the JSON schema of its arguments."""
+"""Printed for `null`, the reply of tools that look for the last match."""
 
 
 def complete(incomplete: str) -> list[str]:
-    """The tools whose names begin so, for the shell."""
+    """Returns the tools whose names begin so, for the shell's completion."""
     names = (tool.name for tool in build_tools(QuerySettings(), 1.0, writing=True))
     return [name for name in names if name.startswith(incomplete)]
 
@@ -64,95 +63,90 @@ def ask(
     Values are JSON where they read as such (seconds_ago=10, value=true), else text. With --json
     the reply is exactly what an MCP client receives.
     """
-    with reporting("ask"):
-        chosen = settings_for(bag_dir, settings)
-        memory = opened(chosen, verbose=verbose)
-        dispatcher = build_dispatcher(chosen, memory)
+    with reported_errors("ask"):
+        loaded = load_for(bag_dir, settings)
+        memory = open_memory(loaded, verbose=verbose)
+        dispatcher = build_dispatcher(loaded, memory)
         schemas = {each.name: each.schema for each in dispatcher.tools}
         if tool is None:
-            show(output(), [_row(name, schema) for name, schema in schemas.items()])
+            rows: list[JsonValue] = [_tool_row(*each) for each in schemas.items()]
+            print_reply(stdout_console(), rows)
             return
-        arguments = parsed(given or (), schemas.get(tool, {}))
-        with busy(f"asking {tool}"):
-            reply = asked(dispatcher, tool, arguments)
+        arguments = parse_arguments(given or (), schemas.get(tool, {}))
+        with spinner(f"asking {tool}"):
+            (reply,) = call_tools(dispatcher, {tool: arguments})
     answer: JsonValue = json.loads(reply.text)
     if as_json:
-        say(reply.text)
+        print_line(reply.text)
     elif answer is None:
-        say(NEVER)
+        print_line(NEVER)
     else:
-        show(output(), answer, _now(memory))
+        print_reply(stdout_console(), answer, unix_from_ns(present(memory)))
     if tool not in schemas:
         typer.echo(f"tools: {', '.join(schemas)}", err=True)
-    if reply.is_error or is_without_answer(answer):
-        raise typer.Exit(NOT_SO)
+    if reply.is_error or is_error(answer):
+        raise typer.Exit(EXIT_NEGATIVE)
 
 
-def _now(memory: Memory) -> float:
-    """What ages count from (Unix seconds)."""
-    latest = memory.index.snapshot().dating.latest
-    wall = memory.limits.now == "wall" or latest is None
-    return unix_from_ns(memory.clock.now() if wall or latest is None else latest)
+def call_tools(dispatcher: Dispatcher, calls: Mapping[str, Mapping[str, object]]) -> list[Reply]:
+    """Returns the replies of tools, by name and arguments; the dispatcher takes no further call."""
 
+    async def replies() -> list[Reply]:
+        return [await dispatcher.answer(tool, arguments) for tool, arguments in calls.items()]
 
-def asked(dispatcher: Dispatcher, tool: str, arguments: Mapping[str, object]) -> Reply:
-    """The reply of one tool."""
     try:
-        return anyio.run(dispatcher.answer, tool, arguments)
+        return anyio.run(replies)
     finally:
         dispatcher.stop()
 
 
-def is_without_answer(reply: JsonValue) -> bool:
-    """Whether a reply only says why there is none."""
+def is_error(reply: JsonValue) -> bool:
+    """Returns whether a reply only says why there is no answer."""
     return isinstance(reply, dict) and "error" in reply
 
 
-def parsed(given: Sequence[str], schema: Mapping[str, object]) -> dict[str, object]:
-    """The arguments of a tool: one JSON object, or `key=value` each.
+def parse_arguments(given: Sequence[str], schema: Mapping[str, object]) -> dict[str, object]:
+    """Parses the arguments of a tool: one JSON object, or `key=value` each.
+
+    Args:
+        given: the words of the command line.
+        schema: the tool's JSON schema: what it takes as text is not parsed as JSON.
 
     Raises:
-        InvalidArgumentsError: it is neither.
+        InvalidArgumentsError: a word is neither.
     """
     if len(given) == 1 and given[0].lstrip().startswith("{"):
-        value = _json(given[0])
+        value = _from_json(given[0], None)
         if not isinstance(value, dict):
             raise InvalidArgumentsError(f"{given[0]} is no JSON object")
         return {**value}
     arguments: dict[str, object] = {}
-    for each in given:
-        key, equals, text = each.partition("=")
+    for word in given:
+        key, equals, text = word.partition("=")
         if not equals or not key:
             raise InvalidArgumentsError(
-                f"{each!r} is no argument; write key=value, such as seconds_ago=10, or one JSON "
+                f"{word!r} is no argument; write key=value, such as seconds_ago=10, or one JSON "
                 "object"
             )
-        arguments[key] = text if _is_text(schema, key) else _value(text)
+        arguments[key] = text if _takes_text(schema, key) else _from_json(text, text)
     return arguments
 
 
-def _value(text: str) -> JsonValue:
-    value = _json(text)
-    return text if value is None and text != "null" else value
-
-
-def _json(text: str) -> JsonValue:
-    """What a text says as JSON; None where it is none."""
+def _from_json(text: str, otherwise: str | None) -> JsonValue:
     try:
         value: JsonValue = json.loads(text)
     except (ValueError, RecursionError):
-        return None
+        return otherwise
     return value
 
 
-def _is_text(schema: Mapping[str, object], key: str) -> bool:
-    """Whether a tool takes this argument as text alone, whatever it looks like."""
+def _takes_text(schema: Mapping[str, object], key: str) -> bool:
     properties = schema.get("properties")
     known = properties.get(key) if isinstance(properties, dict) else None
     return isinstance(known, dict) and known.get("type") == "string"
 
 
-def _row(name: str, schema: Mapping[str, object]) -> dict[str, JsonValue]:
+def _tool_row(name: str, schema: Mapping[str, object]) -> JsonValue:
     properties, required = schema.get("properties"), schema.get("required")
     names = list(properties) if isinstance(properties, dict) else []
     needed = required if isinstance(required, list) else []

@@ -1,26 +1,117 @@
-"""`ros2-memory doctor`: looks at everything that has to be right, and says what to do."""
+"""`ros2-memory doctor`: checks everything that has to be right, and says what to do.
 
+One function for each concern; each yields findings, and changes nothing.
+"""
+
+import getpass
+import http.client
 import json
 import os
-from collections.abc import Iterator, Sequence
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from difflib import get_close_matches
+from enum import IntEnum
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Final
 
 import typer
 from rich.console import Console
 from rich.text import Text
 
-from ros2_memory.cli import findings
-from ros2_memory.cli.extras import of_extras
-from ros2_memory.cli.findings import Finding, Level
-from ros2_memory.cli.opening import opened
-from ros2_memory.cli.output import plain
-from ros2_memory.cli.running import AsJson, BagDir, Overrides, Verbose, busy, output, reporting, say
-from ros2_memory.cli.server_finding import of_server
-from ros2_memory.cli.settling import settings_for
-from ros2_memory.config import config_dir
-from ros2_memory.core.errors import ConfigError
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
+from ros2_memory.bootstrap import build_recorder, query_settings_of
+from ros2_memory.cli.info import assumed_active, overlaps
+from ros2_memory.cli.options import (
+    AsJson,
+    BagDir,
+    Overrides,
+    Verbose,
+    load_for,
+    open_memory,
+    print_line,
+    reported_errors,
+    spinner,
+    stdout_console,
+)
+from ros2_memory.cli.output import escape
+from ros2_memory.config import NullRecorderNode, Settings, config_dir
+from ros2_memory.core import directories
+from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
+from ros2_memory.core.model import JsonValue, SetAside
+from ros2_memory.core.text import MAX_NAMED, counted, listed
+from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local, unix_from_ns
+from ros2_memory.history.context import Call, Latching, Memory
+from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
+from ros2_memory.index.listed_splits import absent_splits, describe_absent
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.insights.status import nothing_here, odd_bags
+from ros2_memory.queries import data_time_range
+from ros2_memory.recorder.process.topics import TopicSelection, load_topics
+from ros2_memory.retention.policy import GB
+from ros2_memory.serving.auth import api_token
+from ros2_memory.storage.base import BagReader, Closing
 
-_STYLES = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
+_RECENT_NS: Final[Ns] = 3600 * NS_PER_S
+"""A topic without a message in the newest data of this length is not being recorded."""
+_HEALTH_TIMEOUT_S: Final = 5.0
+_MAX_HEALTH_BYTES: Final = 1 << 20
+_LOCAL_ADDRESSES: Final[Mapping[str, str]] = {
+    "0.0.0.0": "127.0.0.1",  # noqa: S104 - looked up, never bound
+    "::": "::1",
+    "": "127.0.0.1",
+}
+"""Where a server that listens on all interfaces is reached from its own machine."""
+_MSG_FOLDERS: Final = "reader.custom_msg_paths"
+_NOT_DECODED: Final = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
+_NOT_REPAIRED: Final = "copy them anew from where they were recorded, or delete them"
+_UNOFFERED: Final = "no publisher has offered it since the recorder started"
+_START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
+
+
+class Level(IntEnum):
+    """How bad a finding is; its value is the exit code."""
+
+    OK = 0
+    WARNING = 1
+    ERROR = 2
+
+
+_STYLES: Final = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What was seen of one concern, and what to do about it; nothing where all is in order."""
+
+    level: Level
+    about: str
+    seen: str
+    do: str = ""
+
+    def as_json(self) -> dict[str, JsonValue]:
+        """Returns the finding for programs."""
+        return {
+            "level": self.level.name.lower(),
+            "about": self.about,
+            "seen": self.seen,
+            "do": self.do or None,
+        }
+
+
+def _ok(about: str, seen: str) -> Finding:
+    return Finding(Level.OK, about, seen)
+
+
+def _warning(about: str, seen: str, do: str) -> Finding:
+    return Finding(Level.WARNING, about, seen, do)
+
+
+def _error(about: str, seen: str, do: str) -> Finding:
+    return Finding(Level.ERROR, about, seen, do)
 
 
 def doctor(
@@ -33,49 +124,457 @@ def doctor(
 
     Each finding says what to do.
     """
-    with reporting("doctor"):
-        found = [*examined(bag_dir, overrides, verbose=verbose)]
-    worst = max(each.level for each in found)
+    with reported_errors("doctor"):
+        findings = [*_examine(bag_dir, overrides, verbose=verbose)]
+    worst = max(each.level for each in findings)
     if as_json:
-        told = {"status": worst.name.lower(), "findings": [each.as_json() for each in found]}
-        say(json.dumps(told))
+        rows = [each.as_json() for each in findings]
+        print_line(json.dumps({"status": worst.name.lower(), "findings": rows}))
     else:
-        _show(output(), found)
+        _print(stdout_console(), findings)
     raise typer.Exit(int(worst))
 
 
-def examined(
-    bag_dir: Path | None, overrides: Sequence[str] | None, *, verbose: bool = False
+def _examine(
+    bag_dir: Path | None, overrides: Sequence[str] | None, *, verbose: bool
 ) -> Iterator[Finding]:
-    """All findings; of a configuration that is refused no other."""
+    """Yields all findings; one alone where the configuration is refused."""
     try:
-        settings = settings_for(bag_dir, overrides)
-        memory = opened(settings, verbose=verbose)
+        settings = load_for(bag_dir, overrides)
+        memory = open_memory(settings, verbose=verbose)
     except ConfigError as error:
-        yield Finding(Level.ERROR, "config", str(error), "correct the key that it names")
+        yield _error("config", str(error), "correct the key that it names")
         return
-    yield Finding(Level.OK, "config", f"composed from {config_dir(os.environ)}")
+    yield _ok("config", f"composed from {config_dir(os.environ)}")
     now, snapshot = memory.clock.now(), memory.index.snapshot()
-    with busy("asking the disk, ros2, the recorder and the server"):
+    with spinner("asking the disk, ros2, the recorder and the server"):
         foreign = memory.foreign(snapshot)
-        yield from findings.of_bag_dir(settings, 0 if foreign is None else foreign.total_bytes)
-        yield from findings.of_clock(snapshot, now)
-        yield from findings.of_bags(settings, memory)
-        yield from findings.of_what_lies_there(memory, snapshot)
-        yield from findings.of_ros(settings, memory.reader)
-        yield from findings.of_recorder(settings, now)
-        yield from findings.of_topics(settings, snapshot, now)
-        yield from of_extras(settings)
-        yield from of_server(settings)
+        yield from check_bag_dir(settings, 0 if foreign is None else foreign.total_bytes)
+        yield from check_clock(snapshot, now)
+        yield from check_bags(settings, memory)
+        yield from check_recordings(memory, snapshot)
+        yield from check_ros(settings, memory.reader)
+        yield from check_recorder(settings, now)
+        yield from check_topics(settings, snapshot, now)
+        yield from check_extras(settings)
+        yield from check_server(settings)
 
 
-def _show(console: Console, found: Sequence[Finding]) -> None:
-    for each in found:
+def _print(console: Console, findings: Sequence[Finding]) -> None:
+    for each in findings:
         line = Text.assemble(
             (f"{each.level.name.lower():<8}", _STYLES[each.level]),
             (f"{each.about:<9}", "bold"),
-            plain(each.seen),
+            escape(each.seen),
         )
         console.print(line, soft_wrap=True)
         if each.do and each.level is not Level.OK:
-            console.print(Text(f"{'':17}-> {plain(each.do)}"), soft_wrap=True)
+            console.print(Text(f"{'':17}-> {escape(each.do)}"), soft_wrap=True)
+
+
+def check_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Finding]:
+    """Whether the bag directory is there, may be used by this user, and has room.
+
+    `foreign_bytes` is what bags take that its recorder did not make, and keeps.
+    """
+    bag_dir, about = settings.recording.bag_dir.absolute(), "bag_dir"
+    records = not isinstance(settings.recorder, NullRecorderNode)
+    if not bag_dir.is_dir():
+        if not records:
+            do = "name the directory of the bags: MEMORY_BAG_DIR, or recording.bag_dir=DIR"
+            yield _error(about, f"{bag_dir} is no directory", do)
+            return
+        yield _warning(
+            about,
+            f"{bag_dir} is not there",
+            "the recorder makes it when it starts; is its disk mounted?",
+        )
+    else:
+        yield from _permissions(bag_dir, records=records)
+    if records:
+        yield from _room(settings, bag_dir, foreign_bytes)
+
+
+def _permissions(bag_dir: Path, *, records: bool) -> Iterator[Finding]:
+    user = _user()
+    wanted = os.R_OK | os.X_OK
+    if not os.access(bag_dir, wanted):
+        do = "give this user the right to read it, or run as the user of the services"
+        yield _error("bag_dir", f"{user} may not read {bag_dir}", do)
+    elif records and not os.access(bag_dir, wanted | os.W_OK):
+        yield _warning(
+            "bag_dir",
+            f"{user} may read {bag_dir}, and not write there",
+            "fine if the recorder runs as another user, who may: "
+            "sudo -u USER ros2-memory doctor looks as that one",
+        )
+    else:
+        may = "read and write" if records else "read"
+        yield _ok("bag_dir", f"{bag_dir}, where {user} may {may}")
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container's user without an entry
+        return f"user {os.getuid()}"
+
+
+def _room(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Iterator[Finding]:
+    there = next(each for each in (bag_dir, *bag_dir.parents) if each.is_dir())
+    try:
+        disk = shutil.disk_usage(there)
+    except OSError as error:
+        yield _error("disk", f"{there} cannot be measured: {error}", "look after the disk")
+        return
+    mount = next(each for each in (there, *there.parents) if os.path.ismount(each))
+    kept = settings.retention
+    free, used = disk.free / GB, max(_size(bag_dir) - foreign_bytes, 0) / GB
+    seen = f"{free:.1f} GB free on {mount}; {used:.1f} of {kept.max_total_gb:g} GB used"
+    if foreign_bytes:
+        seen += (
+            f"; bags that this recorder did not make take {foreign_bytes / GB:.2g} GB more, and "
+            "are neither deleted nor counted: `ros2-memory adopt DIR` takes those of a directory"
+        )
+    if free < kept.min_free_gb:
+        do = (
+            f"recording pauses below retention.min_free_gb={kept.min_free_gb:g}; delete what else "
+            "lies on this disk"
+        )
+        yield _error("disk", seen, do)
+    elif free - kept.min_free_gb < kept.max_total_gb - used:
+        do = (
+            "the disk is full before the budget is: lower retention.max_total_gb to "
+            f"{max(free - kept.min_free_gb + used, 0):.1f}, or make room"
+        )
+        yield _warning("disk", seen, do)
+    else:
+        yield _ok("disk", seen)
+
+
+def _size(folder: Path) -> int:
+    """The bytes of all files below a folder, as far as they can be seen; two names count once."""
+    sizes: dict[tuple[int, int], int] = {}
+    for _, entries in directories.walk(folder):
+        for entry in entries:
+            with suppress(OSError):
+                if not entry.is_dir(follow_symlinks=False):
+                    status = entry.stat(follow_symlinks=False)
+                    sizes[status.st_dev, status.st_ino] = status.st_size
+    return sum(sizes.values())
+
+
+def check_clock(snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
+    """Whether this machine's clock can be right, and those that dated the bags."""
+    do = "set the clock (timedatectl, chrony); bags keep the dates they were given"
+    latest = snapshot.dating.latest
+    if now < FIRST_BAGS_NS:
+        yield _error("clock", f"it says {iso_local(now)}: it was never set", do)
+    elif latest is not None and latest > now + FUTURE_NS:
+        seen = f"the newest data is dated {unix_from_ns(latest - now):.0f} s after the present"
+        yield _error("clock", seen, do)
+    elif snapshot.dating.faults:
+        faults = counted(len(snapshot.dating.faults), "bag was", "bags were")
+        seen = f"{faults} dated by a wrong clock: `ros2-memory info` lists them"
+        yield _warning("clock", seen, do)
+    else:
+        yield _ok("clock", f"it says {iso_local(now)}")
+
+
+def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
+    """Whether all bags can be read, and all messages in them understood."""
+    told = data_time_range(memory, Call())
+    snapshot = memory.index.snapshot()
+    if snapshot.problem:
+        do = "see bag_dir above; is the disk mounted?"
+        yield _error("bags", snapshot.problem, do)
+        return
+    newest = "" if told.latest is None else f", the newest from {iso_local(told.latest)}"
+    answering = counted(told.bags, "bag answers", "bags answer")
+    if told.bags or told.active:
+        yield _ok("bags", f"{answering}{newest}")
+    else:
+        do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
+        yield _warning("bags", nothing_here(snapshot), do)
+    left = (*told.damaged, *told.incomplete)
+    if left:
+        yield _warning(
+            "bags",
+            f"{len(told.damaged)} damaged and {len(told.incomplete)} unfinished: "
+            f"{listed([f'{each.path.name} ({each.reason})' for each in left])}",
+            _how_to_repair(left, memory.reader, settings.recording.bag_dir),
+        )
+    if told.unread:
+        names = listed([each.path.name for each in told.unread])
+        do = "storage=rosbag2 reads sqlite and compressed bags, too"
+        files = counted(len(told.unread), "file is", "files are")
+        yield _warning("bags", f"{files} not read: {names}", do)
+    odd = odd_bags(snapshot)
+    if odd:
+        seen = counted(len(odd), "bag is not whole", "bags are not whole")
+        names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in odd])
+        do = "what is readable of them answers; record or copy them anew for the rest"
+        yield _warning("bags", f"{seen}: {names}", do)
+    for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
+        do = "copy what is missing from where it was recorded"
+        yield _warning("bags", sentence, do)
+    if told.undecodable:
+        # Those that a configured folder would mend say so themselves.
+        lacking = [each for each in told.undecodable if _MSG_FOLDERS in each.reason]
+        others = [each for each in told.undecodable if _MSG_FOLDERS not in each.reason]
+        name_them = f"name the folder with the .msg files in {_MSG_FOLDERS}"
+        for some, do in ((lacking, name_them), (others, _NOT_DECODED)):
+            if some:
+                topics = listed([f"{each.topic} ({each.reason})" for each in some])
+                seen = f"{counted(len(some), 'topic')} cannot be decoded: {topics}"
+                yield _warning("bags", seen, do)
+
+
+def _how_to_repair(left: Sequence[SetAside], reader: BagReader, bag_dir: Path) -> str:
+    """What mends bags that were left open or are damaged, as far as anything does."""
+    others = sum(not _is_repairable(each.path, reader) for each in left)
+    if others == len(left):
+        return _NOT_REPAIRED
+    rest = f"; {others} of them it cannot repair: {_NOT_REPAIRED}" if others else ""
+    return f"ros2-memory recover {bag_dir}{rest}"
+
+
+def _is_repairable(path: Path, reader: BagReader) -> bool:
+    """Whether `ros2-memory recover` takes a file: MCAP that its writer did not finish."""
+    try:
+        return path.suffix == ".mcap" and reader.closing(path) is Closing.OPEN
+    except BagError:
+        return False
+
+
+def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
+    """Whether what lies in the directory is one history, and whether all of it is told of."""
+    pairs = overlaps(snapshot)
+    for pair in pairs[:MAX_NAMED]:
+        seen = (
+            f"recordings {pair.first} and {pair.second} overlap from {iso_local(pair.start)} to "
+            f"{iso_local(pair.end)}, and are answered together"
+        )
+        do = "give the bags of each robot or run a folder of their own, and a server each"
+        yield _warning("bags", seen, do)
+    if len(pairs) > MAX_NAMED:
+        seen = f"{counted(len(pairs) - MAX_NAMED, 'more pair overlaps', 'more pairs overlap')}"
+        do = "`ros2-memory info` lists them all"
+        yield _warning("bags", seen, do)
+    for path, until in assumed_active(memory, snapshot):
+        seen = (
+            f"{path.parent.name}/{path.name} has no end and was written lately: until "
+            f"{iso_local(until)} it counts as still being written"
+        )
+        do = "if nobody writes it, as a copy, wait until then: what is whole of it answers"
+        yield _warning("bags", seen, do)
+
+
+def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
+    """What the recorder last said of itself."""
+    about = "recorder"
+    if isinstance(settings.recorder, NullRecorderNode):
+        yield _ok(about, "recorder=none: nothing is recorded here")
+        return
+    start = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
+    heartbeat, reason = read_heartbeat(settings.recording.bag_dir)
+    if heartbeat is None:
+        yield _error(about, str(reason), start)
+        return
+    age = f"{unix_from_ns(abs(now - heartbeat.updated)):.0f} s ago"
+    if heartbeat.state is RecorderState.STOPPED:
+        yield _warning(about, f"it was stopped {age}", start)
+    elif not heartbeat.is_live(now):
+        do = "journalctl -u ros2-memory-recorder says why it ended; " + start
+        yield _error(about, f"it was last heard of {age}, and never said why", do)
+    elif heartbeat.state is RecorderState.PAUSED:
+        why = heartbeat.last_error or "it does not say why"
+        yield _error(about, f"it is paused: {why}", "see disk above")
+    else:
+        yield _ok(
+            about, f"{heartbeat.state}, {counted(len(heartbeat.subscribed), 'topic')} subscribed"
+        )
+        yield from _troubles(heartbeat)
+
+
+def _troubles(heartbeat: Heartbeat) -> Iterator[Finding]:
+    if heartbeat.silent:
+        do = (
+            "is their publisher running? Under another user it is heard over the network alone: "
+            "FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder"
+        )
+        seen = f"subscribed and never heard: {listed(heartbeat.silent)}"
+        yield _warning("recorder", seen, do)
+    if heartbeat.age_held:
+        do = "have the clock synchronised: timedatectl set-ntp true, or chrony; the budget holds"
+        yield _warning("recorder", heartbeat.age_held, do)
+    if heartbeat.last_error:
+        seen = f"its last error: {heartbeat.last_error}"
+        if heartbeat.restarts:
+            times = counted(heartbeat.restarts, "time")
+            seen = f"it had to start ros2 bag record anew {times}; {seen}"
+        yield _warning("recorder", seen, "its log has more of it")
+
+
+def check_ros(settings: Settings, reader: BagReader) -> Iterator[Finding]:
+    """Whether `ros2 bag record` can be run, in the environment that the recorder gives it."""
+    if isinstance(settings.recorder, NullRecorderNode):
+        return
+    try:
+        build_recorder(settings, reader=reader).check()
+    except EpisodicError as error:
+        reason, _, do = str(error).partition("; ")
+        yield _error("ros", reason, do or "correct recorder.setup_files")
+    else:
+        named = ", ".join(str(each) for each in settings.recorder.setup_files)
+        seen = f"ros2 bag record can be run{f' after {named}' if named else ''}"
+        yield _ok("ros", seen)
+
+
+def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
+    """Whether what `topics.yaml` names has been recorded lately."""
+    if isinstance(settings.recorder, NullRecorderNode):
+        return
+    try:
+        selection = load_topics(settings.recording.topics_file)
+    except EpisodicError as error:
+        yield _error("topics", str(error), "correct recording.topics_file")
+        return
+    missing = never_heard(selection, snapshot, query_settings_of(settings).latching)
+    heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
+    live = heartbeat is not None and heartbeat.is_live(now)
+    unoffered = [*heartbeat.missing] if live and heartbeat is not None else []
+    listed_there = counted(len(selection.entries), "entry", "entries")
+    file = settings.recording.topics_file
+    if not snapshot.bags:
+        seen = f"{file} lists {listed_there}; nothing is recorded yet"
+        yield _ok("topics", seen)
+    elif not missing and not unoffered:
+        seen = f"{listed_there} of {file}: all are in the newest hour of data, or latched"
+        yield _ok("topics", seen)
+    for entry, near in missing.items():
+        hint = f"is it {' or '.join(near)}? " if near else ""
+        why = f"; {_UNOFFERED}" if entry in unoffered else ""
+        yield _warning(
+            "topics",
+            f"{entry} is in {file}, and not in the newest hour of data{why}",
+            f"{hint}compare with `ros2 topic list`; a name that nobody publishes is recorded by "
+            "nobody",
+        )
+
+    for entry in unoffered:
+        if entry not in missing:
+            do = "is its publisher running? compare with `ros2 topic list`"
+            yield _warning("topics", f"{entry} is in {file}; {_UNOFFERED}", do)
+
+
+def never_heard(
+    selection: TopicSelection, snapshot: Snapshot, latching: Latching
+) -> Mapping[str, list[str]]:
+    """The entries of which nothing was recorded lately, with recorded names that are like them."""
+    latest = snapshot.dating.latest
+    heard = []
+    for topic in snapshot.topics():
+        last = max(each.last for each in snapshot.stated(topic).values())
+        waits = latching.is_latched(snapshot, topic) or snapshot.is_log(topic)
+        if latest is None or waits or last > latest - _RECENT_NS:
+            heard.append(topic)
+    if not snapshot.bags:
+        return {}
+    return {
+        entry: get_close_matches(entry, snapshot.topics(), n=2)
+        for entry in selection.entries
+        if not any(TopicSelection((entry,)).matches(topic) for topic in heard)
+    }
+
+
+def check_extras(settings: Settings) -> Iterator[Finding]:
+    """Checks whether the optional packages are installed that the configuration asks for."""
+    server = settings.server
+    wanted: dict[str, tuple[str, ...]] = {}
+    if server.metrics:
+        wanted["server.metrics"] = ("prometheus_client",)
+    if server.traces:
+        wanted["server.traces"] = ("opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http")
+    do = "pip install 'ros2-memory[observability]', or set it to false: the server does not start"
+    for key, modules in wanted.items():
+        if missing := [name for name in modules if not _is_installed(name)]:
+            seen = f"{key}=true needs {', '.join(missing)}, which cannot be imported"
+            yield _error("extras", seen, do)
+        else:
+            yield _ok("extras", f"what {key}=true needs is installed")
+    if server.metrics and server.transport == "stdio":
+        seen = "server.metrics=true with server.transport=stdio, which has no /metrics"
+        do = "choose server.transport=sse, or set server.metrics to false"
+        yield _error("extras", seen, do)
+    if _is_installed("pyarrow"):
+        yield _ok("extras", "export --parquet is installed")
+    else:
+        seen = "export --parquet is not installed: pip install 'ros2-memory[parquet]' adds it"
+        yield _ok("extras", seen)
+
+
+def _is_installed(module: str) -> bool:
+    """Returns whether a module can be found; imports only the packages above it."""
+    try:
+        return find_spec(module) is not None
+    except (ImportError, ValueError):  # a package above it is missing
+        return False
+
+
+def check_server(settings: Settings) -> Iterator[Finding]:
+    """What the server's `/health` says."""
+    at, about = settings.server, "server"
+    if at.transport == "stdio":
+        seen = "server.transport=stdio: each client starts its own, there is none to ask"
+        yield _ok(about, seen)
+        return
+    begun = time.monotonic()
+    try:
+        status, reply = _health(_LOCAL_ADDRESSES.get(at.host, at.host), at.port)
+    except (OSError, http.client.HTTPException) as error:
+        seen = f"nothing answers on {at.host} port {at.port}: {error}"
+        do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
+        yield _error(about, seen, do)
+        return
+    except (ValueError, EpisodicError) as error:
+        seen = f"what answers on {at.host} port {at.port} is another program: {error}"
+        yield _error(about, seen, "give the server another port: server.port")
+        return
+    if status == http.HTTPStatus.UNAUTHORIZED:
+        seen = f"the server on {at.host} port {at.port} takes another token than MEMORY_API_TOKEN"
+        do = "give doctor the token that the server was started with"
+        yield _warning(about, seen, do)
+        return
+    took = f"in {(time.monotonic() - begun) * 1000:.0f} ms"
+    if reply.get("status") == "ok":
+        yield _ok(about, f"ok on {at.host} port {at.port}, {took}")
+        return
+    problems = reply.get("problems")
+    named = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
+    seen = f"{reply.get('status', f'HTTP {status}')}: {named or 'it does not say why'}"
+    yield _warning(about, seen, "the findings above and its log have the cause")
+
+
+def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
+    """Status and reply of `/health`; no reply where it refuses the token.
+
+    Raises:
+        OSError: nothing answers; what answers in no HTTP raises an HTTPException.
+        ValueError: the reply is no JSON object with a status.
+        ConfigError: the token to show cannot be read.
+    """
+    token = api_token(os.environ)
+    headers = {"Authorization": f"Bearer {token.get_secret_value()}"} if token else {}
+    connection = http.client.HTTPConnection(host, port, timeout=_HEALTH_TIMEOUT_S)
+    try:
+        connection.request("GET", "/health", headers=headers)
+        response = connection.getresponse()
+        if response.status == http.HTTPStatus.UNAUTHORIZED and token:
+            return response.status, {}
+        reply: JsonValue = json.loads(response.read(_MAX_HEALTH_BYTES))
+    finally:
+        connection.close()
+    if not isinstance(reply, dict) or "status" not in reply:
+        raise ValueError("it gives no status")
+    return response.status, reply

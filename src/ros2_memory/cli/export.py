@@ -7,13 +7,22 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.console import Console
-from rich.progress import Progress
 
-from ros2_memory.cli.opening import opened
-from ros2_memory.cli.running import NOT_SO, BagDir, Overrides, Verbose, reporting, say
-from ros2_memory.cli.settling import settings_for
-from ros2_memory.cli.windows import End, Last, Start, window_of
+from ros2_memory.cli.options import (
+    EXIT_NEGATIVE,
+    BagDir,
+    End,
+    Last,
+    Overrides,
+    Start,
+    Verbose,
+    load_for,
+    open_memory,
+    parse_window,
+    print_line,
+    reported_errors,
+)
+from ros2_memory.cli.progress import progress_bar
 from ros2_memory.core.errors import (
     BagError,
     ConfigError,
@@ -32,7 +41,7 @@ from ros2_memory.history.view import View
 from ros2_memory.storage.base import ROS2_PROFILE, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 
-_TELL_EVERY: Final = 512
+_REPORT_EVERY: Final = 512
 
 
 def export(
@@ -76,13 +85,13 @@ def export(
     MCAP has the original messages, definitions, log and publish times. Parquet has one row for a
     message: what it says as JSON, and its pose in columns. Needs ros2-memory[parquet].
     """
-    with reporting("export"):
+    with reported_errors("export"):
         if (mcap is None) == (parquet is None):
             raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
-        settings = settings_for(bag_dir, overrides)
-        memory = opened(settings, verbose=verbose)
+        settings = load_for(bag_dir, overrides)
+        memory = open_memory(settings, verbose=verbose)
         view = View(memory, Call())
-        window = window_of(memory, view.snapshot, start, end, last)
+        window = parse_window(memory, start, end, last)
         topics = _topics(view, topic or ())
         note_unread(view, window)
         with _progress(view, window) as tell:
@@ -93,16 +102,16 @@ def export(
                 view.notes.add(
                     "no message lies in the window: what latched ones held is all there is"
                 )
-            found = _told(chain(held, first, within), tell)
+            found = _reported(chain(held, first, within), tell)
             if mcap is not None:
                 done = as_mcap(mcap, found, _profile(view, topics, window, held))
             elif parquet is not None:
                 done = _as_parquet(parquet, found, memory, robot)
-    say(done)
+    print_line(done)
     for note in view.notes.sentences():
         typer.echo(f"note: {note}", err=True)
     if not view.notes.complete or lost_in(view.snapshot, window):
-        raise typer.Exit(NOT_SO)
+        raise typer.Exit(EXIT_NEGATIVE)
 
 
 def _topics(view: View, globs: Sequence[str]) -> list[str]:
@@ -222,20 +231,22 @@ def _as_parquet(
     return f"{counted(dataset.rows, 'message')} in {counted(dataset.files, 'file')} below {path}"
 
 
-def _told(found: Iterator[StoredMessage], tell: Callable[[Ns], None]) -> Iterator[StoredMessage]:
-    for number, each in enumerate(found):
-        if number % _TELL_EVERY == 0:
-            tell(each.time)
+def _reported(
+    messages: Iterator[StoredMessage], report: Callable[[Ns], None]
+) -> Iterator[StoredMessage]:
+    """Yields the messages, and reports the time of every so many."""
+    for number, each in enumerate(messages):
+        if number % _REPORT_EVERY == 0:
+            report(each.time)
         yield each
 
 
 @contextmanager
 def _progress(view: View, window: TimeWindow) -> Iterator[Callable[[Ns], None]]:
-    """A bar along the window on a terminal, and nothing elsewhere."""
+    """Shows a progress bar along the window; yields what takes the time that is reached."""
     bags = view.snapshot.overlapping(window)
     first = max(window.start, min((bag.start for bag in bags), default=0))
     last = min(window.stop, max((bag.end for bag in bags), default=0) + 1)
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+    with progress_bar() as bar:
         task = bar.add_task("exporting", total=max(last - first, 1))
-        yield lambda at: bar.update(task, completed=max(at - first, 0))
+        yield lambda time: bar.update(task, completed=max(time - first, 0))

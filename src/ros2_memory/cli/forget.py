@@ -16,11 +16,22 @@ from ros2_memory.bag_dir.metadata_yaml import take_out
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_reader, supposed_own
 from ros2_memory.catalogue.store import BagKey
-from ros2_memory.cli.opening import opened
-from ros2_memory.cli.output import moment
-from ros2_memory.cli.running import NOT_SO, BagDir, Overrides, Verbose, busy, reporting, say
-from ros2_memory.cli.settling import settings_for
-from ros2_memory.cli.windows import End, Last, Start, window_of
+from ros2_memory.cli.options import (
+    EXIT_NEGATIVE,
+    BagDir,
+    End,
+    Last,
+    Overrides,
+    Start,
+    Verbose,
+    load_for,
+    open_memory,
+    parse_window,
+    print_line,
+    reported_errors,
+    spinner,
+)
+from ros2_memory.cli.output import format_time
 from ros2_memory.config import NullRecorderNode
 from ros2_memory.core import directories
 from ros2_memory.core.errors import (
@@ -62,8 +73,8 @@ def forget(
     Latched messages (maps, static transforms) that later answers need are carried on. Only where
     this deployment records.
     """
-    with reporting("forget"):
-        settings = settings_for(bag_dir, overrides)
+    with reported_errors("forget"):
+        settings = load_for(bag_dir, overrides)
         if isinstance(settings.recorder, NullRecorderNode):
             raise ConfigError(
                 "recorder=none: bags that another program records are not deleted here; choose the "
@@ -71,11 +82,11 @@ def forget(
             )
         if last is None and (start is None or end is None):
             raise InvalidArgumentsError("say what to forget: --start and --end, or --last")
-        memory = opened(settings, verbose=verbose)
+        memory = open_memory(settings, verbose=verbose)
         snapshot = memory.index.snapshot()
         if snapshot.problem:
             raise RecorderError(snapshot.problem)
-        window = window_of(memory, snapshot, start, end, last)
+        window = parse_window(memory, start, end, last)
         bag_root = settings.recording.bag_dir
         own = supposed_own(bag_root) if settings.retention.foreign == "keep" else None
         plan = planned(snapshot, window, bag_root, own)
@@ -87,21 +98,21 @@ def forget(
         )
         stays = [*plan.stays, *_beside(memory, carrier, plan, window)]
         for line in stays:
-            say(f"stays: {line}")
+            print_line(f"stays: {line}")
         if not plan.doomed:
-            say("no closed bag lies wholly inside the window")
+            print_line("no closed bag lies wholly inside the window")
         elif dry_run:
-            say(f"would be deleted: {_told(plan)}")
+            print_line(f"would be deleted: {_told(plan)}")
             for bag in plan.doomed:
-                say(f"  {_named(bag.path, settings.recording.bag_dir)}")
+                print_line(f"  {_named(bag.path, settings.recording.bag_dir)}")
         else:
-            say(f"to be deleted: {_told(plan)}")
+            print_line(f"to be deleted: {_told(plan)}")
             if not yes:
                 typer.confirm("Delete them? This cannot be undone.", abort=True)
             counts = _counts(build_reader(settings), plan.doomed)
             stays += _forgotten(bag_root, memory, plan, carrier, counts)
     if stays:
-        raise typer.Exit(NOT_SO)
+        raise typer.Exit(EXIT_NEGATIVE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +230,7 @@ def _forgotten(
     such messages stay then.
     """
     stays = []
-    with busy("deleting"), _alone(bag_dir) as recorder:
+    with spinner("deleting"), _alone(bag_dir) as recorder:
         snapshot, own = memory.index.refresh(), plan.own
         there = {*snapshot.bags}
         doomed = [
@@ -239,15 +250,15 @@ def _forgotten(
             ]
         removal.remove(doomed)
         notes = removal.correct_metadata(counts)
-    say(
+    print_line(
         f"deleted: {counted(removal.bags, 'bag')}, {removal.freed / _MB:.1f} MB"
         f"{'' if carried is None else f'; {_carried(carried)} on'}"
     )
     stays += removal.faults
     for line in stays:
-        say(f"stays: {line}")
+        print_line(f"stays: {line}")
     for line in notes:
-        say(line)
+        print_line(line)
     return stays
 
 
@@ -273,7 +284,7 @@ def _told(plan: Plan) -> str:
     first, last = min(bag.start for bag in plan.doomed), max(bag.end for bag in plan.doomed)
     return (
         f"{counted(len(plan.doomed), 'bag')}, {plan.size / _MB:.1f} MB, from "
-        f"{moment(unix_from_ns(first))} to {moment(unix_from_ns(last))}"
+        f"{format_time(unix_from_ns(first))} to {format_time(unix_from_ns(last))}"
     )
 
 

@@ -1,107 +1,136 @@
-"""`ros2-memory index`: fills the catalogue at once, and shows how far it is."""
+"""`ros2-memory index`: digests every closed bag into the catalogue, for people and for a server.
 
-from __future__ import annotations
+A server starts it as a child process (`--for-server PID`), so that digesting takes no processor
+time from the process that answers.
+"""
 
 import ctypes
 import os
 import signal
 import sys
+from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import Annotated, Final
 
+import typer
+
+from ros2_memory.bootstrap import build_backfill, build_memory
+from ros2_memory.cli.options import (
+    EXIT_CANNOT_RUN,
+    BagDir,
+    Overrides,
+    Verbose,
+    load_for,
+    open_memory,
+    reported_errors,
+)
+from ros2_memory.cli.progress import progress_bar
+from ros2_memory.config import Settings
+from ros2_memory.core.errors import ConfigError, RecorderError
+from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.text import counted
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ros2_memory.serving.backfill import Backfill, Progress
+from ros2_memory.serving.backfill import Backfill, Progress
 
 NICENESS: Final = 15
-"""So low that whoever answers meanwhile goes first."""
+"""So low a priority that the process that answers goes first."""
 
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
-_ROUND: Final = 64
-"""Bags that are digested before it is looked what has closed meanwhile."""
-_WIDTH: Final = 40
+_BATCH: Final = 64
+"""Bags digested before the program looks which others closed meanwhile."""
+_BAR_WIDTH: Final = 40
 
 
-class Bar:
-    """A line that tells how far the work is: rewritten in place on a terminal, else only its end.
+def index(
+    overrides: Overrides = None,
+    bag_dir: BagDir = None,
+    verbose: Verbose = False,
+    for_server: Annotated[int | None, typer.Option(metavar="PID", hidden=True)] = None,
+) -> None:
+    """Look into every bag once, so that questions about a week take milliseconds.
 
-    Args:
-        stream: where it is shown; stderr unless given.
+    Fills the catalogue of the bags at once, with the settings of the server. The server does the
+    same by itself, in the background; no answer depends on it.
     """
-
-    def __init__(self, stream: TextIO | None = None) -> None:
-        self._stream = stream or sys.stderr
-        self._moves = self._stream.isatty()
-
-    def show(self, progress: Progress) -> None:
-        """Shows how far it is."""
-        if self._moves:
-            self._stream.write(f"\r{line(progress)}")
-            self._stream.flush()
-
-    def end(self, progress: Progress) -> None:
-        """Leaves the last line standing."""
-        self._stream.write(f"\r{line(progress)}\n" if self._moves else f"{line(progress)}\n")
-        self._stream.flush()
+    with reported_errors("index"):
+        settings = load_for(bag_dir, overrides)
+        if for_server is None:
+            _fill_for_people(settings, verbose=verbose)
+        else:
+            _fill_for_server(settings, for_server)
 
 
-def line(progress: Progress) -> str:
-    """How far it is, in one line."""
-    known = progress.closed - progress.waiting - progress.refused
-    part = known / progress.closed if progress.closed else 1.0
-    bar = "#" * int(part * _WIDTH)
-    bags = counted(progress.closed, "bag is", "bags are")
-    refused = f", {progress.refused} cannot be" if progress.refused else ""
-    return f"[{bar:<{_WIDTH}}] {known} of {bags} in the catalogue{refused}"
+def _fill_for_people(settings: Settings, *, verbose: bool) -> None:
+    memory = open_memory(settings, verbose=verbose)
+    if problem := memory.index.snapshot().problem:
+        raise RecorderError(problem)
+    backfill = build_backfill(settings, memory)
+    if backfill.in_memory:
+        raise ConfigError(
+            "no catalogue can be written, neither beside the bags nor in the cache folder: "
+            "give XDG_CACHE_HOME a folder that can be"
+        )
+    with progress_bar() as bar:
+        task = bar.add_task("", total=None)
+
+        def show(progress: Progress) -> None:
+            known = progress.closed - progress.waiting
+            bar.update(task, completed=known, total=progress.closed)
+
+        progress = fill_catalogue(backfill, show)
+    print(describe_progress(progress), file=sys.stderr)
 
 
-def fill(filler: Backfill, bar: Bar | None, abandoned: Callable[[], bool]) -> Progress:
-    """Digests until nothing waits, the newest first, and gives where that has led.
+def _fill_for_server(settings: Settings, server: int) -> None:
+    if not _end_with_parent(server):
+        raise typer.Exit(EXIT_CANNOT_RUN)
+    configure_logging(
+        settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
+    )
+    backfill = build_backfill(settings, build_memory(settings))
+    with suppress(OSError):  # some sandboxes forbid it
+        os.nice(NICENESS)
+    fill_catalogue(backfill, is_cancelled=lambda: os.getppid() != server)
 
-    A bag that changed a moment ago is left for later.
+
+def fill_catalogue(
+    backfill: Backfill,
+    show: Callable[[Progress], None] = lambda _: None,
+    is_cancelled: Callable[[], bool] = lambda: False,
+) -> Progress:
+    """Digests until no bag waits, the newest first, and returns the progress at the end.
+
+    A bag that changed a moment ago is left for a later run.
     """
     done = 1
-    while done and not abandoned():
+    while done and not is_cancelled():
         done = 0
-        progress = filler.progress()
-        for number, bag in enumerate(filler.waiting()[:_ROUND]):
-            if abandoned():
+        progress = backfill.progress()
+        for number, bag in enumerate(backfill.waiting()[:_BATCH]):
+            if is_cancelled():
                 break
-            if bar is not None:
-                bar.show(progress.after(number))
-            done += filler.digest(bag)
-    if not abandoned():
-        filler.tidy()
-        filler.warm()
-    progress = filler.progress()
-    if bar is not None:
-        bar.end(progress)
-    return progress
+            show(progress.after(number))
+            done += backfill.digest(bag)
+    if not is_cancelled():
+        backfill.tidy()
+        backfill.warm()
+    return backfill.progress()
 
 
-def die_with(parent: int) -> bool:
-    """Has the system kill this process when its parent dies; whether that still lives.
+def describe_progress(progress: Progress) -> str:
+    """Returns how many bags are in the catalogue, in one line."""
+    known = progress.closed - progress.waiting - progress.refused
+    share = known / progress.closed if progress.closed else 1.0
+    bar = "#" * int(share * _BAR_WIDTH)
+    bags = counted(progress.closed, "bag is", "bags are")
+    refused = f", {progress.refused} cannot be" if progress.refused else ""
+    return f"[{bar:<{_BAR_WIDTH}}] {known} of {bags} in the catalogue{refused}"
 
-    What is killed loses nothing: entries are written whole or not at all.
 
-    Args:
-        parent: the number of the process that started this one.
+def _end_with_parent(parent: int) -> bool:
+    """Asks the kernel to kill this process when its parent dies; False if it is dead already.
+
+    Nothing is lost by the kill: the catalogue's entries are written whole or not at all.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent
-
-
-def orphaned() -> Callable[[], bool]:
-    """Tells whether the process that started this one is gone."""
-    parent = os.getppid()
-    return lambda: os.getppid() != parent
-
-
-def step_back() -> None:
-    """Lets every other program go first, where that is allowed."""
-    with suppress(OSError):
-        os.nice(NICENESS)

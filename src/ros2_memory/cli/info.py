@@ -1,35 +1,39 @@
-"""`ros2-memory topics` and `info`: what there is, and how much of it."""
+"""`ros2-memory topics` and `info`: what is recorded, and how much of it."""
 
 import json
-from typing import Final
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import typer
 
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.cli.ask import asked, is_without_answer
-from ros2_memory.cli.oddities import counted_as_active, merged
-from ros2_memory.cli.opening import opened
-from ros2_memory.cli.output import cell, show
-from ros2_memory.cli.running import (
-    NOT_SO,
+from ros2_memory.cli.ask import call_tools, is_error
+from ros2_memory.cli.options import (
+    EXIT_NEGATIVE,
     AsJson,
     BagDir,
     Overrides,
     Verbose,
-    output,
-    reporting,
-    say,
+    load_for,
+    open_memory,
+    print_line,
+    reported_errors,
+    stdout_console,
 )
-from ros2_memory.cli.settling import settings_for
+from ros2_memory.cli.output import format_value, print_reply
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
+from ros2_memory.index.overlaps import named, overlapping_recordings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.queries import list_recorded_topics
+from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
+from ros2_memory.results import TopicRow
 
-_WHOLE: Final = "server.max_reply_chars=1000000000"
+_WHOLE_REPLY: Final = "server.max_reply_chars=1000000000"
 """A planner's context is short; a person's screen scrolls."""
-_USUAL_NS: Final = 3600 * NS_PER_S
+_RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
 
 def topics(
@@ -42,59 +46,55 @@ def topics(
 
     The rate is that of the topic's newest hour, without the gaps between bags.
     """
-    with reporting("topics"):
-        settings = settings_for(bag_dir, [*(overrides or ()), _WHOLE])
-        memory = opened(settings, verbose=verbose)
-        text = asked(build_dispatcher(settings, memory), "list_recorded_topics", {}).text
-        reply: JsonValue = json.loads(text)
-        snapshot = memory.index.snapshot()
-    rows = [each for each in reply if isinstance(each, dict)] if isinstance(reply, list) else []
-    remarks = _remarks(memory) if rows else {}
-    shown = [
-        {
-            **row,
-            **remarks.get((str(row["topic"]), str(row["type"])), {}),
-            "rate_hz": usual_rate(snapshot, str(row["topic"]), memory.limits.latching),
-        }
-        for row in rows
-    ]
+    with reported_errors("topics"):
+        settings = load_for(bag_dir, [*(overrides or ()), _WHOLE_REPLY])
+        memory = open_memory(settings, verbose=verbose)
+        dispatcher = build_dispatcher(settings, memory)
+        (answer,) = call_tools(dispatcher, {"list_recorded_topics": {}})
+        reply: JsonValue = json.loads(answer.text)
+        rows: list[JsonValue] = []
+        if isinstance(reply, list) and reply:
+            known = list_recorded_topics(memory, Call())
+            rows = [_topic_row(memory, *each) for each in zip(reply, known, strict=True)]
     if as_json:
-        say(json.dumps(shown) if rows else text)
+        print_line(json.dumps(rows) if rows else answer.text)
     elif rows:
-        show(output(), [*shown])
-    elif is_without_answer(reply):
-        show(output(), reply)
+        print_reply(stdout_console(), rows)
+    elif is_error(reply):
+        print_reply(stdout_console(), reply)
     else:
-        say(f"nothing is recorded in {settings.recording.bag_dir}")
+        print_line(f"nothing is recorded in {settings.recording.bag_dir}")
     if not rows:
-        raise typer.Exit(NOT_SO)
+        raise typer.Exit(EXIT_NEGATIVE)
 
 
-def _remarks(memory: Memory) -> dict[tuple[str, str], dict[str, JsonValue]]:
-    """By topic and type what is odd of them; planners read it in `data_time_range`."""
-    remarks: dict[tuple[str, str], dict[str, JsonValue]] = {}
-    for row in list_recorded_topics(memory, Call()):
-        of_row = remarks.setdefault((row.topic, row.type), {})
-        if row.undecodable is not None:
-            of_row["undecodable"] = row.undecodable
-        if row.notes:
-            of_row["notes"] = [*row.notes]
-    return remarks
+def _topic_row(memory: Memory, reply: JsonValue, known: TopicRow) -> JsonValue:
+    """Returns a row of the tool's reply, with what planners read in `data_time_range` instead."""
+    row = {**reply} if isinstance(reply, dict) else {}
+    if known.undecodable is not None:
+        row["undecodable"] = known.undecodable
+    if known.notes:
+        row["notes"] = [*known.notes]
+    row["rate_hz"] = usual_rate(memory.index.snapshot(), known.topic, memory.limits.latching)
+    return row
 
 
 def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
-    """How often a topic was heard in its newest hour (Hz); None where that says nothing."""
+    """Returns the rate (Hz) of a topic in its newest hour, without the gaps between bags.
+
+    None for a latched topic, and where no bag holds two messages of it.
+    """
     if latching.is_latched(snapshot, topic):
         return None
     stated = [*snapshot.stated(topic).values()]
     if not stated:
         return None
     last = max(each.last for each in stated)
-    messages, spent = 0, 0
-    for _, held in snapshot.holding(topic, TimeWindow(last - _USUAL_NS, last + 1)):
-        messages += held.count - 1
-        spent += held.last - held.first
-    return round(messages / unix_from_ns(spent), 2) if messages > 0 and spent > 0 else None
+    intervals, duration = 0, 0
+    for _, part in snapshot.holding(topic, TimeWindow(last - _RATE_WINDOW_NS, last + 1)):
+        intervals += part.count - 1
+        duration += part.last - part.first
+    return round(intervals / unix_from_ns(duration), 2) if intervals and duration else None
 
 
 def info(
@@ -104,68 +104,103 @@ def info(
     verbose: Verbose = False,
 ) -> None:
     """What the memory covers: range, gaps, damaged files, the budget, and how long it lasts."""
-    with reporting("info"):
-        settings = settings_for(bag_dir, [*(overrides or ()), _WHOLE, "server.tools=all"])
-        memory = opened(settings, verbose=verbose)
-        replies: dict[str, JsonValue] = {
-            tool: json.loads(asked(build_dispatcher(settings, memory), tool, {}).text)
-            for tool in ("memory_status", "data_time_range")
+    with reported_errors("info"):
+        settings = load_for(bag_dir, [*(overrides or ()), _WHOLE_REPLY, "server.tools=all"])
+        memory = open_memory(settings, verbose=verbose)
+        dispatcher = build_dispatcher(settings, memory)
+        tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
+        replies: list[JsonValue] = [
+            json.loads(answer.text) for answer in call_tools(dispatcher, tools)
+        ]
+        snapshot = memory.index.snapshot()
+        lists: dict[str, list[JsonValue]] = {
+            "overlapping_recordings": [
+                {
+                    "recording": each.first,
+                    "and": each.second,
+                    "from": unix_from_ns(each.start),
+                    "to": unix_from_ns(each.end),
+                }
+                for each in overlaps(snapshot)
+            ],
+            "counted_as_active": [
+                {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
+                for path, until in assumed_active(memory, snapshot)
+            ],
         }
-        beside = _beside(memory)
     if as_json:
-        say(json.dumps(replies | beside))
+        print_line(json.dumps(dict(zip(tools, replies, strict=True)) | lists))
     else:
-        console = output()
-        for reply in replies.values():
-            show(console, _in_words(reply))
+        console = stdout_console()
+        for reply in replies:
+            print_reply(console, _with_budget_sentence(reply))
             console.print()
-        for name, rows in beside.items():
+        for name, rows in lists.items():
             if rows:
-                show(console, {name: rows})
-    if not memory.index.snapshot().bags:
-        raise typer.Exit(NOT_SO)
+                print_reply(console, {name: rows})
+    if not snapshot.bags:
+        raise typer.Exit(EXIT_NEGATIVE)
 
 
-def _beside(memory: Memory) -> dict[str, JsonValue]:
-    """What the tools' replies do not say; mostly there is nothing."""
-    snapshot = memory.index.snapshot()
-    return {
-        "overlapping_recordings": [
-            {
-                "recording": each.first,
-                "and": each.second,
-                "from": unix_from_ns(each.start),
-                "to": unix_from_ns(each.end),
-            }
-            for each in merged(snapshot)
-        ],
-        "counted_as_active": [
-            {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
-            for path, until in counted_as_active(memory, snapshot)
-        ],
-    }
+class Overlap(NamedTuple):
+    """Two recordings by name, and when they overlap (log times, inclusive)."""
+
+    first: str
+    second: str
+    start: Ns
+    end: Ns
 
 
-def _in_words(reply: JsonValue) -> JsonValue:
-    """A status whose budget is a sentence."""
+def overlaps(snapshot: Snapshot) -> list[Overlap]:
+    """Returns the recordings that overlap although neither continues the other.
+
+    Answers mix their messages.
+    """
+    pairs = overlapping_recordings(snapshot)
+    return [
+        Overlap(first, second, pair.start, pair.end)
+        for pair, (first, second) in zip(pairs, named(pairs), strict=True)
+    ]
+
+
+def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, Ns]]:
+    """Yields the files without an end that count as active only because they changed lately.
+
+    Each comes with the time (wall clock) from which it counts as left open by a crash. Yields
+    nothing while a live recorder reports what it writes.
+    """
+    heartbeat = memory.index.heartbeat()
+    if heartbeat is not None and heartbeat.is_live(memory.clock.now()):
+        return
+    patience = ns_from_unix(SPLITS_OF_PATIENCE * memory.limits.split_duration_s)
+    for each in snapshot.active:
+        try:
+            yield each.path, each.path.stat().st_mtime_ns + patience
+        except OSError:
+            continue  # the file was moved or deleted since the scan
+
+
+def _with_budget_sentence(reply: JsonValue) -> JsonValue:
+    """Returns a reply of `memory_status` whose budget is a sentence; any other as it is."""
     budget = reply.get("budget") if isinstance(reply, dict) else None
     if not isinstance(reply, dict) or not isinstance(budget, dict):
         return reply
-    return {**reply, "budget": budget_in_words(budget)}
+    return {**reply, "budget": describe_budget(budget)}
 
 
-def budget_in_words(budget: dict[str, JsonValue]) -> str:
-    """What the bags take of the budget, and for how long it lasts."""
-    used, most, growth = (budget.get(key) for key in ("used_gb", "max_gb", "growth_gb_per_day"))
-    text = f"{cell(used)} GB"
+def describe_budget(budget: dict[str, JsonValue]) -> str:
+    """Returns how much of the budget the bags take, and how long it lasts."""
+    most, growth = budget.get("max_gb"), budget.get("growth_gb_per_day")
+    text = f"{format_value(budget.get('used_gb'))} GB"
     if most is None:
         text += "; recorder=none: nothing is recorded or deleted here, so no budget and no growth"
     else:
-        text += f" of {cell(most)} GB"
+        text += f" of {format_value(most)} GB"
     if budget.get("foreign_gb"):
-        text += f"; bags that the recorder did not make take {cell(budget['foreign_gb'])} GB more"
+        foreign = format_value(budget["foreign_gb"])
+        text += f"; bags that the recorder did not make take {foreign} GB more"
     if growth is not None:
-        text += f"; grows by {cell(growth)} GB a day"
+        text += f"; grows by {format_value(growth)} GB a day"
     if "full_in_days" in budget:
         text += f"; full in {_days(budget['full_in_days'])}"
         text += f", and keeps {_days(budget['keeps_days'])}"
@@ -173,4 +208,4 @@ def budget_in_words(budget: dict[str, JsonValue]) -> str:
 
 
 def _days(value: JsonValue) -> str:
-    return f"{cell(value)} {'day' if value == 1 else 'days'}"
+    return f"{format_value(value)} {'day' if value == 1 else 'days'}"

@@ -1,6 +1,6 @@
-"""Replies as people read them: tables for lists, lines for the rest.
+"""Prints replies for people: tables for lists, lines for the rest.
 
-What was recorded is foreign text: control characters in it never reach the terminal.
+Recorded text comes from elsewhere: control characters in it never reach the terminal.
 """
 
 from __future__ import annotations
@@ -21,220 +21,226 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
 
-_FIRST_MOMENT: Final = 1e9
-_LAST_MOMENT: Final = 4.2e9
+_EARLIEST_TIME: Final = 1e9
+_LATEST_TIME: Final = 4.2e9
 """Replies have times as floats of Unix seconds; hardly anything else lies between 2001 and 2103."""
 _MINUTES_FROM_S: Final = 120.0
 _HOURS_FROM_S: Final = 7200.0
 _DAYS_FROM_S: Final = 172_800.0
-_AT_ONCE_S: Final = 0.05
-_NESTED: Final = 8
-_MOST_COLUMNS: Final = 9
-_NOTHING: Final = "-"
-_NONE: Final = "none"
-_BETWEEN: Final = 2
-_TIME_OF_DAY: Final = 12
-_UNBROKEN: Final = 16
-"""Columns that text keeps for itself where a table is wider than the terminal."""
-_VECTOR: Final = frozenset({"x", "y", "z", "w", "yaw_deg", "frame_id"})
-_IN_WORDS: Final = re.compile(r"\b\d{10}\.\d{3,9}\b")
+_NO_AGE_BELOW_S: Final = 0.05
+_MAX_FLATTENED_KEYS: Final = 8
+_MAX_COLUMNS: Final = 9
+_COLUMN_GAP: Final = 2
+_TIME_OF_DAY_WIDTH: Final = 12
+_MIN_TEXT_WIDTH: Final = 16
+"""Columns that a text keeps where a table is wider than the terminal."""
+_VECTOR_KEYS: Final = frozenset({"x", "y", "z", "w", "yaw_deg", "frame_id"})
+_TIME_IN_NOTE: Final = re.compile(r"\b\d{10}\.\d{3,9}\b")
 
 
-def show(console: Console, value: JsonValue, now: float | None = None) -> None:
-    """Shows any reply; `now` (Unix seconds) is what the age of a moment counts from."""
+def print_reply(console: Console, value: JsonValue, now: float | None = None) -> None:
+    """Prints any reply. The ages of times count from `now` (Unix s), or from the reply's own."""
     if isinstance(value, dict):
         stated = value.get("now")
-        _show_object(console, value, stated if isinstance(stated, float) else now)
+        _print_object(console, value, stated if isinstance(stated, float) else now)
     elif isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
-        _show_rows(console, [each for each in value if isinstance(each, dict)])
+        _print_rows(console, [each for each in value if isinstance(each, dict)])
     else:
-        console.print(Text(cell(value) if value else _NONE))
+        console.print(Text(format_value(value) if value else "none"))
 
 
-def _show_object(console: Console, value: Mapping[str, JsonValue], now: float | None) -> None:
+def _print_object(console: Console, value: Mapping[str, JsonValue], now: float | None) -> None:
     lists: dict[str, list[dict[str, JsonValue]]] = {}
     lines = Table.grid(padding=(0, 2))
     lines.add_column(style="bold", no_wrap=True)
     lines.add_column(overflow="fold")
-    for key, each in flat(value).items():
+    for key, each in _flattened(value).items():
         rows = [row for row in each if isinstance(row, dict)] if isinstance(each, list) else []
         if isinstance(each, list) and rows and len(rows) == len(each):
             lists[key] = rows
         elif key == "notes" and isinstance(each, list):
             for note in each:
-                lines.add_row("note", Text(_with_local_times(cell(note))))
+                local = _TIME_IN_NOTE.sub(lambda found: format_time(float(found[0])), str(note))
+                lines.add_row("note", Text(escape(local)))
         else:
-            lines.add_row(Text(plain(key)), Text(_line(key, each, now)))
+            lines.add_row(Text(escape(key)), Text(_format_line(key, each, now)))
     if lines.row_count:
         console.print(lines)
     for key, rows in lists.items():
-        console.print(Text(f"\n{plain(key)}", style="bold"))
-        _show_rows(console, rows)
+        console.print(Text(f"\n{escape(key)}", style="bold"))
+        _print_rows(console, rows)
 
 
-def _show_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> None:
-    """A table, or one after the other where it would be wider than the terminal."""
-    shown = table(rows, console.width)
-    if shown is not None:
-        console.print(shown)
+def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> None:
+    """Prints a table, or one object after the other where it is wider than the terminal."""
+    table = _table(rows, console.width)
+    if table is not None:
+        console.print(table)
         return
     for row in rows:
         console.print()
-        _show_object(console, row, None)
+        _print_object(console, row, None)
 
 
-def _line(key: str, value: JsonValue, now: float | None) -> str:
-    """What stands behind a key; of a moment how long ago it was, too."""
+def _format_line(key: str, value: JsonValue, now: float | None) -> str:
+    """Formats the value of a key; a time with its age."""
     if value is None or value == []:
-        return _NONE
-    if not isinstance(value, float) or not is_moment(value):
-        return _under(key, value)
-    ago = 0.0 if now is None else now - value
-    if abs(ago) < _AT_ONCE_S:
-        return moment(value)
-    return f"{moment(value)} ({span(ago)} ago)" if ago > 0 else f"{moment(value)} (in {span(-ago)})"
+        return "none"
+    if not isinstance(value, float) or not _is_time(value):
+        return _format_for_key(key, value)
+    age = 0.0 if now is None else now - value
+    if abs(age) < _NO_AGE_BELOW_S:
+        return format_time(value)
+    described = f"{format_duration(age)} ago" if age > 0 else f"in {format_duration(-age)}"
+    return f"{format_time(value)} ({described})"
 
 
-def _under(key: str, value: JsonValue) -> str:
-    """A value as its key means it: long times are in minutes, hours or days."""
-    seconds = isinstance(value, int | float) and not isinstance(value, bool) and key.endswith("_s")
-    if seconds and isinstance(value, int | float) and abs(value) >= _MINUTES_FROM_S:
-        return cell(value) if is_moment(value) else span(value)
-    return cell(value)
+def _format_for_key(key: str, value: JsonValue) -> str:
+    """Formats a value; under a key that ends in `_s`, long durations in minutes, hours or days."""
+    if (
+        isinstance(value, int | float)
+        and key.endswith("_s")
+        and abs(value) >= _MINUTES_FROM_S
+        and not _is_time(value)
+    ):
+        return format_duration(value)
+    return format_value(value)
 
 
-def _with_local_times(note: str) -> str:
-    """A note whose Unix seconds are local times."""
-    return _IN_WORDS.sub(lambda found: moment(float(found[0])), note)
+def _table(rows: Sequence[Mapping[str, JsonValue]], width: int) -> Table | None:
+    """Returns objects as rows; their keys, in order of appearance, are the columns.
 
-
-def table(rows: Sequence[Mapping[str, JsonValue]], width: int) -> Table | None:
-    """Objects as rows; their keys, in order of appearance, are the columns.
-
-    None where it cannot be brought to a width of so many characters.
+    None if the table does not fit into `width` characters.
     """
-    flattened = [flat(row) for row in rows]
-    if len(_keys(flattened)) > _MOST_COLUMNS:
+    flattened = [_flattened(row) for row in rows]
+    if len(_all_keys(flattened)) > _MAX_COLUMNS:
         flattened = [{**row} for row in rows]
-    columns = [_Column.of(key, [row.get(key) for row in flattened]) for key in _keys(flattened)]
-    if sum(each.least + _BETWEEN for each in columns) > width:
+    keys = _all_keys(flattened)
+    columns = [_Column.of(key, [row.get(key) for row in flattened]) for key in keys]
+    if sum(each.min_width + _COLUMN_GAP for each in columns) > width:
         return None
-    narrow = sum(each.longest + _BETWEEN for each in columns) > width
-    shown = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    is_narrow = sum(each.width + _COLUMN_GAP for each in columns) > width
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for each in columns:
-        shown.add_column(
-            Text(plain(each.key)),
-            justify="right" if each.numeric else "left",
+        table.add_column(
+            Text(escape(each.key)),
+            justify="right" if each.is_numeric else "left",
             overflow="fold",
-            no_wrap=each.numeric,
-            min_width=each.least,
-            max_width=each.least if narrow and each.moments else None,
+            no_wrap=each.is_numeric,
+            min_width=each.min_width,
+            max_width=each.min_width if is_narrow and each.has_times else None,
         )
     for row in flattened:
-        shown.add_row(*(Text(_under(each.key, row.get(each.key))) for each in columns))
-    return shown
+        table.add_row(*(Text(_format_for_key(key, row.get(key))) for key in keys))
+    return table
 
 
 @dataclass(frozen=True, slots=True)
 class _Column:
-    """What a column holds, and how many characters it takes: `longest`, or `least` if it must."""
+    """A column's content, and the characters that it takes: `width`, or at least `min_width`."""
 
     key: str
-    numeric: bool
-    moments: bool
-    longest: int
-    least: int
+    is_numeric: bool
+    has_times: bool
+    width: int
+    min_width: int
 
     @classmethod
     def of(cls, key: str, values: Sequence[JsonValue]) -> _Column:
-        """The column of these values; a moment may be broken between its day and its time."""
-        moments = any(is_moment(each) for each in values)
-        numeric = all(
-            isinstance(each, int | float) and not isinstance(each, bool) and not is_moment(each)
+        """Returns the column of these values; a time may break between its date and its time."""
+        has_times = any(_is_time(each) for each in values)
+        is_numeric = all(
+            isinstance(each, int | float) and not isinstance(each, bool) and not _is_time(each)
             for each in values
             if each is not None
         )
-        longest = max(len(key), *(len(_under(key, each)) for each in values))
-        if moments:
-            return cls(key, numeric, moments, longest, _TIME_OF_DAY)
-        return cls(key, numeric, moments, longest, longest if numeric else min(longest, _UNBROKEN))
+        width = max(len(key), *(len(_format_for_key(key, each)) for each in values))
+        if has_times:
+            return cls(key, is_numeric, has_times, width, _TIME_OF_DAY_WIDTH)
+        least = width if is_numeric else min(width, _MIN_TEXT_WIDTH)
+        return cls(key, is_numeric, has_times, width, least)
 
 
-def _keys(rows: Sequence[Mapping[str, JsonValue]]) -> list[str]:
+def _all_keys(rows: Sequence[Mapping[str, JsonValue]]) -> list[str]:
     return list(dict.fromkeys(key for row in rows for key in row))
 
 
-def flat(value: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    """Small objects inside become keys with dots; what is larger, and a place, stays."""
-    shown: dict[str, JsonValue] = {}
+def _flattened(value: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    """Returns an object whose small objects are keys with dots; positions stay objects."""
+    flat: dict[str, JsonValue] = {}
     for key, each in value.items():
-        if isinstance(each, dict) and 0 < len(each) <= _NESTED and not _is_vector(each):
-            if each.keys() == {"value"}:  # of a message that has this one field
-                shown[key] = each["value"]
-            else:
-                shown.update((f"{key}.{inner}", item) for inner, item in flat(each).items())
+        if (
+            not isinstance(each, dict)
+            or not 0 < len(each) <= _MAX_FLATTENED_KEYS
+            or _is_vector(each)
+        ):
+            flat[key] = each
+        elif each.keys() == {"value"}:  # a message that has this one field
+            flat[key] = each["value"]
         else:
-            shown[key] = each
-    return shown
+            flat.update((f"{key}.{inner}", item) for inner, item in _flattened(each).items())
+    return flat
 
 
 def _is_vector(value: Mapping[str, JsonValue]) -> bool:
-    """Whether an object is a place, a direction or a rotation."""
-    return {"x", "y"} <= value.keys() <= _VECTOR
+    """Returns whether an object is a position, a direction or a rotation."""
+    return {"x", "y"} <= value.keys() <= _VECTOR_KEYS
 
 
-def cell(value: JsonValue) -> str:
-    """One value as text."""
+def format_value(value: JsonValue) -> str:
+    """Formats one value as text; a time as local time, an absent or empty one as `-`."""
     if value is None:
-        return _NOTHING
+        return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return moment(value) if is_moment(value) else f"{value:,.10g}".replace(",", "")
+        return format_time(value) if _is_time(value) else f"{value:,.10g}".replace(",", "")
     if isinstance(value, str):
-        return plain(value)
+        return escape(value)
     if isinstance(value, int):
         return str(value)
-    return (_list(value) if isinstance(value, list) else _object(value)) or _NOTHING
+    return (_format_list(value) if isinstance(value, list) else _format_object(value)) or "-"
 
 
-def _list(value: Sequence[JsonValue]) -> str:
-    simple = all(isinstance(each, str | int | float) for each in value)
-    return (", " if simple else " | ").join(cell(each) for each in value)
+def _format_list(values: Sequence[JsonValue]) -> str:
+    is_simple = all(isinstance(each, str | int | float) for each in values)
+    return (", " if is_simple else " | ").join(format_value(each) for each in values)
 
 
-def _object(value: Mapping[str, JsonValue]) -> str:
-    """An object in words: `x 1.5, y 2, yaw_deg 90 (map)`, `label: cup; score: 0.9`."""
+def _format_object(value: Mapping[str, JsonValue]) -> str:
+    """Formats an object: `x 1.5, y 2, yaw_deg 90 (map)`, `label: cup; score: 0.9`."""
     if _is_vector(value):
-        flat_ground = "w" not in value and not value.get("z")
-        told = ", ".join(
-            f"{key} {cell(each)}"
+        is_planar = "w" not in value and not value.get("z")
+        text = ", ".join(
+            f"{key} {format_value(each)}"
             for key, each in value.items()
-            if key != "frame_id" and not (key == "z" and flat_ground)
+            if key != "frame_id" and not (key == "z" and is_planar)
         )
         frame = value.get("frame_id")
-        return told if frame is None else f"{told} ({cell(frame)})"
+        return text if frame is None else f"{text} ({format_value(frame)})"
     if value.keys() == {"value"}:
-        return cell(value["value"])
+        return format_value(value["value"])
     return "; ".join(
-        f"{plain(key)} ({cell(each)})" if isinstance(each, dict) else f"{plain(key)}: {cell(each)}"
+        f"{escape(key)} ({format_value(each)})"
+        if isinstance(each, dict)
+        else f"{escape(key)}: {format_value(each)}"
         for key, each in value.items()
     )
 
 
-def is_moment(value: JsonValue) -> bool:
-    """Whether a number of a reply is a time."""
-    return isinstance(value, float) and _FIRST_MOMENT < value < _LAST_MOMENT
+def _is_time(value: JsonValue) -> bool:
+    """Returns whether a number of a reply is a time (Unix s)."""
+    return isinstance(value, float) and _EARLIEST_TIME < value < _LATEST_TIME
 
 
-def moment(unix_s: float) -> str:
-    """A time in this machine's zone, to the millisecond."""
+def format_time(unix_s: float) -> str:
+    """Formats a time in this machine's zone, to the millisecond."""
     local = datetime.fromtimestamp(unix_s, tz=UTC).astimezone()
     return f"{local:%Y-%m-%d %H:%M:%S}.{local.microsecond // 1000:03d}"
 
 
-def span(seconds: float) -> str:
-    """A duration in the unit that suits it: `4.2 s`, `12 min`, `5.1 h`, `23 days`."""
+def format_duration(seconds: float) -> str:
+    """Formats a duration in the unit that suits it: `4.2 s`, `12 min`, `5.1 h`, `23 days`."""
     amount = abs(seconds)
     if amount < _MINUTES_FROM_S:
         return f"{seconds:.1f} s"
@@ -243,10 +249,8 @@ def span(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if amount < _DAYS_FROM_S else f"{seconds / 86_400:.0f} days"
 
 
-def plain(text: str) -> str:
-    """The text without what a terminal would obey."""
-    return "".join(each if each.isprintable() else _escaped(each) for each in text)
-
-
-def _escaped(character: str) -> str:
-    return character.encode("unicode_escape").decode()
+def escape(text: str) -> str:
+    """Returns the text with control characters spelled out, so that a terminal ignores them."""
+    return "".join(
+        each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
+    )

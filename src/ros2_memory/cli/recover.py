@@ -1,12 +1,36 @@
-"""`ros2-memory recover`: repairs MCAP files that were left unfinished."""
+"""`ros2-memory recover`: repairs MCAP files that were left unfinished.
 
+A recorder does the same when it starts. The command is for files that it does not repair: those
+that another recorder wrote, copies on a laptop, files so large that a recorder would start late.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
+from rich.console import Console
+from rich.progress import Progress, TaskID
 
-from ros2_memory.cli.recovery import recover as recover_files
-from ros2_memory.cli.running import NOT_SO, reporting, say
+from ros2_memory.bag_dir.hard_links import HardLinks
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.layout import METADATA_FILE
+from ros2_memory.bootstrap import build_repairer
+from ros2_memory.cli.options import EXIT_NEGATIVE, print_line, reported_errors
+from ros2_memory.cli.progress import progress_bar
+from ros2_memory.core import directories
+from ros2_memory.core.errors import BagError, BagVanishedError, RecorderError
+from ros2_memory.core.text import counted
+from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, WallClock, unix_from_ns
+from ros2_memory.index.scan import Tree
+from ros2_memory.retention.repair import Repairer, open_files
+
+RECENT_NS: Final[Ns] = 30 * NS_PER_S
+"""A file that changed so lately may be being written by a program that does not say so."""
+
+_MCAP: Final = ".mcap"
 
 
 def recover(
@@ -26,7 +50,198 @@ def recover(
     Rewrites each from all that can be read of it, in place: the original stays until the whole one
     has been read back and is on the disk. Files of 0 bytes are removed.
     """
-    with reporting("recover"):
-        outcome = recover_files(path, say, force=force)
+    with reported_errors("recover"):
+        outcome = recover_files(path, print_line, force=force)
     if outcome.failed:
-        raise typer.Exit(NOT_SO)
+        raise typer.Exit(EXIT_NEGATIVE)
+
+
+@dataclass(slots=True)
+class RecoveryOutcome:
+    """How many files were whole, repaired, removed or not repaired."""
+
+    whole: int = 0
+    repaired: int = 0
+    removed: int = 0
+    failed: int = 0
+    messages: int = 0
+
+    def __str__(self) -> str:
+        """Returns one line for people."""
+        return (
+            f"MCAP files: {self.whole} whole, {self.repaired} repaired "
+            f"({counted(self.messages, 'message')}), "
+            f"{self.removed} empty and removed, {self.failed} not repaired"
+        )
+
+
+def recover_files(
+    path: Path,
+    report: Callable[[str], None],
+    *,
+    force: bool = False,
+    console: Console | None = None,
+    clock: Clock | None = None,
+) -> RecoveryOutcome:
+    """Repairs one file, or every MCAP file below a directory.
+
+    Args:
+        path: the file or directory.
+        report: takes a line for each file that was not whole, and one at the end.
+        force: also repairs what changed in the last half minute.
+        console: where a progress bar is shown, if it is a terminal; stderr unless given.
+        clock: the wall clock.
+
+    Raises:
+        RecorderError: there is no such file or directory.
+    """
+    clock = clock or WallClock()
+    files, others = _files_below(path, clock)
+    sizes = [_size(file) for file in files]
+    recovery = _Recovery(clock, force, build_repairer())
+    with progress_bar(console) as bar:
+        task = bar.add_task("", total=max(sum(sizes), 1))
+        done = 0
+        for file, size in zip(files, sizes, strict=True):
+            name = str(file if file == path else file.relative_to(path))
+            bar.update(task, completed=done, description=name)
+            line = recovery.recover(file, partial(_advance, bar, task, done))
+            if line is None and file == path:
+                line = "whole already: there is nothing to repair"
+            if line is not None:
+                bar.stop()  # or the line would be printed into the bar
+                report(f"{name}: {line}")
+                bar.start()
+            done += size
+    for folder in sorted(recovery.changed):
+        recovery.correct_metadata(folder, report)
+    for folder in sorted(recovery.changed):
+        # A recording whose metadata.yaml was never written: only its recorder knew all of it.
+        if any(folder.glob(f"*{_MCAP}")) and not _size(folder / METADATA_FILE):
+            report(f"{folder} has no {METADATA_FILE}: `ros2 bag reindex {folder}` makes one")
+    if others:
+        left = counted(others, "bag file of another kind was", "bag files of other kinds were")
+        report(f"{left} left alone: only MCAP files are repaired")
+    report(str(recovery.outcome))
+    return recovery.outcome
+
+
+def _advance(bar: Progress, task: TaskID, done: int, read: int) -> None:
+    bar.update(task, completed=done + read)
+
+
+class _Recovery:
+    """Repairs one file after the other, and counts what became of them.
+
+    `changed` holds the folders in which a file was repaired or removed.
+    """
+
+    def __init__(self, clock: Clock, force: bool, repairer: Repairer) -> None:
+        self._clock = clock
+        self._force = force
+        self._repairer = repairer
+        self._open_files = open_files()
+        self.outcome = RecoveryOutcome()
+        self.changed: set[Path] = set()
+
+    def recover(self, file: Path, on_read: Callable[[int], None]) -> str | None:
+        """Repairs a file, and returns what was done; None where it was whole."""
+        outcome = self.outcome
+        try:
+            if self._repairer.is_whole(file):
+                outcome.whole += 1
+                return None
+            self._require_unused(file)
+            repaired = self._repairer.repair(file, on_read)
+        except BagVanishedError:
+            outcome.failed += 1
+            return "NOT REPAIRED: it is not there any more"
+        except BagError as error:
+            outcome.failed += 1
+            return f"NOT REPAIRED: {error.reason}"
+        self.changed.add(file.parent)
+        rewritten = None if repaired is None else repaired.rewritten
+        if repaired is None or rewritten is None:
+            outcome.removed += 1
+            return "empty, removed"
+        outcome.repaired += 1
+        outcome.messages += rewritten.messages
+        return (
+            f"repaired: {counted(rewritten.messages, 'message')}, "
+            f"{counted(rewritten.lost_bytes, 'byte')} lost "
+            f"({repaired.was_bytes} bytes before, {repaired.is_bytes} now)"
+            f"{''.join(f'; {note}' for note in rewritten.notes)}"
+        )
+
+    def correct_metadata(self, folder: Path, report: Callable[[str], None]) -> None:
+        """Rewrites metadata.yaml where it does not describe the files of the recording."""
+        path = folder / METADATA_FILE
+        try:
+            if self._repairer.correct_metadata(folder):
+                report(f"{path}: written anew, with what the files hold")
+        except BagError as error:
+            report(f"{path} NOT CORRECTED: {error.path}: {error.reason}")
+        except (OSError, ValueError) as error:
+            report(f"{path} NOT CORRECTED: {error}")
+
+    def _require_unused(self, file: Path) -> None:
+        """Checks that nothing writes a file, as far as that can be known.
+
+        Raises:
+            BagError: something does or may write it, or its name is not that of an MCAP file.
+            BagVanishedError: it is gone.
+        """
+        now = self._clock.now()
+        for folder in file.absolute().parents:
+            heartbeat = read_heartbeat(folder).heartbeat
+            if heartbeat is None or not heartbeat.is_live(now):
+                continue
+            if any(file.absolute().is_relative_to(folder / name) for name in heartbeat.recordings):
+                reason = f"the recorder (process {heartbeat.pid}) is writing it; stop that first"
+                raise BagError(str(file), reason)
+        try:
+            status = file.lstat()
+        except OSError as error:
+            raise BagVanishedError(str(file), "it is not there any more") from error
+        if not status.st_size and file.suffix != _MCAP:
+            raise BagError(str(file), f"it is empty, and its name does not end in {_MCAP}")
+        if (status.st_dev, status.st_ino) in self._open_files:
+            raise BagError(str(file), "a process has it open; end that first")
+        age = now - status.st_mtime_ns
+        if abs(age) < RECENT_NS and not self._force:
+            since = f"{unix_from_ns(abs(age)):.0f} s ago"
+            reason = f"it changed {since}; if nothing writes it any more, try again with --force"
+            raise BagError(str(file), reason)
+
+
+def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
+    """Returns the MCAP files to look at, and how many bags of other kinds are beside them.
+
+    Raises:
+        RecorderError: the path does not exist, is behind a symbolic link, or cannot be listed.
+    """
+    link = directories.link_in(path)
+    if link is not None:
+        raise RecorderError(
+            f"{path}: {link} is a symbolic link, and nothing behind one is repaired; "
+            f"give the path itself: {path.resolve()}"
+        )
+    if path.is_file():
+        return [path], 0
+    if not path.is_dir():
+        raise RecorderError(f"{path}: there is no such file or directory")
+    walked = Tree(path).walk(clock.now(), ())
+    if walked.problem is not None:
+        raise RecorderError(f"{path} cannot be listed: {walked.problem}")
+    # A saved moment has hard links to bags, which were whole when it was saved.
+    links = HardLinks(path)
+    bags = sorted(Path(each) for each in walked.looked_at if not links.is_saved(each))
+    files = [bag for bag in bags if bag.suffix == _MCAP]
+    return files, len(bags) - len(files)
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:
+        return 0

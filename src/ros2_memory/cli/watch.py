@@ -14,10 +14,17 @@ from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.cli.info import usual_rate
-from ros2_memory.cli.opening import opened
-from ros2_memory.cli.output import moment, plain, span
-from ros2_memory.cli.running import BagDir, Overrides, Verbose, output, reporting, say
-from ros2_memory.cli.settling import settings_for
+from ros2_memory.cli.options import (
+    BagDir,
+    Overrides,
+    Verbose,
+    load_for,
+    open_memory,
+    print_line,
+    reported_errors,
+    stdout_console,
+)
+from ros2_memory.cli.output import escape, format_duration, format_time
 from ros2_memory.core.errors import BagError, InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
@@ -90,7 +97,7 @@ class Look:
         """Why answers may be missing something."""
         missing = self.status.missing if self.status.live else ()
         never = [f"offered by no publisher: {listed(missing)}"] if missing else []
-        return [plain(each) for each in (*never, *self.status.problems)]
+        return [escape(each) for each in (*never, *self.status.problems)]
 
     @property
     def newest(self) -> str:
@@ -99,8 +106,8 @@ class Look:
         if latest is None:
             return "no data"
         if self.status.now == latest != self.now:
-            return f"{moment(unix_from_ns(latest))}, which is now (data.now=latest)"
-        return f"{span(unix_from_ns(self.status.now - latest))} old"
+            return f"{format_time(unix_from_ns(latest))}, which is now (data.now=latest)"
+        return f"{format_duration(unix_from_ns(self.status.now - latest))} old"
 
 
 def watch(
@@ -118,18 +125,18 @@ def watch(
     Ages count as in the tools' answers (data.now). Rates are judged only while data comes in.
     On a terminal a table that is kept up to date, elsewhere a line for each look. Ends with Ctrl-C.
     """
-    with reporting("watch"):
+    with reported_errors("watch"):
         if not every > 0 or (count is not None and count < 1):
             raise InvalidArgumentsError("--every and --count must be more than 0")
-        settings = settings_for(bag_dir, ["reader.include_active=true", *(overrides or ())])
-        memory = opened(settings, verbose=verbose)
-        console = output()
+        settings = load_for(bag_dir, ["reader.include_active=true", *(overrides or ())])
+        memory = open_memory(settings, verbose=verbose)
+        console = stdout_console()
         try:
             if console.is_terminal:
                 _live(console, _looks(memory, every, count))
             else:
                 for look in _looks(memory, every, count):
-                    say(line(look))
+                    print_line(line(look))
         except KeyboardInterrupt:
             raise typer.Exit from None
 
@@ -210,11 +217,11 @@ def line(look: Look) -> str:
     if look.live:
         odd = [each for each in look.courses if each.judged != AS_USUAL]
         usual = counted(len(look.courses) - len(odd), "topic")
-        said = [f"{usual} as usual", *(f"{plain(each.topic)} {_rates(each)}" for each in odd)]
+        said = [f"{usual} as usual", *(f"{escape(each.topic)} {_rates(each)}" for each in odd)]
     else:
         said = [_not_live(look)] if look.courses else []
     return (
-        f"{moment(unix_from_ns(look.now))} recorder: {look.recorder}; newest: {look.newest}"
+        f"{format_time(unix_from_ns(look.now))} recorder: {look.recorder}; newest: {look.newest}"
         f"{''.join(f'; {each}' for each in [*said, *look.troubles])}"
     )
 
@@ -233,7 +240,7 @@ def shown(look: Look) -> Sequence[Text | Table]:
     budget, gigabyte = look.status.budget, 1e9
     most = "" if budget.most is None else f" of {budget.most / gigabyte:.3g}"
     head = Text.assemble(
-        (moment(unix_from_ns(look.now)), "bold"),
+        (format_time(unix_from_ns(look.now)), "bold"),
         f"  recorder: {look.recorder}  newest: {look.newest}  "
         f"used: {budget.used / gigabyte:.3g}{most} GB",
     )
@@ -244,7 +251,7 @@ def shown(look: Look) -> Sequence[Text | Table]:
     table.add_column("")
     for each in look.courses:
         table.add_row(
-            Text(plain(each.topic)),
+            Text(escape(each.topic)),
             f"{each.rate:.1f}",
             "-" if each.usual is None else f"{each.usual:.1f}",
             f"{each.age_s:.1f} s",

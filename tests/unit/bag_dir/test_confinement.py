@@ -25,7 +25,7 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.request_queue import PendingRequest, RequestQueue
 from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
 from ros2_memory.catalogue.database import open_file
-from ros2_memory.cli.recovery import recover
+from ros2_memory.cli.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError
@@ -277,7 +277,7 @@ class TestDeletions:
         link(bags, outside)
         before = contents(outside)
         lines: list[str] = []
-        recover(bags, lines.append, force=True)
+        recover_files(bags, lines.append, force=True)
         assert contents(outside) == before
 
     def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
@@ -290,7 +290,7 @@ class TestDeletions:
         before = contents(outside)
         for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
             with pytest.raises(RecorderError, match="symbolic link") as refused:
-                recover(path, lambda _: None, force=True)
+                recover_files(path, lambda _: None, force=True)
             assert str(path.resolve()) in str(refused.value)
             if path.suffix:
                 with pytest.raises(BagError, match="behind a symbolic link"):

@@ -14,10 +14,9 @@ import yaml
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.cli.app import COMMANDS
-from ros2_memory.cli.ask import complete, parsed
-from ros2_memory.cli.exits import epilog
-from ros2_memory.cli.output import cell, plain
+from ros2_memory.cli.app import COMMANDS, epilog
+from ros2_memory.cli.ask import complete, parse_arguments
+from ros2_memory.cli.output import escape, format_value
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
@@ -97,7 +96,7 @@ class TestAsk:
 class TestArguments:
     def test_values_are_json_where_they_read_so_and_text_elsewhere(self) -> None:
         given = ["a=1", "b=true", "c=scissors", 'd={"x": 1}', "e=null", "f=1=2", "g="]
-        assert parsed(given, {}) == {
+        assert parse_arguments(given, {}) == {
             "a": 1,
             "b": True,
             "c": "scissors",
@@ -109,12 +108,12 @@ class TestArguments:
 
     def test_what_a_tool_takes_as_text_stays_text(self) -> None:
         schema = {"properties": {"topic": {"type": "string"}}}
-        assert parsed(["topic=7"], schema) == {"topic": "7"}
+        assert parse_arguments(["topic=7"], schema) == {"topic": "7"}
 
     @pytest.mark.parametrize("given", [["{]"], ["=1"], ["seconds"]])
     def test_anything_else_is_refused(self, given: list[str]) -> None:
         with pytest.raises(InvalidArgumentsError):
-            parsed(given, {})
+            parse_arguments(given, {})
 
 
 class TestTopics:
@@ -294,6 +293,6 @@ class TestTheProgram:
         assert "\x1b" not in done.stdout
 
     def test_control_characters_are_spelled(self) -> None:
-        assert plain("a\x07\u202eb ß") == "a\\x07\\u202eb ß"
-        assert cell([1.5, "x"]) == "1.5, x"
-        assert cell([]) == cell(None) == "-"
+        assert escape("a\x07\u202eb ß") == "a\\x07\\u202eb ß"
+        assert format_value([1.5, "x"]) == "1.5, x"
+        assert format_value([]) == format_value(None) == "-"

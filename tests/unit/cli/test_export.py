@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory import cli
 from ros2_memory.cli.export import as_mcap
-from ros2_memory.cli.windows import unix_of
+from ros2_memory.cli.options import parse_time
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -446,7 +446,7 @@ class TestWindows:
         assert capsys.readouterr().err
 
     def test_times_are_unix_seconds_or_iso(self) -> None:
-        assert unix_of("1700000000.5") == 1_700_000_000.5
-        assert unix_of("2023-11-14T22:13:20+00:00") == 1_700_000_000
+        assert parse_time("1700000000.5") == 1_700_000_000.5
+        assert parse_time("2023-11-14T22:13:20+00:00") == 1_700_000_000
         with pytest.raises(InvalidArgumentsError):
-            unix_of("noon")
+            parse_time("noon")

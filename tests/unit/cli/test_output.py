@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from rich.console import Console
 
-from ros2_memory.cli.output import cell, moment, show
+from ros2_memory.cli.output import format_time, format_value, print_reply
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
@@ -18,7 +18,7 @@ T0 = 1_700_000_000.25
 
 def shown(value: JsonValue, width: int = 80, now: float | None = None) -> str:
     stream = io.StringIO()
-    show(Console(file=stream, width=width), value, now)
+    print_reply(Console(file=stream, width=width), value, now)
     lines = [line.rstrip() for line in stream.getvalue().splitlines()]
     assert all(len(line) <= width for line in lines)
     return "\n".join(lines)
@@ -40,14 +40,14 @@ def shown(value: JsonValue, width: int = 80, now: float | None = None) -> str:
     ],
 )
 def test_objects_in_a_cell_are_words(value: JsonValue, told: str) -> None:
-    assert cell(value) == told
+    assert format_value(value) == told
 
 
 def test_a_moment_has_its_local_time_and_its_age() -> None:
     told = shown({"timestamp": T0, "first": T0 - 7200.0, "next": T0 + 60.0}, now=T0)
-    assert told.splitlines()[0].split(maxsplit=1) == ["timestamp", moment(T0)]
-    assert f"{moment(T0 - 7200)} (2.0 h ago)" in told
-    assert f"{moment(T0 + 60)} (in 60.0 s)" in told
+    assert told.splitlines()[0].split(maxsplit=1) == ["timestamp", format_time(T0)]
+    assert f"{format_time(T0 - 7200)} (2.0 h ago)" in told
+    assert f"{format_time(T0 + 60)} (in 60.0 s)" in told
 
 
 def test_ages_count_from_the_now_that_a_reply_states() -> None:
@@ -56,7 +56,7 @@ def test_ages_count_from_the_now_that_a_reply_states() -> None:
 
 def test_moments_in_notes_are_local_times() -> None:
     told = shown({"notes": [f"the memory ends at {T0:.6f}", "2 of 1300000000 samples"]})
-    assert f"the memory ends at {moment(T0)}" in told
+    assert f"the memory ends at {format_time(T0)}" in told
     assert "1300000000 samples" in told
 
 
@@ -75,13 +75,13 @@ def test_what_there_is_not_is_said_in_words() -> None:
 def test_a_table_for_which_there_is_room_has_a_row_for_each() -> None:
     rows: JsonValue = [{"topic": "/odom", "last": T0, "count": n} for n in range(3)]
     told = shown({"topics": rows})
-    assert told.count(moment(T0)) == 3
+    assert told.count(format_time(T0)) == 3
 
 
 def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time() -> None:
     rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
     told = shown(rows)
-    day, _, time = moment(T0).partition(" ")
+    day, _, time = format_time(T0).partition(" ")
     assert [line.count(day) for line in told.splitlines() if day in line] == [2]
     assert [line.count(time) for line in told.splitlines() if time in line] == [2]
     assert "12345" in told

@@ -13,7 +13,7 @@ import pytest
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.cli.output import span
+from ros2_memory.cli.output import format_duration
 from ros2_memory.cli.watch import AS_USUAL, Course
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, odom, text, write_mcap
@@ -148,4 +148,4 @@ class TestOldData:
     ],
 )
 def test_a_duration_has_the_unit_that_suits_it(seconds: float, told: str) -> None:
-    assert span(seconds) == told
+    assert format_duration(seconds) == told

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bootstrap import build_memory, catalogue_fingerprint
-from ros2_memory.cli.findings import _size
-from ros2_memory.cli.recovery import recover
+from ros2_memory.cli.doctor import _size
+from ros2_memory.cli.recover import recover_files
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from ros2_memory.retention.clear import clear_bags
@@ -96,7 +96,7 @@ def test_they_are_scanned_repaired_measured_and_counted(
     assert len(memory.index.snapshot().bags) == 1
     keeper_of(bags).apply()
     lines: list[str] = []
-    assert recover(bags, lines.append).whole == 1
+    assert recover_files(bags, lines.append).whole == 1
     assert _size(bags) >= bag.stat().st_size
 
 

@@ -17,7 +17,7 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
-from ros2_memory.cli.recovery import recover
+from ros2_memory.cli.recover import recover_files
 from ros2_memory.retention import saved_moments
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.saved_moments import MomentKeeper
@@ -333,7 +333,7 @@ class TestOthers:
         recording(tmp_path, A, 0, splits=1)
         kept(house_of(tmp_path), tmp_path, 0, 5)
         said: list[str] = []
-        assert recover(tmp_path, said.append).whole == 1
+        assert recover_files(tmp_path, said.append).whole == 1
 
     def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)

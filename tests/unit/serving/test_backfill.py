@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import os
 import sys
@@ -22,7 +21,7 @@ from ros2_memory.catalogue.digest import Digester
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER, Catalogue
 from ros2_memory.cli import main
-from ros2_memory.cli.index import Bar, fill, line
+from ros2_memory.cli.index import describe_progress, fill_catalogue
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
@@ -58,10 +57,6 @@ def filler_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -
     return Backfill(memory, made, bag_dir)
 
 
-def never() -> bool:
-    return False
-
-
 def test_the_newest_bag_comes_first(tmp_path: Path) -> None:
     paths = [bag(tmp_path, number) for number in range(3)]
     filler = filler_of(recalling(tmp_path), tmp_path)
@@ -73,14 +68,14 @@ def test_when_all_is_digested_nothing_waits(tmp_path: Path) -> None:
         bag(tmp_path, number)
     filler = filler_of(recalling(tmp_path), tmp_path)
     assert filler.progress() == Progress(3, 3, 0)
-    assert fill(filler, None, never) == Progress(3, 0, 0)
-    assert fill(filler_of(recalling(tmp_path), tmp_path), None, never) == Progress(3, 0, 0)
+    assert fill_catalogue(filler) == Progress(3, 0, 0)
+    assert fill_catalogue(filler_of(recalling(tmp_path), tmp_path)) == Progress(3, 0, 0)
 
 
 def test_a_bag_that_a_crash_left_open_is_never_digested(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     bag(tmp_path, 1, finish=False)
-    assert fill(filler_of(recalling(tmp_path), tmp_path), None, never) == Progress(1, 0, 0)
+    assert fill_catalogue(filler_of(recalling(tmp_path), tmp_path)) == Progress(1, 0, 0)
 
 
 def test_a_bag_that_changed_a_moment_ago_waits(tmp_path: Path) -> None:
@@ -96,10 +91,10 @@ def test_a_bag_that_changed_a_moment_ago_waits(tmp_path: Path) -> None:
 def test_a_changed_bag_or_sidecar_has_the_bag_digested_again(tmp_path: Path) -> None:
     path = bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    fill(filler_of(memory, tmp_path), None, never)
+    fill_catalogue(filler_of(memory, tmp_path))
     write_handover(path.parent, Handover())
     assert len(filler_of(recalling(tmp_path), tmp_path).waiting()) == 1
-    fill(filler_of(recalling(tmp_path), tmp_path), None, never)
+    fill_catalogue(filler_of(recalling(tmp_path), tmp_path))
     path.write_bytes(bag(tmp_path, 1).read_bytes())
     assert path in [each.path for each in filler_of(recalling(tmp_path), tmp_path).waiting()]
 
@@ -132,14 +127,14 @@ def test_a_bag_that_cannot_be_digested_is_told_of_and_not_tried_for_ever(tmp_pat
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
     filler = filler_of(memory, tmp_path, Failing(memory.reader, memory.extractor, 10.0))
-    assert fill(filler, None, never) == Progress(1, 0, 1)
+    assert fill_catalogue(filler) == Progress(1, 0, 1)
     assert len(queries.list_recorded_topics(memory, Call())) == 1
 
 
 def test_entries_of_bags_that_are_gone_are_dropped(tmp_path: Path) -> None:
     paths = [bag(tmp_path, number) for number in range(3)]
     memory = recalling(tmp_path)
-    fill(filler_of(memory, tmp_path), None, never)
+    fill_catalogue(filler_of(memory, tmp_path))
     paths[0].unlink()
     filler_of(memory, tmp_path).tidy()
     assert memory.recall is not None
@@ -151,7 +146,7 @@ def test_a_bag_directory_that_is_gone_for_a_while_keeps_its_entries(tmp_path: Pa
     bag(bag_dir, 0)
     recall = DigestCache(Catalogue([tmp_path / FILE], "test"), bag_dir)
     memory = replace(memory_of(bag_dir), recall=recall)
-    fill(filler_of(memory, bag_dir), None, never)
+    fill_catalogue(filler_of(memory, bag_dir))
     bag_dir.rename(elsewhere)
     filler_of(memory, bag_dir).tidy()
     assert recall.catalogue.paths() == ["rec/rec_0.mcap"]
@@ -211,21 +206,11 @@ def own_logging() -> Iterator[None]:
     structlog.reset_defaults()
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_on_a_terminal_one_line_moves_and_elsewhere_only_its_end_is_shown() -> None:
-    terminal, log = Terminal(), io.StringIO()
-    for stream in (terminal, log):
-        bar = Bar(stream)
-        bar.show(Progress(4, 3, 0))
-        bar.end(Progress(4, 0, 1))
-    assert terminal.getvalue().count("\r") == 2
-    assert log.getvalue() == f"{line(Progress(4, 0, 1))}\n"
-    assert "3 of 4 bags are in the catalogue, 1 cannot be" in log.getvalue()
-    assert "0 of 0" in line(Progress(0, 0, 0))
+def test_the_last_line_counts_what_is_in_the_catalogue_and_what_cannot_be() -> None:
+    shown = describe_progress(Progress(4, 0, 1))
+    assert "3 of 4 bags are in the catalogue, 1 cannot be" in shown
+    assert shown.count("#") == 30
+    assert "0 of 0" in describe_progress(Progress(0, 0, 0))
 
 
 @pytest.mark.usefixtures("own_logging")
@@ -237,7 +222,8 @@ def test_the_command_fills_the_catalogue_beside_the_bags(
     hour_ago = time.time_ns() - 3600 * NS_PER_S
     os.utime(path, ns=(hour_ago, hour_ago))
     assert main(["index"]) == 0
-    assert "1 of 1 bag is in the catalogue" in capsys.readouterr().err
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("1 of 1 bag is in the catalogue")
     assert (tmp_path / FOLDER / FILE).is_file()
 
 
@@ -279,6 +265,6 @@ def test_texts_of_the_newest_bag_are_found_before_and_after_it_is_digested(tmp_p
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "scissors")])
     memory = recalling(tmp_path)
     before = queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors")
-    fill(filler_of(memory, tmp_path), None, never)
+    fill_catalogue(filler_of(memory, tmp_path))
     assert queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors") == before
     assert before.found is not None

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 from mcap.reader import make_reader
+from rich.console import Console
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from ros2_memory import cli
-from ros2_memory.cli.recovery import Outcome, recover
+from ros2_memory.cli.recover import RecoveryOutcome, recover_files
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
@@ -27,18 +28,15 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 MESSAGES = [odom(T0 + n * S // 20, n / 20, 0.0) for n in range(100)]
 
 
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
 def left_open(path: Path) -> Path:
     return write_mcap(path, MESSAGES, McapLayout(chunk_size=2000, finish=False))
 
 
-def recovered(path: Path, *, seconds_later: int = 60, **more: bool) -> tuple[Outcome, list[str]]:
+def recovered(
+    path: Path, *, seconds_later: int = 60, force: bool = False
+) -> tuple[RecoveryOutcome, list[str]]:
     said: list[str] = []
-    outcome = recover(path, said.append, stream=io.StringIO(), clock=later(seconds_later), **more)
+    outcome = recover_files(path, said.append, force=force, clock=later(seconds_later))
     return outcome, said
 
 
@@ -50,7 +48,7 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     before = whole.stat(), whole.read_bytes()
     count = McapReader().summarize(cut).count
     outcome, said = recovered(tmp_path)
-    assert outcome == Outcome(whole=1, repaired=1, removed=1, failed=0, messages=count)
+    assert outcome == RecoveryOutcome(whole=1, repaired=1, removed=1, failed=0, messages=count)
     assert McapReader().summarize(cut).complete
     stat, content = before
     after = whole.stat()
@@ -172,7 +170,7 @@ def test_a_single_file_is_repaired_whatever_its_name(tmp_path: Path) -> None:
 def test_a_whole_file_is_said_to_be(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a_0.mcap", MESSAGES)
     outcome, said = recovered(path)
-    assert outcome == Outcome(whole=1)
+    assert outcome == RecoveryOutcome(whole=1)
     assert said[0].endswith("whole already: there is nothing to repair")
 
 
@@ -180,7 +178,7 @@ def test_what_is_no_mcap_file_is_said_to_be_none_and_stays(tmp_path: Path) -> No
     path = tmp_path / "a_0.mcap"
     path.write_bytes(b"a letter")
     outcome, said = recovered(tmp_path)
-    assert outcome == Outcome(failed=1)
+    assert outcome == RecoveryOutcome(failed=1)
     assert said[0] == "a_0.mcap: NOT REPAIRED: not an MCAP file: it does not begin as one"
     assert path.read_bytes() == b"a letter"
 
@@ -224,7 +222,7 @@ def test_what_changed_a_moment_ago_is_left_alone_unless_that_is_forced(tmp_path:
 def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
     write_db3(tmp_path / "a/a_0.db3", MESSAGES)
     outcome, said = recovered(tmp_path)
-    assert outcome == Outcome()
+    assert outcome == RecoveryOutcome()
     assert said[0].startswith("1 bag file of another kind was left alone")
 
 
@@ -246,18 +244,19 @@ def test_on_a_full_disk_the_original_stays(tmp_path: Path) -> None:
 def test_a_terminal_sees_how_far_it_is_and_then_a_clean_line(tmp_path: Path) -> None:
     for name in ("a/a_0.mcap", "a/a_1.mcap"):
         left_open(tmp_path / name)
-    terminal = Terminal()
-    recover(tmp_path, lambda _: None, stream=terminal, clock=later(60))
+    terminal = io.StringIO()
+    console = Console(file=terminal, force_terminal=True, width=100)
+    recover_files(tmp_path, lambda _: None, console=console, clock=later(60))
     shown = terminal.getvalue()
-    assert "  0% a/a_0.mcap" in shown
-    assert " 50% a/a_1.mcap" in shown
-    assert shown.endswith("\r\x1b[K")
+    assert " 50% a/a_0.mcap" in shown
+    assert "100% a/a_1.mcap" in shown
+    assert "\x1b[2K" in shown.rpartition("%")[2]
 
 
 def test_nothing_but_a_terminal_sees_it(tmp_path: Path) -> None:
     left_open(tmp_path / "a_0.mcap")
     stream = io.StringIO()
-    recover(tmp_path, lambda _: None, stream=stream, clock=later(60))
+    recover_files(tmp_path, lambda _: None, console=Console(file=stream), clock=later(60))
     assert stream.getvalue() == ""
 
 
@@ -285,4 +284,4 @@ def test_what_killed_recorders_left(tmp_path: Path) -> None:
     for name in ("session_killed", "session_killed_chunk64k", "extra/full_truncated"):
         copied(RECORDED / name, tmp_path / name.rpartition("/")[2])
     outcome, _ = recovered(tmp_path, force=True)
-    assert outcome == Outcome(whole=4, repaired=2, removed=1, messages=251 + 94)
+    assert outcome == RecoveryOutcome(whole=4, repaired=2, removed=1, messages=251 + 94)

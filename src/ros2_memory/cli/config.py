@@ -1,0 +1,106 @@
+"""`ros2-memory config show`: the configuration as it is composed, and who set each key."""
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+import yaml
+
+from ros2_memory.cli.app import epilog
+from ros2_memory.cli.options import (
+    BagDir,
+    Overrides,
+    load_with_sources,
+    print_line,
+    reported_errors,
+)
+from ros2_memory.cli.output import escape
+from ros2_memory.config import AdapterNode, Settings
+from ros2_memory.config_sources import GROUPS, Sources
+from ros2_memory.core.model import JsonValue
+
+_MASK: Final = "********"
+_SECRETS: Final = ("token", "password", "secret", "credential")
+
+config = typer.Typer(
+    help="The configuration, as the programs see it.", no_args_is_help=True, rich_markup_mode=None
+)
+
+
+@config.command("show", epilog=epilog("config"))
+def config_show(
+    overrides: Overrides = None,
+    bag_dir: BagDir = None,
+    sources: Annotated[bool, typer.Option("--sources", help="Say of each key who set it.")] = False,
+) -> None:
+    """The configuration as YAML, composed of files, environment and arguments; no secrets.
+
+    Whether there is a token for the server is told in a comment, never what it is.
+    """
+    with reported_errors("config show"):
+        settings, source = load_with_sources(bag_dir, overrides)
+    if sources:
+        for line in _lines_with_sources(settings, source):
+            print_line(line)
+        return
+    sections: dict[str, dict[str, JsonValue]] = {}
+    for key, value in _keys(settings):
+        section, _, name = key.partition(".")
+        sections.setdefault(section, {})[name] = value
+    print_line(yaml.safe_dump(sections, sort_keys=False, allow_unicode=True).rstrip())
+    for name in ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
+        if os.environ.get(name):
+            print_line(f"# {name} is set: {_MASK}")
+
+
+def _lines_with_sources(settings: Settings, source: Sources) -> Iterator[str]:
+    """Yields a line for each group's choice and for each key: its name, who set it, its value.
+
+    A key of a group that only takes over another key's value names that one as its source.
+    """
+    yield f"# files are those of {source.folder}"
+    rows: list[tuple[str, str, str]] = []
+    for group in GROUPS:
+        option, who = source.choice(group)
+        rows.append((group, _shortened_source(who, source.folder), option or "null"))
+    for key, value in _keys(settings):
+        who = _shortened_source(source(key), source.folder)
+        rows.append((key, who, value if isinstance(value, str) else json.dumps(value)))
+    key_width, source_width = (max(len(row[column]) for row in rows) for column in (0, 1))
+    for key, who, text in rows:
+        yield f"{key:<{key_width}}  {who:<{source_width}}  {text}"
+
+
+def _shortened_source(who: str, folder: Path) -> str:
+    file, link, other = who.partition(", as ")
+    return f"as {other}" if link else file.replace(f"in {folder}/", "")
+
+
+def _keys(settings: object, prefix: str = "") -> Iterator[tuple[str, JsonValue]]:
+    """Yields every key with its plain value, `_target_` under the name that the files have."""
+    if not is_dataclass(settings):
+        return
+    for each in fields(settings):
+        value: object = getattr(settings, each.name)
+        is_target = isinstance(settings, AdapterNode) and each.name == "target"
+        key = f"{prefix}{'_target_' if is_target else each.name}"
+        if is_dataclass(value):
+            yield from _keys(value, f"{key}.")
+        else:
+            yield key, _plain_value(key, value)
+
+
+def _plain_value(key: str, value: object) -> JsonValue:
+    if value and any(word in key.rpartition(".")[2].lower() for word in _SECRETS):
+        return _MASK
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, tuple):
+        return [_plain_value("", each) for each in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    return escape(str(value))

@@ -1,0 +1,194 @@
+"""What the commands share: their options, how they open a memory, and how they print and fail.
+
+Typer reads annotations at run time, so modules with commands do without `annotations` of
+`__future__`.
+"""
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.console import Console
+
+from ros2_memory.config import Settings, load_explained
+from ros2_memory.config_sources import Sources, quoted
+from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import counted, listed
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
+from ros2_memory.core.withheld import withheld_warnings, withhold_warnings
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+
+EXIT_NEGATIVE: Final = 1
+"""Exit code: it ran, and the answer is no: an error reply, or something left undone."""
+EXIT_CANNOT_RUN: Final = 2
+"""Exit code: it could not run, and stderr says why."""
+MB: Final = 1_000_000
+
+_PIPE_WIDTH: Final = 160
+"""Columns where no terminal says how many there are, so that lines in a pipe are not cut."""
+
+BagDir = Annotated[
+    Path | None,
+    typer.Option(
+        "--bag-dir", metavar="DIR", help="The bags to look at, instead of recording.bag_dir."
+    ),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="key=value", help="Settings, as for ros2-memory-server."),
+]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="key=value", help="A setting, as for ros2-memory-server."),
+]
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", help="Show the log on stderr, from logging.level on."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, for programs.")]
+Start = Annotated[
+    str | None,
+    typer.Option(metavar="TIME", help="From here on: Unix seconds, or ISO 8601 (local time)."),
+]
+End = Annotated[str | None, typer.Option(metavar="TIME", help="Up to here, inclusive; likewise.")]
+Last = Annotated[
+    float | None, typer.Option(metavar="S", help="The last seconds, instead of a start and an end.")
+]
+
+
+def load_with_sources(
+    bag_dir: Path | None, overrides: Sequence[str] | None
+) -> tuple[Settings, Sources]:
+    """Loads the configuration as the server does, and who set each key; `--bag-dir` wins.
+
+    Raises:
+        ConfigError: the configuration is refused.
+    """
+    chosen = [] if bag_dir is None else [f"recording.bag_dir={quoted(str(bag_dir.absolute()))}"]
+    return load_explained([*(overrides or ()), *chosen])
+
+
+def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
+    """Loads the configuration as `load_with_sources` does, without the sources."""
+    return load_with_sources(bag_dir, overrides)[0]
+
+
+def open_memory(settings: Settings, *, verbose: bool = False) -> "Memory":
+    """Returns the memory of the configured bags, with an index of the directory as it is now.
+
+    `verbose` shows log events on stderr. Without it warnings are counted, and `reported_errors`
+    prints the count when the command ends.
+
+    Raises:
+        ConfigError: an adapter cannot be built.
+    """
+    # Imported here: `adopt`, `recover` and `config show` do without the libraries that answer.
+    from ros2_memory.bootstrap import build_memory  # noqa: PLC0415
+
+    configure_logging(settings.logging.level if verbose else "warning", settings.logging.format)
+    if not verbose:
+        withhold_warnings()
+    memory = build_memory(settings)
+    with spinner(f"looking through {settings.recording.bag_dir}"):
+        memory.index.refresh()
+    return memory
+
+
+def present(memory: "Memory") -> Ns:
+    """Returns the time that ages count from: the wall clock, or the newest data (`data.now`)."""
+    latest = memory.index.snapshot().dating.latest
+    return memory.clock.now() if memory.limits.now == "wall" or latest is None else latest
+
+
+def parse_window(
+    memory: "Memory", start: str | None, end: str | None, last: float | None
+) -> TimeWindow:
+    """Returns the window of `--start`, `--end` and `--last`; a side that is not given is open.
+
+    Raises:
+        InvalidArgumentsError: the options contradict each other, or one is not a time.
+    """
+    if last is None:
+        first = unix_from_ns(MIN_NS) if start is None else parse_time(start)
+        return TimeWindow.from_unix(first, unix_from_ns(MAX_NS) if end is None else parse_time(end))
+    if start is not None or end is not None:
+        raise InvalidArgumentsError("give --last, or --start and --end, not both")
+    if not last > 0:
+        raise InvalidArgumentsError(f"--last is {last:g}; it must be more than 0 seconds")
+    now = unix_from_ns(present(memory))
+    return TimeWindow.from_unix(now - last, now)
+
+
+def parse_time(text: str) -> float:
+    """Returns the Unix seconds of a time that is written so, or as ISO 8601.
+
+    Raises:
+        InvalidArgumentsError: the text is neither.
+    """
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return datetime.fromisoformat(text).astimezone().timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise InvalidArgumentsError(
+            f"{text!r} is no time; write Unix seconds (1795163910.5) or ISO 8601 "
+            "(2026-11-20T08:30:00)"
+        ) from None
+
+
+@contextmanager
+def reported_errors(command: str) -> Iterator[None]:
+    """Prints an error of the block as one line on stderr, and exits with code 2.
+
+    Also prints how many warnings were logged and not shown.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except (EpisodicError, OSError) as error:
+        print(f"ros2-memory {command}: {error}", file=sys.stderr)
+        raise typer.Exit(EXIT_CANNOT_RUN) from None
+    finally:
+        if events := withheld_warnings():
+            names = listed([each if n == 1 else f"{n} x {each}" for each, n in events.items()])
+            print(
+                f"ros2-memory: {counted(events.total(), 'warning')} logged ({names}); -v shows the "
+                "log, `ros2-memory doctor` says what to do",
+                file=sys.stderr,
+            )
+
+
+@contextmanager
+def spinner(activity: str) -> Iterator[None]:
+    """Shows on a terminal, and nowhere else, what the block is doing."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(activity):
+        yield
+
+
+def stdout_console() -> Console:
+    """Returns the console for answers; where it is no terminal, lines are not cut."""
+    console = Console(highlight=False, markup=False, emoji=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console = Console(highlight=False, markup=False, emoji=False, width=_PIPE_WIDTH)
+    return console
+
+
+def print_line(line: str) -> None:
+    """Prints a line on stdout, and flushes it."""
+    print(line, flush=True)
