@@ -31,10 +31,19 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history import transforms as frame_history
-from ros2_memory.history.coverage import amiss, by_remark, misdated, note_edges, note_unread
-from ros2_memory.history.driven_path import carries_no, decoded, driven_path
+from ros2_memory.history.coverage import (
+    by_remark,
+    describe_misdated,
+    describe_odd,
+    note_edges,
+    note_unread,
+    recording_gaps,
+    unix_text,
+)
+from ros2_memory.history.driven_path import driven_path
 from ros2_memory.history.no_data import (
-    moment,
+    decode,
+    describe_lack,
     no_data_at,
     no_data_between,
     require_bags,
@@ -69,7 +78,7 @@ from ros2_memory.insights.status import (
 from ros2_memory.messages.downsample import samples_note
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import Extracted
@@ -148,12 +157,12 @@ def position(
     name = resolve_pose_topic(view, topic, degrees=True)
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
-    message, type_name = decoded(view, found), found.record.channel.type
+    message, type_name = decode(view, found), found.record.channel.type
     pose = memory.extractor.pose(message, type_name)
     if pose is None:
         place = memory.extractor.geodetic(message, type_name)
         if place is None:
-            raise InvalidArgumentsError(carries_no(view, "position", found))
+            raise InvalidArgumentsError(describe_lack(view, "position", found))
         if not (math.isfinite(place.latitude) and math.isfinite(place.longitude)):
             view.notes.add("the recorded position is not a number")
         nowhere = Pose((math.nan,) * 3, None, place.frame_id)
@@ -180,9 +189,9 @@ def velocity(
     name = resolve_pose_topic(view, topic, "velocity")
     found = _found_at(view, name, at, tolerance_s)
     _note_held(view, found, at)
-    twist = memory.extractor.twist(decoded(view, found), found.record.channel.type)
+    twist = memory.extractor.twist(decode(view, found), found.record.channel.type)
     if twist is None:
-        raise InvalidArgumentsError(carries_no(view, "velocity", found))
+        raise InvalidArgumentsError(describe_lack(view, "velocity", found))
     return results.Velocity(name, found.time, twist, view.notes.sentences(), _age(found, now))
 
 
@@ -194,9 +203,9 @@ def transform(
     try:
         found = frame_history.transform_at(view, parent, child, at)
     except NoDataError as error:
-        note_unread(view, _around(at, TF_CACHE_NS), nothing=True)
+        note_unread(view, TimeWindow.around(at, TF_CACHE_NS), nothing=True)
         raise NoDataError(error.reason, error.detail, view.notes.sentences()) from error
-    note_unread(view, _around(at, found.reach))
+    note_unread(view, TimeWindow.around(at, found.reach))
     age = None if now is None else now - at
     return results.TransformAt(
         parent, child, at, found.lookup.transform, found.clock, view.notes.sentences(), age
@@ -274,7 +283,7 @@ def value_when(
     held = _newest_beside(view, name, upto, found)
     note_unread(view, upto if held is None else replace(upto, start=held.time), nothing=not held)
     if held is None:
-        view.notes.add(f"{name} held no message yet at {moment(found.time)}")
+        view.notes.add(f"{name} held no message yet at {unix_text(found.time)}")
         return results.ValueWhen(matched, None, view.notes.sentences())
     distance = found.time - held.time
     latched = memory.limits.latching.holds(view.snapshot, held)
@@ -338,7 +347,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
         latest=snapshot.dating.latest,
         now=now,
         bags=len(snapshot.bags),
-        gaps=_gaps(view),
+        gaps=tuple(results.Gap(*each) for each in recording_gaps(view)),
         incomplete=left_open(snapshot),
         active=snapshot.active,
         damaged=snapshot.damaged,
@@ -451,7 +460,7 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
 def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:
     """A message as a reply shows it, with the notes on that message alone."""
     begin = time.perf_counter_ns()
-    message = decoded(view, found)
+    message = decode(view, found)
     shown = view.memory.extractor.shown(message, found.record.channel.type, fields)
     view.call.stages.add("extract", time.perf_counter_ns() - begin)
     return shown
@@ -505,17 +514,13 @@ def _age(found: StoredMessage, now: Ns | None) -> Ns | None:
     return None if now is None else now - found.time
 
 
-def _around(at: Ns, reach: Ns) -> TimeWindow:
-    return TimeWindow(max(at - reach, MIN_NS), min(at + reach + 1, MAX_NS))
-
-
 def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
     """What is amiss in the bags that hold a topic, for the topics of which something is."""
     odd: dict[str, list[BagFile]] = {}
     for bag in snapshot.odd(TimeWindow.everything()):
         for heading in bag.summary.shape.topics:
             odd.setdefault(heading.topic, []).append(bag)
-    notes = {topic: list(amiss(bags)) for topic, bags in odd.items()}
+    notes = {topic: list(describe_odd(bags)) for topic, bags in odd.items()}
     if snapshot.misdated:
         named = {fault.bag.file: fault for fault in snapshot.misdated}
         held: dict[str, list[str]] = {}
@@ -524,7 +529,7 @@ def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
                 held.setdefault(heading.topic, []).append(fault.bag.file)
         for topic, files in held.items():
             faults = [named[file] for file in dict.fromkeys(files)]
-            notes.setdefault(topic, []).append(misdated(faults))
+            notes.setdefault(topic, []).append(describe_misdated(faults))
     return {topic: tuple(sentences) for topic, sentences in notes.items()}
 
 
@@ -533,20 +538,3 @@ def _note_odd_bags(view: View) -> None:
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in odd_bags(view.snapshot)]
     for sentence in by_remark(odd, _ODD_BAGS):
         view.notes.add(sentence)
-
-
-def _gaps(view: View) -> tuple[results.Gap, ...]:
-    """Holes of more than two splits between one bag's end and the next one's start."""
-    longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
-    return tuple(_holes(view.snapshot, longest))
-
-
-def _holes(snapshot: Snapshot, longest: Ns) -> Iterator[results.Gap]:
-    reach: Ns | None = None
-    left_out = snapshot.dating.misdated
-    for bag in snapshot.bags:
-        if bag.file in left_out:
-            continue
-        if reach is not None and bag.start - reach > longest:
-            yield results.Gap(reach, bag.start)
-        reach = bag.end if reach is None else max(reach, bag.end)

@@ -90,6 +90,11 @@ class TimeWindow:
         """All of time up to and including `end`."""
         return cls(MIN_NS, min(end + 1, MAX_NS))
 
+    @classmethod
+    def around(cls, moment: Ns, reach: Ns) -> TimeWindow:
+        """Returns the window from `reach` before a moment up to and including `reach` after it."""
+        return cls(max(moment - reach, MIN_NS), min(moment + reach + 1, MAX_NS))
+
     def asked(self) -> tuple[Ns, Ns]:
         """The inclusive bounds that were asked for, without the slack of floats of seconds.
 

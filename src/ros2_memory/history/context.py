@@ -1,4 +1,4 @@
-"""What a question is asked of, and what one call carries with it."""
+"""What queries are asked of, `Memory` with its settings, and what one call carries, `Call`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from ros2_memory.index.pace import is_rare
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.catalogue.lookup import DigestCache
@@ -34,9 +33,10 @@ NowOfMemory = Literal["wall", "latest"]
 
 @dataclass(frozen=True, slots=True)
 class QuerySettings:
-    """The knobs of the configuration that questions need.
+    """The part of the configuration that queries need.
 
-    `kept` is how much the recorder keeps; None where nothing is recorded, and nothing deleted.
+    Units are the last word of each name. `kept` is how much the recorder keeps; None where nothing
+    is recorded, and nothing deleted.
     """
 
     position_tolerance_m: float = 0.5
@@ -56,15 +56,15 @@ class QuerySettings:
 
     @property
     def latching(self) -> Latching:
-        """Which topics are latched."""
+        """Returns what decides which topics are latched."""
         return Latching(self.tf_static_topics, self.latched_topics, self.never_latched_topics)
 
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """The robot's past, as far as it lies in bags: closed ones, unless the index includes others.
+    """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
-    Every answer is the same with `recall` and without.
+    `recall` holds digests of the bags. Every answer is the same with it and without.
     """
 
     index: IndexManager
@@ -75,22 +75,26 @@ class Memory:
     recall: DigestCache | None = None
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
-        """The bags that retention neither deletes nor counts, since the recorder did not make them.
+        """Returns the bags that retention neither deletes nor counts: not made by the recorder.
 
-        None where nothing is deleted, or all bags are, or no recorder has listed its own yet.
+        None where nothing is deleted, or bags of any origin are, or no recorder has listed its own.
         """
         kept = self.limits.kept
         return self.index.foreign(snapshot) if kept is not None and kept.keeps_foreign else None
 
     def heartbeat(self) -> Heartbeat | None:
-        """What the recorder of these bags last said; None where none was heard of.
+        """Returns the last heartbeat of the recorder of these bags; None where there is none.
 
-        None of bags of another day, too, which nobody records (`recorder=none`, `data.now=latest`):
-        a heartbeat that was copied with them says nothing of today.
+        None for bags of another day, too (`recorder=none`, `data.now=latest`): a heartbeat that was
+        copied with them is not about today.
         """
         if self.limits.kept is None and self.limits.now == "latest":
             return None
         return self.index.heartbeat()
+
+    def now(self, wall: Ns, latest: Ns | None) -> Ns:
+        """Returns what ages count from: the wall clock, or the newest recorded time."""
+        return wall if self.limits.now == "wall" or latest is None else latest
 
 
 class Stages:
@@ -107,7 +111,7 @@ class Stages:
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Adds what the block takes."""
+        """Adds the time that the block takes."""
         begin = time.perf_counter_ns()
         try:
             yield
@@ -115,7 +119,7 @@ class Stages:
             self.add(stage, time.perf_counter_ns() - begin)
 
     def as_ms(self) -> dict[str, float]:
-        """Milliseconds by stage, for the log event of the call."""
+        """Returns milliseconds by stage, for the log event of the call."""
         return {stage: round(ms_from_ns(spent), 3) for stage, spent in self._spent.items()}
 
 
@@ -134,7 +138,12 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class Latching:
-    """Judges topics.
+    """Decides which topics are latched: their last message holds until the next, however old.
+
+    Durability alone does not: PX4 publishes telemetry of 100 Hz as transient local, and `/rosout`
+    is transient local everywhere. A topic is latched where it is transient local, no log, and has a
+    message every 5 s or less often over its recording (see `is_rare`); so are the topics of static
+    transforms, which some writers record without QoS. The configuration overrides this by topic.
 
     Attributes:
         static_topics: those of static transforms.
@@ -148,30 +157,36 @@ class Latching:
 
     def may_hold(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether some message of a topic may be latched."""
-        said = self._configured(topic)
-        return snapshot.is_held(topic) if said is None else said
+        configured = self._configured(topic)
+        return snapshot.is_held(topic) if configured is None else configured
 
     def holds(self, snapshot: Snapshot, found: StoredMessage) -> bool:
         """Whether a message is latched, by the pace of its topic in its own recording."""
         channel = found.record.channel
-        said = self._configured(channel.topic)
-        if said is not None or not snapshot.is_held(channel.topic):
-            return bool(said)
+        configured = self._configured(channel.topic)
+        if configured is not None or not snapshot.is_held(channel.topic):
+            return bool(configured)
         if is_carried(found.bag.path):
             origin = origin_of(channel)
             return origin is None or not origin.often
         return is_rare(snapshot.pace(channel.topic, found.bag.recording))
 
     def is_latched(self, snapshot: Snapshot, topic: str) -> bool:
-        """Whether a topic is latched, by its pace in the newest recording that holds it."""
-        said = self._configured(topic)
-        if said is not None or not snapshot.is_held(topic):
-            return bool(said)
-        newest = _newest(snapshot, topic)
+        """Whether a topic is latched, by its pace in the newest recording that holds it.
+
+        Carried messages count as a recording only where there is no other.
+        """
+        configured = self._configured(topic)
+        if configured is not None or not snapshot.is_held(topic):
+            return bool(configured)
+        last = {path: span[1] for path, span in snapshot.recordings(topic).items()}
+        newest = max(
+            last, key=lambda path: (path.name != CARRY_FOLDER, last[path], str(path)), default=None
+        )
         return newest is not None and is_rare(snapshot.pace(topic, newest))
 
     def _configured(self, topic: str) -> bool | None:
-        """What the configuration says of a topic; None where it says nothing."""
+        """Returns what the configuration has of a topic; None where it has nothing."""
         if any(match_topics((topic,), glob) for glob in self.exclude):
             return False
         if topic in self.static_topics or any(
@@ -179,13 +194,3 @@ class Latching:
         ):
             return True
         return None
-
-
-def _newest(snapshot: Snapshot, topic: str) -> Path | None:
-    """The recording with the newest message of a topic; that of carried ones where no other is."""
-    spans = {
-        recording: last
-        for recording, (_, last) in snapshot.recordings(topic).items()
-        if recording.name != CARRY_FOLDER
-    } or {recording: last for recording, (_, last) in snapshot.recordings(topic).items()}
-    return max(spans, key=lambda each: (spans[each], str(each)), default=None)

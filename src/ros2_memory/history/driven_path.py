@@ -14,9 +14,9 @@ from ros2_memory.analysis.odometry import TimedPosition, is_place
 from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import counted
 from ros2_memory.history.bag_groups import DigestKind, Fold
-from ros2_memory.history.no_data import topics_with, undecodable, undecodable_in
+from ros2_memory.history.no_data import describe_lack, undecodable_in
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -85,7 +85,7 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None
     if failures:
         error = failures[0]
         if span is None:
-            raise undecodable_in(view, window, error.topic, error.type_name, error) from error
+            raise undecodable_in(view, window, error) from error
         view.notes.complete = False
         count = len(failures)
         view.notes.add(f"poses left out, since they cannot be decoded: {count} ({error.reason})")
@@ -147,7 +147,7 @@ def add_poses(
                 failures.append(sight)
                 continue
             if sight.pose is None:
-                raise InvalidArgumentsError(carries_no(view, "position", found))
+                raise InvalidArgumentsError(describe_lack(view, "position", found))
             add(found.time, sight.pose, sight.speed_mps)
             first = found.time if first is None else first
             last = found.time
@@ -189,28 +189,3 @@ def leave_out(view: View, error: UndecodableError) -> None:
     """Says that there are poses which cannot be decoded, and why."""
     view.notes.complete = False
     view.notes.add(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")
-
-
-def decoded(view: View, found: StoredMessage) -> object:
-    """The message that was found.
-
-    Raises:
-        NoDataError: it cannot be decoded.
-    """
-    try:
-        return view.memory.reader.decode(found.record)
-    except UndecodableError as error:
-        raise undecodable(error.topic, error.type_name, error) from error
-
-
-def carries_no(view: View, what: str, found: StoredMessage) -> str:
-    """The sentence for a topic that is asked for what its type does not have."""
-    channel = found.record.channel
-    has = f"carries no {what}"
-    if "geodetic" in view.memory.extractor.kinds_of(channel.type):
-        has = f"carries latitude and longitude in degrees, and no {what} in metres"
-    those = topics_with(view, what)
-    hint = f"such as {listed(those)}" if those else "such as one of type nav_msgs/msg/Odometry"
-    return (
-        f"topic: {channel.topic} is a {channel.type}, which {has}; give a topic that does, {hint}"
-    )

@@ -1,4 +1,4 @@
-"""Why there is nothing to answer with, and what to ask instead."""
+"""Errors of questions that have no answer: why there is none, and what to ask instead."""
 
 from __future__ import annotations
 
@@ -14,31 +14,25 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
     unix_from_ns,
-    unix_rounded_up,
 )
-from ros2_memory.history.coverage import may_be_written, note_unread
+from ros2_memory.history.coverage import may_be_written, note_unread, unix_text
 
 if TYPE_CHECKING:
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-
 
 ON_DISK_S: Final = 3
 """A message that the recorder received longer ago is on disk, as small as its chunks are."""
 
 
 def seconds(duration: Ns) -> str:
-    """A duration for a sentence: to three digits, and never less exact than to the second."""
+    """Returns a duration for a sentence: three digits, and never less exact than to the second."""
     length = unix_from_ns(duration)
     return f"{length:.0f} s" if length >= 100 else f"{length:.3g} s"
 
 
-def moment(at: Ns) -> str:
-    """A moment for a sentence: the Unix seconds that find it again."""
-    return f"{unix_rounded_up(at):.6f}"
-
-
 def resolve_topic(view: View, name: str) -> str:
-    """The recorded topic that a question means; a missing or extra leading slash is forgiven.
+    """Returns the recorded topic of a name; a missing or extra leading slash is accepted.
 
     Raises:
         NoDataError: `topic_not_recorded` with the nearest names, or `empty_memory`.
@@ -53,7 +47,7 @@ def resolve_topic(view: View, name: str) -> str:
 def resolve_pose_topic(
     view: View, name: str | None = None, what: str = "position", *, degrees: bool = False
 ) -> str:
-    """The recorded topic that a question about the robot's motion means.
+    """Returns the recorded topic for a question about the robot's motion.
 
     Args:
         view: what is recorded.
@@ -62,7 +56,7 @@ def resolve_pose_topic(
         degrees: whether the latitude and longitude of a satellite receiver answer too.
 
     Raises:
-        NoDataError: as `resolve_topic`; where the configured topic is not recorded the sentence
+        NoDataError: as for `resolve_topic`; where the configured topic is not recorded the sentence
             names those that carry poses.
     """
     if name is not None:
@@ -73,28 +67,29 @@ def resolve_pose_topic(
     except NoDataError as error:
         if error.reason is not NoDataReason.TOPIC_NOT_RECORDED:
             raise
-        those = topics_with(view, what)
-        if not those and what == "position" and (fixes := topics_with(view, "geodetic")):
-            told = (
-                f"no topic {configured} is recorded, which data.pose_topic names, nor another with "
-                f"poses in metres; latitude and longitude are on {listed(fixes)}"
+        detail = f"no topic {configured} is recorded, which data.pose_topic names"
+        topics = topics_with(view, what)
+        if topics:
+            those = {"position": "poses", "velocity": "velocities"}[what]
+            which = topics[0].partition(" ")[0] if len(topics) == 1 else "to one of them"
+            detail += (
+                f"; {those} are on {listed(topics)}: set data.pose_topic"
+                f"{'=' if len(topics) == 1 else ' '}{which}, "
+                "or give topic where the tool takes it"
             )
+        elif what == "position" and (fixes := topics_with(view, "geodetic")):
             advice = "give topic" if degrees else "get_position_at answers them by topic"
-            raise NoDataError(error.reason, f"{told}: {advice}", error.notes) from error
-        if not those:
+            detail += (
+                ", nor another with poses in metres; latitude and longitude are on "
+                f"{listed(fixes)}: {advice}"
+            )
+        else:
             raise
-        what = {"position": "poses", "velocity": "velocities"}[what]
-        which = those[0].partition(" ")[0] if len(those) == 1 else "to one of them"
-        told = (
-            f"no topic {configured} is recorded, which data.pose_topic names; {what} are on "
-            f"{listed(those)}: set data.pose_topic{'=' if len(those) == 1 else ' '}{which}, "
-            "or give topic where the tool takes it"
-        )
-        raise NoDataError(error.reason, told, error.notes) from error
+        raise NoDataError(error.reason, detail, error.notes) from error
 
 
 def topics_with(view: View, what: str) -> list[str]:
-    """The recorded topics of types that carry a `position`, `velocity` or `geodetic` place.
+    """Returns the recorded topics of types that carry `position`, `velocity` or `geodetic`.
 
     Each with its type behind it. What types that are not in the schema map carry is not known.
     """
@@ -108,7 +103,7 @@ def topics_with(view: View, what: str) -> list[str]:
 
 
 def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
-    """The recorded topics that a name or glob (`/vision/*/scene_objects`) means.
+    """Returns the recorded topics that match a name or glob (`/vision/*/scene_objects`).
 
     Raises:
         NoDataError: none does.
@@ -122,7 +117,7 @@ def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
 
 
 def require_bags(view: View) -> None:
-    """Refuses a question to a memory that holds nothing.
+    """Checks that the memory holds something.
 
     Raises:
         NoDataError: `empty_memory`, or `not_closed_yet` where the first split is being written.
@@ -134,7 +129,7 @@ def require_bags(view: View) -> None:
         raise NoDataError(
             NoDataReason.NOT_CLOSED_YET,
             f"nothing of the first split is on disk yet; ask again in {ON_DISK_S} s"
-            if _answering(view)
+            if _active_answers(view)
             else "the first split is still being written; ask again when it closes, in "
             f"{view.memory.limits.split_duration_s:g} s or less",
         )
@@ -149,20 +144,24 @@ def require_bags(view: View) -> None:
 
 
 def not_recorded(view: View, name: str) -> NoDataError:
-    """No message of such a topic lies in any closed bag."""
+    """Returns the error for a topic of which no closed bag holds a message.
+
+    Raises:
+        NoDataError: the memory holds nothing at all.
+    """
     require_bags(view)
     snapshot = view.snapshot
     if name in snapshot.silent_topics or f"/{name}" in snapshot.silent_topics:
-        told = f"{name} is declared in the bags, but not one message of it was recorded"
+        detail = f"{name} is declared in the bags, but not one message of it was recorded"
     else:
-        told = f"no topic {name} is recorded"
+        detail = f"no topic {name} is recorded"
     close = get_close_matches(name, snapshot.topics(), n=5, cutoff=0.6)
     if not close:
         stem = name.rstrip("/").rpartition("/")[2].strip("*")
         close = [topic for topic in snapshot.topics() if stem and stem in topic][:5]
     hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
     note_unread(view, TimeWindow.everything(), nothing=True)
-    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{told}; {hint}", view.notes.sentences())
+    return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{detail}; {hint}", view.notes.sentences())
 
 
 def no_data_at(
@@ -172,55 +171,62 @@ def no_data_at(
     tolerance: Ns | None,
     around: Ns | None = None,
 ) -> NoDataError:
-    """No message of these topics at or shortly before a moment; with `around`, nor shortly after.
+    """Returns the error for no message of these topics at a moment or within a tolerance before.
 
-    The sentence names the nearest older and newer message with their distances, and what to do.
+    With `around`, neither so long after it. The sentence names the nearest older and newer message
+    with their distances, and what to do.
     """
-    older = view.stream.first(topics, TimeWindow.until(at), newest_first=True)
-    newer = view.stream.first(topics, TimeWindow(at + 1, MAX_NS))
-    names = " or ".join(topics)
+    older, newer = _neighbours(view, topics, at, at + 1)
     when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
     if around is not None:
         when = f"within {seconds(around)} of"
-    told = [f"no message of {names} {when} {moment(at)}"]
+    detail = [f"no message of {' or '.join(topics)} {when} {unix_text(at)}"]
     if older:
-        told.append(
-            f"the nearest older one is {seconds(at - older.time)} before it, at "
-            f"{moment(older.time)}"
-        )
+        ago = seconds(at - older.time)
+        detail.append(f"the nearest older one is {ago} before it, at {unix_text(older.time)}")
     if newer:
-        told.append(
-            f"the nearest newer one is {seconds(newer.time - at)} after it, at {moment(newer.time)}"
-        )
+        later = seconds(newer.time - at)
+        detail.append(f"the nearest newer one is {later} after it, at {unix_text(newer.time)}")
     before = tolerance if around is None else around
-    start = TimeWindow.everything().start if before is None else max(at - before, MIN_NS)
+    start = MIN_NS if before is None else max(at - before, MIN_NS)
     window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
     reason = between(view, window) if older and newer else beyond(view, at)
-    acceptable = older.time if older and tolerance is not None else None
-    told.append(_advice(view, reason, at, acceptable))
+    detail += _advice(view, reason)
+    if older and tolerance is not None:
+        enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
+        detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     note_unread(view, window, nothing=True)
-    return NoDataError(reason, "; ".join(told), view.notes.sentences())
+    return NoDataError(reason, "; ".join(detail), view.notes.sentences())
 
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
-    """No message of these topics in a window."""
-    older = view.stream.first(topics, TimeWindow.until(window.start - 1), newest_first=True)
-    newer = view.stream.first(topics, TimeWindow(window.stop, MAX_NS))
-    names = " or ".join(topics)
+    """Returns the error for no message of these topics in a window."""
+    older, newer = _neighbours(view, topics, window.start - 1, window.stop)
     start, end = window.asked()
-    told = [f"no message of {names} between {moment(start)} and {moment(end)}"]
+    names = " or ".join(topics)
+    detail = [f"no message of {names} between {unix_text(start)} and {unix_text(end)}"]
     if older:
-        told.append(f"the last one before is at {moment(older.time)}")
+        detail.append(f"the last one before is at {unix_text(older.time)}")
     if newer:
-        told.append(f"the first one after is at {moment(newer.time)}")
+        detail.append(f"the first one after is at {unix_text(newer.time)}")
     reason = between(view, window) if older and newer else beyond(view, end)
-    told.append(_advice(view, reason, window.start, None))
+    detail += _advice(view, reason)
     note_unread(view, window, nothing=True)
-    return NoDataError(reason, "; ".join(told), view.notes.sentences())
+    return NoDataError(reason, "; ".join(detail), view.notes.sentences())
+
+
+def _neighbours(
+    view: View, topics: tuple[str, ...], until: Ns, since: Ns
+) -> tuple[StoredMessage | None, StoredMessage | None]:
+    """Returns the last message up to one log time, and the first from another one on."""
+    return (
+        view.stream.first(topics, TimeWindow.until(until), newest_first=True),
+        view.stream.first(topics, TimeWindow(since, MAX_NS)),
+    )
 
 
 def between(view: View, window: TimeWindow) -> NoDataReason:
-    """Why a window with something on either of its sides has no answer.
+    """Returns why a window with messages on both sides has none.
 
     While one recording takes over from another, the older one may not be on disk as far as the
     newer one begins: what lies between is no gap.
@@ -230,49 +236,70 @@ def between(view: View, window: TimeWindow) -> NoDataReason:
 
 
 def beyond(view: View, at: Ns) -> NoDataReason:
-    """Why a moment with nothing on one of its sides has no answer."""
+    """Returns why a moment with no message on one of its sides has no answer."""
     latest = view.snapshot.latest
     if latest is not None and at > latest and view.snapshot.active:
         return NoDataReason.NOT_CLOSED_YET
     return NoDataReason.OUTSIDE_RANGE
 
 
-def undecodable(topic: str, type_name: str, error: UndecodableError) -> NoDataError:
-    """Messages are there, but mean nothing to us."""
+def undecodable(error: UndecodableError) -> NoDataError:
+    """Returns the error for messages that are there, and that cannot be decoded."""
     return NoDataError(
         NoDataReason.UNDECODABLE,
-        f"messages of {topic} ({type_name}) are recorded but cannot be decoded: {error.reason}",
+        f"messages of {error.topic} ({error.type_name}) are recorded but cannot be decoded: "
+        f"{error.reason}",
     )
 
 
-def undecodable_in(
-    view: View, window: TimeWindow, topic: str, type_name: str, error: UndecodableError
-) -> NoDataError:
-    """As `undecodable`, of all that a window holds, with the notes on what else was not read."""
+def undecodable_in(view: View, window: TimeWindow, error: UndecodableError) -> NoDataError:
+    """Returns the same for all messages of a window, with notes on what else was not read."""
     note_unread(view, window, nothing=True)
-    told = undecodable(topic, type_name, error)
-    return NoDataError(told.reason, told.detail, view.notes.sentences())
+    failure = undecodable(error)
+    return NoDataError(failure.reason, failure.detail, view.notes.sentences())
 
 
-def _answering(view: View) -> bool:
-    """Whether what is being written answers, as far as it is on disk."""
+def decode(view: View, found: StoredMessage) -> object:
+    """Returns the decoded message.
+
+    Raises:
+        NoDataError: it cannot be decoded.
+    """
+    try:
+        return view.memory.reader.decode(found.record)
+    except UndecodableError as error:
+        raise undecodable(error) from error
+
+
+def describe_lack(view: View, what: str, found: StoredMessage) -> str:
+    """Returns the sentence on a topic whose type does not carry the `what` that was asked for."""
+    channel = found.record.channel
+    has = f"carries no {what}"
+    if "geodetic" in view.memory.extractor.kinds_of(channel.type):
+        has = f"carries latitude and longitude in degrees, and no {what} in metres"
+    topics = topics_with(view, what)
+    hint = f"such as {listed(topics)}" if topics else "such as one of type nav_msgs/msg/Odometry"
+    return (
+        f"topic: {channel.topic} is a {channel.type}, which {has}; give a topic that does, {hint}"
+    )
+
+
+def _active_answers(view: View) -> bool:
+    """Whether files that are being written answer, as far as they are on disk."""
     return all(aside.answers for aside in view.snapshot.active)
 
 
-def _advice(view: View, reason: NoDataReason, at: Ns, older: Ns | None) -> str:
+def _advice(view: View, reason: NoDataReason) -> list[str]:
     snapshot = view.snapshot
     earliest, latest = snapshot.earliest, snapshot.latest
     advice = []
     if earliest is not None and latest is not None:
-        advice.append(f"the memory reaches from {moment(earliest)} to {moment(latest)}")
+        advice.append(f"the memory reaches from {unix_text(earliest)} to {unix_text(latest)}")
     if reason is NoDataReason.NOT_CLOSED_YET:
         advice.append(
             f"ask about an earlier moment, or again in {ON_DISK_S} s"
-            if _answering(view)
+            if _active_answers(view)
             else "the split being written does not answer until it closes: ask about an earlier "
             f"moment, or again in {view.memory.limits.split_duration_s:g} s"
         )
-    if older is not None:
-        enough = math.ceil(unix_from_ns(at - older) * 1000) / 1000
-        advice.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
-    return "; ".join(advice)
+    return advice

@@ -11,9 +11,9 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, Un
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.history.coverage import is_searched, note_unread
+from ros2_memory.history.coverage import is_covered, note_unread, unix_text
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.no_data import matching_topics, moment, undecodable_in
+from ros2_memory.history.no_data import matching_topics, undecodable_in
 from ros2_memory.history.notes import Note
 
 if TYPE_CHECKING:
@@ -90,10 +90,10 @@ class Search:
             NoDataError: nothing was found, since no message could be decoded.
         """
         if not found and self._failures and not self._tested and not candidates.ruled_out:
-            (topic, type_name), (failure, _) = next(iter(self._failures.items()))
+            failure, _ = next(iter(self._failures.values()))
             if len(self._failures) > 1:
                 self.note_undecodable()
-            raise undecodable_in(self._view, window, topic, type_name, failure)
+            raise undecodable_in(self._view, window, failure)
         self.note_undecodable()
         if not found:
             self._require_testable()
@@ -170,9 +170,9 @@ class Search:
     def _out_of_time(self, back_to: Ns) -> QueryTimeoutError:
         budget_s = self._view.call.deadline.budget_s
         return QueryTimeoutError(
-            f"no match back to {moment(back_to)}, and {budget_s:g} s are over; "
+            f"no match back to {unix_text(back_to)}, and {budget_s:g} s are over; "
             f"{self._view.bags.backfill_progress()}to go on from there, ask again with "
-            f"before={moment(back_to)}",
+            f"before={unix_text(back_to)}",
             searched_back_to=back_to,
         )
 
@@ -183,7 +183,7 @@ def unsearched(view: View, window: TimeWindow | None = None) -> tuple[str, ...]:
     Empty where it was.
     """
     searched = window or TimeWindow.everything()
-    if is_searched(view, searched):
+    if is_covered(view, searched):
         return ()
     note_unread(view, searched, nothing=True)
     return view.notes.sentences()

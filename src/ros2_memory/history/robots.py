@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.duplicates import COPY_HORIZON_NS, copy_key
 from ros2_memory.history.transforms import sessions_of
 
@@ -57,8 +57,7 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
 
 def note_robots_near(view: View, found: StoredMessage) -> None:
     """As `note_robots`, of the time of a message."""
-    start, stop = max(found.time - _NEAR_NS, MIN_NS), min(found.time + _NEAR_NS + 1, MAX_NS)
-    note_robots(view, found.record.channel.topic, TimeWindow(start, stop))
+    note_robots(view, found.record.channel.topic, TimeWindow.around(found.time, _NEAR_NS))
 
 
 def _at_once(
@@ -89,8 +88,7 @@ def _are_apart(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow
 
 def _stands_in(view: View, topic: str, recording: Path, found: StoredMessage) -> bool:
     """Whether a recording holds a copy of a message."""
-    start, stop = found.time - COPY_HORIZON_NS, found.time + COPY_HORIZON_NS + 1
-    near = TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
+    near = TimeWindow.around(found.time, COPY_HORIZON_NS)
     key = copy_key(found.record)
     return any(copy_key(each.record) == key for each in _messages(view, topic, recording, near))
 

@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import CARRY_FOLDER
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -180,8 +180,7 @@ class Sessions:
 
     def _folders_around(self, moment: Ns) -> set[str]:
         """Where the recordings lie that went on at a moment."""
-        start, stop = max(moment - _AROUND_NS, MIN_NS), min(moment + _AROUND_NS + 1, MAX_NS)
-        bags = self._view.snapshot.overlapping(TimeWindow(start, stop))
+        bags = self._view.snapshot.overlapping(TimeWindow.around(moment, _AROUND_NS))
         return {self.folder(bag.recording) for bag in bags} - {self._carried}
 
     def _of(self, folder: str) -> Session:

@@ -35,11 +35,11 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     Ns,
 )
+from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import united
 from ros2_memory.history.no_data import (
     between,
     beyond,
-    moment,
     no_data_at,
     not_recorded,
     seconds,
@@ -158,7 +158,7 @@ def _transform_in(view: View, among: Session, frames: tuple[str, str], at: Ns) -
     limits = view.memory.limits
     static = _static_at(view, at, among)
     for half_width in _HALF_WIDTHS:
-        window = _around(at, half_width)
+        window = TimeWindow.around(at, half_width)
         dynamic = list(_transforms(view, limits.tf_topics, window, among, static=False))
         try:
             found = _lookup(static, dynamic, limits.tf_clock, frames, at)
@@ -355,10 +355,10 @@ def _explained(
     if failure.reason in _OF_ALL_TIMES:
         then = _of_then(failure, at)
         unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
-        if not (unknown and connected(view, frames, _around(at, _LONGER_NS), among)):
+        if not (unknown and connected(view, frames, TimeWindow.around(at, _LONGER_NS), among)):
             return then
         told = f"{then.detail}; within {seconds(_LONGER_NS)} the two were connected: ask about then"
-        return NoDataError(between(view, _around(at, TF_CACHE_NS)), told)
+        return NoDataError(between(view, TimeWindow.around(at, TF_CACHE_NS)), told)
     if failure.reason not in {NoDataReason.OUTSIDE_RANGE, NoDataReason.GAP}:
         return failure
     inside = topics and all(
@@ -368,7 +368,7 @@ def _explained(
             (TimeWindow(at + 1, MAX_NS), False),
         )
     )
-    reason = between(view, _around(at, TF_CACHE_NS)) if inside else beyond(view, at)
+    reason = between(view, TimeWindow.around(at, TF_CACHE_NS)) if inside else beyond(view, at)
     return NoDataError(reason, failure.detail)
 
 
@@ -405,7 +405,7 @@ def _of_stamps(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataErr
         return NoDataError(
             NoDataReason.OUTSIDE_RANGE,
             f"no moving transform has a header stamp within {seconds(TF_CACHE_NS)} of "
-            f"{moment(at)}; data.tf_clock has them looked up by header stamp, not by log time",
+            f"{unix_text(at)}; data.tf_clock has them looked up by header stamp, not by log time",
         )
     return _of_then(failure, at) if failure.reason in _OF_ALL_TIMES else failure
 
@@ -414,7 +414,7 @@ def _of_then(failure: NoDataError, at: Ns) -> NoDataError:
     """A failure that sounds as if it held for all times, said of the time that was looked at."""
     return NoDataError(
         failure.reason,
-        f"within {seconds(TF_CACHE_NS)} of {moment(at)}: {failure.detail}; "
+        f"within {seconds(TF_CACHE_NS)} of {unix_text(at)}: {failure.detail}; "
         "list_frames names the frames of all times",
     )
 
@@ -453,10 +453,6 @@ def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]
         )
         for transform in _decoded(view, found, static=False)
     ]
-
-
-def _around(at: Ns, half_width: Ns) -> TimeWindow:
-    return TimeWindow(max(at - half_width, MIN_NS), min(at + half_width + 1, MAX_NS))
 
 
 def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:

@@ -45,7 +45,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_groups import DigestKind, Fold
-from ros2_memory.history.coverage import note_edges, note_unread
+from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
 from ros2_memory.history.driven_path import add_poses, driven_path, length_notes
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.notes import Note
@@ -147,7 +147,10 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
         _thing(each, goes_on=each.last == there_still.get(each.label))
         for each in things.longest(MOST_EVENTS)
     ]
-    events += _gaps(view, window)
+    events += [
+        Event("gap", begin, until, "nothing was recorded")
+        for begin, until in recording_gaps(view, window)
+    ]
     note_unread(view, window)
     note_edges(view, window)
     counts = Counter(each.kind for each in events)
@@ -166,7 +169,7 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     return Recap(
         start=start,
         end=end,
-        now=memory.clock.now() if memory.limits.now == "wall" or latest is None else latest,
+        now=memory.now(memory.clock.now(), latest),
         distance_m=None if known is None else known.distance_m,
         max_speed=None if known is None else known.max_speed,
         stood=stood,
@@ -232,25 +235,6 @@ def _error(fault: ReportedError) -> Event:
 def _thing(presence: VisibleInterval, *, goes_on: bool) -> Event:
     text = f"{presence.label} in view"
     return Event("thing", presence.first, presence.last, text, goes_on)
-
-
-def _gaps(view: View, window: TimeWindow) -> Iterator[Event]:
-    """Where nothing was recorded for more than two splits, inside what the memory spans."""
-    longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
-    earliest, latest = view.snapshot.earliest, view.snapshot.latest
-    if earliest is None or latest is None:
-        return
-    reach = max(window.start, earliest)
-    misdated = view.snapshot.dating.misdated
-    for bag in view.snapshot.overlapping(window):
-        if bag.file in misdated:
-            continue
-        if bag.start - reach > longest:
-            yield Event("gap", reach, bag.start, "nothing was recorded")
-        reach = max(reach, bag.end)
-    end = min(window.stop, latest)
-    if end - reach > longest:
-        yield Event("gap", reach, end, "nothing was recorded")
 
 
 def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -> list[Event]:

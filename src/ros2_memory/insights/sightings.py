@@ -30,8 +30,8 @@ from ros2_memory.core.timebase import (
     START_SLACK_NS,
     Ns,
 )
-from ros2_memory.history.coverage import note_unread
-from ros2_memory.history.no_data import moment, require_bags
+from ros2_memory.history.coverage import note_unread, unix_text
+from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.reverse_search import Search
 from ros2_memory.history.time_arguments import TimeRange, clamped, ns_argument
 from ros2_memory.history.transforms import own_holdings, transform_at
@@ -101,7 +101,7 @@ def find_matches(
     view = View(memory, call, min(_window(span, wall).stop, wall))
     require_bags(view)
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
-    now = wall if memory.limits.now == "wall" or latest is None else latest
+    now = memory.now(wall, latest)
     window = clamped(view, _window(span, now))
     runs = _Runs(limit, oldest_first=oldest_first)
     _gather(view, topic, condition, window, runs)
@@ -184,7 +184,7 @@ def _gather(
         runs.cut = True
         view.notes.complete = False
         view.notes.add(
-            f"the search ran out of time at {moment(before)}: to go on, ask with end there"
+            f"the search ran out of time at {unix_text(before)}: to go on, ask with end there"
         )
         return
     for topic in runs.under_way():

@@ -36,7 +36,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     view.bags.track_all_sources()
     snapshot, heartbeat = view.snapshot, memory.heartbeat()
     latest = snapshot.dating.latest
-    now = wall if memory.limits.now == "wall" or latest is None else latest
+    now = memory.now(wall, latest)
     return Status(
         now=now,
         earliest=snapshot.dating.earliest,

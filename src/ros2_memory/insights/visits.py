@@ -28,17 +28,16 @@ from ros2_memory.core.geometry import off_segment
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
 from ros2_memory.history.bag_groups import StoredDigests, groups_of
-from ros2_memory.history.coverage import note_unread
+from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.driven_path import (
     POSES,
     add_poses,
-    carries_no,
     driven_path,
     leave_out,
     stops,
 )
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.no_data import moment, require_bags, resolve_pose_topic
+from ros2_memory.history.no_data import describe_lack, require_bags, resolve_pose_topic
 from ros2_memory.history.reverse_search import CandidateBags
 from ros2_memory.history.view import View
 from ros2_memory.insights.map_placement import map_placement
@@ -96,7 +95,7 @@ def visits(
     place = map_placement(view, _pose_frame(view, topic), topic, frame_id)
     looking = _Looking(view, topic, place, (x, y, radius))
     latest, newest = view.snapshot.latest, looking.newest_time
-    now = wall if memory.limits.now == "wall" or latest is None else latest
+    now = memory.now(wall, latest)
     stale = _SPLITS * ns_from_unix(memory.limits.split_duration_s)
     known = newest is not None and newest >= now - stale
     found, total = looking.newest(limit)
@@ -115,8 +114,8 @@ def visits(
     )
     if newest is not None and any(visit.departed == newest for visit in told):
         view.notes.add(
-            f"the newest pose, of {moment(newest)}, is too old to know whether the robot is there "
-            "now: departed is that pose"
+            f"the newest pose, of {unix_text(newest)}, is too old to know whether the robot is "
+            "there now: departed is that pose"
         )
     if any(visit.restarts for visit in told):
         view.notes.add(
@@ -171,7 +170,7 @@ def _frame_of(view: View, found: StoredMessage) -> str:
     message = view.memory.reader.decode(found.record)
     pose = view.memory.extractor.pose(message, found.record.channel.type)
     if pose is None:
-        raise InvalidArgumentsError(carries_no(view, "position", found))
+        raise InvalidArgumentsError(describe_lack(view, "position", found))
     return pose.frame_id
 
 
@@ -216,9 +215,9 @@ class _Looking:
                 raise
             self._view.notes.complete = False
             if self._counting is None:
-                self._view.notes.add(f"the search ran out of time at {moment(before)}")
+                self._view.notes.add(f"the search ran out of time at {unix_text(before)}")
             self._view.notes.add(
-                f"total counts the visits back to {moment(before)}: there may be more"
+                f"total counts the visits back to {unix_text(before)}: there may be more"
             )
         return [(stay, self._closest(stay)) for stay in stays.all[:limit]], len(stays.all)
 
@@ -246,7 +245,7 @@ class _Looking:
             except QueryTimeoutError:
                 self._view.notes.complete = False
                 self._view.notes.add(
-                    f"closest_m of the visit until {moment(stay.departed)} is not the least: "
+                    f"closest_m of the visit until {unix_text(stay.departed)} is not the least: "
                     "the time was over before all of its poses were read"
                 )
                 return min(approaches, default=bound)
