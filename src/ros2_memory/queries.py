@@ -51,7 +51,7 @@ from ros2_memory.history.no_data import (
     resolve_topic,
     seconds,
 )
-from ros2_memory.history.reverse_search import last_match, unsearched
+from ros2_memory.history.reverse_search import ReverseSearch, not_covered
 from ros2_memory.history.robots import note_robots, note_robots_near
 from ros2_memory.history.time_arguments import (
     AtTime,
@@ -240,9 +240,9 @@ def find_last_match(
     now = memory.clock.now()
     view = View(memory, call, now)
     until = _before(before_s)
-    found = last_match(view, topic, condition, until)
+    found = ReverseSearch(view, topic, condition).newest(until)
     if found is None:
-        return results.Match(None, unsearched(view, TimeWindow(MIN_NS, until)))
+        return results.Match(None, not_covered(view, TimeWindow(MIN_NS, until)))
     note_robots_near(view, found)
     note_unread(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
@@ -273,9 +273,9 @@ def value_when(
     now, until = memory.clock.now(), _before(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
-    found = last_match(view, condition_topic, condition, until)
+    found = ReverseSearch(view, condition_topic, condition).newest(until)
     if found is None:
-        return results.ValueWhen(None, notes=unsearched(view, TimeWindow(MIN_NS, until)))
+        return results.ValueWhen(None, notes=not_covered(view, TimeWindow(MIN_NS, until)))
     note_unread(view, _searched(view, found, until, now), search=True)
     note_robots_near(view, found)
     matched = _value(view, found, (), None)

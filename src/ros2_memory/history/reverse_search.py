@@ -1,4 +1,9 @@
-"""Searching the history backwards for the last time that a condition held."""
+"""Search backwards in time for the last message that meets a condition.
+
+The catalogue's digests rule out bags that cannot contain a match. A match that counts is in a bag
+that is not ruled out, so only the time of such bags is searched. Inside of it everything that can
+decide which messages count is read, as without a catalogue: the answer is the same.
+"""
 
 from __future__ import annotations
 
@@ -29,21 +34,11 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment
 
 
-def last_match(view: View, pattern: str, condition: Condition, until: Ns) -> StoredMessage | None:
-    """The newest match before a moment; what could not be tested is noted.
-
-    Raises:
-        InvalidArgumentsError: no value of the topics can meet the condition.
-        QueryTimeoutError: the call's time is over; says how far back was searched.
-    """
-    return Search(view, pattern, condition).newest(until)
-
-
-class Search:
-    """One condition on the topics of a name or glob.
+class ReverseSearch:
+    """A search for one condition on the topics of a name or glob.
 
     Attributes:
-        topics: the recorded topics that are meant.
+        topics: the recorded topics that match.
 
     Raises:
         NoDataError: there is no such topic.
@@ -54,42 +49,56 @@ class Search:
         self._condition = condition
         self.topics = matching_topics(view, pattern)
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
-        self._tested = False
-        self._back_to: Ns | None = None
+        self._has_decoded = False
 
     def candidates(self, until: Ns) -> CandidateBags:
-        """The bags that may hold a match before a moment."""
+        """Returns the bags that can contain a match before a moment."""
         return CandidateBags(self._view, self.topics, self._condition, until)
 
     def newest(self, until: Ns) -> StoredMessage | None:
-        """The newest match before a moment, as `last_match` gives it."""
+        """Returns the newest match before a moment; notes say what could not be tested.
+
+        Raises:
+            InvalidArgumentsError: no value of the topics can meet the condition.
+            NoDataError: no message could be decoded.
+            QueryTimeoutError: the call's time is over; says how far back was searched.
+        """
         candidates = self.candidates(until)
-        said = self._view.notes.keys()
+        noted_before = self._view.notes.keys()
+        searched_to: Ns | None = None
         try:
-            for stretch in candidates.stretches():
-                for found in self._messages(stretch):
+            for part in candidates.windows():
+                for found in self._messages(part):
                     if self.matches(found):
-                        self._view.notes.retract_before(found.time, said)
+                        # What lies before the match was read for nothing, or not: that depends on
+                        # what the catalogue knows, so the reply must not.
+                        self._view.notes.retract_before(found.time, noted_before)
                         self._view.stream.find_first_copy(found)
                         self.note_undecodable()
                         return found
-                    self._back_to = found.time
-                self._back_to = stretch.window.start
+                    searched_to = found.time
+                searched_to = part.window.start
         except QueryTimeoutError as error:
-            if self._back_to is None:
+            if searched_to is None:
                 raise
-            raise self._out_of_time(self._back_to) from error
+            back_to, budget_s = unix_text(searched_to), self._view.call.deadline.budget_s
+            raise QueryTimeoutError(
+                f"no match back to {back_to}, and {budget_s:g} s are over; "
+                f"{self._view.bags.backfill_progress()}to go on from there, ask again with "
+                f"before={back_to}",
+                searched_back_to=searched_to,
+            ) from error
         self.close(candidates, TimeWindow(MIN_NS, until), found=False)
         return None
 
     def close(self, candidates: CandidateBags, window: TimeWindow, *, found: bool) -> None:
-        """Ends a search that looked everywhere in a window: notes what could not be tested.
+        """Ends a search that looked everywhere in a window, and notes what could not be tested.
 
         Raises:
             InvalidArgumentsError: nothing was found, and no value of the topics can be a match.
             NoDataError: nothing was found, since no message could be decoded.
         """
-        if not found and self._failures and not self._tested and not candidates.ruled_out:
+        if not found and self._failures and not self._has_decoded and not candidates.ruled_out:
             failure, _ = next(iter(self._failures.values()))
             if len(self._failures) > 1:
                 self.note_undecodable()
@@ -99,46 +108,43 @@ class Search:
             self._require_testable()
 
     def _require_testable(self) -> None:
-        """Refuses to call "never" what no value of these topics can meet.
+        """Checks that some value of the topics can meet the condition: else "never" is no answer.
 
         Raises:
             InvalidArgumentsError: the newest value of none of the topics has what is tested.
         """
         if not can_be_untestable(self._condition):
             return
-        first: str | None = None
+        refusals = []
         for topic in self.topics:
-            reason = self._refusal(topic)
-            if reason is None:
+            refusal = self._refusal(topic)
+            if refusal is None:
                 return
-            first = first or reason
-        raise InvalidArgumentsError(f"{self.topics[0]}: {first}")
+            refusals.append(refusal)
+        raise InvalidArgumentsError(f"{self.topics[0]}: {refusals[0]}")
 
     def _refusal(self, topic: str) -> str | None:
         found = self._view.stream.newest(topic, TimeWindow.everything())
-        if found is None:
-            return None
-        try:
-            message = self._view.memory.reader.decode(found.record)
-        except UndecodableError:
+        message = None if found is None else self._view.bags.decode(found)
+        if found is None or message is None:
             return None
         value = self._view.memory.extractor.exact(message, found.record.channel.type)
         return untestable(self._condition, value)
 
-    def _messages(self, stretch: SearchWindow) -> Iterator[StoredMessage]:
-        """The messages of a stretch, newest first.
+    def _messages(self, part: SearchWindow) -> Iterator[StoredMessage]:
+        """Returns the messages of a part, newest first.
 
-        Of bags that are ruled out those are read which may hold the original of a copy. Of topics
-        none is: a stretch of a topic may be as short as a message, and there may be thousands.
+        Bags that are ruled out are read where they may hold the original of a duplicate. Topics
+        that are ruled out are not: there may be thousands.
         """
-        window = stretch.window
+        window = part.window
         wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
         among = [
             held
-            for held in self._view.stream.overlapping_bags(stretch.topics, wider)
-            if held.bag.file in stretch.bags or stretch.recordings != {held.bag.recording}
+            for held in self._view.stream.overlapping_bags(part.topics, wider)
+            if held.bag.file in part.bags or part.recordings != {held.bag.recording}
         ]
-        return self._view.stream.messages(stretch.topics, window, newest_first=True, among=among)
+        return self._view.stream.messages(part.topics, window, newest_first=True, among=among)
 
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
@@ -148,7 +154,7 @@ class Search:
         try:
             message = memory.reader.decode(found.record)
             value = memory.extractor.exact(message, channel.type)
-            self._tested = True
+            self._has_decoded = True
             return self._condition.matches(value)
         except UndecodableError as error:
             # One that was raised keeps all that was on the way, the message with it.
@@ -159,38 +165,24 @@ class Search:
             self._view.call.stages.add("extract", time.perf_counter_ns() - begin)
 
     def note_undecodable(self, since: Ns = MIN_NS) -> None:
-        """Notes what could not be tested since a moment, of a search newest first."""
+        """Notes which topics have messages from a moment on that could not be tested."""
         for (topic, type_name), (error, newest) in self._failures.items():
-            if newest < since:
-                continue
-            self._view.notes.complete = False
-            reason = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
-            self._view.notes.add(Note(reason, f"{topic} ({type_name})"))
-
-    def _out_of_time(self, back_to: Ns) -> QueryTimeoutError:
-        budget_s = self._view.call.deadline.budget_s
-        return QueryTimeoutError(
-            f"no match back to {unix_text(back_to)}, and {budget_s:g} s are over; "
-            f"{self._view.bags.backfill_progress()}to go on from there, ask again with "
-            f"before={unix_text(back_to)}",
-            searched_back_to=back_to,
-        )
+            if newest >= since:
+                self._view.notes.complete = False
+                kind = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
+                self._view.notes.add(Note(kind, f"{topic} ({type_name})"))
 
 
-def unsearched(view: View, window: TimeWindow | None = None) -> tuple[str, ...]:
-    """Why a search of a window (or of everything) without a match was not complete.
-
-    Empty where it was.
-    """
-    searched = window or TimeWindow.everything()
-    if is_covered(view, searched):
+def not_covered(view: View, window: TimeWindow) -> tuple[str, ...]:
+    """Returns why a search of a window without a match was not complete; empty where it was."""
+    if is_covered(view, window):
         return ()
-    note_unread(view, searched, nothing=True)
+    note_unread(view, window, nothing=True)
     return view.notes.sentences()
 
 
 class SearchWindow(NamedTuple):
-    """A half-open span of time, and what in it is not ruled out: the topics, and the files."""
+    """A part of the history to search, and what in it is not ruled out: topics and bag files."""
 
     window: TimeWindow
     topics: tuple[str, ...]
@@ -199,7 +191,7 @@ class SearchWindow(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A bag that may hold a match on a topic between two log times (inclusive)."""
+    """A bag that can contain a match on a topic between two log times (inclusive)."""
 
     first: Ns
     last: Ns
@@ -208,10 +200,10 @@ class _Candidate(NamedTuple):
 
 
 class CandidateBags:
-    """Looks for bags that may hold a match on any of the topics.
+    """Finds the bags that can contain a match on any of the topics, before a moment.
 
     Attributes:
-        ruled_out: whether a bag was passed over; each of its messages could be decoded.
+        ruled_out: whether a bag was left out; each of its messages could be decoded.
     """
 
     def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
@@ -221,51 +213,54 @@ class CandidateBags:
         self._until = until
         self.ruled_out = False
 
-    def stretches(self) -> Iterator[SearchWindow]:
-        """The stretches in which a match may lie before `until`, newest first, none twice."""
+    def windows(self) -> Iterator[SearchWindow]:
+        """Yields the windows in which a match can lie, newest first; they do not overlap."""
         group: list[_Candidate] = []
         start = until = self._until
         for each in self._newest_first():
             if group and each.last < start:
-                yield _stretch(group, start, until)
+                yield _search_window(group, start, until)
                 group, until = [], start
             group.append(each)
             start = min(start, each.first)
         if group:
-            yield _stretch(group, start, until)
+            yield _search_window(group, start, until)
 
     def _newest_first(self) -> Iterator[_Candidate]:
-        """The bags that may hold a match, by the time of their last message of the topic."""
-        runs = [
-            (-run.spans[topic][1], -rank, order, topic, run)
-            for rank, run in enumerate(self._view.snapshot.runs)
+        """Yields the candidates by the time of their last message of the topic, newest first.
+
+        A heap of segments feeds a heap of bags, so that only segments which are reached are opened.
+        """
+        segments = [
+            (-segment.spans[topic][1], -rank, order, topic, segment)
+            for rank, segment in enumerate(self._view.snapshot.runs)
             for order, topic in enumerate(self._topics)
-            if topic in run.spans and run.spans[topic][0] < self._until
+            if topic in segment.spans and segment.spans[topic][0] < self._until
         ]
-        heapq.heapify(runs)
+        heapq.heapify(segments)
         waiting: list[tuple[Ns, int, _Candidate]] = []
         count = 0
-        while runs or waiting:
-            if runs and (not waiting or runs[0][0] <= waiting[0][0]):
-                *_, topic, run = heapq.heappop(runs)
+        while segments or waiting:
+            if segments and (not waiting or segments[0][0] <= waiting[0][0]):
+                *_, topic, segment = heapq.heappop(segments)
                 self._view.bags.check_deadline()
-                for each in self._in_run(run, topic):
+                for each in self._in_segment(segment, topic):
                     count += 1
                     heapq.heappush(waiting, (-each.last, count, each))
             else:
                 yield heapq.heappop(waiting)[2]
 
-    def _in_run(self, run: Segment, topic: str) -> Iterator[_Candidate]:
-        notes = self._view.bags.digests_of(run)
-        known = {} if notes is None else notes.numbers
+    def _in_segment(self, segment: Segment, topic: str) -> Iterator[_Candidate]:
+        digests = self._view.bags.digests_of(segment)
+        known = {} if digests is None else digests.numbers
         possible: Collection[int] = ()
-        if notes is not None and known:
-            if self._condition.can_match(notes.zone_map(topic)):
-                possible = self._possible(notes, topic)
-            if notes.whole and not possible:
+        if digests is not None and known:
+            if self._condition.can_match(digests.zone_map(topic)):
+                possible = self._possible(digests, topic)
+            if digests.whole and not possible:
                 self.ruled_out = True
                 return
-        for bag, first, last in run.extents(topic):
+        for bag, first, last in segment.extents(topic):
             if first >= self._until:
                 continue
             number = known.get(bag.file)
@@ -274,22 +269,20 @@ class CandidateBags:
             else:
                 self.ruled_out = True
 
-    def _possible(self, notes: SegmentDigests, topic: str) -> Collection[int]:
-        """The entries that may hold a match."""
+    def _possible(self, digests: SegmentDigests, topic: str) -> Collection[int]:
+        """Returns the numbers of the entries that can contain a match."""
         place = self._condition.place
         if place is not None:
-            boxes = notes.boxes(topic)
-            return boxes.meeting(place.x, place.y, place.z, place.tolerance_m)
-        said = notes.zone_maps(topic)
-        return {number for number, each in said.items() if self._condition.can_match(each)}
+            return digests.boxes(topic).meeting(place.x, place.y, place.z, place.tolerance_m)
+        maps = digests.zone_maps(topic)
+        return {number for number, each in maps.items() if self._condition.can_match(each)}
 
 
-def _stretch(group: Sequence[_Candidate], start: Ns, until: Ns) -> SearchWindow:
+def _search_window(group: Sequence[_Candidate], start: Ns, until: Ns) -> SearchWindow:
     stop = min(until, max(each.last for each in group) + 1)
-    bags = [each.bag for each in group]
     return SearchWindow(
         TimeWindow(start, stop),
         tuple(sorted({each.topic for each in group})),
-        frozenset(bag.file for bag in bags),
-        frozenset(bag.recording for bag in bags),
+        frozenset(each.bag.file for each in group),
+        frozenset(each.bag.recording for each in group),
     )

@@ -32,7 +32,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import require_bags
-from ros2_memory.history.reverse_search import Search
+from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.time_arguments import TimeRange, clamped, ns_argument
 from ros2_memory.history.transforms import own_holdings, transform_at
 from ros2_memory.history.view import View
@@ -155,11 +155,11 @@ def _gather(
         NoDataError: there is no such topic, or none of its messages can be decoded.
         QueryTimeoutError: the call's time is over before the first match was found.
     """
-    search = Search(view, pattern, condition)
+    search = ReverseSearch(view, pattern, condition)
     candidates = search.candidates(window.stop)
     before = window.stop
     try:
-        for part, topics in _parts(view, search.topics, candidates.stretches(), window):
+        for part, topics in _parts(view, search.topics, candidates.windows(), window):
             runs.end_silent(part.stop)
             _pass_over(view, runs, TimeWindow(part.stop, max(before, part.stop)))
             # There may be thousands of topics: read are those that can begin a row or end one.
@@ -203,7 +203,7 @@ def _pass_over(view: View, runs: _Runs, gap: TimeWindow) -> None:
             runs.end(topic)
 
 
-def _leave(search: Search, runs: _Runs) -> None:
+def _leave(search: ReverseSearch, runs: _Runs) -> None:
     """Ends a search that need not have looked further."""
     runs.cut = True
     search.note_undecodable(runs.told[-1].first)

@@ -275,7 +275,7 @@ class _Looking:
             near = Condition(NearPosition(0.0, 0.0, None, math.inf))
         else:
             near = Condition(NearPosition(*here, None, self._radius))
-        for stretch in CandidateBags(self._view, (self._topic,), near, MAX_NS).stretches():
+        for stretch in CandidateBags(self._view, (self._topic,), near, MAX_NS).windows():
             yield stretch.window
 
     def _pass_over(self, stays: DwellBuilder, gap: TimeWindow) -> None:

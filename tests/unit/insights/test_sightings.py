@@ -23,7 +23,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import Deadline, FixedClock, unix_from_ns
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.reverse_search import Search
+from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
@@ -260,7 +260,7 @@ def grouped(
     """What sightings are, read off all messages in order."""
     condition = parse_condition(kind, value, memory.limits.position_tolerance_m)
     view = View(memory, Call(), memory.clock.now())
-    search = Search(view, topic, condition)
+    search = ReverseSearch(view, topic, condition)
     rows: list[list[tuple[str, int]]] = []
     under_way: dict[str, list[tuple[str, int]]] = {}
     backwards = view.stream.messages(search.topics, TimeWindow.everything(), newest_first=True)
