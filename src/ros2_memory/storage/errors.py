@@ -24,7 +24,6 @@ from ros2_memory.core.errors import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-    from types import TracebackType
 
     from ros2_memory.core.timebase import Ns
 
@@ -79,38 +78,24 @@ def raise_if_lost(path: Path, item: T | LostError) -> T:
     return item
 
 
-def reading(path: Path) -> _Reading:
-    """A context that raises only `EpisodicError`, about `path`, whatever is raised inside it.
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Raises every exception of its block as an `EpisodicError` about `path`.
 
     Raises:
         BagVanishedError: the file or a folder above it is gone.
         BagUnreachableError: the fault is not the file's, and may pass.
-        BagError: anything else; it ends on the reason.
+        BagError: anything else; its text ends with the reason.
     """
-    return _Reading(path)
-
-
-class _Reading:
-    # A class and not a generator: it is entered for every query of every bag.
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if not isinstance(error, Exception) or isinstance(error, EpisodicError):
-            return
+    try:
+        yield
+    except EpisodicError:
+        raise
+    except Exception as error:
         if isinstance(error, OSError) and error.errno in _GONE:
-            raise BagVanishedError(str(self._path), "the file is not there any more") from error
-        kind_of = BagUnreachableError if _may_pass(error) else BagError
-        raise kind_of(str(self._path), reason_of(error)) from error
+            raise BagVanishedError(str(path), "the file is not there any more") from error
+        error_type = BagUnreachableError if _may_pass(error) else BagError
+        raise error_type(str(path), reason_of(error)) from error
 
 
 @contextmanager

@@ -24,7 +24,6 @@ from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
     ContradictionError,
     LostError,
-    UnreachableError,
     UnreadableError,
     as_unreadable,
     reason_of,
@@ -249,8 +248,6 @@ class McapBags:
                 try:
                     with as_unreadable():
                         data = self._chunk_data(file, chunk)
-                except UnreachableError:
-                    raise
                 except UnreadableError as error:
                     lost = self._lost(file, chunk, wanted, window, str(error))
                     return _lost(lost, newest_first=newest_first) if lost else _NO_ROWS
@@ -326,8 +323,6 @@ class McapBags:
         try:
             with as_unreadable():
                 columns = self._chunk_columns(file, chunk, wanted, None)
-        except UnreachableError:
-            raise
         except UnreadableError:
             first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
             return LostError(reason, first, last)
@@ -357,8 +352,6 @@ class McapBags:
             if self._found.get(key) is None:
                 try:
                     require_channels(file, chunk)
-                except UnreachableError:
-                    raise
                 except (UnreadableError, struct.error) as error:
                     raise _ContradictedError(reason_of(error)) from error
                 self._found.put(key, NO_MESSAGES, NO_MESSAGES.bytes_held)
@@ -391,8 +384,6 @@ class McapBags:
         else:
             try:
                 read = proven_columns(file, chunk, missing, data)
-            except UnreachableError:
-                raise
             except (UnreadableError, ValueError, struct.error) as error:
                 raise _ContradictedError(reason_of(error), chunk) from error
         for channel, found in read.items():
@@ -404,8 +395,6 @@ class McapBags:
         try:
             with as_unreadable():
                 return self._chunk_data(file, chunk)
-        except UnreachableError:
-            raise
         except UnreadableError:
             return None
 
