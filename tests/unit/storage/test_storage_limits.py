@@ -30,7 +30,7 @@ from ros2_memory.storage.errors import (
     UnreadableError,
     most_unpacked,
 )
-from ros2_memory.storage.mcap.chunk import walk
+from ros2_memory.storage.mcap.chunk import walk_chunk
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -107,14 +107,14 @@ class TestChunks:
 
     def test_a_chunk_of_more_messages_than_are_kept_in_mind_is_refused(self) -> None:
         one = message(1, 5, b"").data
-        assert walk(one * 10).messages == 10
+        assert walk_chunk(one * 10).messages == 10
         with pytest.raises(UnreadableError, match=f"more than {MAX_CHUNK_MESSAGES} messages"):
-            walk(one * (MAX_CHUNK_MESSAGES + 40_000))
+            walk_chunk(one * (MAX_CHUNK_MESSAGES + 40_000))
 
     def test_a_chunk_that_declares_more_than_any_writer_does_is_refused(self) -> None:
-        assert len(walk(STRINGS[0].data * 20_000).declarations) == 20_000
+        assert len(walk_chunk(STRINGS[0].data * 20_000).declarations) == 20_000
         with pytest.raises(UnreadableError, match="declares more than 20000 things"):
-            walk(STRINGS[0].data * 20_001)
+            walk_chunk(STRINGS[0].data * 20_001)
 
     def test_a_message_outside_of_chunks_that_is_larger_than_allowed_is_left_out(
         self, tmp_path: Path

@@ -34,7 +34,7 @@ from ros2_memory.storage.mcap.chunk import (
     NOT_THERE,
     Column,
     joined,
-    walk,
+    walk_chunk,
 )
 from ros2_memory.storage.mcap.index import (
     McapIndex,
@@ -378,7 +378,7 @@ class McapBags:
         if not missing:
             return columns
         if chunk.index_places is None:
-            read = walk(self._chunk_data(file, chunk) if data is None else data).columns
+            read = walk_chunk(self._chunk_data(file, chunk) if data is None else data).columns
         elif data is None:
             return [*columns, *chunk_columns(file, chunk, missing).values()]
         else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import lz4.frame  # type: ignore[import-untyped]  # has no types
@@ -29,7 +28,7 @@ from ros2_memory.storage.mcap.records import (
 from ros2_memory.storage.zstd_bag import unpacked_zstd
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from ros2_memory.storage.file_io import OpenFile
 
@@ -213,7 +212,7 @@ def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, b
     found: list[tuple[int, bytes]] = []
     between = begins < ends
     for begin, end in zip(begins[between].tolist(), ends[between].tolist(), strict=True):
-        walked = walk(data[begin:end])
+        walked = walk_chunk(data[begin:end])
         if walked.messages:
             raise UnreadableError("damaged: a chunk holds messages that its indexes do not")
         found += walked.declarations
@@ -288,7 +287,7 @@ _COUNTED_EVERY: Final = 1 << 20
 
 
 @dataclass(slots=True)
-class Walked:
+class ChunkContent:
     """What walking the records of a chunk found.
 
     `usable` is how many bytes of whole records there are.
@@ -300,7 +299,7 @@ class Walked:
     declarations: list[tuple[int, bytes]] = field(default_factory=list)
 
 
-def walk(data: bytes) -> Walked:
+def walk_chunk(data: bytes) -> ChunkContent:
     """The messages of a decompressed chunk, as far as whole records reach.
 
     Raises:
@@ -335,7 +334,7 @@ def walk(data: bytes) -> Walked:
         position = following
     columns = {channel: column_of(*lists) for channel, lists in found.items()}
     messages = sum(len(times) for times, _ in found.values())
-    return Walked(columns, position, messages, declarations)
+    return ChunkContent(columns, position, messages, declarations)
 
 
 def _require_few(found: Mapping[int, tuple[list[int], list[int]]]) -> None:

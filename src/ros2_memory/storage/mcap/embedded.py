@@ -14,8 +14,9 @@ from mcap.records import Metadata
 
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, RECORD, Opcode, require_mcap
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, Opcode
 from ros2_memory.storage.mcap.salvage import parsed
+from ros2_memory.storage.mcap.walk import file_records
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,7 +50,6 @@ def custom_data(path: Path) -> dict[str, str] | None:
     """
     try:
         with OpenFile(path) as file:
-            require_mcap(file)
             for record in _before_messages(file):
                 if isinstance(record, Metadata):
                     text = record.metadata.get(_KEY)
@@ -63,27 +63,24 @@ def custom_data(path: Path) -> dict[str, str] | None:
 
 
 def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
-    """The records before the first message or chunk.
+    """Yields the records before the first message or chunk.
 
     Raises:
-        UnreadableError: the file ends before one, or what stands before it is damaged.
+        UnreadableError: the file ends before one, or a record before it is damaged.
     """
-    position, begins = MAGIC_SIZE, True
-    while True:
-        opcode, length = RECORD.unpack(file.read(position, RECORD.size))
-        if begins != (opcode == Opcode.HEADER):
+    for record in file_records(file):
+        opcode, size = record.opcode, record.end - record.body_at
+        if (record.offset == MAGIC_SIZE) != (opcode == Opcode.HEADER):
             raise UnreadableError("damaged: it does not begin with one header")
         if opcode in _END:
             return
-        if opcode not in _BEFORE or length > _MOST_BYTES:
+        if opcode not in _BEFORE or size > _MOST_BYTES:
             raise UnreadableError("damaged: no such record stands before the first message")
-        body = file.read(position + RECORD.size, length)
-        records = [*parsed([(opcode, body)])]
-        if not records:
+        read = next(parsed([(opcode, file.read(record.body_at, size))]), None)
+        if read is None:
             raise UnreadableError("damaged: a record before the first message cannot be read")
-        yield records[0]
-        position += RECORD.size + length
-        begins = False
+        yield read
+    raise UnreadableError("it ends before its first message")
 
 
 def _custom_data_in(text: str) -> dict[str, str] | None:

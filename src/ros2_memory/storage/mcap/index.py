@@ -49,7 +49,7 @@ from ros2_memory.storage.mcap.summary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel

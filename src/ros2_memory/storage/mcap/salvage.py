@@ -1,8 +1,8 @@
-"""Every record of an MCAP file that can be read, in file order, wherever the file ends.
+"""Reads every record of an MCAP file that can be read, in file order, wherever the file ends.
 
-The chunks are opened on the way: their records come in their place, those of a last, partial chunk
-as far as they are whole. What follows the data section repeats it, but for channels without a
-message, which may be declared there alone.
+Chunks are opened on the way: their records come in their place, those of a last, partial chunk as
+far as they are whole. The summary section repeats the data section, but channels without a message
+may be declared there alone.
 """
 
 from __future__ import annotations
@@ -16,30 +16,15 @@ from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.errors import (
-    MAX_SECTION_BYTES,
-    UnreadableError,
-    as_unreadable,
-    most_unpacked,
-)
-from ros2_memory.storage.mcap.chunk import (
-    packed_chunk,
-    unpacked,
-    unpacked_in_part,
-    walk,
-)
-from ros2_memory.storage.mcap.records import (
-    MAGIC_SIZE,
-    MESSAGE_FIELDS,
-    RECORD,
-    Opcode,
-    require_mcap,
-)
+from ros2_memory.storage.errors import MAX_SECTION_BYTES, UnreadableError, as_unreadable
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, RECORD, Opcode
+from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from ros2_memory.storage.file_io import OpenFile
+    from ros2_memory.storage.mcap.walk import FileRecord
 
 _READERS: Final[dict[int, Callable[[ReadDataStream], mcap_records.McapRecord]]] = {
     Opcode.HEADER: mcap_records.Header.read,
@@ -55,87 +40,66 @@ _MESSAGE_BODY: Final = struct.Struct("<HIQQ")
 
 
 class Salvage:
-    """Reads one file once; `lost_bytes` then is what of it made no whole record."""
+    """Reads one file once.
+
+    Attributes:
+        lost_bytes: bytes of the file that made no whole record; final when `records` has ended.
+    """
 
     def __init__(self, file: OpenFile, max_chunk_bytes: int) -> None:
         self._file = file
         self._max_chunk_bytes = max_chunk_bytes
-        self._unpacked = 0
+        self._opener = ChunkOpener(file, max_chunk_bytes)
         self.lost_bytes = 0
 
     def records(self, progress: Callable[[int], None] | None = None) -> Iterator[tuple[int, bytes]]:
-        """The records that say something of their own as (opcode, body).
+        """Yields opcode and body of each record that has content of its own, not of indexes.
+
+        Args:
+            progress: called with the number of bytes read so far, after each record of the file.
 
         Raises:
-            UnreadableError: it is no MCAP file, or ends within its magic.
+            UnreadableError: the file is not MCAP, or ends within its magic.
         """
-        file = self._file
-        require_mcap(file)
-        position, data_ended = MAGIC_SIZE, False
-        while position + RECORD.size <= file.size:
-            opcode, length = RECORD.unpack(file.read(position, RECORD.size))
-            start, end = position + RECORD.size, position + RECORD.size + length
-            if opcode == 0 or (opcode == Opcode.MESSAGE and length < MESSAGE_FIELDS):
-                break
-            if end > file.size or opcode == Opcode.FOOTER:
-                if opcode == Opcode.CHUNK:
-                    yield from self._cut_chunk(start)
-                    position = file.size
-                break
-            data_ended = data_ended or opcode == Opcode.DATA_END
-            yield from self._whole(opcode, start, end)
-            position = end
+        read_to, data_ended = MAGIC_SIZE, False
+        for record in file_records(self._file):
+            data_ended = data_ended or record.opcode == Opcode.DATA_END
+            if record.opcode == Opcode.CHUNK:
+                yield from self._chunk(record)
+            elif record.opcode in _CONTENT:
+                yield from self._whole(record)
+            read_to = min(record.end, self._file.size)
             if progress is not None:
-                progress(position)
+                progress(read_to)
         if not data_ended:
-            self.lost_bytes += file.size - position
+            self.lost_bytes += self._file.size - read_to
 
-    def _whole(self, opcode: int, start: int, end: int) -> Iterator[tuple[int, bytes]]:
-        if opcode == Opcode.CHUNK:
-            yield from self._chunk(start, end)
-        elif opcode in _CONTENT:
-            whole = end - start + RECORD.size <= self._max_chunk_bytes
-            if whole if opcode == Opcode.MESSAGE else end - start <= MAX_SECTION_BYTES:
-                yield opcode, self._file.read(start, end - start)
-            else:
-                self.lost_bytes += end - start
+    def _whole(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
+        size = record.end - record.body_at
+        if record.opcode == Opcode.MESSAGE:
+            readable = record.end - record.offset <= self._max_chunk_bytes
+        else:
+            readable = size <= MAX_SECTION_BYTES
+        if readable:
+            yield record.opcode, self._file.read(record.body_at, size)
+        else:
+            self.lost_bytes += size
 
-    def _chunk(self, start: int, end: int) -> Iterator[tuple[int, bytes]]:
+    def _chunk(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
+        in_file = min(record.end, self._file.size) - record.body_at
         try:
-            with as_unreadable():
-                head, packed = packed_chunk(self._file, start, end - start, self._max_chunk_bytes)
-                data = unpacked(head, packed, self._max_chunk_bytes)
-                usable = self._usable(data)
+            opened = self._opener.open(record)
         except UnreadableError:
-            # Those behind it may be whole.
-            self.lost_bytes += end - start
+            # The chunks behind it may be whole.
+            self.lost_bytes += in_file
             return
-        self.lost_bytes += len(data) - usable
-        yield from _whole_records(data, usable)
-
-    def _usable(self, data: bytes) -> int:
-        """How much of a chunk is whole records; none of it is used where the file does harm."""
-        if self._unpacked > most_unpacked(self._file.size):
-            raise UnreadableError("its chunks hold more than such a file can")
-        self._unpacked += len(data)
-        return walk(data).usable
-
-    def _cut_chunk(self, start: int) -> Iterator[tuple[int, bytes]]:
-        """The chunk inside which the file ends."""
-        held = self._file.size - start
-        try:
-            with as_unreadable():
-                head, packed = packed_chunk(self._file, start, held, self._max_chunk_bytes)
-                data = unpacked_in_part(head, packed, self._max_chunk_bytes)
-                usable = self._usable(data)
-        except UnreadableError:
-            self.lost_bytes += held
-            return
-        self.lost_bytes += len(data) - usable if usable else held
-        yield from _whole_records(data, usable)
+        usable = opened.content.usable
+        is_cut = record.end > self._file.size
+        self.lost_bytes += in_file if is_cut and not usable else len(opened.data) - usable
+        yield from _content_of(opened.data, usable)
 
 
-def _whole_records(data: bytes, usable: int) -> Iterator[tuple[int, bytes]]:
+def _content_of(data: bytes, usable: int) -> Iterator[tuple[int, bytes]]:
     position = 0
     while position < usable:
         opcode, length = RECORD.unpack_from(data, position)

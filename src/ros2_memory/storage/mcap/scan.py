@@ -1,7 +1,7 @@
-"""The index of an MCAP file by reading it once from front to back.
+"""Indexes an MCAP file by reading it once from front to back.
 
-For files without a summary to rely on, and for files that end early: every whole record counts,
-and the messages of a last, partial chunk as far as they reach.
+For files without a summary section to rely on, and for files that end early: every whole record
+counts, and so do the messages of a last, partial chunk as far as the file reaches.
 """
 
 from __future__ import annotations
@@ -16,23 +16,12 @@ from mcap.opcode import Opcode
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.errors import (
-    MAX_CHUNKS,
     MAX_SECTION_BYTES,
-    MAX_TIMES_PACKED,
-    MESSAGE_BYTES,
     UnreadableError,
     as_unreadable,
-    most_unpacked,
     too_large,
 )
-from ros2_memory.storage.mcap.chunk import (
-    Walked,
-    column_of,
-    packed_chunk,
-    unpacked,
-    unpacked_in_part,
-    walk,
-)
+from ros2_memory.storage.mcap.chunk import column_of
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     McapIndex,
@@ -44,38 +33,37 @@ from ros2_memory.storage.mcap.index import (
 from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
     MESSAGE,
-    MESSAGE_FIELDS,
-    RECORD,
     Declarations,
     Statistics,
     closing_of,
-    require_mcap,
     statistics,
 )
 from ros2_memory.storage.mcap.summary import Chunk
+from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.chunk import ChunkHead, Column
+    from ros2_memory.storage.mcap.chunk import ChunkContent
+    from ros2_memory.storage.mcap.walk import FileRecord
 
-_BLOCK: Final = 256 * 1024
+_DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
 
 
 def index_by_scan(file: OpenFile, max_chunk_bytes: int, note: str = "") -> McapIndex:
-    """The index of the messages that can be read.
+    """Returns the index of the messages that can be read.
 
     Args:
         file: the open file.
-        max_chunk_bytes: what a chunk may hold, decompressed; larger ones are left out and noted.
-        note: why the summary section was not used, where that is worth telling.
+        max_chunk_bytes: the decompressed size up to which a chunk is read; larger ones are noted.
+        note: why the summary section was not used; empty where no user needs to know.
 
     Raises:
-        UnreadableError: it is no MCAP file, or is empty.
+        UnreadableError: the file is not MCAP, or is empty.
     """
-    require_mcap(file)
-    scan = _Scan(file, max_chunk_bytes, closed=closing_of(file) is Closing.CLOSED)
-    scan.run()
+    scan = _Scan(file, max_chunk_bytes, ChunkOpener(file, max_chunk_bytes))
+    for record in file_records(file):
+        scan.add(record)
     return scan.index(note)
 
 
@@ -83,10 +71,11 @@ def index_by_scan(file: OpenFile, max_chunk_bytes: int, note: str = "") -> McapI
 class _Scan:
     file: OpenFile
     max_chunk_bytes: int
-    position: int = MAGIC_SIZE
-    closed: bool = False
+    opener: ChunkOpener
+    read_to: int = MAGIC_SIZE
     data_ended: bool = False
-    # By the summary section, by the records before it, and by chunks, which a checksum protects.
+    # Schemas and channels of the summary section, of the records before it, and of the chunks.
+    # Those of chunks win: a checksum protects them.
     repeated: Declarations = field(default_factory=Declarations)
     declared: Declarations = field(default_factory=Declarations)
     in_chunks: Declarations = field(default_factory=Declarations)
@@ -99,151 +88,105 @@ class _Scan:
     damaged: list[str] = field(default_factory=list)
     partial: int = 0  # bytes of a last, compressed chunk that was read in part
     back: Ns = 0  # as `set_back` of `McapIndex`, however little
-    unpacked: int = 0  # bytes that the chunks so far have come to
-    _block: bytes = b""
-    _block_at: int = 0
 
-    def run(self) -> None:
-        """Reads on until the footer, or until what follows is no whole record."""
-        size = self.file.size
-        while self.position + RECORD.size <= size:
-            opcode, length = RECORD.unpack(self._peek(self.position, RECORD.size))
-            end = self.position + RECORD.size + length
-            if opcode in {0, Opcode.FOOTER}:
-                return
-            if end > size:
-                if opcode == Opcode.CHUNK:
-                    self._cut_chunk(size)
-                return
-            if opcode == Opcode.MESSAGE and length < MESSAGE_FIELDS:
-                return
-            self._record(opcode, end)
-            self.position = end
-
-    def _record(self, opcode: int, end: int) -> None:
-        if opcode == Opcode.MESSAGE:
-            if end - self.position > self.max_chunk_bytes:
-                self.damaged.append(too_large("a message", self.max_chunk_bytes))
-                return
-            head = MESSAGE.unpack(self._peek(self.position, MESSAGE.size))
-            times, places = self.loose.setdefault(head[2], (array("Q"), array("q")))
-            times.append(head[4])
-            places.append(self.position)
-            self.messages += 1
+    def add(self, record: FileRecord) -> None:
+        """Adds a record; one that is damaged is noted, since those behind it may be whole."""
+        if record.end > self.file.size:
+            self._add_cut_chunk(record)
             return
-        self.data_ended = self.data_ended or opcode == Opcode.DATA_END
+        self.data_ended = self.data_ended or record.opcode == Opcode.DATA_END
         try:
-            if opcode == Opcode.CHUNK:
-                self._whole_chunk(end)
-            elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS}:
-                self._declare(
-                    opcode, self._body(end), self.repeated if self.data_ended else self.declared
-                )
+            if record.opcode == Opcode.MESSAGE:
+                self._add_message(record)
+            elif record.opcode == Opcode.CHUNK:
+                self._add_chunk(record)
+            elif record.opcode in _DECLARED:
+                known = self.repeated if self.data_ended else self.declared
+                self._declare(record.opcode, self._body(record), known)
         except UnreadableError as error:
-            # Those behind it may be whole.
             self.damaged.append(str(error))
+        self.read_to = record.end
 
-    def _declare(self, opcode: int, body: bytes, among: Declarations) -> None:
+    def _add_message(self, record: FileRecord) -> None:
+        if record.end - record.offset > self.max_chunk_bytes:
+            raise UnreadableError(too_large("a message", self.max_chunk_bytes))
+        _, _, channel, _, log_time, _ = MESSAGE.unpack(record.head)
+        times, places = self.loose.setdefault(channel, (array("Q"), array("q")))
+        times.append(log_time)
+        places.append(record.offset)
+        self.messages += 1
+
+    def _declare(self, opcode: int, body: bytes, known: Declarations) -> None:
         with as_unreadable():
             if opcode == Opcode.STATISTICS:
                 self.stated = statistics(body)
                 return
-            self.redeclared = self.redeclared or not among.agrees(opcode, body)
-            among.add(opcode, body)
+            self.redeclared = self.redeclared or not known.agrees(opcode, body)
+            known.add(opcode, body)
 
-    def _body(self, end: int) -> bytes:
-        start = self.position + RECORD.size
-        if end - start > MAX_SECTION_BYTES:
+    def _body(self, record: FileRecord) -> bytes:
+        if record.end - record.body_at > MAX_SECTION_BYTES:
             raise UnreadableError("damaged: a record is larger than any can be")
-        return self.file.read(start, end - start)
+        return self.file.read(record.body_at, record.end - record.body_at)
 
-    def _whole_chunk(self, end: int) -> None:
-        self._require_harmless()
-        with as_unreadable():
-            data = unpacked(*self._packed(end), self.max_chunk_bytes)
-        self.unpacked += len(data)
-        walked = walk(data)
-        self.unpacked += MESSAGE_BYTES * walked.messages
-        if walked.usable < len(data):
+    def _add_chunk(self, record: FileRecord) -> None:
+        opened = self.opener.open(record)
+        if opened.content.usable < len(opened.data):
             self.damaged.append("damaged: a chunk holds something that is no record")
-        self._take(walked, end, None)
+        self._add_content(opened.content, record.offset, record.end, None)
 
-    def _cut_chunk(self, size: int) -> None:
-        """The chunk inside which the file ends."""
+    def _add_cut_chunk(self, record: FileRecord) -> None:
+        """Adds the chunk that the file ends in."""
         try:
-            self._require_harmless()
-            head, packed = self._packed(size)
-            with as_unreadable():
-                walked = walk(unpacked_in_part(head, packed, self.max_chunk_bytes))
+            opened = self.opener.open(record)
         except UnreadableError:
             return
-        if not walked.usable:
+        usable = opened.content.usable
+        if not usable:
             return
-        self._take(walked, size, walked.usable)
-        if head.compression:
-            self.partial = size - self.position
-            self.position = size
+        self._add_content(opened.content, record.offset, self.file.size, usable)
+        if opened.compression:
+            self.partial = self.file.size - record.offset
+            self.read_to = self.file.size
         else:
-            self.position += RECORD.size + head.data_at + walked.usable
+            self.read_to = record.body_at + opened.data_at + usable
 
-    def _require_harmless(self) -> None:
-        """Looks into no more chunks where those so far came to more than a robot's ever do."""
-        if len(self.chunks) >= MAX_CHUNKS:
-            raise UnreadableError(f"it has more than {MAX_CHUNKS} chunks")
-        if self.unpacked > most_unpacked(self.file.size):
-            raise UnreadableError(
-                f"its chunks hold more than {MAX_TIMES_PACKED} times what the file does"
-            )
-
-    def _packed(self, end: int) -> tuple[ChunkHead, bytes]:
-        body_at = self.position + RECORD.size
-        return packed_chunk(self.file, body_at, end - body_at, self.max_chunk_bytes)
-
-    def _take(self, walked: Walked, end: int, usable: int | None) -> None:
-        for opcode, body in walked.declarations:
+    def _add_content(
+        self, content: ChunkContent, offset: int, end: int, usable: int | None
+    ) -> None:
+        for opcode, body in content.declarations:
             try:
                 self._declare(opcode, body, self.in_chunks)
             except UnreadableError as error:
                 self.damaged.append(str(error))
-        self.messages += walked.messages
-        held = {channel: column for channel, column in walked.columns.items() if column.times.size}
-        for channel, column in held.items():
+        self.messages += content.messages
+        columns = {channel: each for channel, each in content.columns.items() if each.times.size}
+        for channel, column in columns.items():
             known = self.totals.get(channel)
             if known is not None:
                 self.back = max(self.back, known.last - int(column.times[0]))
             add_column(self.totals, channel, column)
-        if held:
-            self.chunks.append(
-                Chunk(
-                    self.position,
-                    end - self.position,
-                    min(int(column.times[0]) for column in held.values()),
-                    max(int(column.times[-1]) for column in held.values()),
-                    frozenset(held),
-                    usable=usable,
-                )
-            )
-
-    def _peek(self, offset: int, length: int) -> bytes:
-        """A few bytes, by way of a block: small records lie close together."""
-        at = offset - self._block_at
-        if at < 0 or at + length > len(self._block):
-            self._block = self.file.read(offset, min(_BLOCK, self.file.size - offset))
-            self._block_at, at = offset, 0
-        return self._block[at : at + length]
+        if columns:
+            first = min(int(column.times[0]) for column in columns.values())
+            last = max(int(column.times[-1]) for column in columns.values())
+            numbers = frozenset(columns)
+            self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
 
     def index(self, note: str) -> McapIndex:
-        """What was found."""
+        """Returns what was found; `note` comes before the notes on it."""
+        complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
         columns = {channel: column_of(*lists) for channel, lists in self.loose.items()}
-        back = max([self.back, *(_back_in(times) for times, _ in self.loose.values())])
+        back = max([self.back, *(_set_back(times) for times, _ in self.loose.values())])
         for channel, column in columns.items():
             add_column(self.totals, channel, column)
         declarations = self.repeated
         differing = declarations.update(self.declared)
         differing = declarations.update(self.in_chunks) or differing
         channels = declarations.channels()
-        known = {channel: total for channel, total in self.totals.items() if channel in channels}
-        notes = [note, *self._notes(known)] if note else self._notes(known)
+        totals = {channel: total for channel, total in self.totals.items() if channel in channels}
+        notes = self._notes(totals, complete=complete)
+        if note:
+            notes.insert(0, note)
         if differing and not note.startswith(OTHER_DECLARED):
             notes.append(OTHER_DECLARED)
         if self.redeclared:
@@ -251,28 +194,26 @@ class _Scan:
         return McapIndex(
             channels,
             tuple(self.chunks),
-            known,
-            _held(columns),
-            complete=self.data_ended and self.closed,
+            totals,
+            {channel: column for channel, column in columns.items() if column.times.size},
+            complete=complete,
             notes=tuple(notes),
             set_back=beyond_disorder(back),
         )
 
-    def _notes(self, known: dict[int, Total]) -> list[str]:
-        notes = []
-        if not (self.data_ended and self.closed):
-            notes.append(self._end_note())
+    def _notes(self, totals: dict[int, Total], *, complete: bool) -> list[str]:
+        notes = [] if complete else [self._end_note()]
         if self.damaged:
             notes.append(f"{len(self.damaged)} damaged records were left out ({self.damaged[0]})")
         counted = sum(total.count for total in self.totals.values())
-        orphans = counted - sum(total.count for total in known.values())
+        orphans = counted - sum(total.count for total in totals.values())
         if orphans:
             notes.append(f"{orphans} messages belong to no declared channel and were left out")
         if self.messages > counted:
             notes.append(f"{self.messages - counted} messages bear no possible log time")
-        # Where something was left out, the statistics count it rightly.
+        # Statistics that count what was left out are right.
         if self.stated is not None and not notes:
-            notes.extend(disagreements(self.stated, known))
+            notes.extend(disagreements(self.stated, totals))
         return notes
 
     def _end_note(self) -> str:
@@ -283,19 +224,15 @@ class _Scan:
             )
         if self.data_ended:
             return "the file ends early, behind its messages: none is lost"
-        unread = self.file.size - self.position
+        unread = self.file.size - self.read_to
         if unread:
             return f"the file ends early: the last {unread} bytes could not be read"
         return "the file ends early: its writer did not finish it"
 
 
-def _held(columns: dict[int, Column]) -> dict[int, Column]:
-    return {channel: column for channel, column in columns.items() if column.times.size}
-
-
-def _back_in(times: array[int]) -> Ns:
-    """By how much possible log times go back in this order, at most."""
-    written = np.array([time for time in times if time <= MAX_NS], np.int64)
-    if not written.size:
+def _set_back(times: array[int]) -> Ns:
+    """Returns by how much possible log times go back in this order, at most."""
+    possible = np.array([time for time in times if time <= MAX_NS], np.int64)
+    if not possible.size:
         return 0
-    return int((np.maximum.accumulate(written) - written).max())
+    return int((np.maximum.accumulate(possible) - possible).max())
