@@ -1,0 +1,113 @@
+"""What both adapters of `BagReader` share: open a file, delegate to the format, decode."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+from ros2_memory.storage.base import BagReader
+from ros2_memory.storage.decoding import Decoding
+from ros2_memory.storage.errors import raise_if_lost, reading
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from ros2_memory.core.model import BagSummary, TimeWindow
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import CdrLayout, Channel, Record
+    from ros2_memory.storage.errors import LostError
+    from ros2_memory.storage.mcap.bag_file import McapBags
+    from ros2_memory.storage.sqlite_bag import SqliteBags
+
+
+class OpenedBag(NamedTuple):
+    """A bag file in a form that its format can be read from.
+
+    Attributes:
+        bags: reads files of this format.
+        path: the file itself, or a temporary copy.
+        note: why the file is not complete; empty where nothing is odd.
+    """
+
+    bags: McapBags | SqliteBags
+    path: Path
+    note: str
+
+
+class FileReader(BagReader):
+    """Translates every exception of a format into `EpisodicError`, and decodes.
+
+    Args:
+        custom_msg_paths: folders of `.msg` files for types that a bag holds no definition of.
+
+    Raises:
+        ConfigError: one of the paths cannot be used.
+    """
+
+    def __init__(self, custom_msg_paths: Sequence[Path | str]) -> None:
+        self._decoding = Decoding(custom_msg_paths)
+
+    @abstractmethod
+    def _open(self, path: Path) -> AbstractContextManager[OpenedBag]:
+        """Returns a context in which the file can be read."""
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Returns topics with exact counts and exact first and last log times."""
+        with reading(path), self._open(path) as opened:
+            summary = opened.bags.summarize(opened.path)
+        if not opened.note:
+            return summary
+        return summary.replaced(complete=False, notes=(opened.note, *summary.notes))
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        """Yields the undecoded messages of `topics` inside the window, by log time."""
+
+        def found() -> Iterator[Record | LostError]:
+            with reading(path), self._open(path) as opened:
+                records = opened.bags.records
+                yield from records(opened.path, topics, window, newest_first=newest_first)
+
+        # Mapped outside of the generator: one that has raised could not go on behind lost messages.
+        return map(partial(raise_if_lost, path), found())
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """Returns the latest message of the topic inside the window."""
+        with reading(path), self._open(path) as opened:
+            return opened.bags.newest(opened.path, topic, window)
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
+        """Returns the log times of the topic inside the window, without reading payloads."""
+        with reading(path), self._open(path) as opened:
+            return opened.bags.log_times(opened.path, topic, window)
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """Returns every channel that is declared in the file."""
+        with reading(path), self._open(path) as opened:
+            return opened.bags.channels(opened.path)
+
+    def profile(self, path: Path) -> str:
+        """Returns the profile in the header of an MCAP file; `ros2` for a sqlite file."""
+        with reading(path), self._open(path) as opened:
+            return opened.bags.profile(opened.path)
+
+    def undecodable(self, channel: Channel) -> str | None:
+        """Returns why no message of this channel can be decoded, or None."""
+        return self._decoding.undecodable(channel)
+
+    def decode(self, record: Record) -> object:
+        """Decodes the message of a record."""
+        return self._decoding.decode(record)
+
+    def layout(self, record: Record) -> CdrLayout | None:
+        """Returns where the numbers of a record lie, or None."""
+        return self._decoding.layout(record)
