@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from typing import TYPE_CHECKING, Generic, TypeVar
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable
+    from collections.abc import Hashable, Mapping
+
+    from ros2_memory.storage.base import Channel
 
 T = TypeVar("T")
 
-_MAX_SHARED = 10_000
-_MAX_SHARED_BYTES = 16 << 20
+_SHARED_BYTES: Final = 32 << 10
+"""The size up to which a channel is shared; a longer one belongs to its file alone."""
 
 
 class ByteLru(Generic[T]):
@@ -57,25 +60,20 @@ class ByteLru(Generic[T]):
             return self._bytes
 
 
-class Shared(Generic[T]):
-    """One object for all that are equal: bags of one robot declare the same channels.
+def shared(channel: Channel) -> Channel:
+    """Returns the first channel met that equals this one: bags of one robot declare the same.
 
-    Args:
-        size_of: about how many bytes a value takes.
+    A channel with long texts is returned as it is, so that no more than 16 MiB are held.
     """
+    return _first_met(channel) if channel.bytes_held <= _SHARED_BYTES else channel
 
-    def __init__(self, size_of: Callable[[T], int]) -> None:
-        self._size_of = size_of
-        self._known: dict[T, T] = {}
-        self._bytes = 0
 
-    def of(self, value: T) -> T:
-        """The first object met that equals `value`."""
-        known = self._known.get(value)
-        if known is not None:
-            return known
-        if len(self._known) >= _MAX_SHARED or self._bytes > _MAX_SHARED_BYTES:
-            self._known.clear()
-            self._bytes = 0
-        self._bytes += self._size_of(value)
-        return self._known.setdefault(value, value)
+def unshared_bytes(channels: Mapping[int, Channel]) -> int:
+    """Returns about how much memory channels take that no other file shares."""
+    sizes = [channel.bytes_held for channel in channels.values()]
+    return 300 * len(sizes) + sum([size for size in sizes if size > _SHARED_BYTES])
+
+
+@lru_cache(512)
+def _first_met(channel: Channel) -> Channel:
+    return channel

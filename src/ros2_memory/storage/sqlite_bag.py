@@ -15,7 +15,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import starmap, zip_longest
-from operator import attrgetter, eq
+from operator import eq
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
@@ -29,7 +29,7 @@ from ros2_memory.storage.base import (
     Schema,
     bag_summary,
 )
-from ros2_memory.storage.cache import ByteLru, Shared
+from ros2_memory.storage.cache import ByteLru, shared
 from ros2_memory.storage.errors import (
     MAX_CHANNELS,
     MAX_CHUNK_MB,
@@ -115,7 +115,6 @@ class SqliteBags:
     def __init__(self, max_message_mb: int = MAX_CHUNK_MB) -> None:
         self._max_message_bytes = max_message_mb << 20
         self._known: ByteLru[_Topics] = ByteLru(_KEPT_BYTES)
-        self._shared: Shared[Channel] = Shared(attrgetter("bytes_held"))
         # Whether the indexes of a file give what its table holds.
         self._proven: ByteLru[bool] = ByteLru(_KEPT_BYTES)
 
@@ -273,7 +272,7 @@ class SqliteBags:
             value = dict(zip(names, row, strict=True))
             raw_type = str(value["type"])
             schema = definitions.get(raw_type, Schema(_full_type(raw_type)))
-            channels[int(value["id"])] = self._shared.of(
+            channels[int(value["id"])] = shared(
                 Channel(
                     str(value["name"]),
                     # Before the column existed there was one format.

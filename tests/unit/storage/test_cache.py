@@ -3,8 +3,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.storage.base import Schema
-from ros2_memory.storage.cache import ByteLru, Shared
+from ros2_memory.storage.base import Channel, Schema
+from ros2_memory.storage.cache import ByteLru, shared
 
 
 def test_what_was_used_last_is_kept() -> None:
@@ -42,8 +42,11 @@ def test_what_is_held_never_passes_the_bound(puts: list[tuple[int, int]]) -> Non
     assert sum(size for size in held if size is not None) == cache.bytes_held
 
 
-def test_equal_objects_become_one() -> None:
-    shared: Shared[Schema] = Shared(lambda schema: len(schema.name))
-    first = shared.of(Schema("a/msg/A"))
-    assert shared.of(Schema("a/msg/A")) is first
-    assert shared.of(Schema("a/msg/B")) == Schema("a/msg/B")
+def channel(topic: str, text: bytes = b"") -> Channel:
+    return Channel(topic, "cdr", Schema("a/msg/A", "ros2msg", text))
+
+
+def test_equal_channels_become_one() -> None:
+    first = shared(channel("/a"))
+    assert shared(channel("/a")) is first
+    assert shared(channel("/b")) == channel("/b")

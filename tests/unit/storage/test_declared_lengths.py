@@ -9,7 +9,7 @@ from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.errors import BagError
 from ros2_memory.storage.base import Channel, Schema
-from ros2_memory.storage.cache import Shared
+from ros2_memory.storage.cache import shared, unshared_bytes
 from ros2_memory.storage.errors import MAX_DEFINITION_BYTES, MAX_NAMES_CHARS
 from ros2_memory.storage.mcap_reader import McapReader
 
@@ -59,9 +59,8 @@ def test_of_a_definition_larger_than_any_no_more_is_held_than_shows_it(tmp_path:
 
 
 def test_what_is_shared_is_bounded_by_its_length() -> None:
-    shared: Shared[Channel] = Shared(lambda channel: channel.bytes_held)
-    for number in range(60):
-        text = bytes([number]) * MAX_DEFINITION_BYTES
-        channel = shared.of(Channel("/a", "cdr", Schema("a/msg/B", "ros2msg", text)))
-        assert shared.of(Channel("/a", "cdr", Schema("a/msg/B", "ros2msg", text))) is channel
-    assert sum(each.bytes_held for each in shared._known) < 20 << 20
+    long = b"#" * MAX_DEFINITION_BYTES
+    one, other = (Channel("/a", "cdr", Schema("a/msg/B", "ros2msg", long)) for _ in range(2))
+    assert shared(one) is one
+    assert shared(other) is other
+    assert unshared_bytes({1: one}) > MAX_DEFINITION_BYTES

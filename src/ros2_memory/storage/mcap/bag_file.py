@@ -19,7 +19,7 @@ from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import Channel, Closing, Held, Record, bag_summary
-from ros2_memory.storage.cache import ByteLru, Shared
+from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
     ContradictionError,
@@ -38,7 +38,6 @@ from ros2_memory.storage.mcap.chunk import (
 )
 from ros2_memory.storage.mcap.index import (
     McapIndex,
-    channels_bytes,
     chunk_columns,
     chunk_data,
     index_from_summary,
@@ -53,12 +52,11 @@ from ros2_memory.storage.mcap.summary import Chunk, DoubtError
 from ros2_memory.storage.zstd_bag import plain_payload
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import BagSummary
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.file_io import FileKey
 
 
 _LARGE_BYTES: Final = 8 << 20
@@ -95,15 +93,10 @@ class McapBags:
         self._found: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._data: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self._contradicted: ByteLru[str] = ByteLru(_CONTRADICTED_BYTES)
-        self._finished: FileKey | None = None
 
     def closing(self, path: Path) -> Closing:
         """Whether the writer has finished the file."""
         with OpenFile(path) as file:
-            if is_finished(file):
-                # A bag is mostly asked for its summary next.
-                self._finished = file.key
-                return Closing.CLOSED
             return closing_of(file)
 
     def summarize(self, path: Path) -> BagSummary:
@@ -299,16 +292,11 @@ class McapBags:
             reason = self._contradicted.get(file.key)
             if reason is not None:
                 return self._keep(file, self._without_indexes(file, reason))
-            finished = file.key == self._finished or is_finished(file)
-            index = _index_of(file, self._max_chunk_bytes, finished=finished)
-            index = self._keep(file, index)
+            index = self._keep(file, _index_of(file, self._max_chunk_bytes))
         return index
 
     def _keep(self, file: OpenFile, index: McapIndex) -> McapIndex:
-        """Keeps an index, with one object for all equal channels."""
-        shared, size = _sharing(index.channels)
-        index = index._replace(channels=shared)
-        self._found.put(file.key, index, index.bytes_held + size)
+        self._found.put(file.key, index, index.bytes_held)
         return index
 
     def _lost(
@@ -447,26 +435,8 @@ class McapBags:
         return data
 
 
-_shared: Final[Shared[Channel]] = Shared(attrgetter("bytes_held"))
-_last_shared: tuple[Mapping[int, Channel], Mapping[int, Channel], int] = {}, {}, 0
-
-
-def _sharing(given: Mapping[int, Channel]) -> tuple[Mapping[int, Channel], int]:
-    """The channels as one object for all equal ones, and about how much memory they take.
-
-    The next bag mostly has the very channels of the one before.
-    """
-    global _last_shared  # noqa: PLW0603 - replaced as a whole, so that threads may share it
-    last, shared, size = _last_shared
-    if given is not last:
-        shared = {number: _shared.of(each) for number, each in given.items()}
-        size = channels_bytes(shared)
-        _last_shared = given, shared, size
-    return shared, size
-
-
-def _index_of(file: OpenFile, max_chunk_bytes: int, *, finished: bool) -> McapIndex:
-    if not finished:
+def _index_of(file: OpenFile, max_chunk_bytes: int) -> McapIndex:
+    if not is_finished(file):
         return index_by_scan(file, max_chunk_bytes)
     try:
         return index_from_summary(file)

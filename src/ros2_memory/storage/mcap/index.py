@@ -64,7 +64,6 @@ _STATED: Final = struct.Struct("<BQQQ")
 _STATED_BYTES: Final = _STATED.size
 _HEAD_BYTES: Final = RECORD.size
 _stating: Final = _STATED.pack
-_USUAL_BYTES: Final = 32 << 10
 _NEVER: Final = 1 << 64
 """Later than any time that a file can state."""
 
@@ -89,6 +88,7 @@ class McapIndex(NamedTuple):
     """
 
     channels: Mapping[int, Channel]
+    channel_bytes: int
     chunks: tuple[Chunk, ...]
     totals: Mapping[int, Total]
     loose: Mapping[int, Column] = MappingProxyType({})
@@ -100,16 +100,10 @@ class McapIndex(NamedTuple):
 
     @property
     def bytes_held(self) -> int:
-        """About how much memory it takes, but for `channels_bytes`."""
+        """About how much memory it takes, without the channels that files share."""
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
         loose = sum([column.times.nbytes * 2 for column in self.loose.values()])
-        return 1000 + 400 * len(self.chunks) + places + loose
-
-
-def channels_bytes(channels: Mapping[int, Channel]) -> int:
-    """About how much memory channels take; those of usual length are shared with other files."""
-    long = sum([size for each in channels.values() if (size := each.bytes_held) > _USUAL_BYTES])
-    return 300 * len(channels) + long
+        return 1000 + self.channel_bytes + 400 * len(self.chunks) + places + loose
 
 
 def chunk_columns(
@@ -253,7 +247,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
 
 
 def _index_from_summary(file: OpenFile) -> McapIndex:
-    start, channels, declared, chunks, stated = read_summary(file)
+    start, channels, channel_bytes, declared, chunks, stated = read_summary(file)
     if stated is None or not declared.resolved or stated.channels > len(channels):
         raise DoubtError
     counts = stated.counts
@@ -276,7 +270,15 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
         raise DoubtError
     notes = disagreements(stated, totals)
     back = _set_back(file, held)
-    return McapIndex(channels, tuple(held), totals, notes=notes, set_back=back, declared=declared)
+    return McapIndex(
+        channels,
+        channel_bytes,
+        tuple(held),
+        totals,
+        notes=notes,
+        set_back=back,
+        declared=declared,
+    )
 
 
 def _require_as_stated(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:

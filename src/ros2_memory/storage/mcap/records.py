@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from ros2_memory.storage.base import Channel, Closing, Schema
+from ros2_memory.storage.cache import shared
 from ros2_memory.storage.errors import (
     MAX_CHANNELS,
     MAX_DEFINITION_BYTES,
@@ -178,12 +179,14 @@ class Declarations:
         if names + types > MAX_NAMES_CHARS:
             raise UnreadableError("its topics and types have longer names than any can have")
         return {
-            number: Channel(
-                channel.topic,
-                channel.message_encoding,
-                self._schemas.get(channel.schema_id, Schema("")),
-                offered_as_latched(channel.metadata.get("offered_qos_profiles", "")),
-                tuple(channel.metadata.items()),
+            number: shared(
+                Channel(
+                    channel.topic,
+                    channel.message_encoding,
+                    self._schemas.get(channel.schema_id, Schema("")),
+                    offered_as_latched(channel.metadata.get("offered_qos_profiles", "")),
+                    tuple(channel.metadata.items()),
+                )
             )
             for number, channel in self._channels.items()
         }

@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import Closing
+from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import (
     MAX_SECTION_BYTES,
     UnreadableError,
@@ -193,6 +194,7 @@ class _Scan:
             notes.append("it declares a channel or a type in more than one way: the last counts")
         return McapIndex(
             channels,
+            unshared_bytes(channels),
             tuple(self.chunks),
             totals,
             {channel: column for channel, column in columns.items() if column.times.size},

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mcap.opcode import Opcode
 
+from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import MAX_SECTION_BYTES, UnreadableError
 from ros2_memory.storage.mcap.records import (
     FOOTER,
@@ -76,6 +77,7 @@ class _Declared(NamedTuple):
 
     records: bytes
     channels: Mapping[int, Channel]
+    channel_bytes: int
     declarations: Declarations
 
 
@@ -91,8 +93,8 @@ class Summary(NamedTuple):
     """What a summary section states, and where in the file it begins."""
 
     start: int
-
     channels: Mapping[int, Channel]
+    channel_bytes: int
     declarations: Declarations
     chunks: list[Chunk]
     statistics: Statistics | None
@@ -129,7 +131,9 @@ def read_summary(file: OpenFile) -> Summary:
     if beginning is None or len(declaring) > 1:
         beginning = _declared(b"".join(declaring))
         _remember(beginning, section)
-    return Summary(start, beginning.channels, beginning.declarations, chunks, stated)
+    return Summary(
+        start, beginning.channels, beginning.channel_bytes, beginning.declarations, chunks, stated
+    )
 
 
 def _section(file: OpenFile) -> tuple[int, bytes]:
@@ -171,7 +175,8 @@ def _declared(records: bytes) -> _Declared:
     declarations = Declarations()
     for opcode, body in framed(records):
         declarations.add(opcode, body)
-    return _Declared(records, declarations.channels(), declarations)
+    channels = declarations.channels()
+    return _Declared(records, channels, unshared_bytes(channels), declarations)
 
 
 def _remember(declared: _Declared, section: bytes) -> None:
