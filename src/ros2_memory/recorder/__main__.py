@@ -1,42 +1,60 @@
-"""The recorder daemon: `ros2-memory-recorder [KEY=VALUE ...]`."""
+"""The recorder daemon: `ros2-memory-recorder [KEY=VALUE ...]`.
+
+It locks the bag directory, puts it in order, records until a signal comes, and then ends the
+recording.
+"""
 
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
-from typing import TYPE_CHECKING, Final
+import time
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING, Final, Self
 
 import structlog
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_housekeeper, build_reader, build_recorder, claim
 from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_settings
-from ros2_memory.core.errors import ConfigError, EpisodicError
+from ros2_memory.core.errors import ConfigError, EpisodicError, RecorderError
 from ros2_memory.core.logging_setup import configure_logging
-from ros2_memory.core.sd_notify import ServiceManager
-from ros2_memory.recorder.daemon import (
-    Upkeep,
-    lock_bag_dir,
-    put_in_order,
-    record_until_told,
+from ros2_memory.core.sd_notify import (
+    READY,
+    STOPPING,
+    WATCHDOG,
+    ServiceManager,
+    watchdog_interval_s,
 )
+from ros2_memory.recorder.handover.recovery import recover_handovers
 from ros2_memory.recorder.process.topics import load_topics
+from ros2_memory.retention.clear import clear_bags, refuse_homes
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+    from types import FrameType
 
     from ros2_memory.config import Settings
+    from ros2_memory.recorder.base import Housekeeper, Recorder
+    from ros2_memory.storage.base import BagReader
 
 PROGRAM: Final = "ros2-memory-recorder"
 FAILED: Final = 1
 INTERRUPTED: Final = 130
+TICK_S: Final = 0.2
+RECOVER_EVERY_S: Final = 60.0
+ENDING_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Records until it is told to stop, and returns the exit code.
+    """Records until a signal comes, and returns the exit code.
 
     0: stopped by a signal, or there is nothing to record (`recorder=none`); 1: recording cannot
     begin; 2: the configuration or the command line is refused; 130: interrupted before it began.
@@ -57,20 +75,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stderr.write(f"{PROGRAM} cannot record: {error}\n")
             return FAILED
         except KeyboardInterrupt:
-            # It came while the bag directory was put in order, which can be broken off.
+            # It came while the bag directory was put in order, which can be interrupted.
             return INTERRUPTED
     return 0
 
 
 def _record(settings: Settings) -> None:
-    # A list that is refused stops it before anything is deleted.
+    # Nothing is deleted before the list of topics and the environment proved fit for recording.
     load_topics(settings.recording.topics_file)
     bag_dir = settings.recording.bag_dir.absolute()
     reader = BagDirReader(build_reader(settings), bag_dir, every_message=True)
     own = OwnRecordings(bag_dir)
     housekeeper = build_housekeeper(settings, bag_dir, reader, own)
     clear = settings.recording.clear_on_startup
-    lock = lock_bag_dir(bag_dir, clear=clear)
+    lock = _lock_bag_dir(bag_dir, clear=clear)
     try:
         recorder = build_recorder(
             settings,
@@ -79,16 +97,166 @@ def _record(settings: Settings) -> None:
             own=own,
             keep_open=(lock.descriptor,),
         )
-        # So does an environment in which nothing can be recorded.
         recorder.check()
         claim(own)
-        keeps_foreign = settings.retention.foreign == "keep"
-        put_in_order(bag_dir, reader, housekeeper, clear=clear, own=own if keeps_foreign else None)
+        if clear:
+            _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
+        _put_in_order(bag_dir, reader, housekeeper)
         _log.info("starting", bag_dir=str(bag_dir))
-        record_until_told(recorder, ServiceManager(), Upkeep(bag_dir, reader, lock))
+        _record_until_signal(recorder, BagDirUpkeep(bag_dir, reader, lock))
         _log.info("stopped")
     finally:
         lock.release()
+
+
+def _lock_bag_dir(bag_dir: Path, *, clear: bool) -> BagDirLock:
+    """Makes the bag directory where it does not exist, and locks it.
+
+    Raises:
+        RecorderError: another recorder holds it, it cannot be written to, or it is to be cleared
+            and holds a home directory.
+    """
+    if clear:
+        refuse_homes(bag_dir)
+    try:
+        bag_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecorderError(
+            f"{bag_dir} cannot be made: {error.strerror}; correct recording.bag_dir"
+        ) from error
+    return BagDirLock.acquire(bag_dir)
+
+
+def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:
+    cleared = clear_bags(bag_dir, own)
+    _log.warning("bags_cleared", files=cleared.files, bytes=cleared.bytes)
+    for fault in cleared.faults:
+        _log.error("not_cleared", reason=fault)
+    if cleared.more:
+        _log.error("not_cleared", reason=f"{cleared.more} more cannot be deleted")
+
+
+def _put_in_order(bag_dir: Path, reader: BagReader, housekeeper: Housekeeper) -> None:
+    """Repairs what a crash left, completes handovers, and begins to apply the limits.
+
+    A failure is reported, and recording begins all the same.
+    """
+    tasks: dict[str, Callable[[], None]] = {
+        "repair": housekeeper.repair,
+        "settle": lambda: recover_handovers(bag_dir, reader),
+        "apply": housekeeper.apply,
+    }
+    for name, task in tasks.items():
+        try:
+            task()
+        except (EpisodicError, OSError) as error:
+            _log.error("not_prepared", task=name, reason=str(error))
+
+
+def _record_until_signal(recorder: Recorder, upkeep: BagDirUpkeep) -> None:
+    """Records until SIGTERM, SIGINT or SIGHUP comes, and ends what it started.
+
+    Must be called from the main thread, which the recorder's processes die with.
+
+    Raises:
+        EpisodicError: recording cannot begin, or another recorder took the bag directory.
+    """
+    manager = ServiceManager()
+    interval_s = watchdog_interval_s()
+    next_sign_s = 0.0
+    with EndingSignals() as signals:
+        try:
+            recorder.start()
+            manager.tell(READY)
+            while not signals.wait(TICK_S):
+                recorder.tick()
+                upkeep.tick()
+                if interval_s is not None and time.monotonic() >= next_sign_s:
+                    manager.tell(WATCHDOG)
+                    next_sign_s = time.monotonic() + interval_s / 2
+        finally:
+            manager.tell(STOPPING)
+            recorder.stop()
+
+
+class BagDirUpkeep:
+    """Keeps the bag directory locked and its handovers complete while it is recorded into.
+
+    The lock is taken again where its file has gone. A handover that could not be completed, as on
+    a full disk, is tried again: until then the messages of its new recording do not count.
+    """
+
+    def __init__(self, bag_dir: Path, reader: BagReader, lock: BagDirLock) -> None:
+        self._bag_dir = bag_dir
+        self._reader = reader
+        self._lock = lock
+        self._recover_at_s = time.monotonic() + RECOVER_EVERY_S
+
+    def tick(self) -> None:
+        """Does what is due.
+
+        Raises:
+            RecorderError: another recorder took the bag directory.
+        """
+        if self._lock.renew():
+            _log.warning("lock_renewed", reason="its file had gone from the bag directory")
+        if time.monotonic() >= self._recover_at_s:
+            self._recover_at_s = time.monotonic() + RECOVER_EVERY_S
+            self.recover()
+
+    def recover(self) -> None:
+        """Completes the handovers of recordings that are no longer written."""
+        heartbeat = read_heartbeat(self._bag_dir).heartbeat
+        running = heartbeat.recordings if heartbeat else ()
+        # The recorder reports a directory that cannot be listed.
+        with suppress(OSError):
+            recover_handovers(self._bag_dir, self._reader, running)
+
+
+class EndingSignals:
+    """Notes the ending signals while it is entered; they interrupt nothing.
+
+    They are not blocked and waited for with sigwait(3): a thread that a library started before
+    would receive them, and they would end the program. SIGCHLD is not ignored either, or the system
+    would reap children, and other processes could take their numbers.
+    """
+
+    def __init__(self) -> None:
+        self._received: int | None = None
+        self._restore = ExitStack()
+
+    def __enter__(self) -> Self:
+        """Installs the handlers. Only in the main thread."""
+        for number in ENDING_SIGNALS:
+            self._handle(number, self._note)
+        self._handle(signal.SIGCHLD, signal.SIG_DFL)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Restores the handlers that were installed before."""
+        self._restore.close()
+
+    def wait(self, seconds: float) -> bool:
+        """Waits for so long, and returns whether a signal has come.
+
+        A signal does not cut the wait short: Python runs the handler and sleeps on (PEP 475).
+        """
+        if self._received is None:
+            time.sleep(seconds)
+        if self._received is None:
+            return False
+        _log.info("signal_received", signal=signal.Signals(self._received).name)
+        return True
+
+    def _handle(
+        self,
+        number: signal.Signals,
+        handler: Callable[[int, FrameType | None], None] | signal.Handlers,
+    ) -> None:
+        self._restore.callback(signal.signal, number, signal.signal(number, handler))
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        self._received = number
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -207,7 +207,7 @@ class Housekeeping(Housekeeper):
             with self._index.undisturbed() as snapshot:
                 if self._keeper.has_work():
                     self._keeper.keep(snapshot)
-                self._keeper.follow()
+                self._keeper.update_sidecars()
         except OSError as error:
             _log.error("moments_not_minded", reason=str(error))
 

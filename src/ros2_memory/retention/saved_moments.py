@@ -1,8 +1,8 @@
-"""Keeps what was asked to be kept: hard links in `moments/`, which retention never deletes.
+"""Saves the moments that were asked for: hard links in `moments/`, which retention never deletes.
 
-The recorder alone does this, while nothing is deleted. Whatever stops it between two steps, the
-next look finds on the disk how far it came: a moment says that it is pending before its first link
-is made, and a wish is there until it was answered.
+The recorder alone does this, while nothing is deleted. A crash between two steps does no harm: a
+moment's file says that it is pending before its first link is made, and a request stays in the
+queue until it is answered. What a moment needs and whether it fits are decided by pure functions.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import re
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.hard_links import HardLinks
-from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
+from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE, is_carried
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
     SavedMoment,
@@ -30,23 +30,22 @@ from ros2_memory.bag_dir.moment_file import (
 )
 from ros2_memory.bag_dir.request_queue import Outcome, RequestQueue
 from ros2_memory.core import directories
-from ros2_memory.retention.moment_plan import (
-    Weight,
-    admitted,
-    fitting,
-    needed,
-    no_room,
-    window_of,
-)
+from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S
+from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from ros2_memory.bag_dir.moment_file import SaveRequest
     from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Clock
+    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.moment_plan import Needed
+
+REPAIRED_WITHIN_NS: Final[Ns] = 600 * NS_PER_S
+"""For so long a moment waits for a bag that a crash left open: its repair makes another file."""
+LONGEST_WAIT_NS: Final[Ns] = 2 * 3600 * NS_PER_S
+"""No split stays open for longer, unless another program writes it, or clocks differ."""
 
 _FULL: Final = "the share of moments (retention.max_moments_gb) was used up: not all of it is kept"
 _OWN_FOLDER: Final = re.compile(r"\d{8}T\d{6}Z-[a-z0-9-]+(_\d+)?")
@@ -54,12 +53,91 @@ _OWN_FOLDER: Final = re.compile(r"\d{8}T\d{6}Z-[a-z0-9-]+(_\d+)?")
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
+class NeededBags(NamedTuple):
+    """The bags of a moment that can be kept now, in order of time; `waits`: more may come."""
+
+    bags: tuple[BagFile, ...]
+    waits: bool
+
+
+def window_of(start: Ns, end: Ns) -> TimeWindow:
+    """Returns the window of a moment from `start` to `end`, both included."""
+    return TimeWindow(start, min(end + 1, MAX_NS))
+
+
+def needed_bags(
+    window: TimeWindow,
+    asked: Ns,
+    bags: Iterable[BagFile],
+    open_files: Iterable[TimeWindow | None],
+    now: Ns,
+) -> NeededBags:
+    """Chooses the bags that a moment needs.
+
+    Args:
+        window: when the moment was.
+        asked: when it was asked for.
+        bags: those that answer queries.
+        open_files: when what is still being written may have been recorded; None if unknown.
+        now: the present time.
+    """
+    waits = now < window.stop or any(_may_overlap(each, window) for each in open_files)
+    ready = []
+    for bag in bags:
+        if not window.overlaps(bag.start, bag.end) or is_carried(bag.path):
+            continue
+        unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(".mcap")
+        if unfinished and now - asked < REPAIRED_WITHIN_NS:
+            waits = True
+        else:
+            ready.append(bag)
+    return NeededBags(tuple(ready), waits and abs(now - asked) < LONGEST_WAIT_NS)
+
+
+def fitting(
+    files: Iterable[tuple[int, int]], stored: Mapping[int, int], share: int
+) -> dict[int, int]:
+    """Adds files in their order to those that moments store, as long as the share has room.
+
+    Args:
+        files: inodes and sizes (bytes).
+        stored: what moments store, by inode, in bytes.
+        share: how many bytes they may store.
+    """
+    taken = dict(stored)
+    total = sum(taken.values())
+    for inode, size in files:
+        if inode not in taken and total + size <= share:
+            taken[inode] = size
+            total += size
+    return taken
+
+
+def no_room(
+    files: Iterable[tuple[int, int]], stored: Mapping[int, int], share: int, expected: int = 0
+) -> str | None:
+    """Describes why a moment is refused for want of room; None if all of its files fit.
+
+    `files`, `stored` and `share` as for `fitting`; `expected` are the bytes of open files.
+    """
+    used = sum(stored.values())
+    new = {inode: size for inode, size in files if inode not in stored}
+    more = sum(new.values()) + expected
+    if used + more <= share:
+        return None
+    return (
+        f"moments may take {share / GB:.3g} GB, {used / GB:.3g} GB of that are "
+        f"used, and this one takes {more / GB:.3g} GB more; delete folders in moments/ of the bag "
+        "directory, raise retention.max_moments_gb, or ask for fewer seconds"
+    )
+
+
 class MomentKeeper:
-    """The moments of one bag directory. Not for several threads at once, but for `has_work`.
+    """The moments of one bag directory. Not thread-safe, except for `has_work`.
 
     Args:
         bag_dir: the bag directory.
-        share_bytes: what moments may take of its budget.
+        share_bytes: how much of the budget moments may take.
         clock: the wall clock.
     """
 
@@ -67,50 +145,50 @@ class MomentKeeper:
         self._bag_dir = bag_dir
         self._share = share_bytes
         self._clock = clock
-        self._mailbox = RequestQueue(bag_dir)
-        self._names = HardLinks(bag_dir)
-        self._looked = False
+        self._queue = RequestQueue(bag_dir)
+        self._links = HardLinks(bag_dir)
+        self._started = False
         self._waiting = False
 
     def open(self) -> None:
-        """Makes the folder of wishes, so that a server may be let into it alone."""
-        self._mailbox.open()
+        """Makes the folder of requests, so that a server may be given access to it alone."""
+        self._queue.open()
 
     def has_work(self) -> bool:
-        """Whether somebody asks, or a moment waits for bags; also before the first look."""
-        return not self._looked or self._waiting or self._mailbox.has_requests()
+        """Whether a request or a pending moment waits; also before the first call of `keep`."""
+        return not self._started or self._waiting or self._queue.has_requests()
 
     def keep(self, snapshot: Snapshot) -> None:
-        """Does what is asked, and goes on with what is pending. Nothing may be deleted meanwhile.
+        """Answers requests and goes on with pending moments. Nothing may be deleted meanwhile.
 
         Raises:
-            OSError: the folders cannot be listed or written to; the next look tries again.
+            OSError: the folders cannot be listed or written to; the next call tries again.
         """
-        if not self._looked:
-            self._clean()
+        if not self._started:
+            self._remove_unbegun()
         now = self._clock.now()
-        book = {held.folder.name: held for held in stored_moments_in(self._bag_dir)}
-        for name, held in book.items():
-            if held.moment.pending:
-                book[name] = self._advance(held, _all_files(book), snapshot)
-        numbers = {held.moment.number: held for held in book.values()}
-        for wish in self._mailbox.take(now) if self._mailbox.has_requests() else ():
-            known = numbers.get(wish.number)
-            done = _outcome_of(known) if known else self._grant(wish, book, snapshot)
-            self._mailbox.answer(wish, done)
-        self._waiting = any(held.moment.pending for held in book.values())
-        self._looked = True
+        stored = {each.folder.name: each for each in stored_moments_in(self._bag_dir)}
+        for name, moment in stored.items():
+            if moment.moment.pending:
+                stored[name] = self._advance(moment, _all_files(stored), snapshot)
+        numbers = {each.moment.number: each for each in stored.values()}
+        for request in self._queue.take(now) if self._queue.has_requests() else ():
+            known = numbers.get(request.number)
+            outcome = _outcome_of(known) if known else self._grant(request, stored, snapshot)
+            self._queue.answer(request, outcome)
+        self._waiting = any(each.moment.pending for each in stored.values())
+        self._started = True
 
-    def follow(self) -> None:
-        """Links the sidecars of recordings that were written anew; a fault is reported.
+    def update_sidecars(self) -> None:
+        """Links the sidecars of recordings again that were rewritten; a fault is reported.
 
-        What of a bag counts is decided when its recording is over, which may be later.
+        Which messages of a bag count is decided when its recording is over, which may be later.
         """
         moments = moments_of(self._bag_dir)
         if moments.is_symlink():
             return
         for root, _ in directories.walk(moments):
-            recording = self._names.recorded_as(root)
+            recording = self._links.recorded_as(root)
             try:
                 if recording != root:
                     _link_sidecar(Path(recording), Path(root))
@@ -118,129 +196,128 @@ class MomentKeeper:
                 _log.error("moment_not_followed", path=root, reason=str(error))
 
     def _grant(
-        self, wish: SaveRequest, book: dict[str, StoredMoment], snapshot: Snapshot
+        self, request: SaveRequest, stored: dict[str, StoredMoment], snapshot: Snapshot
     ) -> Outcome:
-        """Begins a moment, which is then in the book, or says why not."""
-        need = self._needed(wish, snapshot)
-        refused = self._refusal(wish, need, book, snapshot)
+        """Begins a moment and adds it to `stored`, or refuses it."""
+        need = self._needed(request, snapshot)
+        refused = self._refusal(request, need, stored, snapshot)
         if refused is None:
             try:
-                held = self._begin(wish, need)
+                moment = self._begin(request, need)
             except OSError as error:
                 refused = (
                     f"the bags cannot be kept in {moments_of(self._bag_dir)} by hard links: "
                     f"{error.strerror or error}"
                 )
             else:
-                book[held.folder.name] = held
-                _log.info("moment_kept", folder=held.folder.name, bags=len(held.files))
-                return _outcome_of(held)
-        _log.warning("moment_refused", label=wish.label, reason=refused)
+                stored[moment.folder.name] = moment
+                _log.info("moment_kept", folder=moment.folder.name, bags=len(moment.files))
+                return _outcome_of(moment)
+        _log.warning("moment_refused", label=request.label, reason=refused)
         return Outcome(refused=refused)
 
     def _refusal(
-        self, wish: SaveRequest, need: Needed, book: dict[str, StoredMoment], snapshot: Snapshot
+        self,
+        request: SaveRequest,
+        need: NeededBags,
+        stored: dict[str, StoredMoment],
+        snapshot: Snapshot,
     ) -> str | None:
-        if len(book) >= MAX_MOMENTS:
+        if len(stored) >= MAX_MOMENTS:
             return (
-                f"there are {len(book)} moments, which is as many as are kept; delete folders in "
+                f"there are {len(stored)} moments, which is as many as are kept; delete folders in "
                 "moments/ of the bag directory"
             )
         if not need.bags and not need.waits:
             return "nothing was recorded then: ask for a time of which the memory knows"
-        held = _all_files(book)
-        weights = [weight for bag in need.bags for weight in _weighed(bag)]
-        expected = self._open_bytes(wish, snapshot) if need.waits else 0
-        if admitted(weights, held, self._share, expected) is None:
-            new = {each.inode: each.size for each in weights if each.inode not in held}
-            return no_room(held, sum(new.values()) + expected, self._share)
-        return None
+        files = filter(None, map(_file_of, need.bags))
+        expected = self._open_bytes(request, snapshot) if need.waits else 0
+        return no_room(files, _all_files(stored), self._share, expected)
 
-    def _begin(self, wish: SaveRequest, need: Needed) -> StoredMoment:
-        folder = make_moment_folder(self._bag_dir, wish)
+    def _begin(self, request: SaveRequest, need: NeededBags) -> StoredMoment:
+        folder = make_moment_folder(self._bag_dir, request)
+        begun = SavedMoment.of(request)
         try:
-            write_saved_moment(folder, SavedMoment.of(wish))
+            write_saved_moment(folder, begun)
             missing, files = self._link(folder, need.bags, None)
-            keepsake = replace(SavedMoment.of(wish), pending=need.waits, missing=missing)
-            if keepsake != SavedMoment.of(wish):
-                write_saved_moment(folder, keepsake)
+            moment = replace(begun, pending=need.waits, missing=missing)
+            if moment != begun:
+                write_saved_moment(folder, moment)
         except OSError:
             directories.remove(folder)
             raise
         flush(folder.parent)
-        return StoredMoment(folder, keepsake, files)
+        return StoredMoment(folder, moment, files)
 
     def _advance(
-        self, held: StoredMoment, files: dict[int, int], snapshot: Snapshot
+        self, stored: StoredMoment, files: dict[int, int], snapshot: Snapshot
     ) -> StoredMoment:
-        """Goes on with a moment; what of it cannot be kept it says in its file."""
-        before = held.moment
+        """Goes on with a moment; what of it cannot be kept is listed in its file."""
+        before = stored.moment
         need = self._needed(before, snapshot)
         try:
-            missing, linked = self._link(held.folder, need.bags, files)
+            missing, linked = self._link(stored.folder, need.bags, files)
         except OSError as error:
             missing, linked = (f"not all can be kept: {error.strerror or error}",), {}
-        said = (*before.missing, *(each for each in missing if each not in before.missing))
-        after = replace(before, pending=need.waits, missing=said)
-        files_now = {**held.files, **linked}
-        if after == before:
-            return StoredMoment(held.folder, before, files_now)
-        try:
-            write_saved_moment(held.folder, after)
-        except OSError as error:
-            _log.error("moment_not_written", folder=str(held.folder), reason=str(error))
-            return StoredMoment(held.folder, before, files_now)
-        if not after.pending:
-            _log.info("moment_complete", folder=held.folder.name, missing=list(said))
-        return StoredMoment(held.folder, after, files_now)
+        missing = tuple(dict.fromkeys((*before.missing, *missing)))
+        after = replace(before, pending=need.waits, missing=missing)
+        files_now = {**stored.files, **linked}
+        if after != before:
+            try:
+                write_saved_moment(stored.folder, after)
+            except OSError as error:
+                _log.error("moment_not_written", folder=str(stored.folder), reason=str(error))
+                return StoredMoment(stored.folder, before, files_now)
+            if not after.pending:
+                _log.info("moment_complete", folder=stored.folder.name, missing=list(missing))
+        return StoredMoment(stored.folder, after, files_now)
 
-    def _needed(self, what: SaveRequest | SavedMoment, snapshot: Snapshot) -> Needed:
-        window = window_of(what.start, what.end)
+    def _needed(self, moment: SaveRequest | SavedMoment, snapshot: Snapshot) -> NeededBags:
+        window = window_of(moment.start, moment.end)
         open_files = [snapshot.places[aside] for aside in snapshot.active]
         bags = snapshot.overlapping(window)
-        return needed(window, what.asked, bags, open_files, self._clock.now())
+        return needed_bags(window, moment.asked, bags, open_files, self._clock.now())
 
-    def _open_bytes(self, wish: SaveRequest, snapshot: Snapshot) -> int:
-        """What of the moment is being written, as far as it has come."""
-        window, size = window_of(wish.start, wish.end), 0
+    def _open_bytes(self, request: SaveRequest, snapshot: Snapshot) -> int:
+        """Returns the present size of the open files that may belong to the moment, in bytes."""
+        window, size = window_of(request.start, request.end), 0
         for aside in snapshot.active:
-            place = snapshot.places[aside]
-            if place is None or (place.start < window.stop and window.start < place.stop):
+            if _may_overlap(snapshot.places[aside], window):
                 with suppress(OSError):
                     size += aside.path.lstat().st_size
         return size
 
     def _link(
-        self, folder: Path, bags: Sequence[BagFile], files: dict[int, int] | None
+        self, folder: Path, bags: Sequence[BagFile], stored: dict[int, int] | None
     ) -> tuple[tuple[str, ...], dict[int, int]]:
-        """Links bags into a moment's folder; what could not be, and the links by inode.
+        """Links bags into a moment's folder.
 
-        `files` are what moments hold, where the share is to be minded.
+        Returns why some could not be linked, and the sizes of the links by inode. `stored` is what
+        all moments store, where the share limits them.
 
         Raises:
             OSError: a link cannot be made.
         """
         missing: dict[str, None] = {}
         linked: dict[int, int] = {}
-        weights = {bag.file: _weighed(bag) for bag in bags}
-        every = [weight for each in weights.values() for weight in each]
-        allowed = None if files is None else fitting(every, files, self._share)
+        files = [_file_of(bag) for bag in bags]
+        allowed = None if stored is None else fitting(filter(None, files), stored, self._share)
         touched: set[Path] = set()
-        for bag in bags:
-            name = os.path.relpath(self._names.recorded_as(bag.file), self._bag_dir)
+        for bag, file in zip(bags, files, strict=True):
+            name = os.path.relpath(self._links.recorded_as(bag.file), self._bag_dir)
             target = folder / name
-            if not weights[bag.file] and not target.exists():
+            if file is None:
                 # `forget` deletes in another process, since the index was made.
-                missing[_gone(name)] = None
-            for inode, size in weights[bag.file]:
-                if allowed is not None and inode not in allowed:
-                    missing[_FULL] = None
-                    continue
+                if not target.exists():
+                    missing[_gone(name)] = None
+            elif allowed is not None and file[0] not in allowed:
+                missing[_FULL] = None
+            else:
                 directories.make(self._bag_dir, target.parent)
-                if not _link_bag(bag.path, target, inode):
+                if not _link_bag(bag.path, target, file[0]):
                     missing[_gone(name)] = None
                     continue
-                linked[inode] = size
+                linked.update((file,))
                 if target.parent not in touched:
                     touched.add(target.parent)
                     _link_sidecar(bag.path.parent, target.parent)
@@ -248,7 +325,7 @@ class MomentKeeper:
             flush(parent)
         return tuple(missing), linked
 
-    def _clean(self) -> None:
+    def _remove_unbegun(self) -> None:
         """Removes what a crash left of a moment that had not begun."""
         with suppress(OSError):
             for folder in moments_of(self._bag_dir).iterdir():
@@ -258,31 +335,35 @@ class MomentKeeper:
                         folder.rmdir()
 
 
-def _weighed(bag: BagFile) -> tuple[Weight, ...]:
-    """The file of a bag; none where it has gone."""
+def _may_overlap(recorded: TimeWindow | None, window: TimeWindow) -> bool:
+    """Whether what was recorded in one window may lie in the other; yes if unknown."""
+    return recorded is None or (recorded.start < window.stop and window.start < recorded.stop)
+
+
+def _file_of(bag: BagFile) -> tuple[int, int] | None:
+    """Returns inode and size (bytes) of a bag's file; None where it has gone."""
     try:
         status = bag.path.lstat()
     except FileNotFoundError:
-        return ()
-    return (Weight(status.st_ino, status.st_size),)
+        return None
+    return status.st_ino, status.st_size
 
 
 def _gone(name: str) -> str:
     return f"{name} has gone, or another file of that name is kept"
 
 
-def _all_files(book: dict[str, StoredMoment]) -> dict[int, int]:
-    """What all moments hold, each file once."""
-    return {inode: size for held in book.values() for inode, size in held.files.items()}
+def _all_files(stored: Mapping[str, StoredMoment]) -> dict[int, int]:
+    """Returns the sizes of all files in moments by inode, so that each counts once."""
+    return {inode: size for each in stored.values() for inode, size in each.files.items()}
 
 
-def _outcome_of(held: StoredMoment) -> Outcome:
-    keepsake = held.moment
-    return Outcome(held.folder.name, len(held.files), keepsake.pending)
+def _outcome_of(stored: StoredMoment) -> Outcome:
+    return Outcome(stored.folder.name, len(stored.files), stored.moment.pending)
 
 
 def _link_bag(bag: Path, target: Path, inode: int) -> bool:
-    """Whether the file is there under its second name, too.
+    """Links a bag; returns whether its file now has the second name, too.
 
     Raises:
         OSError: the link cannot be made.
@@ -297,7 +378,7 @@ def _link_bag(bag: Path, target: Path, inode: int) -> bool:
 
 
 def _link_sidecar(recording: Path, folder: Path) -> None:
-    """Links a recording's sidecar, in the place of an earlier one.
+    """Links a recording's sidecar, replacing an earlier one.
 
     Raises:
         OSError: it cannot be linked.

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import structlog
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
@@ -17,13 +19,23 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
-from ros2_memory.cli.recover import recover_files
+from ros2_memory.cli.recovery import recover
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import saved_moments
 from ros2_memory.retention.clear import clear_bags
-from ros2_memory.retention.saved_moments import MomentKeeper
+from ros2_memory.retention.saved_moments import (
+    LONGEST_WAIT_NS,
+    REPAIRED_WITHIN_NS,
+    MomentKeeper,
+    fitting,
+    needed_bags,
+    no_room,
+    window_of,
+)
 from tests.support.bags import McapLayout
 from tests.support.housekeepers import PLENTY, files_in, recording_now
-from tests.support.memories import SettableClock, memory_of
+from tests.support.memories import LAST_WRITTEN, SettableClock, memory_of
 from tests.support.saved_moments import (
     NOW,
     T0,
@@ -41,6 +53,12 @@ from tests.support.saved_moments import (
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from ros2_memory.core.model import BagSummary
+
+AT = LAST_WRITTEN
+# A file has one size.
+FILES = st.lists(st.integers(0, 8).map(lambda inode: (inode, 7 * inode)), max_size=12)
 
 
 class TestKeeping:
@@ -92,7 +110,7 @@ class TestKeeping:
 
         monkeypatch.setattr(type(sidecar), "samefile", gone)
         with structlog.testing.capture_logs() as logs:
-            house._keeper.follow()
+            house._keeper.update_sidecars()
         assert [each for each in logs if each["event"] == "moment_not_followed"] == []
 
     def test_what_was_never_recorded_is_refused(self, tmp_path: Path) -> None:
@@ -131,7 +149,7 @@ class TestKeeping:
         """As where the recorder was killed after it kept a moment, and before it answered."""
         recording(tmp_path, A, 0)
         slot = asked(tmp_path, 15, 25)
-        request = tmp_path / REQUESTS_FOLDER / f"{slot.request.number}.json"
+        request = tmp_path / REQUESTS_FOLDER / f"{slot.wish.number}.json"
         text = request.read_text()
         house_of(tmp_path).keep_moments()
         first = slot.outcome()
@@ -239,8 +257,8 @@ class TestCrashes:
     ) -> None:
         recording(tmp_path, A, 0)
         slot = asked(tmp_path, 15, 25)
-        folder = make_moment_folder(tmp_path, slot.request)
-        write_saved_moment(folder, SavedMoment.of(slot.request))
+        folder = make_moment_folder(tmp_path, slot.wish)
+        write_saved_moment(folder, SavedMoment.of(slot.wish))
         house_of(tmp_path).keep_moments()
         outcome = slot.outcome()
         assert outcome is not None
@@ -333,7 +351,7 @@ class TestOthers:
         recording(tmp_path, A, 0, splits=1)
         kept(house_of(tmp_path), tmp_path, 0, 5)
         said: list[str] = []
-        assert recover_files(tmp_path, said.append).whole == 1
+        assert recover(tmp_path, said.append).whole == 1
 
     def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
@@ -343,3 +361,108 @@ class TestOthers:
         assert not looking.has_work()
         asked(tmp_path, 0, 5)
         assert looking.has_work()
+
+
+def span_of(
+    start: int, end: int, state: BagState = BagState.CLOSED, name: str = "r/r.mcap"
+) -> BagFile:
+    """A bag from `start` to `end` seconds."""
+    unread: BagSummary = None  # type: ignore[assignment]
+    return BagFile(
+        f"/bags/{name}",
+        1,
+        AT,
+        state,
+        unread,
+        AT + start * S,
+        AT + end * S,
+    )
+
+
+def window(start: int, end: int) -> TimeWindow:
+    return window_of(AT + start * S, AT + end * S)
+
+
+class TestWhatIsNeeded:
+    def test_the_bags_that_have_a_moment_of_it_both_ends_included(self) -> None:
+        bags = [
+            span_of(0, 9),
+            span_of(10, 19),
+            span_of(20, 29),
+            span_of(30, 39),
+            span_of(41, 50),
+        ]
+        found = needed_bags(window(19, 40), AT + 60 * S, bags, [], AT + 60 * S)
+        assert found.bags == (bags[1], bags[2], bags[3])
+        assert not found.waits
+
+    def test_it_waits_for_its_own_end_and_for_open_files_that_may_hold_some_of_it(self) -> None:
+        def waits(now: int, *open_files: TimeWindow | None) -> bool:
+            return needed_bags(window(0, 30), AT + 30 * S, [], open_files, AT + now * S).waits
+
+        assert waits(30)
+        assert not waits(31)
+        assert waits(31, window(30, 40))
+        assert waits(31, None)
+        assert not waits(31, window(31, 40))
+
+    def test_it_does_not_wait_for_ever(self) -> None:
+        asked = AT + 30 * S
+        found = needed_bags(window(0, 30), asked, [], [None], asked + LONGEST_WAIT_NS)
+        assert not found.waits
+        assert not needed_bags(window(0, 30), asked, [], [None], asked - LONGEST_WAIT_NS).waits
+
+    def test_a_bag_that_a_crash_left_open_is_waited_for_as_long_as_repair_may_take(self) -> None:
+        left = [span_of(0, 9, BagState.INCOMPLETE)]
+        young = needed_bags(window(0, 5), AT, left, [], AT + 60 * S)
+        assert (young.bags, young.waits) == ((), True)
+        old = needed_bags(window(0, 5), AT, left, [], AT + REPAIRED_WITHIN_NS)
+        assert (old.bags, old.waits) == (tuple(left), False)
+        other = [span_of(0, 9, BagState.INCOMPLETE, "r/r.db3")]
+        assert needed_bags(window(0, 5), AT, other, [], AT + 60 * S).bags == tuple(other)
+
+    def test_the_bag_of_carried_messages_is_none(self) -> None:
+        carried = span_of(0, 9, name="latched/carried.mcap")
+        assert needed_bags(window(0, 5), AT, [carried], [], AT + 60 * S).bags == ()
+
+    def test_a_window_ends_with_time_itself(self) -> None:
+        assert window_of(0, MAX_NS).stop == MAX_NS
+
+
+class TestTheShare:
+    def test_a_file_that_is_stored_already_takes_nothing_more(self) -> None:
+        stored = {1: 60}
+        assert no_room([(1, 60), (2, 40)], stored, 100) is None
+        assert no_room([(1, 60), (2, 41)], stored, 100) is not None
+        assert no_room([(2, 40), (2, 40)], stored, 100) is None
+        assert fitting([(1, 60), (2, 40)], stored, 100) == {1: 60, 2: 40}
+
+    def test_what_is_still_being_written_is_expected(self) -> None:
+        assert no_room([(2, 40)], {}, 100, expected=60) is None
+        assert no_room([(2, 40)], {}, 100, expected=61) is not None
+
+    @given(FILES, FILES, st.integers(0, 150))
+    def test_what_is_granted_or_fits_never_passes_it(
+        self, files: list[tuple[int, int]], before: list[tuple[int, int]], share: int
+    ) -> None:
+        stored: dict[int, int] = {}
+        for inode, size in before:
+            if no_room([(inode, size)], stored, share) is None:
+                stored[inode] = size
+        assert sum(stored.values()) <= share
+        if no_room(files, stored, share) is None:
+            assert sum({**stored, **dict(files)}.values()) <= share
+        taken = fitting(files, stored, share)
+        assert taken.items() >= stored.items()
+        assert sum(taken.values()) <= share
+
+    @given(FILES, st.integers(0, 150))
+    def test_all_that_is_granted_fits(self, files: list[tuple[int, int]], share: int) -> None:
+        if no_room(files, {}, share) is None:
+            assert fitting(files, {}, share) == dict(files)
+
+    def test_a_refusal_says_what_is_used_and_what_to_do(self) -> None:
+        refused = no_room([(2, 200_000_000)], {1: 900_000_000}, 10**9)
+        assert refused is not None
+        assert "may take 1 GB, 0.9 GB of that are used, and this one takes 0.2 GB more" in refused
+        assert "retention.max_moments_gb" in refused

@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.daemon import Upkeep
+from ros2_memory.recorder.__main__ import BagDirUpkeep
 from ros2_memory.recorder.handover.plan import intended, pending, void
 from ros2_memory.recorder.handover.recovery import cut_clock, recover_handovers, unsettled
 from ros2_memory.storage.mcap_reader import McapReader
@@ -222,7 +222,7 @@ class TestWhileSomethingIsRecorded:
         beat = Heartbeat(1, T0, RecorderState.RECORDING, names, T0, 0, (), (), None, 5.0)
         write_heartbeat(bag_dir, beat)
         lock = BagDirLock.acquire(bag_dir)
-        Upkeep(bag_dir, READER, lock).settle()
+        BagDirUpkeep(bag_dir, READER, lock).recover()
         lock.release()
 
     def test_what_nobody_writes_is_settled(self, bag_dir: Path) -> None:
