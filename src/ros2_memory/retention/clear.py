@@ -1,17 +1,16 @@
-"""Deletes what is not history: recordings without a byte, and all bags where that is asked for.
+"""Deletes recordings without a byte, and all bags where that is asked for.
 
 `recording.clear_on_startup` is for simulation and tests, so moments go too. Bags of other programs
 stay, unless retention deletes those as well (`retention.foreign`). Only files that are known by
-name are deleted; a directory goes when that leaves it empty. Links are not followed, and another
+name are deleted, and a directory when that leaves it empty. Links are not followed, and another
 file system that is mounted below is left alone.
 """
 
 from __future__ import annotations
 
-import errno
 import os
 import pwd
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -27,11 +26,10 @@ from ros2_memory.bag_dir.layout import (
     bag_kind,
     is_kept_apart,
 )
+from ros2_memory.core import directories
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 MOST_FAULTS: Final = 100
@@ -40,10 +38,10 @@ _SQLITE_COMPANIONS: Final = (".db3-wal", ".db3-shm", ".db3-journal")
 
 
 @dataclass(slots=True)
-class Wiped:
+class Cleared:
     """What was deleted, and a sentence for each of the first things that could not be.
 
-    `more` is how many could not be besides.
+    `more` counts the others that could not be.
     """
 
     files: int = 0
@@ -51,29 +49,60 @@ class Wiped:
     faults: list[str] = field(default_factory=list)
     more: int = 0
 
+    def add_fault(self, sentence: str) -> None:
+        """Adds a sentence, or only counts it once there are `MOST_FAULTS`."""
+        if len(self.faults) < MOST_FAULTS:
+            self.faults.append(sentence)
+        else:
+            self.more += 1
 
-def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Wiped:
-    """Deletes the bags below the directory: every one, or the recorder's `own` and moments.
+
+def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
+    """Deletes the bags below the directory: all of them, or the recorder's `own` and moments.
 
     Raises:
-        RecorderError: the directory is `/`, a home directory or above one: a mistake, surely.
+        RecorderError: the directory is `/`, a home directory or above one.
     """
     refuse_homes(bag_dir)
     root = bag_dir.resolve()
-    wiped = Wiped()
+    cleared = Cleared()
     try:
         if own is not None:
             own.names()
-        _Clearing(root, wiped, own).run()
+        device = root.stat().st_dev
+        os.listdir(root)  # noqa: PTH208 - only whether it can be
     except FileNotFoundError:
-        pass
+        return cleared
     except OSError as error:
-        wiped.faults.append(f"{root} cannot be listed: {error.strerror}")
-    return wiped
+        cleared.add_fault(f"{root} cannot be listed: {error.strerror}")
+        return cleared
+    # Names, not paths: a path may be longer than the system takes (PATH_MAX), and `opened` finds
+    # each directory again from the root, so that few files are open however deep it lies.
+    waiting: list[tuple[str, ...]] = [()]
+    emptied: list[Path] = []
+    while waiting:
+        parts = waiting.pop()
+        path = root.joinpath(*parts)
+        try:
+            with directories.opened(root, path) as folder:
+                if os.fstat(folder).st_dev != device:
+                    continue
+                had_bags, below = _clear_folder(folder, parts, path, own, cleared)
+            if had_bags and parts:
+                emptied.append(path)
+            waiting.extend((*parts, name) for name in below)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            cleared.add_fault(f"{path} cannot be deleted: {error.strerror}")
+    for path in reversed(emptied):
+        with suppress(OSError), directories.opened(root, path.parent) as above:
+            os.rmdir(path.name, dir_fd=above)
+    return cleared
 
 
 def refuse_homes(bag_dir: Path) -> None:
-    """Says whether bags may be deleted below a directory, before anything is written there.
+    """Checks that bags may be deleted below a directory, before anything is written there.
 
     Raises:
         RecorderError: the directory is `/`, a home directory or above one.
@@ -91,178 +120,70 @@ def refuse_homes(bag_dir: Path) -> None:
 
 
 def remove_if_empty(recording: Path) -> bool:
-    """Deletes the directory of a recording that ended without a byte; whether it did.
+    """Deletes the directory of a recording that ended without a byte; returns whether it did.
 
     A recorder that dies as soon as it starts would leave one with every attempt.
     """
     try:
-        with _opened(recording) as opened:
-            with os.scandir(opened) as listing:
+        with directories.opened(recording.parent, recording) as folder:
+            with os.scandir(folder) as listing:
                 entries = list(listing)
-            if not all(_is_nothing(entry) for entry in entries):
+            if not all(_is_worthless(entry) for entry in entries):
                 return False
             for entry in entries:
-                os.unlink(entry.name, dir_fd=opened)
+                os.unlink(entry.name, dir_fd=folder)
         recording.rmdir()
     except OSError:
         return False
     return True
 
 
-def _is_nothing(entry: os.DirEntry[str]) -> bool:
-    if not entry.is_file(follow_symlinks=False):
-        return False
-    empty = entry.stat(follow_symlinks=False).st_size == 0
-    return entry.name == HANDOVER_FILE or (
-        empty and (_is_bag(entry) or entry.name == METADATA_FILE)
-    )
+def _clear_folder(
+    folder: int, parts: tuple[str, ...], path: Path, own: OwnRecordings | None, cleared: Cleared
+) -> tuple[bool, list[str]]:
+    """Deletes the bags in an open directory, which has this path and these names below the root.
 
-
-@dataclass(slots=True)
-class _Folder:
-    """A directory that is being cleared, and the ones in it that still are to be."""
-
-    name: str
-    inode: tuple[int, int]
-    had_bags: bool
-    waiting: list[str]
-
-
-class _Clearing:
-    """Deletes the bags below one directory, however deep they lie.
-
-    One directory is open at a time, and names are looked up in it: whatever takes the place of its
-    path meanwhile is not touched. The way up is `..`, if that is the directory it was come from.
+    Returns whether it may go when it is empty, and the directories in it that are not hidden.
     """
-
-    def __init__(self, root: Path, wiped: Wiped, own: OwnRecordings | None = None) -> None:
-        self._root = root
-        self._own = own
-        self._wiped = wiped
-        self._open = -1
-        self._way: list[_Folder] = []
-
-    def run(self) -> None:
-        """Clears it.
-
-        Raises:
-            OSError: the directory itself cannot be listed.
-        """
-        self._open = _open(self._root)
+    with os.scandir(folder) as listing:
+        entries = list(listing)
+    in_moments = parts[:1] == (MOMENTS_FOLDER,) and len(parts) <= 2
+    has_bags = in_moments or any(_is_bag(entry) for entry in entries)
+    name = "/".join(parts)
+    is_own = own is None or is_kept_apart(name) or own.lists(name, identity_at(folder))
+    names = RECORDING_FILES if has_bags and is_own else frozenset()
+    if not parts:
+        names |= OWN_FILES
+    elif in_moments and len(parts) == 2:
+        names |= {MOMENT_FILE}
+    for entry in entries:
+        known = entry.name in names and entry.is_file(follow_symlinks=False)
+        if not known and not (is_own and _is_bag(entry)):
+            continue
         try:
-            self._device = os.fstat(self._open).st_dev
-            self._enter("")
-            while self._way:
-                waiting = self._way[-1].waiting
-                if waiting:
-                    self._descend(waiting.pop())
-                else:
-                    self._leave()
-        finally:
-            os.close(self._open)
-
-    def _descend(self, name: str) -> None:
-        """Goes down into a directory, where it can, and clears what lies in it."""
-        above = self._open
-        try:
-            self._open = _open(name, above)
+            size = entry.stat(follow_symlinks=False).st_size
+            os.unlink(entry.name, dir_fd=folder)
         except FileNotFoundError:
-            return
+            continue
         except OSError as error:
-            self._fault(name, error)
-            return
-        try:
-            self._enter(name)
-        except OSError as error:
-            os.close(self._open)
-            self._open = above
-            self._fault(name, error)
+            cleared.add_fault(f"{path / entry.name} cannot be deleted: {error.strerror}")
         else:
-            os.close(above)
-
-    def _enter(self, name: str) -> None:
-        """Deletes the bags in the open directory, and what goes with them."""
-        with os.scandir(self._open) as listing:
-            entries = list(listing)
-        status = os.fstat(self._open)
-        level = len(self._way)
-        moments = level in {1, 2} and (name if level == 1 else self._way[1].name) == MOMENTS_FOLDER
-        had_bags = moments or any(_is_bag(entry) for entry in entries)
-        ours = self._is_ours(name)
-        names = RECORDING_FILES if had_bags and ours else frozenset()
-        if level == 0:
-            names |= OWN_FILES
-        elif level == 2 and moments:
-            names |= {MOMENT_FILE}
-        folder = _Folder(name, (status.st_dev, status.st_ino), had_bags, [])
-        self._way.append(folder)
-        for entry in entries:
-            try:
-                if _is_directory(entry, self._device):
-                    folder.waiting.append(entry.name)
-                elif (ours and _is_bag(entry)) or (
-                    entry.name in names and entry.is_file(follow_symlinks=False)
-                ):
-                    size = entry.stat(follow_symlinks=False).st_size
-                    os.unlink(entry.name, dir_fd=self._open)
-                    self._wiped.files += 1
-                    self._wiped.bytes += size
-            except FileNotFoundError:
-                continue
-            except OSError as error:
-                self._fault(entry.name, error)
-
-    def _is_ours(self, name: str) -> bool:
-        """Whether the bags in the open directory may go."""
-        if self._own is None:
-            return True
-        path = "/".join([*(each.name for each in self._way if each.name), name])
-        return is_kept_apart(path) or self._own.lists(path, identity_at(self._open))
-
-    def _leave(self) -> None:
-        """Goes up again, and deletes the directory where it had bags and nothing is left in it."""
-        left = self._way.pop()
-        if not self._way:
-            return
-        above = _open("..", self._open)
-        os.close(self._open)
-        self._open = above
-        status = os.fstat(above)
-        if (status.st_dev, status.st_ino) != self._way[-1].inode:
-            moved = OSError(errno.EBUSY, "it was moved away while it was cleared")
-            self._fault(left.name, moved)
-            self._way.clear()
-        elif left.had_bags:
-            with suppress(OSError):
-                os.rmdir(left.name, dir_fd=above)
-
-    def _fault(self, name: str, error: OSError) -> None:
-        path = self._root.joinpath(*(each.name for each in self._way if each.name), name)
-        if len(self._wiped.faults) < MOST_FAULTS:
-            self._wiped.faults.append(f"{path} cannot be deleted: {error.strerror}")
-        else:
-            self._wiped.more += 1
+            cleared.files += 1
+            cleared.bytes += size
+    below = [
+        entry.name
+        for entry in entries
+        if not entry.name.startswith(".") and entry.is_dir(follow_symlinks=False)
+    ]
+    return has_bags, below
 
 
-def _open(path: Path | str, within: int | None = None) -> int:
-    """A descriptor of a directory that stands there itself and not through a link."""
-    flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW
-    return os.open(path, flags, dir_fd=within)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[int]:
-    descriptor = _open(path)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
-
-
-def _is_directory(entry: os.DirEntry[str], device: int) -> bool:
-    if entry.name.startswith(".") or not entry.is_dir(follow_symlinks=False):
-        return False
-    return entry.stat(follow_symlinks=False).st_dev == device
+def _is_worthless(entry: os.DirEntry[str]) -> bool:
+    """Whether a file of a recording means nothing where that has no bag with content."""
+    if entry.name == HANDOVER_FILE:
+        return entry.is_file(follow_symlinks=False)
+    empty = entry.is_file(follow_symlinks=False) and not entry.stat(follow_symlinks=False).st_size
+    return empty and (_is_bag(entry) or entry.name == METADATA_FILE)
 
 
 def _is_bag(entry: os.DirEntry[str]) -> bool:
