@@ -45,7 +45,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Memory
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
+from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -392,5 +392,5 @@ class _Removal:
         for path in (bag.path, Path(other_form(bag.file))):
             with suppress(FileNotFoundError):
                 status = path.lstat()
-                inode = Inode(status.st_dev, status.st_ino)
+                inode = (status.st_dev, status.st_ino)
                 self.freed += remove_bag(self.bag_dir, path, inode)

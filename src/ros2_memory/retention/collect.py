@@ -1,9 +1,8 @@
-"""Deletes what the limits do not allow to keep, after what must outlive it was carried on.
+"""Deletes bags that exceed the limits, after their latched messages were carried forward.
 
-Whoever asks a question holds what was known of the bags some seconds ago. So a bag with latched
-messages is deleted only when those have been carried for that long: until then somebody may look
-for them where they stood. Meanwhile the next oldest goes in its place; where there is none, the
-limits come first.
+A query works on a snapshot of the bags that is some seconds old. So a bag with latched messages is
+deleted only when those have been carried for that long: until then a query may look for them in the
+bag. Meanwhile the next oldest bag is deleted instead; where there is none, the limits come first.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import structlog
 
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.core.errors import EpisodicError
-from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
+from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import ages, plan_deletions
 from ros2_memory.retention.recorded_time import relative_recording
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from ros2_memory.retention.recorded_time import RecordedTime
 
 MOST_AT_ONCE: Final = 2000
-"""Bags deleted in one pass: some tenths of a second. The next pass goes on."""
+"""Bags deleted in one pass, which take some tenths of a second. The next pass goes on."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -42,11 +41,17 @@ _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 class Collected:
     """What one pass did.
 
-    `total_bytes` is what the budget counts afterwards, and `fits` whether the limits are kept.
-    `foreign_bytes` is what bags take that the recorder did not make and no limit counts. `carried`
-    is how many latched messages are carried, where their bag was written anew; `failed` is how many
-    bags could not be deleted. `held` is how many are too old by their dates and stay, since the
-    clock is not known to be right.
+    Attributes:
+        bags: how many bags were deleted.
+        bytes: how many bytes that freed.
+        recordings: how many directories of recordings were deleted.
+        carried: how many latched messages are carried, if their bag was rewritten.
+        failed: how many bags could not be deleted.
+        total_bytes: what the budget counts afterwards.
+        foreign_bytes: the size of bags that the recorder did not make and no limit counts.
+        fits: whether the limits are kept.
+        held: how many bags are too old by their dates and stay, since the clock is not known to be
+            right.
     """
 
     bags: int = 0
@@ -62,39 +67,39 @@ class Collected:
 
 @dataclass(slots=True)
 class _Pass:
-    """One pass under way: bags that were deleted (`kept` of them in moments), and those that stay.
+    """The state of one pass.
 
-    Of these some are `waiting`: they could be deleted, and should be some moments later. When it is
-    `urgent` nothing is waited for. `synchronised`: whether the system clock is; None until asked.
+    Attributes:
+        urgent: whether it does not wait until carried messages have been known for long enough.
+        synchronised: whether the system clock is synchronised; None until asked.
+        waiting: those of the remaining bags that can be deleted some moments later.
+        result: what it did so far.
+        deleted: bags that were deleted.
+        remaining: bags that stay.
+        saved: those of the deleted bags whose files are saved in moments.
     """
 
     urgent: bool
     synchronised: bool | None = None
     waiting: set[str] = field(default_factory=set)
-    done: Collected = field(default_factory=Collected)
-    gone: set[str] = field(default_factory=set)
-    staying: set[str] = field(default_factory=set)
-    kept: set[Path] = field(default_factory=set)
-
-    def hurry(self) -> None:
-        """Waits no more."""
-        self.urgent = True
-        self.staying -= self.waiting
-        self.waiting.clear()
+    result: Collected = field(default_factory=Collected)
+    deleted: set[str] = field(default_factory=set)
+    remaining: set[str] = field(default_factory=set)
+    saved: set[Path] = field(default_factory=set)
 
 
 class GarbageCollector:
-    """Keeps one bag directory within its limits. Not for several threads at once.
+    """Keeps one bag directory within its limits. Not thread-safe.
 
     Args:
         bag_dir: the bag directory.
         limits: how much is kept.
-        carrier: carries latched messages on.
+        carrier: carries latched messages forward.
         own: the recordings that the recorder made.
         recorded: how long was recorded after each recording.
         is_synchronised: whether the system clock is synchronised; may take some seconds.
-        static_topics: topics that are latched whatever their publishers say.
-        grace_s: how long latched messages are carried before the bag goes that they stood in.
+        static_topics: topics that are latched whatever their publishers declare.
+        grace_s: how long latched messages are carried before their bag is deleted.
         monotonic: a clock that never steps, in seconds.
     """
 
@@ -120,8 +125,8 @@ class GarbageCollector:
         self._grace_s = grace_s
         self._monotonic = monotonic
         self._carried_since: dict[str, float] = {}
-        self._told: set[str] = set()
-        self._untidy: set[Path] = set()
+        self._reported: set[str] = set()
+        self._emptied: set[Path] = set()
 
     def apply(
         self,
@@ -131,130 +136,134 @@ class GarbageCollector:
         free_bytes: Callable[[], int] | None = None,
         min_free_bytes: int | None = None,
     ) -> Collected:
-        """Deletes what is too old, and then what is too much. What cannot be deleted is reported.
+        """Deletes what is too old, then what exceeds the budget. Reports what cannot be deleted.
 
         Args:
-            known: what the index knows of files.
-            snapshot: what it publishes of them.
-            free_bytes: measures what the disk has left; where None, that does not count.
-            min_free_bytes: what must be free, where that is not as the limits have it.
+            known: what the index knows about files.
+            snapshot: the index's snapshot of the same files.
+            free_bytes: measures what the disk has left; None if that does not count.
+            min_free_bytes: what must be free, in place of the limits' own figure.
 
         Raises:
-            OSError: what is free cannot be measured, or it cannot be read which recordings are the
-                recorder's own.
+            OSError: the free space cannot be measured, or the list of the recorder's own recordings
+                cannot be read.
         """
         limits = self._limits
         if min_free_bytes is not None:
             limits = replace(limits, min_free_bytes=min_free_bytes)
-        under_way = _Pass(urgent=free_bytes is not None)
+        run = _Pass(urgent=free_bytes is not None)
         while True:
-            stock = self._inventory.stock(known, gone=under_way.gone, staying=under_way.staying)
+            stock = self._inventory.stock(known, deleted=run.deleted, remaining=run.remaining)
             if free_bytes is not None:
                 stock = replace(stock, free_bytes=free_bytes())
-            stock = self._with_clocks(stock, limits, under_way)
-            found = plan_deletions(stock, limits)
-            under_way.done.foreign_bytes = stock.foreign_bytes
-            under_way.done.total_bytes, under_way.done.fits = found.total_bytes, found.fits
-            doomed = found.doomed[: MOST_AT_ONCE - len(under_way.gone)]
-            if doomed:
-                kept = {file.inode for file in stock.kept}
-                self._dispose(doomed, kept, snapshot, under_way)
-            elif found.fits or not under_way.waiting:
+            stock = self._with_clocks(stock, limits, run)
+            plan = plan_deletions(stock, limits)
+            run.result.foreign_bytes = stock.foreign_bytes
+            run.result.total_bytes, run.result.fits = plan.total_bytes, plan.fits
+            to_delete = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
+            if to_delete:
+                saved = {file.inode for file in stock.saved}
+                self._delete_all(to_delete, saved, snapshot, run)
+            elif plan.fits or not run.waiting:
                 break
             else:
-                under_way.hurry()
-        self._tidy(known, under_way)
-        return under_way.done
+                run.urgent = True
+                run.remaining -= run.waiting
+                run.waiting.clear()
+        self._remove_emptied(known, run)
+        return run.result
 
     def _with_clocks(
-        self, stock: RetentionStock, limits: RetentionLimits, under_way: _Pass
+        self, stock: RetentionStock, limits: RetentionLimits, run: _Pass
     ) -> RetentionStock:
-        """The stock, and what the clocks say of it."""
+        """Adds how long was recorded after each bag, and whether the clock is synchronised."""
         names = {
             bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in stock.bags
         }
         since = self._recorded.since(names.values())
         stock = replace(stock, recorded_since={path: since[name] for path, name in names.items()})
         old = ages(stock, limits)
-        # A program has to be started to know, so only where it matters.
-        if old.by_dates != old.by_recording and under_way.synchronised is None:
-            under_way.synchronised = self._is_synchronised()
-        synchronised = bool(under_way.synchronised)
-        under_way.done.held = len(old.held(synchronised=synchronised))
+        # Asking starts a program, so only where it matters.
+        if old.by_dates != old.by_recording and run.synchronised is None:
+            run.synchronised = self._is_synchronised()
+        synchronised = bool(run.synchronised)
+        run.result.held = len(old.held(synchronised=synchronised))
         return replace(stock, synchronised=synchronised)
 
-    def _dispose(
+    def _delete_all(
         self,
-        doomed: Sequence[StoredBag],
-        kept: Collection[tuple[int, int]],
+        to_delete: Sequence[StoredBag],
+        saved: set[tuple[int, int]],
         snapshot: Snapshot,
-        under_way: _Pass,
+        run: _Pass,
     ) -> None:
-        leaving = {Path(bag.path) for bag in doomed} | {Path(path) for path in under_way.gone}
+        leaving = {Path(bag.path) for bag in to_delete} | {Path(path) for path in run.deleted}
         latched = {str(bag.path) for bag in self._carrier.concerned(snapshot, leaving)}
         try:
-            under_way.kept |= {
-                Path(bag.path) for bag in doomed if any(each.inode in kept for each in bag.files)
+            run.saved |= {
+                Path(bag.path)
+                for bag in to_delete
+                if any(each.inode in saved for each in bag.files)
             }
-            carried = self._carrier.carry(snapshot, leaving, under_way.kept)
+            carried = self._carrier.carry(snapshot, leaving, run.saved)
         except (EpisodicError, OSError) as error:
-            # The others may go all the same, and make the room that was missing.
+            # Bags without latched messages can be deleted all the same, and may make enough room.
             reason = f"its latched messages cannot be carried on: {error}"
-            for each in doomed:
+            for each in to_delete:
                 if each.path in latched:
-                    self._stays(each.path, reason, under_way)
+                    self._keep(each.path, reason, run)
         else:
-            under_way.done.carried = under_way.done.carried if carried is None else carried
-        for each in doomed:
-            if each.path in latched and self._is_asked_for(each.path, under_way):
-                under_way.staying.add(each.path)
-                under_way.waiting.add(each.path)
-            if each.path not in under_way.staying:
-                self._delete(each, under_way)
+            run.result.carried = run.result.carried if carried is None else carried
+        for each in to_delete:
+            if each.path in latched and self._is_in_grace(each.path, run):
+                run.remaining.add(each.path)
+                run.waiting.add(each.path)
+            if each.path not in run.remaining:
+                self._delete(each, run)
 
-    def _is_asked_for(self, path: str, under_way: _Pass) -> bool:
-        """Whether latched messages are still looked for in a bag, though they are carried."""
+    def _is_in_grace(self, path: str, run: _Pass) -> bool:
+        """Whether queries may still look for latched messages in a bag, though they are carried."""
         now = self._monotonic()
         since = self._carried_since.setdefault(path, now)
-        return not under_way.urgent and now - since < self._grace_s
+        return not run.urgent and now - since < self._grace_s
 
-    def _delete(self, bag: StoredBag, under_way: _Pass) -> None:
+    def _delete(self, bag: StoredBag, run: _Pass) -> None:
         size = 0
         for path, file in zip((bag.path, other_form(bag.path)), bag.files, strict=False):
             try:
-                freed = remove_bag(self._bag_dir, Path(path), Inode(*file.inode))
-                size += 0 if Path(path) in under_way.kept else freed
+                freed = remove_bag(self._bag_dir, Path(path), file.inode)
+                size += 0 if Path(path) in run.saved else freed
             except FileNotFoundError:
                 continue
             except OSError as error:
-                self._stays(bag.path, str(error), under_way)
+                self._keep(bag.path, str(error), run)
                 return
-        self._told.discard(bag.path)
+        self._reported.discard(bag.path)
         self._carried_since.pop(bag.path, None)
-        under_way.gone.add(bag.path)
-        under_way.done.bags += 1
-        under_way.done.bytes += size
+        run.deleted.add(bag.path)
+        run.result.bags += 1
+        run.result.bytes += size
 
-    def _tidy(self, known: KnownBags, under_way: _Pass) -> None:
-        """Deletes what is left of recordings without a bag, unless one is being written."""
+    def _remove_emptied(self, known: KnownBags, run: _Pass) -> None:
+        """Deletes what is left of recordings without a bag, except those being written."""
         named = {self._bag_dir / name for name in known.named}
-        self._untidy |= {Path(path).parent for path in under_way.gone}
-        for recording in self._untidy - named:
+        self._emptied |= {Path(path).parent for path in run.deleted}
+        for recording in self._emptied - named:
             try:
                 remove_emptied(self._bag_dir, recording)
             except OSError as error:
-                self._tell(str(recording), str(error))
+                self._report(str(recording), str(error))
             else:
-                self._untidy.discard(recording)
-                under_way.done.recordings += not recording.exists()
+                self._emptied.discard(recording)
+                run.result.recordings += not recording.exists()
 
-    def _stays(self, path: str, reason: str, under_way: _Pass) -> None:
-        under_way.staying.add(path)
-        under_way.done.failed += 1
-        self._tell(path, reason)
+    def _keep(self, path: str, reason: str, run: _Pass) -> None:
+        run.remaining.add(path)
+        run.result.failed += 1
+        self._report(path, reason)
 
-    def _tell(self, path: str, reason: str) -> None:
-        """Reports a fault; silent while it stands."""
-        if path not in self._told:
-            self._told.add(path)
+    def _report(self, path: str, reason: str) -> None:
+        """Reports a fault once, until the bag is deleted."""
+        if path not in self._reported:
+            self._reported.add(path)
             _log.error("not_deleted", path=path, reason=reason)

@@ -1,7 +1,7 @@
-"""Deletes bags and what stands beside them, and never anything else.
+"""Deletes bags and the files that belong to them, and never anything else.
 
-Every name is looked up below the bag directory without following a link, and a bag file goes only
-while it is the very file that was judged. A recording's directory goes when nothing is left in it.
+Every name is looked up below the bag directory without following a link, and a bag file is deleted
+only while it is the very file that was judged. A recording's directory goes when it is empty.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 import re
 import stat
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import RECORDING_FILES, bag_kind
 from ros2_memory.core import directories
@@ -23,20 +23,13 @@ _LEFTOVER: Final = re.compile(r"\.(?P<target>.+)\.tmp|\.(?P<bag>.+)" + re.escape
 _COMPANION: Final = re.compile(r"(?P<bag>.+\.db3)-(wal|shm|journal)", re.IGNORECASE)
 
 
-class Inode(NamedTuple):
-    """Which file a name means: its device and its number there."""
-
-    device: int
-    number: int
-
-
 def repair_name(name: str) -> str:
-    """What a bag file is called while it is being repaired; the index passes it by."""
+    """Returns the name of a bag file while it is being repaired, which the index ignores."""
     return f".{name}{REPAIR_SUFFIX}"
 
 
 def left_by_repair(name: str) -> bool:
-    """Whether a file is what a repair that was cut short left."""
+    """Whether a file was left by a repair that was interrupted."""
     left = _LEFTOVER.fullmatch(name)
     return left is not None and bag_kind(left["bag"] or "") is not None
 
@@ -44,7 +37,7 @@ def left_by_repair(name: str) -> bool:
 def goes_with_bags(name: str) -> bool:
     """Whether a file of a recording has no meaning without its bags.
 
-    Those are what the recorder notes of them, and what a crash left of files being written.
+    Those are the recorder's sidecars, and what a crash left of files being written.
     """
     left = _LEFTOVER.fullmatch(name)
     if left is not None:
@@ -52,8 +45,13 @@ def goes_with_bags(name: str) -> bool:
     return name in RECORDING_FILES or _COMPANION.fullmatch(name) is not None
 
 
-def remove_bag(root: Path, path: Path, inode: Inode) -> int:
-    """Deletes one bag file below the root, and a sqlite bag's journals; the bytes it held.
+def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
+    """Deletes one bag file below the root, and a sqlite bag's journals; returns its size in bytes.
+
+    Args:
+        root: the bag directory.
+        path: the file.
+        inode: the device and inode number that it must have.
 
     Raises:
         FileNotFoundError: it is not there any more.
@@ -71,9 +69,9 @@ def remove_bag(root: Path, path: Path, inode: Inode) -> int:
 
 
 def remove_emptied(root: Path, recording: Path) -> int:
-    """Deletes a recording of which no bag is left; how many files went.
+    """Deletes a recording of which no bag is left; returns how many files were deleted.
 
-    What is not known by name stays, and then the directory does.
+    A file that is not known by name stays, and so does the directory then.
 
     Raises:
         OSError: something that has to go cannot be deleted.
@@ -101,7 +99,7 @@ def remove_emptied(root: Path, recording: Path) -> int:
 
 
 def beside_bags(recording: Path) -> int:
-    """The bytes of what goes with the last bag of a recording; what cannot be seen counts none."""
+    """Returns the bytes that are deleted with a recording's last bag; 0 for what cannot be read."""
     size = 0
     with suppress(OSError), os.scandir(recording) as entries:
         for entry in entries:

@@ -1,7 +1,7 @@
-"""Whether the bag directory lies on the disk that it lay on when recording began.
+"""Notices when the bag directory no longer lies on the disk on which recording began.
 
-Where a disk is unmounted under a running recorder, the bag directory's path names a directory of
-the disk below it, mostly the one that the system runs from, which recordings would fill.
+When a disk is unmounted under a running recorder, the path of the bag directory names a directory
+of the disk below it, mostly the system disk, which recordings would fill.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def free_bytes(directory: Path) -> int:
-    """What the file system of a directory has left for this user.
+    """Returns the bytes that the file system of a directory has left for this user.
 
     Raises:
         OSError: it cannot be measured.
@@ -24,10 +24,10 @@ def free_bytes(directory: Path) -> int:
 
 
 def device_of(directory: Path) -> int:
-    """The device that a directory lies on, or would lie on if it were made.
+    """Returns the device that a directory lies on, or would lie on if it were made.
 
     Raises:
-        OSError: it cannot be told.
+        OSError: it cannot be looked at.
     """
     for existing in (directory, *directory.parents):
         try:
@@ -38,7 +38,7 @@ def device_of(directory: Path) -> int:
 
 
 class HomeDisk:
-    """The disk that a bag directory lay on at first."""
+    """The disk that a bag directory lay on when recording began."""
 
     def __init__(self, bag_dir: Path, device: Callable[[Path], int] = device_of) -> None:
         self._bag_dir = bag_dir
@@ -48,18 +48,19 @@ class HomeDisk:
         self._away = False
 
     def remember(self) -> None:
-        """Takes the disk that the bag directory lies on for its own.
+        """Remembers the disk that the bag directory lies on now.
 
         Raises:
-            OSError: it cannot be told which it is.
+            OSError: it cannot be looked at.
         """
         self._device = self._device_of(self._bag_dir)
         self._away = False
 
     def is_away(self, recordings: Collection[str]) -> bool:
-        """Whether another disk lies there; as before where that cannot be told.
+        """Whether another disk lies there now; the answer from before if that cannot be read.
 
-        A disk may come back under another number, so one that has a recording of this run is it.
+        A disk may come back under another device number, so one with a recording of this run is
+        taken for the same.
 
         Args:
             recordings: those that are being written and exist.

@@ -1,8 +1,8 @@
-"""What lies in the bag directory because of this program, and which of it may be deleted.
+"""Lists what this program put into the bag directory, and which of it may be deleted.
 
-The index knows the bags; here stands what retention weighs besides: which recordings are its
-recorder's own, what goes with the last bag of a recording, what nothing may delete, and which files
-are two names of one. Worked out for what changed since the last time, since a week is 60,000 bags.
+The index knows the bags. Retention also needs to know which recordings are the recorder's own, what
+goes with the last bag of a recording, what must not be deleted, and which files are two names of
+one. Only what changed is worked out again, since a week has 60,000 bags.
 """
 
 from __future__ import annotations
@@ -42,31 +42,38 @@ if TYPE_CHECKING:
     from ros2_memory.index.scan import Stamp
 
 OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
-"""What is derived from bags, and what `ros2` logs."""
+"""Data derived from bags, and the logs of `ros2`."""
 SETTLED_NS: Final[Ns] = 120 * NS_PER_S
-"""A directory that changed longer ago holds what it will hold."""
+"""A directory that has not changed for so long is complete."""
 _BLOCK: Final = 4096
 _WHOLE: Final = frozenset({FileState.CLOSED, FileState.EMPTY})
 
 
-class _Deletable(Enum):
-    """What may become of a bag."""
+class Deletable(Enum):
+    """Whether a bag may be deleted, and what counts if not."""
 
-    MAY_GO = auto()
-    MAY_GO_UNNAMED = auto()  # where the recorder does not name its recording
-    STAYS = auto()
-    DAMAGED = auto()  # stays, and counts where the recorder made it
-    FROM_ELSEWHERE = auto()  # stays, and does not count
-    KEPT = auto()  # in a moment: stays, and counts with the others there
+    YES = auto()
+    IF_UNNAMED = auto()  # unless the recorder names its recording in the heartbeat
+    NO = auto()
+    DAMAGED = auto()  # no; counts if the recorder made it
+    UNREAD = auto()  # no, and does not count
+    SAVED = auto()  # no; a file of a moment, which counts with the others there
+
+
+_OTHERS: Final = {
+    FileState.INCOMPLETE: Deletable.IF_UNNAMED,
+    FileState.DAMAGED: Deletable.DAMAGED,
+    FileState.UNREAD: Deletable.UNREAD,
+}
 
 
 class _Entry(NamedTuple):
     """A bag, and what it was made from."""
 
-    verdict: Classification
+    classification: Classification
     stamp: Stamp
     bag: StoredBag
-    fate: _Deletable
+    deletable: Deletable
 
 
 class _Folder(NamedTuple):
@@ -84,10 +91,13 @@ class _Folder(NamedTuple):
 
 
 class Inventory:
-    """The stock of one bag directory. Not for several threads at once.
+    """The stock of one bag directory. Not thread-safe.
 
-    `static_topics` are latched whatever their publishers say. Of bags that are not among the
-    recorder's `own` only the size is told; all bags are weighed where None.
+    Args:
+        root: the bag directory.
+        static_topics: topics that are latched whatever their publishers declare.
+        own: the recorder's recordings; only the size of other bags is counted. None: all bags may
+            be deleted.
     """
 
     def __init__(
@@ -103,20 +113,20 @@ class Inventory:
         self._folders: dict[str, _Folder] = {}
 
     def stock(
-        self, known: KnownBags, *, gone: Collection[str] = (), staying: Collection[str] = ()
+        self, known: KnownBags, *, deleted: Collection[str] = (), remaining: Collection[str] = ()
     ) -> RetentionStock:
-        """The bags that may be deleted, and the size of everything else.
+        """Returns the bags that may be deleted, and the size of everything else.
 
-        A bag that is being written may not, nor one that cannot be read: it says nothing of its
-        age. Whole bags may that were left open by a crash, unless the recorder named them last.
+        A bag that is being written must not be deleted, nor one that cannot be read: its age is
+        unknown. A bag that a crash left open may, unless the recorder named it last.
 
         Args:
             known: what the index knows.
-            gone: bags that have been deleted since.
-            staying: bags that cannot be deleted.
+            deleted: bags that have been deleted since.
+            remaining: bags that cannot be deleted.
 
         Raises:
-            OSError: it cannot be read which recordings are the recorder's own.
+            OSError: the list of the recorder's own recordings cannot be read.
         """
         bags: list[StoredBag] = []
         others = self._own_bytes()
@@ -127,31 +137,28 @@ class Inventory:
         if self._own is not None:
             self._own.names()
         entries, files = self._entries, known.files
-        for path, verdict in known.counted.items():
-            if path in gone:
+        for path, classification in known.counted.items():
+            if path in deleted:
                 continue
             entry = entries.get(path)
-            if (
-                entry is None
-                or entry.verdict is not verdict
-                or entry.stamp is not files[path].stamp
-            ):
-                entry = entries[path] = self._entered(path, verdict, known)
-            fate, bag = entry.fate, entry.bag
+            stamp = files[path].stamp
+            if not (entry and entry.classification is classification and entry.stamp is stamp):
+                entry = entries[path] = self._entry(path, classification, known)
+            deletable, bag = entry.deletable, entry.bag
             own = owned.get(bag.recording)
             if own is None:
                 own = owned[bag.recording] = self._is_own(bag.recording, known.now)
-            # One that has just been begun is listed with its directory some moments later.
+            # A recording is listed as own some moments after its directory appears.
             ours = own or bag.recording in named or is_carried(Path(path))
-            if not ours and fate is not _Deletable.KEPT:
+            if not ours and deletable is not Deletable.SAVED:
                 foreign.update(bag.files)
                 continue
-            unnamed = fate is _Deletable.MAY_GO_UNNAMED and bag.recording not in named
-            if own and (fate is _Deletable.MAY_GO or unnamed) and path not in staying:
+            unnamed = deletable is Deletable.IF_UNNAMED and bag.recording not in named
+            if own and (deletable is Deletable.YES or unnamed) and path not in remaining:
                 bags.append(bag)
             else:
                 occupied.add(bag.recording)
-                if fate is not _Deletable.KEPT and not self._is_from_elsewhere(fate, bag):
+                if self._counts(deletable, bag):
                     others += sum(file.size for file in bag.files)
         self._forget(known)
         emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
@@ -159,8 +166,10 @@ class Inventory:
         occupied.update(bag.recording for bag in bags)
         others += sum(self._folder(each, known.now).size for each in occupied - emptied)
         elsewhere = sum({file.inode: file.size for file in foreign}.values())
-        kept = self._kept(known)
-        return RetentionStock(bags, known.now, sidecars, others, kept=kept, foreign_bytes=elsewhere)
+        saved = self._saved(known)
+        return RetentionStock(
+            bags, known.now, sidecars, others, saved=saved, foreign_bytes=elsewhere
+        )
 
     def _is_own(self, recording: str, now: Ns) -> bool:
         if self._own is None:
@@ -168,19 +177,20 @@ class Inventory:
         name = self._own.name_of(recording)
         return self._own.lists(name, self._folder(recording, now).identity)
 
-    def _is_from_elsewhere(self, fate: _Deletable, bag: StoredBag) -> bool:
-        """Whether a bag that stays does not count: where all are weighed, its name has to tell."""
-        if fate is _Deletable.DAMAGED:
-            return self._own is None and not has_own_name(Path(bag.recording).name)
-        return fate is _Deletable.FROM_ELSEWHERE
+    def _counts(self, deletable: Deletable, bag: StoredBag) -> bool:
+        """Whether a bag that stays counts among the other bytes."""
+        if deletable is Deletable.DAMAGED:
+            # Where all bags may be deleted, only its name shows whether the recorder made it.
+            return self._own is not None or has_own_name(Path(bag.recording).name)
+        return deletable not in {Deletable.SAVED, Deletable.UNREAD}
 
-    def _entered(self, path: str, verdict: Classification, known: KnownBags) -> _Entry:
-        bag = self._stored(path, verdict, known)
-        fate = _Deletable.KEPT if path in known.kept else _fate(verdict, bag)
-        return _Entry(verdict, known.files[path].stamp, bag, fate)
+    def _entry(self, path: str, classification: Classification, known: KnownBags) -> _Entry:
+        bag = self._stored(path, classification, known)
+        deletable = Deletable.SAVED if path in known.kept else _deletable(classification, bag)
+        return _Entry(classification, known.files[path].stamp, bag, deletable)
 
-    def _kept(self, known: KnownBags) -> tuple[StoredFile, ...]:
-        """The files of moments, each once."""
+    def _saved(self, known: KnownBags) -> tuple[StoredFile, ...]:
+        """Returns the files of moments, each once."""
         if not known.kept:
             return ()
         try:
@@ -193,7 +203,7 @@ class Inventory:
             for inode, stamp in stamps.items()
         )
 
-    def _stored(self, path: str, verdict: Classification, known: KnownBags) -> StoredBag:
+    def _stored(self, path: str, classification: Classification, known: KnownBags) -> StoredBag:
         recording = str(known.files[path].path.parent)
         device = self._folder(recording, known.now).device
         other = other_form(path)
@@ -202,22 +212,24 @@ class Inventory:
         files = (
             StoredFile((device, each.inode), each.size, _on_disk(each.size)) for each in stamps
         )
-        return StoredBag(path, recording, self._span(verdict), stamps[0].mtime_ns, tuple(files))
+        return StoredBag(
+            path, recording, self._span(classification), stamps[0].mtime_ns, tuple(files)
+        )
 
-    def _span(self, verdict: Classification) -> Span | None:
-        if verdict.bag is None:
+    def _span(self, classification: Classification) -> Span | None:
+        if classification.bag is None:
             return None
-        said = [
+        spans = [
             (topic.first, topic.last)
-            for topic in verdict.bag.summary.topics
+            for topic in classification.bag.summary.topics
             if not self._is_received_again(topic)
         ]
-        if not said:
+        if not spans:
             return None
-        return Span(min(first for first, _ in said), max(last for _, last in said))
+        return Span(min(first for first, _ in spans), max(last for _, last in spans))
 
     def _is_received_again(self, topic: TopicSummary) -> bool:
-        """Whether all that a bag holds of a topic may be what each recording receives again."""
+        """Whether all messages of a topic in a bag may be such that each recording receives again."""
         pace = Pace(Stated(topic.first, topic.last, topic.count), topic.first, topic.last)
         rare = topic.latched and is_rare(pace)
         return rare or topic.topic in self._static_topics
@@ -229,7 +241,7 @@ class Inventory:
         except OSError:
             return _Folder(0, settled=False, device=-1, size=0)
         if known is None or not known.settled or known.mtime_ns != status.st_mtime_ns:
-            # metadata.yaml is made, and written some moments later.
+            # metadata.yaml is created first and written some moments later.
             since = abs(now - status.st_mtime_ns)
             size = beside_bags(Path(path))
             known = _Folder(status.st_mtime_ns, since >= SETTLED_NS, status.st_dev, size)
@@ -252,7 +264,7 @@ class Inventory:
                 del self._folders[path]
 
     def _own_bytes(self) -> int:
-        """The size of what this program keeps beside the recordings."""
+        """Returns the size of what this program stores beside the recordings, in bytes."""
         own = [self._root / name for name in (*OWN_FILES, LOCK_FILE)]
         with suppress(OSError):
             own += (self._root / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
@@ -267,15 +279,11 @@ class Inventory:
         return size
 
 
-def _fate(verdict: Classification, bag: StoredBag) -> _Deletable:
-    path = Path(bag.path)
-    if verdict.standing is FileState.INCOMPLETE:
-        return _Deletable.MAY_GO_UNNAMED
-    if verdict.standing in _WHOLE:
-        return _Deletable.STAYS if is_carried(path) else _Deletable.MAY_GO
-    if verdict.standing is FileState.DAMAGED:
-        return _Deletable.DAMAGED
-    return _Deletable.FROM_ELSEWHERE if verdict.standing is FileState.UNREAD else _Deletable.STAYS
+def _deletable(classification: Classification, bag: StoredBag) -> Deletable:
+    state = classification.standing
+    if state in _WHOLE:
+        return Deletable.NO if is_carried(Path(bag.path)) else Deletable.YES
+    return _OTHERS.get(state, Deletable.NO)
 
 
 def _on_disk(size: int) -> int:

@@ -1,22 +1,21 @@
-"""Which bags are deleted: those too old, then the oldest beyond the budget. Pure decisions.
+"""Decides which bags are deleted: those too old, then the oldest beyond the budget. Pure.
 
-Age deletes only by a clock that is known to be right. Where the system clock is synchronised that
-is the one of the dates; else it is the monotonic clock: a bag is too old when more than
-`max_age_ns` has been recorded after it. What the dates alone call too old is held.
+Age deletes only by a clock that is known to be right. If the system clock is synchronised, dates
+count; else the monotonic clock does: a bag is too old when more than `max_age_ns` has been recorded
+after it. A bag that only its dates make too old is held.
 
 By dates, age counts from the newest recorded data, not from the wall clock: a robot that was
 switched off does not erase itself when it wakes. Clocks step, so not every date is believed:
 
-- A bag dated in the future, before there was ROS 2, or longer than any recording is not dated: it
-  ages no others, and is itself as old as its file.
-- A pause longer than `max_age_ns`, and than a day, is a robot that was off or a clock that was
-  set, which nothing can tell apart. It parts two eras, and no bag ages those of another era.
+- A bag dated in the future, before there was ROS 2, or longer than any recording counts as
+  undated: it makes no other bag old, and is itself as old as its file.
+- A pause longer than both `max_age_ns` and a day is a robot that was off or a clock that was set,
+  and nothing distinguishes the two. It separates two eras; a bag ages only against its own era.
 
-The budget takes them all, oldest first: a dated bag of the present era by its newest message, any
-other by the time of its file. A file dated after all that may be kept, counted from now, tells no
-time, and goes first: else it would stay for good. One dated before there was ROS 2, while the clock
-stands there now, is being recorded now, and goes last. The newest bag stays, whatever the limits
-say.
+The budget deletes the oldest first: a dated bag of the present era by its newest message, any other
+by the time of its file. A file dated further ahead of now than history is kept goes first, since
+its time means nothing and it would otherwise stay for good. A file dated before there was ROS 2,
+while the clock is there as well, is being recorded now and goes last. The newest bag always stays.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 class RetentionLimits:
     """How much is kept: bytes in all, age of the oldest, and what must stay free on the disk.
 
-    `keeps_foreign`: bags that the recorder did not make are no part of it, and never deleted.
+    `keeps_foreign`: bags that the recorder did not make are never deleted, and do not count.
     """
 
     max_total_bytes: int
@@ -51,7 +50,7 @@ class RetentionLimits:
 
 
 class StoredFile(NamedTuple):
-    """One file of a bag. Files that share an inode (device and number) take their space once.
+    """One file of a bag. Files that share an inode (device and number) count once.
 
     `size` is what the budget counts, `disk` what deleting it frees.
     """
@@ -69,11 +68,11 @@ class Span(NamedTuple):
 
 
 class StoredBag(NamedTuple):
-    """A bag that may be deleted (a tuple: a week is 60,000 of them, weighed every few seconds).
+    """A bag that may be deleted. A tuple, since a week has 60,000, judged every few seconds.
 
-    `span` leaves latched topics out, since each recording receives those again; None where the bag
-    holds nothing else. `written` is when its file was last written to; `recording` is the
-    directory that it lies in.
+    `span` leaves latched topics out, since each recording receives those again; it is None for a
+    bag that contains nothing else. `written` is when its file was last modified; `recording` is
+    the directory that it lies in.
     """
 
     path: str
@@ -85,15 +84,19 @@ class StoredBag(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RetentionStock:
-    """All that lies in the bag directory because of this program.
+    """All that this program put into the bag directory.
 
-    `sidecars` says, for each recording that goes with its last bag, how many bytes go with it.
-    `other_bytes` is what nothing here may delete: open bags, and what is not worth deleting.
-    `kept` are the files of moments, which nothing here deletes; bags may be other names of them.
-    `foreign_bytes` is what bags of other programs take that are kept; no limit counts them.
-    `free_bytes` is what the disk has left; None where that is not to count. `recorded_since` is by
-    recording how long was recorded after it, by the monotonic clock (none where it is missing), and
-    `synchronised` whether the system clock is.
+    Attributes:
+        bags: those that may be deleted.
+        now: the wall clock.
+        sidecars: for each recording that goes with its last bag, the bytes that go with it.
+        other_bytes: what must not be deleted: open bags, and files that are not worth deleting.
+        free_bytes: what the disk has left; None if that does not count.
+        saved: the files of moments, which are never deleted; bags may be other names of them.
+        recorded_since: how long was recorded after each recording, by the monotonic clock; a
+            recording that is missing counts as new.
+        synchronised: whether the system clock is synchronised.
+        foreign_bytes: the size of bags of other programs, which no limit counts.
     """
 
     bags: Sequence[StoredBag]
@@ -101,7 +104,7 @@ class RetentionStock:
     sidecars: Mapping[str, int] = field(default_factory=dict)
     other_bytes: int = 0
     free_bytes: int | None = None
-    kept: Sequence[StoredFile] = ()
+    saved: Sequence[StoredFile] = ()
     recorded_since: Mapping[str, Ns] = field(default_factory=dict)
     synchronised: bool = False
     foreign_bytes: int = 0
@@ -114,38 +117,33 @@ class Ages(NamedTuple):
     by_recording: frozenset[str]
 
     def too_old(self, *, synchronised: bool) -> frozenset[str]:
-        """Those that age deletes."""
+        """Returns the bags that age deletes."""
         return self.by_dates if synchronised else self.by_recording
 
     def held(self, *, synchronised: bool) -> frozenset[str]:
-        """Those that would go if the clock were known to be right."""
+        """Returns the bags that would be deleted if the clock were known to be right."""
         return self.by_dates - self.too_old(synchronised=synchronised)
 
 
 class DeletionPlan(NamedTuple):
-    """What the limits say of a stock.
+    """What the limits require.
 
-    `doomed` are the bags to delete, oldest first. `total_bytes` is what the budget counted, each
-    file once; `fits` says whether the limits are kept when those bags are gone.
+    `to_delete` has the oldest bag first. `total_bytes` is what the budget counted, each file once.
+    `fits`: whether the limits are kept once those bags are deleted.
     """
 
-    doomed: tuple[StoredBag, ...]
+    to_delete: tuple[StoredBag, ...]
     total_bytes: int
     fits: bool
 
 
-def expired(stock: RetentionStock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
-    """The bags to delete, oldest first: all that are too old, and no more than the budget needs."""
-    return plan_deletions(stock, limits).doomed
-
-
 def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
-    """The bags that are too old by either clock."""
+    """Returns the bags that are too old by either clock."""
     return _ages(stock, _eras(stock, limits), limits.max_age_ns)
 
 
 def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPlan:
-    """The bags to delete, and what came of weighing them."""
+    """Plans which bags to delete: all that are too old, then no more than the budget needs."""
     plan = _Plan(stock)
     total = plan.total
     eras = _eras(stock, limits)
@@ -153,34 +151,34 @@ def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPl
     if not aged and plan.fits(limits):
         return DeletionPlan((), total, fits=True)
     order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)
-    # What shares a file with the bag that stays would free nothing.
-    kept = _inodes(_newest(order, eras))
-    doomed: set[str] = set()
+    # Deleting a bag that shares a file with the one that stays would free nothing.
+    staying = _inodes(_newest(order, eras))
+    to_delete: set[str] = set()
     for bag in order:
-        if bag.path in aged and kept.isdisjoint(_inodes(bag)):
-            doomed.add(bag.path)
+        if bag.path in aged and staying.isdisjoint(_inodes(bag)):
+            to_delete.add(bag.path)
             plan.delete(bag)
     for bag in order:
         if plan.fits(limits):
             break
-        if bag.path not in aged and kept.isdisjoint(_inodes(bag)) and plan.frees(bag):
-            doomed.add(bag.path)
+        if bag.path not in aged and staying.isdisjoint(_inodes(bag)) and plan.frees(bag):
+            to_delete.add(bag.path)
             plan.delete(bag)
     return DeletionPlan(
-        tuple(bag for bag in order if bag.path in doomed), total, fits=plan.fits(limits)
+        tuple(bag for bag in order if bag.path in to_delete), total, fits=plan.fits(limits)
     )
 
 
 class _Plan:
-    """What is left when some bags are deleted."""
+    """Counts what is left when some bags are deleted."""
 
     def __init__(self, stock: RetentionStock) -> None:
         files = [each for bag in stock.bags for each in bag.files]
         sizes = {each.inode: each.size for each in files}
         self.shared = len(sizes) < len(files)
-        # What a moment keeps stays when every other name of it goes.
-        self._kept = {each.inode for each in stock.kept}
-        sizes.update((each.inode, each.size) for each in stock.kept)
+        # A file of a moment stays when every other name of it is deleted.
+        self._saved = {each.inode for each in stock.saved}
+        sizes.update((each.inode, each.size) for each in stock.saved)
         self._links = Counter(each.inode for each in files) if self.shared else Counter()
         self._bags_in = Counter(bag.recording for bag in stock.bags)
         self._sidecars = stock.sidecars
@@ -188,10 +186,10 @@ class _Plan:
         self._free = stock.free_bytes
 
     def delete(self, bag: StoredBag) -> None:
-        """Leaves one bag out."""
+        """Takes one bag away."""
         for each in bag.files:
             self._links[each.inode] -= 1
-            if self._links[each.inode] <= 0 and each.inode not in self._kept:
+            if self._links[each.inode] <= 0 and each.inode not in self._saved:
                 self._release(each.size, each.disk)
         self._bags_in[bag.recording] -= 1
         if not self._bags_in[bag.recording]:
@@ -199,8 +197,8 @@ class _Plan:
             self._release(size, size)
 
     def frees(self, bag: StoredBag) -> bool:
-        """Whether any of a bag's files could go for good."""
-        return not self._kept or any(each.inode not in self._kept for each in bag.files)
+        """Whether deleting a bag frees any of its files."""
+        return not self._saved or any(each.inode not in self._saved for each in bag.files)
 
     def fits(self, limits: RetentionLimits) -> bool:
         """Whether what is left is within the budget, and leaves enough of the disk."""
@@ -217,7 +215,7 @@ _Era: TypeAlias = "list[tuple[Span, StoredBag]]"
 
 
 def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
-    """The dated bags, parted where a pause is too long; the last era is the present one."""
+    """Splits the dated bags where a pause is too long; the last era is the present one."""
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
     latest = stock.now + FUTURE_NS
     dated = [
@@ -252,9 +250,9 @@ def _ages(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
 
 
 def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
-    """The bags that are too old for the newest of their era, if all dates are right.
+    """Returns the bags that are too old compared with the newest of their era, by their dates.
 
-    One that is not dated is of the present era if it was written in it, else of none.
+    An undated bag belongs to the present era if it was written in it, else to none.
     """
     aged: set[str] = set()
     dated = {bag.path for era in eras for _, bag in era}
@@ -271,26 +269,28 @@ def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> se
 def _oldest_first(
     stock: RetentionStock, limits: RetentionLimits, present: _Era, *, shared: bool
 ) -> list[StoredBag]:
-    """All bags, oldest first.
+    """Sorts all bags, oldest first.
 
-    One that shares a file is as old as the newest that does: deleting it frees nothing before.
+    A bag that shares a file counts as old as the newest that does: deleting it earlier frees
+    nothing.
     """
-    moments = {bag.path: _written(bag, stock.now, limits) for bag in stock.bags}
-    moments.update((bag.path, (span.end, span.end)) for span, bag in present)
+    keys = {bag.path: _written(bag, stock.now, limits) for bag in stock.bags}
+    keys.update((bag.path, (span.end, span.end)) for span, bag in present)
     if shared:
         newest: dict[tuple[int, int], tuple[Ns, Ns]] = {}
         for bag in stock.bags:
-            moment = moments[bag.path]
+            key = keys[bag.path]
             for each in bag.files:
-                newest[each.inode] = max(moment, newest.get(each.inode, moment))
-        moments = {bag.path: max(newest[each.inode] for each in bag.files) for bag in stock.bags}
-    return sorted(stock.bags, key=lambda bag: (moments[bag.path], bag.path))
+                newest[each.inode] = max(key, newest.get(each.inode, key))
+        keys = {bag.path: max(newest[each.inode] for each in bag.files) for bag in stock.bags}
+    return sorted(stock.bags, key=lambda bag: (keys[bag.path], bag.path))
 
 
 def _written(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns, Ns]:
-    """What orders a bag by its file; the second number orders those of which the first is made up.
+    """Returns the sort key of a bag by the time of its file.
 
-    While the clock is behind by less than history is kept, the dates of files still order them.
+    The first number may be made up; then the second orders the bags. While the clock is behind by
+    less than history is kept, the times of files still order them.
     """
     if now < FIRST_BAGS_NS:
         return (MAX_NS if bag.written < FIRST_BAGS_NS else bag.written), bag.written
@@ -299,11 +299,11 @@ def _written(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns, Ns]:
 
 
 def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:
-    """The bag that stays: the newest dated one, else the last written that holds anything."""
+    """Returns the bag that stays: the newest dated one, else the last written with messages."""
     if eras:
         return max(eras[-1], key=lambda each: (each[0].end, each[1].path))[1]
-    holding = [bag for bag in order if bag.span is not None] or order
-    return holding[-1] if holding else None
+    candidates = [bag for bag in order if bag.span is not None] or order
+    return candidates[-1] if candidates else None
 
 
 def _inodes(bag: StoredBag | None) -> set[tuple[int, int]]:

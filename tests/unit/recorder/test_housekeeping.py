@@ -17,7 +17,7 @@ from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.retention.delete import Inode, remove_bag, remove_emptied
+from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.housekeepers import (
@@ -469,7 +469,7 @@ class TestRemoval:
         path = bag(tmp_path / "a/a_0.mcap", 0)
         status = path.stat()
         with pytest.raises(OSError, match="not the file that was looked at"):
-            remove_bag(tmp_path, path, Inode(status.st_dev, status.st_ino + 1))
+            remove_bag(tmp_path, path, (status.st_dev, status.st_ino + 1))
         assert path.exists()
 
     def test_a_directory_that_became_a_link_is_not_followed(self, tmp_path: Path) -> None:
@@ -478,7 +478,7 @@ class TestRemoval:
         (tmp_path / "bags/a").rename(tmp_path / "moved")
         (tmp_path / "bags/a").symlink_to(tmp_path / "moved", target_is_directory=True)
         with pytest.raises(OSError, match="behind a symbolic link"):
-            remove_bag(tmp_path / "bags", path, Inode(status.st_dev, status.st_ino))
+            remove_bag(tmp_path / "bags", path, (status.st_dev, status.st_ino))
         assert (tmp_path / "moved/a_0.mcap").exists()
 
     def test_nothing_outside_the_bag_directory_is_touched(self, tmp_path: Path) -> None:
@@ -486,7 +486,7 @@ class TestRemoval:
         status = path.stat()
         (tmp_path / "bags").mkdir()
         with pytest.raises(ValueError, match="is not in the subpath"):
-            remove_bag(tmp_path / "bags", path, Inode(status.st_dev, status.st_ino))
+            remove_bag(tmp_path / "bags", path, (status.st_dev, status.st_ino))
         assert path.exists()
 
     def test_the_bag_directory_itself_stays(self, tmp_path: Path) -> None:

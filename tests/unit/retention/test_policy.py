@@ -13,7 +13,6 @@ from ros2_memory.retention.policy import (
     Span,
     StoredBag,
     StoredFile,
-    expired,
     plan_deletions,
 )
 
@@ -57,6 +56,10 @@ def stock(
     return RetentionStock(bags, now, sidecars or {}, other_bytes, free_bytes, synchronised=True)
 
 
+def expired(stock: RetentionStock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
+    return plan_deletions(stock, limits).to_delete
+
+
 def names(bags: Iterable[StoredBag]) -> list[str]:
     return [each.path.rpartition("/")[2] for each in bags]
 
@@ -68,8 +71,8 @@ def hourly(hours: int, *, until: int = NOW, size: int = 10) -> list[StoredBag]:
 
 class TestAge:
     def test_what_is_older_than_the_limit_is_deleted_oldest_first(self) -> None:
-        doomed = expired(stock(*hourly(172)), LIMITS)
-        assert names(doomed) == ["h171", "h170", "h169"]
+        deleted = expired(stock(*hourly(172)), LIMITS)
+        assert names(deleted) == ["h171", "h170", "h169"]
 
     def test_a_bag_of_exactly_the_limit_stays(self) -> None:
         assert expired(stock(*hourly(169)), LIMITS) == ()
@@ -83,12 +86,12 @@ class TestAge:
 
     def test_within_each_side_of_a_long_pause_age_counts_as_ever(self) -> None:
         before = [bag(f"before{ago}", NOW - 30 * DAY - ago * HOUR) for ago in range(170)]
-        doomed = expired(stock(*before, *hourly(170)), LIMITS)
-        assert names(doomed) == ["before169", "h169"]
+        deleted = expired(stock(*before, *hourly(170)), LIMITS)
+        assert names(deleted) == ["before169", "h169"]
 
     def test_a_shorter_pause_ages_what_lies_before_it(self) -> None:
-        doomed = expired(stock(bag("old", NOW - 10 * HOUR), bag("new", NOW)), hours(1))
-        assert names(doomed) == ["old"]
+        deleted = expired(stock(bag("old", NOW - 10 * HOUR), bag("new", NOW)), hours(1))
+        assert names(deleted) == ["old"]
 
     def test_a_bag_dated_in_the_future_neither_ages_nor_is_aged(self) -> None:
         ahead = bag("ahead", NOW + 3650 * DAY)
@@ -111,13 +114,13 @@ class TestAge:
         ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
         boot = bag("boot", 60 * S, written=NOW - 171 * HOUR)
         fresh = bag("fresh", 60 * S, written=NOW - HOUR)
-        doomed = expired(stock(ahead, boot, fresh, *hourly(172)), LIMITS)
-        assert names(doomed) == ["boot", "h171", "ahead", "h170", "h169"]
+        deleted = expired(stock(ahead, boot, fresh, *hourly(172)), LIMITS)
+        assert names(deleted) == ["boot", "h171", "ahead", "h170", "h169"]
 
     def test_a_bag_without_messages_does_not_age_others_and_goes_with_its_time(self) -> None:
         old = bag("empty", None, written=NOW - 170 * HOUR + 1)
-        doomed = expired(stock(old, bag("later", None, written=NOW), *hourly(172)), LIMITS)
-        assert names(doomed) == ["h171", "h170", "empty", "h169"]
+        deleted = expired(stock(old, bag("later", None, written=NOW), *hourly(172)), LIMITS)
+        assert names(deleted) == ["h171", "h170", "empty", "h169"]
 
     def test_a_bag_without_messages_of_another_era_is_not_aged(self) -> None:
         early = bag("empty", None, written=NOW - 300 * DAY)
@@ -126,24 +129,24 @@ class TestAge:
 
 class TestBudget:
     def test_the_oldest_are_deleted_and_no_more_than_needed(self) -> None:
-        doomed = expired(stock(*hourly(10)), budget(75))
-        assert names(doomed) == ["h9", "h8", "h7"]
+        deleted = expired(stock(*hourly(10)), budget(75))
+        assert names(deleted) == ["h9", "h8", "h7"]
 
     def test_what_fits_is_kept(self) -> None:
         assert expired(stock(*hourly(10)), budget(100)) == ()
 
     def test_what_nothing_may_delete_counts(self) -> None:
-        doomed = expired(stock(*hourly(10), other_bytes=15), budget(100))
-        assert names(doomed) == ["h9", "h8"]
+        deleted = expired(stock(*hourly(10), other_bytes=15), budget(100))
+        assert names(deleted) == ["h9", "h8"]
 
     def test_the_newest_stays_however_small_the_budget(self) -> None:
-        doomed = expired(stock(*hourly(10)), budget(0))
-        assert names(doomed) == [f"h{ago}" for ago in range(9, 0, -1)]
+        deleted = expired(stock(*hourly(10)), budget(0))
+        assert names(deleted) == [f"h{ago}" for ago in range(9, 0, -1)]
 
     def test_the_newest_by_its_data_stays_though_another_was_written_later(self) -> None:
         copied = bag("copied", NOW - 5 * DAY, written=NOW + HOUR)
-        doomed = expired(stock(bag("new", NOW), copied), budget(0))
-        assert names(doomed) == ["copied"]
+        deleted = expired(stock(bag("new", NOW), copied), budget(0))
+        assert names(deleted) == ["copied"]
 
     def test_bags_without_a_date_go_by_the_time_of_their_file(self) -> None:
         bags = [
@@ -159,8 +162,8 @@ class TestBudget:
 
     def test_a_bag_of_1970_is_not_the_oldest_before_its_file_is(self) -> None:
         boot = bag("boot", 60 * S, written=NOW - 150 * 60 * S)
-        doomed = expired(stock(boot, *hourly(5)), budget(30))
-        assert names(doomed) == ["h4", "h3", "boot"]
+        deleted = expired(stock(boot, *hourly(5)), budget(30))
+        assert names(deleted) == ["h4", "h3", "boot"]
 
     def test_a_file_from_a_far_future_goes_first_and_is_not_kept_for_good(self) -> None:
         ahead = bag("ahead", NOW + 3650 * DAY)
@@ -173,8 +176,8 @@ class TestBudget:
 
     def test_while_the_clock_is_not_set_what_it_dates_is_newest(self) -> None:
         boot = [bag(f"boot{n}", n * 60 * S) for n in (1, 2)]
-        doomed = expired(stock(*hourly(3), *boot, now=200 * S), budget(20))
-        assert names(doomed) == ["h2", "h1", "h0"]
+        deleted = expired(stock(*hourly(3), *boot, now=200 * S), budget(20))
+        assert names(deleted) == ["h2", "h1", "h0"]
 
     def test_the_last_bag_of_a_recording_takes_its_sidecars_along(self) -> None:
         bags = [bag("a", NOW - 2 * HOUR, recording="old"), *hourly(2)]
@@ -259,9 +262,9 @@ all_limits = st.builds(
 )
 
 
-def without(held: RetentionStock, doomed: Iterable[StoredBag]) -> RetentionStock:
+def without(held: RetentionStock, deleted: Iterable[StoredBag]) -> RetentionStock:
     """What lies there after these bags, and the sidecars of emptied recordings, are deleted."""
-    gone = {each.path for each in doomed}
+    gone = {each.path for each in deleted}
     bags = [each for each in held.bags if each.path not in gone]
     left = {each.recording for each in bags}
     emptied = {each.recording for each in held.bags} - left
@@ -307,9 +310,9 @@ class TestAlways:
         self, held: RetentionStock, limits: RetentionLimits
     ) -> None:
         aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
-        doomed = [each for each in expired(held, limits) if each not in aged]
-        if doomed:
-            spared = [each for each in doomed if each.files != doomed[-1].files]
+        deleted = [each for each in expired(held, limits) if each not in aged]
+        if deleted:
+            spared = [each for each in deleted if each.files != deleted[-1].files]
             assert not fits(without(held, [*aged, *spared]), limits)
 
     @given(stocks(), all_limits)
@@ -355,27 +358,27 @@ class TestMoments:
         bags = hourly(4)
         kept = tuple(each.files[0] for each in bags[2:])
         limits = replace(LIMITS, max_total_bytes=39)
-        found = plan_deletions(replace(stock(*bags), kept=kept), limits)
+        found = plan_deletions(replace(stock(*bags), saved=kept), limits)
         # The two oldest would free nothing.
-        assert (names(found.doomed), found.total_bytes, found.fits) == (["h1"], 40, True)
+        assert (names(found.to_delete), found.total_bytes, found.fits) == (["h1"], 40, True)
 
     def test_what_lies_in_moments_alone_counts_too(self) -> None:
         kept = (StoredFile((1, 5), 15, 15),)
         limits = replace(LIMITS, max_total_bytes=30)
-        found = plan_deletions(replace(stock(*hourly(2)), kept=kept), limits)
-        assert (names(found.doomed), found.total_bytes, found.fits) == (["h1"], 35, True)
+        found = plan_deletions(replace(stock(*hourly(2)), saved=kept), limits)
+        assert (names(found.to_delete), found.total_bytes, found.fits) == (["h1"], 35, True)
 
     def test_what_is_too_old_goes_from_where_it_was_recorded(self) -> None:
         bags = hourly(170)
-        found = plan_deletions(replace(stock(*bags), kept=bags[-1].files), LIMITS)
-        assert names(found.doomed) == ["h169"]
+        found = plan_deletions(replace(stock(*bags), saved=bags[-1].files), LIMITS)
+        assert names(found.to_delete) == ["h169"]
         assert found.total_bytes == 1700
 
     def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
         bags = hourly(3)
         limits = replace(LIMITS, min_free_bytes=10)
-        found = plan_deletions(replace(stock(*bags, free_bytes=0), kept=bags[-1].files), limits)
-        assert (names(found.doomed), found.fits) == (["h1"], True)
+        found = plan_deletions(replace(stock(*bags, free_bytes=0), saved=bags[-1].files), limits)
+        assert (names(found.to_delete), found.fits) == (["h1"], True)
 
     @given(
         st.lists(st.tuples(st.integers(0, 200), st.integers(0, 6)), min_size=1, max_size=10),
@@ -394,12 +397,12 @@ class TestMoments:
         ]
         limits = replace(LIMITS, max_total_bytes=most)
         files = tuple(file(inode) for inode in kept)
-        found = plan_deletions(replace(stock(*bags), kept=files), limits)
+        found = plan_deletions(replace(stock(*bags), saved=files), limits)
 
         def shown(left: list[StoredBag]) -> int:
             return sum({each.inode: each.size for each in (*files, *_files(left))}.values())
 
-        left = [each for each in bags if each not in found.doomed]
+        left = [each for each in bags if each not in found.to_delete]
         assert found.total_bytes == shown(bags)
         assert found.fits == (shown(left) <= most)
 

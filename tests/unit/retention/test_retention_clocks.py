@@ -18,7 +18,6 @@ from ros2_memory.retention.policy import (
     StoredBag,
     StoredFile,
     ages,
-    expired,
     plan_deletions,
 )
 from ros2_memory.retention.recorded_time import RecordedTime
@@ -31,6 +30,10 @@ T0 = 1_790_000_000 * S
 PLENTY = 10**15
 AGE = 20 * MINUTE
 """Histories of minutes are as good as weeks, and short enough to try many of them."""
+
+
+def expired(stock: RetentionStock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
+    return plan_deletions(stock, limits).to_delete
 
 
 def hourly(count: int, *, until: int) -> list[StoredBag]:
@@ -75,7 +78,7 @@ class TestAForwardStep:
     def test_the_budget_deletes_all_the_same(self) -> None:
         held = self.stock(synchronised=False)
         found = plan_deletions(held, RetentionLimits(500, 168 * HOUR))
-        assert (len(found.doomed), found.fits) == (31, True)
+        assert (len(found.to_delete), found.fits) == (31, True)
 
 
 def too_old_by_dates(bags: list[StoredBag], now: int, max_age: int) -> set[str]:
@@ -161,8 +164,8 @@ class Life:
     def recorded_after(self, bag: StoredBag) -> int:
         return round((self.lived_s - self.ended_s[bag.path]) * S)
 
-    def delete(self, doomed: tuple[StoredBag, ...]) -> None:
-        for bag in doomed:
+    def delete(self, deleted: tuple[StoredBag, ...]) -> None:
+        for bag in deleted:
             self.bags.remove(bag)
             (self.root / bag.recording).rmdir()
 
