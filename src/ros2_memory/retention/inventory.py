@@ -229,7 +229,7 @@ class Inventory:
         return Span(min(first for first, _ in spans), max(last for _, last in spans))
 
     def _is_received_again(self, topic: TopicSummary) -> bool:
-        """Whether all messages of a topic in a bag may be such that each recording receives again."""
+        """Whether all messages of a topic in a bag may be repeated by each recording."""
         pace = Pace(Stated(topic.first, topic.last, topic.count), topic.first, topic.last)
         rare = topic.latched and is_rare(pace)
         return rare or topic.topic in self._static_topics

@@ -10,7 +10,6 @@ import pytest
 import structlog
 from hypothesis import given
 from hypothesis import strategies as st
-from ros2_memory.cli.recovery import recover
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
@@ -20,6 +19,7 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
+from ros2_memory.cli.recover import recover_files
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import saved_moments
@@ -149,7 +149,7 @@ class TestKeeping:
         """As where the recorder was killed after it kept a moment, and before it answered."""
         recording(tmp_path, A, 0)
         slot = asked(tmp_path, 15, 25)
-        request = tmp_path / REQUESTS_FOLDER / f"{slot.wish.number}.json"
+        request = tmp_path / REQUESTS_FOLDER / f"{slot.request.number}.json"
         text = request.read_text()
         house_of(tmp_path).keep_moments()
         first = slot.outcome()
@@ -257,8 +257,8 @@ class TestCrashes:
     ) -> None:
         recording(tmp_path, A, 0)
         slot = asked(tmp_path, 15, 25)
-        folder = make_moment_folder(tmp_path, slot.wish)
-        write_saved_moment(folder, SavedMoment.of(slot.wish))
+        folder = make_moment_folder(tmp_path, slot.request)
+        write_saved_moment(folder, SavedMoment.of(slot.request))
         house_of(tmp_path).keep_moments()
         outcome = slot.outcome()
         assert outcome is not None
@@ -351,7 +351,7 @@ class TestOthers:
         recording(tmp_path, A, 0, splits=1)
         kept(house_of(tmp_path), tmp_path, 0, 5)
         said: list[str] = []
-        assert recover(tmp_path, said.append).whole == 1
+        assert recover_files(tmp_path, said.append).whole == 1
 
     def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
