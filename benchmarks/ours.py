@@ -51,7 +51,7 @@ def counts(memory: Memory) -> list[tuple[str, int]]:
     """Messages by topic, having indexed the folder."""
     snapshot = memory.index.refresh()
     return [
-        (topic, sum(each.messages for each in snapshot.stated(topic).values()))
+        (topic, sum(each.messages for each in snapshot.totals(topic).values()))
         for topic in snapshot.topics()
     ]
 

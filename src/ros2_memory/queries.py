@@ -517,15 +517,15 @@ def _age(found: StoredMessage, now: Ns | None) -> Ns | None:
 def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
     """What is amiss in the bags that hold a topic, for the topics of which something is."""
     odd: dict[str, list[BagFile]] = {}
-    for bag in snapshot.odd(TimeWindow.everything()):
-        for heading in bag.summary.shape.topics:
+    for bag in snapshot.faulty(TimeWindow.everything()):
+        for heading in bag.summary.schema.topics:
             odd.setdefault(heading.topic, []).append(bag)
     notes = {topic: list(describe_odd(bags)) for topic, bags in odd.items()}
     if snapshot.misdated:
         named = {fault.bag.file: fault for fault in snapshot.misdated}
         held: dict[str, list[str]] = {}
         for fault in snapshot.misdated:
-            for heading in fault.bag.summary.shape.topics:
+            for heading in fault.bag.summary.schema.topics:
                 held.setdefault(heading.topic, []).append(fault.bag.file)
         for topic, files in held.items():
             faults = [named[file] for file in dict.fromkeys(files)]

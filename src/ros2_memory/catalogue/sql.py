@@ -94,7 +94,7 @@ def insert_entry(
     connection: sqlite3.Connection, config: str, key: tuple[str, int, int, int], digest: Digest
 ) -> None:
     """Inserts an entry; `key` is path, size, mtime and sidecar's mtime."""
-    schema = _id_of(connection, "shapes", "text", encode_schema(digest.summary.shape))
+    schema = _id_of(connection, "shapes", "text", encode_schema(digest.summary.schema))
     cursor = connection.execute(
         "INSERT INTO bags (config, path, size, mtime, sidecar, shape, counts)"
         " VALUES (?, ?, ?, ?, ?, ?, ?)",

@@ -135,7 +135,7 @@ class Catalogue(CatalogueDatabase):
                     starts, ends = _time_spans(schema, [row[4] for row in rows])
                     for row, start, end in zip(rows, starts, ends, strict=True):
                         path, size, mtime, sidecar, counts = row
-                        summary = BagSummary.packed(schema, counts)
+                        summary = BagSummary.decoded(schema, counts)
                         file = KnownFile(size, mtime, sidecar, summary, start, end)
                         found[f"{bag_dir}{os.sep}{path}"] = file
             return found
@@ -333,7 +333,7 @@ def _time_spans(schema: SummarySchema, counts: Sequence[bytes]) -> tuple[list[Ns
     Raises:
         ValueError: the packed counts are of another schema.
     """
-    size = schema.layout.size
+    size = schema.numbers.size
     if any(len(each) != size for each in counts):
         raise ValueError(f"not the numbers of bags that hold {len(schema.topics)} topics")
     if not size or not counts:

@@ -475,7 +475,7 @@ def never_heard(
     latest = snapshot.dating.latest
     heard = []
     for topic in snapshot.topics():
-        last = max(each.last for each in snapshot.stated(topic).values())
+        last = max(each.last for each in snapshot.totals(topic).values())
         waits = latching.is_latched(snapshot, topic) or snapshot.is_log(topic)
         if latest is None or waits or last > latest - _RECENT_NS:
             heard.append(topic)

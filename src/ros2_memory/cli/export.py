@@ -169,7 +169,7 @@ def _profile(
     """The MCAP profile of all the bags that hold the messages; empty where they differ."""
     chosen = frozenset(topics)
     within = view.snapshot.overlapping(window)
-    bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.shape.places)}
+    bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.schema.positions)}
     bags.update(found.bag.path for found in held)
     profiles: set[str] = set()
     for path in bags:

@@ -162,7 +162,7 @@ def _staying(snapshot: Snapshot, window: TimeWindow, bag_dir: Path, plan: Plan) 
     for bag in snapshot.overlapping(window):
         if bag not in doomed:
             yield f"{_named(bag.path, bag_dir)}: {_reason(bag, bag_dir, plan.own)}"
-    for aside, place in snapshot.places.items():
+    for aside, place in snapshot.unread_spans.items():
         if place is not None and place.overlaps(window.start, window.stop - 1):
             if not aside.answers:
                 yield f"{_named(aside.path, bag_dir)}: {aside.reason}"

@@ -25,7 +25,7 @@ from ros2_memory.cli.output import format_value, print_reply
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
-from ros2_memory.index.overlaps import named, overlapping_recordings
+from ros2_memory.index.overlaps import overlapping_recordings, pair_names
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
@@ -86,12 +86,12 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     """
     if latching.is_latched(snapshot, topic):
         return None
-    stated = [*snapshot.stated(topic).values()]
+    stated = [*snapshot.totals(topic).values()]
     if not stated:
         return None
     last = max(each.last for each in stated)
     intervals, duration = 0, 0
-    for _, part in snapshot.holding(topic, TimeWindow(last - _RATE_WINDOW_NS, last + 1)):
+    for _, part in snapshot.with_topic(topic, TimeWindow(last - _RATE_WINDOW_NS, last + 1)):
         intervals += part.count - 1
         duration += part.last - part.first
     return round(intervals / unix_from_ns(duration), 2) if intervals and duration else None
@@ -159,7 +159,7 @@ def overlaps(snapshot: Snapshot) -> list[Overlap]:
     pairs = overlapping_recordings(snapshot)
     return [
         Overlap(first, second, pair.start, pair.end)
-        for pair, (first, second) in zip(pairs, named(pairs), strict=True)
+        for pair, (first, second) in zip(pairs, pair_names(pairs), strict=True)
     ]
 
 

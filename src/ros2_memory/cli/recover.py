@@ -230,12 +230,12 @@ def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
         return [path], 0
     if not path.is_dir():
         raise RecorderError(f"{path}: there is no such file or directory")
-    walked = Tree(path).walk(clock.now(), ())
+    walked = Tree(path).scan(clock.now(), ())
     if walked.problem is not None:
         raise RecorderError(f"{path} cannot be listed: {walked.problem}")
     # A saved moment has hard links to bags, which were whole when it was saved.
     links = HardLinks(path)
-    bags = sorted(Path(each) for each in walked.looked_at if not links.is_saved(each))
+    bags = sorted(Path(each) for each in walked.stamps if not links.is_saved(each))
     files = [bag for bag in bags if bag.suffix == _MCAP]
     return files, len(bags) - len(files)
 

@@ -190,7 +190,7 @@ def _courses(memory: Memory, snapshot: Snapshot) -> Iterator[Course]:
     for topic in snapshot.topics():
         if memory.limits.latching.is_latched(snapshot, topic):
             continue
-        last = max(each.last for each in snapshot.stated(topic).values())
+        last = max(each.last for each in snapshot.totals(topic).values())
         heard = _heard(memory, snapshot, topic, window)
         age_s = max(unix_from_ns(latest - last), 0.0)
         yield Course(

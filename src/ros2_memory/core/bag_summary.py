@@ -1,8 +1,8 @@
-"""What one bag holds, topic by topic, kept so that 60,000 bags fit into a small memory.
+"""What one bag holds, topic by topic, stored so that 60,000 bags fit into a small memory.
 
 Nearly all bags of a robot hold the same topics and differ in counts and times alone. So a summary
-is a `SummarySchema`, which many share, and its numbers as bytes; a `TopicSummary` is made when it
-is asked for.
+is a `SummarySchema`, which many bags share, and its numbers as bytes; a `TopicSummary` is made when
+it is asked for.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
 _NUMBERS: Final = struct.Struct("<qqq")
 """Count, first and last log time of a topic."""
 
-_SHAPES_AT_HAND: Final = 1024
+_CACHED_SCHEMAS: Final = 1024
 
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """What one bag holds of one topic under one type; only where it holds at least one message.
+    """What one bag holds of one topic under one type; at least one message.
 
     `first` and `last` are the exact log times of its earliest and latest message (inclusive).
     `latched`: some publisher offered it as transient local.
@@ -45,7 +45,7 @@ class TopicSummary:
 
 
 class TopicHeader(NamedTuple):
-    """What of a `TopicSummary` does not differ from bag to bag."""
+    """The part of a `TopicSummary` that does not differ from bag to bag."""
 
     topic: str
     type: str
@@ -55,7 +55,7 @@ class TopicHeader(NamedTuple):
 
 @dataclass(frozen=True)
 class SummarySchema:
-    """All of a summary but its numbers; see `BagSummary` for what the fields say."""
+    """A summary without its numbers; `BagSummary` describes the fields."""
 
     topics: tuple[TopicHeader, ...]
     silent: tuple[str, ...] = ()
@@ -69,16 +69,16 @@ class SummarySchema:
         return (*self.notes, set_back_while_written(self.set_back)) if self.set_back else self.notes
 
     @cached_property
-    def places(self) -> dict[str, tuple[int, ...]]:
-        """By topic, where it stands among `topics`: once for each of its types."""
-        places: dict[str, tuple[int, ...]] = {}
-        for place, heading in enumerate(self.topics):
-            places[heading.topic] = (*places.get(heading.topic, ()), place)
-        return places
+    def positions(self) -> dict[str, tuple[int, ...]]:
+        """By topic, its positions among `topics`: one for each of its types."""
+        positions: dict[str, tuple[int, ...]] = {}
+        for position, header in enumerate(self.topics):
+            positions[header.topic] = (*positions.get(header.topic, ()), position)
+        return positions
 
     @cached_property
-    def layout(self) -> struct.Struct:
-        """How the numbers of a bag lie in their bytes."""
+    def numbers(self) -> struct.Struct:
+        """The layout of a bag's numbers in bytes."""
         return struct.Struct(f"<{3 * len(self.topics)}q")
 
 
@@ -91,15 +91,15 @@ DOUBTS: Final = (
     "its message indexes ",
     "its chunk indexes ",
 )
-"""How notes begin on what a file says of itself, in spite of which it was read from end to end."""
+"""Beginnings of notes on files that contradict themselves, and were read from end to end."""
 
 
 def set_back_while_written(by: Ns) -> str:
-    """The sentence on a bag in the writing of which the clock was set back by so much, or more."""
+    """Returns the sentence on a clock that was set back, at least by this, within one bag."""
     return f"the clock was set back by {by / NS_PER_S:.0f} s or more while it was being written"
 
 
-@lru_cache(maxsize=_SHAPES_AT_HAND)
+@lru_cache(maxsize=_CACHED_SCHEMAS)
 def shared_schema(
     topics: tuple[TopicHeader, ...],
     silent: tuple[str, ...],
@@ -107,36 +107,34 @@ def shared_schema(
     notes: tuple[str, ...],
     set_back: Ns = 0,
 ) -> SummarySchema:
-    """One shape for all bags that have it, with one copy of each name."""
+    """Returns one schema for all bags that have it, with one copy of each name."""
     intern = sys.intern
-    headings = tuple(
+    headers = tuple(
         TopicHeader(intern(each.topic), intern(each.type), intern(each.encoding), each.latched)
         for each in topics
     )
-    return SummarySchema(
-        headings, tuple(intern(name) for name in silent), complete, notes, set_back
-    )
+    return SummarySchema(headers, tuple(intern(name) for name in silent), complete, notes, set_back)
 
 
 class BagSummary:
-    """What one bag file holds. Not to be changed; equal to any other that says the same.
+    """What one bag file holds. Immutable; equal to any other of the same content.
 
     Args:
         topics: one for each topic and type; their numbers fit into 64 bits.
         silent: the topics that are declared without a message.
         complete: False where the file ends early and only what was readable is counted.
-        notes: sentences on what is odd.
+        notes: sentences on what is wrong with the file.
         set_back: by how much the log times of a topic go back in the order of writing, at most; 0
             where they do so by less than a second.
 
     Attributes:
-        shape: the summary without its numbers.
-        numbers: count, first and last of each topic, in the order of the shape.
+        schema: the summary without its numbers.
+        numbers: count, first and last of each topic, in the order of the schema.
     """
 
-    __slots__ = ("numbers", "shape")
+    __slots__ = ("numbers", "schema")
 
-    shape: SummarySchema
+    schema: SummarySchema
     numbers: bytes
 
     def __init__(
@@ -147,18 +145,18 @@ class BagSummary:
         notes: tuple[str, ...] = (),
         set_back: Ns = 0,
     ) -> None:
-        headings = (
+        headers = (
             TopicHeader(each.topic, each.type, each.encoding, each.latched) for each in topics
         )
-        self.shape = shared_schema(tuple(headings), silent, complete, notes, set_back)
+        self.schema = shared_schema(tuple(headers), silent, complete, notes, set_back)
         numbers = (part for each in topics for part in (each.count, each.first, each.last))
-        self.numbers = self.shape.layout.pack(*numbers)
+        self.numbers = self.schema.numbers.pack(*numbers)
 
     @classmethod
-    def packed(cls, shape: SummarySchema, numbers: bytes) -> Self:
-        """The summary of these numbers, which must be as many as the shape has."""
+    def decoded(cls, schema: SummarySchema, numbers: bytes) -> Self:
+        """Returns the summary of these numbers, which must be as many as the schema has."""
         made = cls.__new__(cls)
-        made.shape = shape
+        made.schema = schema
         made.numbers = numbers
         return made
 
@@ -169,58 +167,58 @@ class BagSummary:
         complete: bool | None = None,
         notes: tuple[str, ...] | None = None,
     ) -> BagSummary:
-        """This summary with some of it said otherwise."""
+        """Returns this summary with some fields replaced."""
         return BagSummary(
             self.topics if topics is None else topics,
             self.silent,
             self.complete if complete is None else complete,
             self.notes if notes is None else notes,
-            self.shape.set_back,
+            self.schema.set_back,
         )
 
     @property
     def topics(self) -> tuple[TopicSummary, ...]:
         """Each topic under each of its types, made anew."""
-        return tuple(self.at(place) for place in range(len(self.shape.topics)))
+        return tuple(self.at(position) for position in range(len(self.schema.topics)))
 
-    def at(self, place: int) -> TopicSummary:
-        """The topic at a place of the shape."""
-        topic, type_name, encoding, latched = self.shape.topics[place]
-        count, first, last = _NUMBERS.unpack_from(self.numbers, place * _NUMBERS.size)
+    def at(self, position: int) -> TopicSummary:
+        """Returns the topic at a position of the schema."""
+        topic, type_name, encoding, latched = self.schema.topics[position]
+        count, first, last = _NUMBERS.unpack_from(self.numbers, position * _NUMBERS.size)
         return TopicSummary(topic, type_name, encoding, count, first, last, latched)
 
     def of(self, topic: str) -> tuple[TopicSummary, ...]:
-        """One topic under each of its types."""
-        return tuple(self.at(place) for place in self.shape.places.get(topic, ()))
+        """Returns one topic under each of its types."""
+        return tuple(self.at(position) for position in self.schema.positions.get(topic, ()))
 
     def span_of(self, topics: Collection[str]) -> tuple[Ns, Ns]:
-        """Log times of the first and last message of these topics; it must hold one of them."""
-        known, numbers = self.shape.places, self._unpacked()
-        places = [place for topic in topics for place in known.get(topic, ())]
+        """Returns the first and last log time of these topics; it must hold one of them."""
+        known, numbers = self.schema.positions, self._unpacked()
+        positions = [each for topic in topics for each in known.get(topic, ())]
         return (
-            min(numbers[3 * place + 1] for place in places),
-            max(numbers[3 * place + 2] for place in places),
+            min(numbers[3 * each + 1] for each in positions),
+            max(numbers[3 * each + 2] for each in positions),
         )
 
     @property
     def silent(self) -> tuple[str, ...]:
         """The topics that are declared without a message."""
-        return self.shape.silent
+        return self.schema.silent
 
     @property
     def complete(self) -> bool:
         """Whether the file was readable to its end."""
-        return self.shape.complete
+        return self.schema.complete
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what is odd."""
-        return self.shape.notes
+        """Sentences on what is wrong with the file."""
+        return self.schema.notes
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """The notes, and a sentence on a clock that was set back."""
-        return self.shape.remarks
+        return self.schema.remarks
 
     @property
     def count(self) -> int:
@@ -230,7 +228,7 @@ class BagSummary:
     @property
     def empty(self) -> bool:
         """Whether the bag holds no message: such a bag has no start and no end."""
-        return not self.shape.topics
+        return not self.schema.topics
 
     @property
     def start(self) -> Ns:
@@ -243,18 +241,15 @@ class BagSummary:
         return max(self._unpacked()[2::3])
 
     def _unpacked(self) -> tuple[int, ...]:
-        return self.shape.layout.unpack(self.numbers)
+        return self.schema.numbers.unpack(self.numbers)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, BagSummary):
             return NotImplemented
-        return self.numbers == other.numbers and self.shape == other.shape
+        return self.numbers == other.numbers and self.schema == other.schema
 
     def __hash__(self) -> int:
-        return hash((self.shape, self.numbers))
+        return hash((self.schema, self.numbers))
 
     def __repr__(self) -> str:
-        return (
-            f"BagSummary(topics={self.topics!r}, silent={self.silent!r},"
-            f" complete={self.complete!r}, notes={self.notes!r}, set_back={self.shape.set_back})"
-        )
+        return f"BagSummary(topics={self.topics!r}, schema={self.schema!r})"

@@ -11,7 +11,6 @@ from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Deadline, ms_from_ns
-from ros2_memory.index.pace import is_rare
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -158,18 +157,18 @@ class Latching:
     def may_hold(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether some message of a topic may be latched."""
         configured = self._configured(topic)
-        return snapshot.is_held(topic) if configured is None else configured
+        return snapshot.is_transient_state(topic) if configured is None else configured
 
     def holds(self, snapshot: Snapshot, found: StoredMessage) -> bool:
         """Whether a message is latched, by the pace of its topic in its own recording."""
         channel = found.record.channel
         configured = self._configured(channel.topic)
-        if configured is not None or not snapshot.is_held(channel.topic):
+        if configured is not None or not snapshot.is_transient_state(channel.topic):
             return bool(configured)
         if is_carried(found.bag.path):
             origin = origin_of(channel)
             return origin is None or not origin.often
-        return is_rare(snapshot.pace(channel.topic, found.bag.recording))
+        return snapshot.pace(channel.topic, found.bag.recording).is_rare
 
     def is_latched(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether a topic is latched, by its pace in the newest recording that holds it.
@@ -177,13 +176,13 @@ class Latching:
         Carried messages count as a recording only where there is no other.
         """
         configured = self._configured(topic)
-        if configured is not None or not snapshot.is_held(topic):
+        if configured is not None or not snapshot.is_transient_state(topic):
             return bool(configured)
         last = {path: span[1] for path, span in snapshot.recordings(topic).items()}
         newest = max(
             last, key=lambda path: (path.name != CARRY_FOLDER, last[path], str(path)), default=None
         )
-        return newest is not None and is_rare(snapshot.pace(topic, newest))
+        return newest is not None and snapshot.pace(topic, newest).is_rare
 
     def _configured(self, topic: str) -> bool | None:
         """Returns what the configuration has of a topic; None where it has nothing."""

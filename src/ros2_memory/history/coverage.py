@@ -57,7 +57,7 @@ def note_unread(
     if window.empty:
         return
     absent = _absent(view) if nothing or search else ()
-    odd = [bag for bag in view.snapshot.odd(window) if not _is_noted(view, bag)]
+    odd = [bag for bag in view.snapshot.faulty(window) if not _is_noted(view, bag)]
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.notes.add(sentence)
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
@@ -94,7 +94,7 @@ def is_covered(view: View, window: TimeWindow) -> bool:
     something was not there.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-    return view.notes.complete and not lost and all(map(_is_whole, view.snapshot.odd(window)))
+    return view.notes.complete and not lost and all(map(_is_whole, view.snapshot.faulty(window)))
 
 
 def _is_noted(view: View, bag: BagFile) -> bool:
@@ -141,7 +141,7 @@ def unread_spans(
     ]
     if faults and not nothing:
         yield describe_misdated(faults)
-    yield from describe_odd(snapshot.odd(window) if odd is None else odd)
+    yield from describe_odd(snapshot.faulty(window) if odd is None else odd)
 
 
 def lost_in(
@@ -155,7 +155,7 @@ def lost_in(
 
     None of them was read at all. With `nothing`, those that may hold some.
     """
-    spans = snapshot.bounds if nothing else snapshot.places
+    spans = snapshot.unread_bounds if nothing else snapshot.unread_spans
     if absent:
         spans = {**snapshot.bounds_of(absent), **spans}
     return [
@@ -172,7 +172,9 @@ def may_be_written(snapshot: Snapshot, window: TimeWindow) -> bool:
 
 def _being_written(snapshot: Snapshot, window: TimeWindow) -> list[SetAside]:
     return [
-        aside for aside in snapshot.active if _touches(snapshot.places[aside], window, unknown=True)
+        aside
+        for aside in snapshot.active
+        if _touches(snapshot.unread_spans[aside], window, unknown=True)
     ]
 
 
@@ -235,7 +237,7 @@ def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
 
 def describe_misdated(faults: Sequence[ClockFault]) -> str:
     """Returns the sentence on bags that a wrong clock dated; the last ones are named."""
-    names = [f"{short_name(fault.bag.path)} ({fault.told})" for fault in faults[-MAX_NAMED:]]
+    names = [f"{short_name(fault.bag.path)} ({fault.description})" for fault in faults[-MAX_NAMED:]]
     return f"{counted(len(faults), 'bag')} dated by a wrong clock: {listed(names, len(faults))}"
 
 

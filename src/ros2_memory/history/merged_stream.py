@@ -134,7 +134,7 @@ class MergedStream:
 
     def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """The window cut where runs of bags begin: a stream then holds few of them at a time."""
-        runs = self._snapshot.runs
+        runs = self._snapshot.segments
         begin = bisect_right(runs, window.start, key=_begins)
         end = bisect_left(runs, window.stop, begin, key=_begins)
         cuts = [

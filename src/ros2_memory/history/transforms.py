@@ -282,7 +282,7 @@ def _pairs(
     recorded = _recorded(view, topics)
     unknown: list[tuple[Ns, Ns]] = []
     for topic in recorded:
-        for run in view.snapshot.runs:
+        for run in view.snapshot.segments:
             known, spans = _known_pairs(view, run, topic, window or TimeWindow.everything(), among)
             pairs |= known
             unknown += spans

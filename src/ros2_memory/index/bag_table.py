@@ -1,4 +1,8 @@
-"""Looks at a bag directory again and again, and judges what changed since the last look."""
+"""The files of a bag directory: scans it again and again, and classifies what has changed.
+
+One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, and under several
+paths: where it was recorded, and hard links in saved moments. Of all these one counts.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.hard_links import HardLinks
-from ros2_memory.bag_dir.layout import other_form
+from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import FileNotes, FileState, classify
 from ros2_memory.index.scan import Tree
-from ros2_memory.index.snapshot import Snapshot, Timeline
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import Timeline
 from ros2_memory.index.unchanged_bags import UnchangedBags
-from ros2_memory.index.verdicts import CountedBags
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
@@ -21,20 +25,24 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.file_state import Classification, KnownFile, ScanContext
-    from ros2_memory.index.scan import Stamp, Walked
+    from ros2_memory.index.scan import ScanResult, Stamp
     from ros2_memory.storage.base import BagReader
 
 PATROL: Final = 256
-"""Closed files looked at in each scan, in turn: one overwritten in place changes no directory."""
+"""Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
 
 
 @dataclass(frozen=True, slots=True)
 class KnownBags:
     """What the index knows of the bag directory, by path.
 
-    `counted` are the verdicts on bags, of two forms of one only that which answers; `hidden` are
-    the other forms; `kept` are all files in moments, whether they answer or not. `named` are the
-    recordings that the recorder last said it is writing.
+    Attributes:
+        counted: classifications of files, of all forms and links of a bag only the one that counts.
+        hidden: files whose other form counts.
+        files: notes on all files.
+        named: recordings that the recorder last said it is writing.
+        now: when the directory was scanned.
+        saved: all files in saved moments, whether they count or not.
     """
 
     counted: Mapping[str, Classification]
@@ -42,35 +50,38 @@ class KnownBags:
     files: Mapping[str, FileNotes]
     named: Collection[str]
     now: Ns
-    kept: Collection[str] = ()
+    saved: Collection[str] = ()
 
 
 class TableChange(NamedTuple):
-    """What a look found otherwise than the one before: the bags that left and those that came.
+    """What a scan found changed: bags that left the table and bags that came.
 
-    `news`: whether anything is otherwise, be it no bag. With the first look everything is.
+    `is_new`: whether anything has changed, even if no bag. The first scan changes everything.
     """
 
     removed: list[BagFile]
     added: list[BagFile]
-    news: bool
+    is_new: bool
 
 
-class _Oddities(NamedTuple):
-    """What a walk finds besides files."""
+class _Surroundings(NamedTuple):
+    """What a scan finds besides bag files."""
 
     damaged: tuple[SetAside, ...] = ()
     links: tuple[SetAside, ...] = ()
     problem: str | None = None
-    described: tuple[str, ...] = ()
+    metadata_folders: tuple[str, ...] = ()
 
 
 class BagTable:
-    """What is known of the files of one bag directory. Not for several threads at once.
+    """The known files of one bag directory. Not for several threads at once.
 
-    `known` tells, by path, of closed files that were read earlier: they are not read again while
-    they look as they did. `all_awake`: no bag is kept dormant, since more is asked of it than its
-    answers.
+    Args:
+        bag_dir: the directory.
+        reader: reads its bags.
+        known: returns, by path, closed files that were read earlier: they are not read again while
+            they are unchanged.
+        keep_all_notes: keeps notes on every file, for who needs more than answers.
     """
 
     def __init__(
@@ -79,160 +90,221 @@ class BagTable:
         reader: BagReader,
         *,
         known: Callable[[], Mapping[str, KnownFile]] | None,
-        all_awake: bool,
+        keep_all_notes: bool,
     ) -> None:
         self._reader = reader
         self._known = known
-        self._all_awake = all_awake
+        self._keep_all_notes = keep_all_notes
         self._tree = Tree(bag_dir)
-        self._dormant = UnchangedBags()
+        self._unchanged = UnchangedBags()
         self._files: dict[str, FileNotes] = {}
-        self._names = HardLinks(bag_dir)
-        self._verdicts = CountedBags(self._files, self._dormant, self._names)
+        self._links = HardLinks(bag_dir)
+        self._classified: dict[str, Classification] = {}
+        self._counted: dict[str, Classification] = {}
+        self._set_aside: dict[str, Classification] = {}
+        self._hidden: set[str] = set()
         self._watched: set[str] = set()
         self._patrol: list[str] = []
-        self._odd: _Oddities | None = None
+        self._surroundings: _Surroundings | None = None
         self._timeline = Timeline()
 
-    def look(self, scene: ScanContext, *, patrolling: bool) -> TableChange:
-        """Looks at what may have changed; `patrolling`: and at some of what lies still.
+    def update(self, context: ScanContext, *, patrolling: bool) -> TableChange:
+        """Scans for what may have changed; `patrolling` also checks some of what did not.
 
-        Where it raises, some of what the walk has shown is lost: then a new survey has to begin.
+        Where it raises, some of what the scan has found is lost: then a new table is needed.
         """
-        patrol = self._next_on_patrol() if patrolling else ()
-        walked = self._tree.walk(scene.now, [*self._watched, *patrol])
-        self._rouse(walked, scene)
+        patrol = self._next_patrol() if patrolling else ()
+        scanned = self._tree.scan(context.now, [*self._watched, *patrol])
+        self._reactivate_changed(scanned, context)
         known = self._known_at_first()
-        recalled = self._recall(walked.looked_at, known, scene)
-        changed = self._forget(walked.gone) | self._examine(walked.looked_at, known, scene)
-        hidden = frozenset(self._verdicts.hidden)
-        removed, added = self._verdicts.recount(changed | hidden, scene)
-        changed |= hidden - self._verdicts.hidden
-        added = [*recalled, *added]
+        restored = self._restore(scanned.stamps, known, context)
+        changed = self._forget(scanned.gone) | self._examine(scanned.stamps, known, context)
+        hidden = frozenset(self._hidden)
+        removed, added = self._count(changed | hidden, context)
+        changed |= hidden - self._hidden
+        added = [*restored, *added]
         self._timeline = self._timeline.changed(removed, added)
-        before, self._odd = self._odd, _oddities(walked)
-        return TableChange(removed, added, bool(changed or recalled) or self._odd != before)
+        before = self._surroundings
+        self._surroundings = _Surroundings(
+            _by_path(scanned.damaged),
+            _by_path(scanned.links),
+            scanned.problem,
+            tuple(sorted(scanned.metadata_folders)),
+        )
+        is_new = bool(changed or restored) or self._surroundings != before
+        return TableChange(removed, added, is_new)
 
     def snapshot(self, now: Ns) -> Snapshot:
-        """What the last look left known."""
-        timeline, odd = self._timeline, self._odd or _Oddities()
+        """Returns what is known since the last scan."""
+        timeline, surroundings = self._timeline, self._surroundings or _Surroundings()
         aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
         empty = 0
-        for verdict in self._verdicts.set_aside.values():
-            if verdict.aside is not None:
-                aside.setdefault(verdict.standing, []).append(verdict.aside)
+        for each in self._set_aside.values():
+            if each.aside is not None:
+                aside.setdefault(each.state, []).append(each.aside)
             else:
                 empty += 1
-                silent.update(verdict.silent)
+                silent.update(each.silent)
         return Snapshot(
             bags=timeline.recorded,
             active=_by_path(aside.get(FileState.ACTIVE, ())),
-            damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *odd.damaged]),
-            unread=_by_path([*aside.get(FileState.UNREAD, ()), *odd.links]),
+            damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *surroundings.damaged]),
+            unread=_by_path([*aside.get(FileState.UNREAD, ()), *surroundings.links]),
             empty=empty,
             silent_topics=frozenset(silent - timeline.types.keys()),
             scanned_at=now,
-            problem=odd.problem,
-            described=odd.described,
+            problem=surroundings.problem,
+            metadata_folders=surroundings.metadata_folders,
             timeline=timeline,
         )
 
     def known(self, named: Collection[str], now: Ns) -> KnownBags:
-        """What deletion weighs; `named`: the recordings that the recorder last said it writes."""
-        verdicts = self._verdicts
-        return KnownBags(
-            verdicts.counted, verdicts.hidden, self._files, named, now, self._names.known
-        )
+        """Returns what retention considers; `named` are recordings that are being written."""
+        return KnownBags(self._counted, self._hidden, self._files, named, now, self._links.known)
 
-    def _next_on_patrol(self) -> list[str]:
+    def _next_patrol(self) -> list[str]:
         if not self._patrol:
-            self._patrol = [*self._files, *self._dormant]
+            self._patrol = [*self._files, *self._unchanged]
         following = self._patrol[-PATROL:]
         del self._patrol[-PATROL:]
-        return [path for path in following if path in self._files or path in self._dormant]
+        return [path for path in following if path in self._files or path in self._unchanged]
 
     def _known_at_first(self) -> Mapping[str, KnownFile]:
-        """What was known earlier, where the scan begins anew."""
-        begun = self._files or self._dormant
-        return {} if self._known is None or begun else self._known()
+        """Returns the files that were read earlier, for the first scan."""
+        is_first = not (self._files or self._unchanged)
+        return self._known() if self._known is not None and is_first else {}
 
-    def _recall(
-        self, stamps: dict[str, Stamp], known: Mapping[str, KnownFile], scene: ScanContext
+    def _restore(
+        self, stamps: dict[str, Stamp], known: Mapping[str, KnownFile], context: ScanContext
     ) -> list[BagFile]:
-        """The bags of files that look as they are known, which need no further look."""
-        if self._all_awake or not known:
+        """Returns the bags of files that are unchanged, which need no examination."""
+        if self._keep_all_notes or not known:
             return []
-        # Which of a bag's names answers is to be weighed.
-        kept = {path: stamps.pop(path) for path in self._names.saved_among(stamps)}
-        bags = self._dormant.take(stamps, known, self._reader, scene)
-        stamps.update(kept)
+        # Which link of a saved bag counts has yet to be decided.
+        saved = {path: stamps.pop(path) for path in self._links.saved_among(stamps)}
+        bags = self._unchanged.take(stamps, known, self._reader, context)
+        stamps.update(saved)
         return bags
 
-    def _rouse(self, walked: Walked, scene: ScanContext) -> None:
-        """Wakes the files that went, look otherwise, or have got another form."""
-        if not self._dormant:
+    def _reactivate_changed(self, scanned: ScanResult, context: ScanContext) -> None:
+        """Reactivates files that have gone, changed, or got another form."""
+        if not self._unchanged:
             return
-        for path, stamp in [*walked.looked_at.items()]:
-            if self._dormant.is_undisturbed(path, stamp, scene.now):
-                del walked.looked_at[path]
+        for path, stamp in [*scanned.stamps.items()]:
+            if self._unchanged.is_unchanged(path, stamp, context.now):
+                del scanned.stamps[path]
             else:
-                self._wake(path, scene)
-                self._wake(other_form(path), scene)
-        for path in walked.gone:
-            self._wake(path, scene)
+                self._reactivate(path, context)
+                self._reactivate(other_form(path), context)
+        for path in scanned.gone:
+            self._reactivate(path, context)
 
-    def _wake(self, path: str, scene: ScanContext) -> None:
-        woken = self._dormant.wake(path, scene.now)
-        if woken is not None:
-            self._files[path], verdict = woken
-            self._verdicts.wake(path, verdict)
+    def _reactivate(self, path: str, context: ScanContext) -> None:
+        reactivated = self._unchanged.reactivate(path, context.now)
+        if reactivated is not None:
+            self._files[path], classification = reactivated
+            self._classified[path] = self._counted[path] = classification
 
     def _forget(self, paths: Iterable[str]) -> set[str]:
-        """Drops what is known of these files; gives those that had a verdict."""
+        """Drops what is known of files; returns those that were classified."""
         forgotten = set()
         for path in paths:
             self._watched.discard(path)
             self._files.pop(path, None)
-            self._names.discard(path)
-            if self._verdicts.drop(path):
+            self._links.discard(path)
+            if self._classified.pop(path, None) is not None:
                 forgotten.add(path)
         return forgotten
 
     def _examine(
-        self, stamps: dict[str, Stamp], known: Mapping[str, KnownFile], scene: ScanContext
+        self, stamps: dict[str, Stamp], known: Mapping[str, KnownFile], context: ScanContext
     ) -> set[str]:
-        """Judges these files; gives those of which the verdict changed."""
+        """Classifies files; returns those whose classification changed."""
         changed = set()
         for path, stamp in stamps.items():
             notes = self._files.get(path)
             if notes is None:
-                notes = FileNotes.first(Path(path), stamp, scene.now)
+                notes = FileNotes.first(Path(path), stamp, context.now)
                 self._files[path] = notes
-                self._names.add(path)
+                self._links.add(path)
                 file = known.get(path)
-                if file is not None and notes.trusted and file.looks_like(stamp):
-                    notes.recall(file.summary)
-            elif not notes.look(stamp, scene.now) and path not in self._watched:
+                if file is not None and notes.trusted and file.matches(stamp):
+                    notes.restore(file.summary)
+            elif not notes.update(stamp, context.now) and path not in self._watched:
                 continue
             try:
-                verdict = classify(notes, self._reader, scene)
+                classification = classify(notes, self._reader, context)
             except BagVanishedError:
                 self._tree.distrust(path)
                 changed |= self._forget([path])
                 continue
-            if notes.must_be_watched(verdict, scene):
+            if notes.must_be_watched(classification, context):
                 self._watched.add(path)
             else:
                 self._watched.discard(path)
-            if self._verdicts.give(path, verdict):
+            if classification != self._classified.get(path):
+                self._classified[path] = classification
                 changed.add(path)
         return changed
 
+    def _count(
+        self, changed: Iterable[str], context: ScanContext
+    ) -> tuple[list[BagFile], list[BagFile]]:
+        """Updates which files count; returns the bags that left and those that came."""
+        removed, added = [], []
+        paths = {form for each in changed for form in (each, other_form(each))}
+        if self._links.known:
+            paths.update(link for each in [*paths] for link in self._links.of(each))
+        for path in paths:
+            before, after = self._counted.pop(path, None), self._that_counts(path, context)
+            self._set_aside.pop(path, None)
+            if after is not None:
+                self._counted[path] = after
+                if after.bag is None or after.aside is not None:
+                    self._set_aside[path] = after
+            if before == after:
+                continue
+            if before is not None and before.bag is not None:
+                removed.append(before.bag)
+            if after is not None and after.bag is not None:
+                added.append(after.bag)
+        return removed, added
 
-def _oddities(walked: Walked) -> _Oddities:
-    described = tuple(sorted(walked.described))
-    return _Oddities(_by_path(walked.damaged), _by_path(walked.links), walked.problem, described)
+    def _that_counts(self, path: str, context: ScanContext) -> Classification | None:
+        """Returns a file's classification; None where there is none, or another file counts.
+
+        While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Two
+        complete ones that have been there for three splits are two files that somebody keeps.
+        """
+        self._hidden.discard(path)
+        if any(self._is_same_file(path, link) for link in self._links.before(path)):
+            return None
+        own, other = self._classified.get(path), self._classified.get(other_form(path))
+        if own is None or other is None or own.state > other.state:
+            return own
+        forms = (self._files.get(form) for form in (path, other_form(path)))
+        is_kept = not any(notes is not None and notes.grew_lately(context) for notes in forms)
+        if is_kept and own.state is FileState.UNREAD:
+            return own
+        if own.state == other.state and (
+            (is_kept and own.state is FileState.CLOSED) or not path.endswith(COMPRESSED)
+        ):
+            return own
+        self._hidden.add(path)
+        return None
+
+    def _is_same_file(self, path: str, link: str) -> bool:
+        """Returns whether another path of a file is known, too, and leads to the same file."""
+        notes, own = self._files.get(link), self._files.get(path)
+        stamp = self._unchanged.stamp(link) if notes is None else notes.stamp
+        if stamp is None or own is None:
+            return False
+        return (own.stamp.size, own.stamp.mtime_ns, own.stamp.inode) == (
+            stamp.size,
+            stamp.mtime_ns,
+            stamp.inode,
+        )
 
 
 def _by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:

@@ -1,16 +1,15 @@
-"""Bags that a wrong clock dated, found by what lies around them. Pure decisions.
+"""Bags that a wrong clock dated, found by comparing them with the bags around. Pure decisions.
 
-A robot without a clock of its own starts in 1970 and is corrected once it has a network; clocks
+A robot without a battery-backed clock starts in 1970 and is corrected once it has a network; clocks
 are also ahead, and are set back while a recording runs. Bags keep their times, and are found by
-them; but what spans the memory, and what is its newest moment, is told without the bags that are
-at fault:
+them; but the span of the memory, and its newest moment, are computed without the wrong ones:
 
     before 2017          the clock was not set; simulated where no bag has another date
     after now            the clock was ahead; this machine's own is behind where all bags are so
     set back by a day    of the two sides the one with fewer bags around it; of equals the earlier
 
 A clock that is set back by less is listed and leaves the span as it is. Where this machine's own
-clock stands before 2017 it tells nothing of the future.
+clock is before 2017 nothing can be said about the future.
 """
 
 from __future__ import annotations
@@ -30,11 +29,11 @@ if TYPE_CHECKING:
     from ros2_memory.index.split_order import StepBack
 
 FIRST_BAGS_NS: Final[Ns] = 1_483_228_800 * NS_PER_S
-"""2017-01-01: there was no release of ROS 2 before. Clocks without a battery start in 1970."""
+"""2017-01-01, before the first release of ROS 2. Clocks without a battery start in 1970."""
 FUTURE_NS: Final[Ns] = 60 * NS_PER_S
-"""A date so little ahead of the clock comes from a clock that is being corrected."""
+"""Dates this little ahead of the clock come from a clock that is being corrected."""
 FAR_BACK_NS: Final[Ns] = 24 * 3600 * NS_PER_S
-"""A clock that is set back by so much leaves dates on one of its sides that mean nothing."""
+"""Where a clock is set back by this much, the dates before or after that are wrong."""
 
 
 class FaultyClock(StrEnum):
@@ -50,8 +49,8 @@ class ClockFault(NamedTuple):
     """A bag that a wrong clock dated.
 
     `by` is how far its last message lies after the present, or how far the clock was set back after
-    the bag `before` was begun (None: at least so far, while this one was being written).
-    `misleads`: it is left out of what spans the memory.
+    the bag `before` was begun (None: at least this far, while this bag was being written).
+    `misleads`: it is left out of the span of the memory.
     """
 
     bag: BagFile
@@ -67,12 +66,13 @@ class ClockFault(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """What is wrong, in a sentence."""
-        return f"{self.told}; left out of earliest and latest" if self.misleads else self.told
+        """What is wrong, as a sentence, and what follows from it."""
+        left_out = "; left out of earliest and latest" if self.misleads else ""
+        return f"{self.description}{left_out}"
 
     @property
-    def told(self) -> str:
-        """As `reason`, of the bag alone."""
+    def description(self) -> str:
+        """What is wrong, as a sentence."""
         match self.kind:
             case FaultyClock.UNSET if self.bag.mtime_ns >= FIRST_BAGS_NS:
                 return (
@@ -100,11 +100,10 @@ class ClockFault(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Dating:
-    """What the dates of all bags come to.
+    """What the dates of all bags show.
 
-    `earliest` and `latest` are the log times of the first and last message (inclusive) of the bags
-    that no fault misdates; None without bags. `note` is a sentence on a clock that is at odds with
-    all of them.
+    `earliest` and `latest` are the log times of the first and last message (inclusive) of correctly
+    dated bags; None without bags. `note` is a sentence on a clock that contradicts all of them.
     """
 
     earliest: Ns | None = None
@@ -114,37 +113,37 @@ class Dating:
 
     @property
     def misdated(self) -> frozenset[str]:
-        """The bags that are left out of the span."""
+        """The paths of the bags that are left out of the span."""
         return frozenset(fault.file for fault in self.faults if fault.misleads)
 
 
-class Part(NamedTuple):
+class DatedBags(NamedTuple):
     """Some bags, sorted by their start, and the latest end among them."""
 
     bags: Sequence[BagFile]
     latest: Ns
 
 
-def last_believed(now: Ns) -> Ns:
-    """The latest date that a message can bear now."""
+def max_plausible(now: Ns) -> Ns:
+    """Returns the latest plausible date of a message."""
     return MAX_NS if now < FIRST_BAGS_NS else min(now + FUTURE_NS, MAX_NS)
 
 
-def dating_of(
-    parts: Sequence[Part],
+def check_dates(
+    parts: Sequence[DatedBags],
     steps: Sequence[StepBack],
     now: Ns,
     around: Callable[[Ns, Ns], Sequence[BagFile]],
 ) -> Dating:
-    """What is to be made of the dates of all bags.
+    """Returns what the dates of all bags show.
 
     Args:
-        parts: the bags, in parts in order.
+        parts: the bags, some at a time, in order.
         steps: where a clock was set back while a recording ran.
         now: the present by this machine's clock.
-        around: the bags with a moment between two log times (inclusive).
+        around: returns the bags that overlap two log times (inclusive).
     """
-    limit = last_believed(now)
+    limit = max_plausible(now)
     ahead = [
         ClockFault(bag, FaultyClock.AHEAD, bag.end - now)
         for part in parts
@@ -161,7 +160,7 @@ def dating_of(
     elif len(ahead) + len(unset) == bags:
         unset = []  # a simulated clock, or a robot that has none
     faults = [*unset, *ahead]
-    faults += _of_steps(steps, {fault.file for fault in faults}, around)
+    faults += _step_faults(steps, {fault.file for fault in faults}, around)
     dating = Dating(faults=tuple(faults), note=note)
     if len(dating.misdated) == bags:
         dating = replace(dating, faults=tuple(each._replace(misleads=False) for each in faults))
@@ -169,7 +168,7 @@ def dating_of(
     return replace(dating, earliest=earliest, latest=latest)
 
 
-def _unset(parts: Iterable[Part]) -> Iterator[BagFile]:
+def _unset(parts: Iterable[DatedBags]) -> Iterator[BagFile]:
     for part in parts:
         for bag in part.bags:
             if bag.start >= FIRST_BAGS_NS:
@@ -177,12 +176,12 @@ def _unset(parts: Iterable[Part]) -> Iterator[BagFile]:
             yield bag
 
 
-def _of_steps(
+def _step_faults(
     steps: Iterable[StepBack],
     known: Collection[str],
     around: Callable[[Ns, Ns], Sequence[BagFile]],
 ) -> Iterator[ClockFault]:
-    """The faults that steps back come to, where no other names a bag at the step."""
+    """Yields the faults of clocks that were set back, if no other fault explains the step."""
     named: set[str] = set()
     for step in steps:
         if step.before.file in known or step.after.file in known:
@@ -194,15 +193,15 @@ def _of_steps(
             continue
         half = FAR_BACK_NS // 2
         sides = [around(at - half, at + half) for at in (step.after.start, step.before.end)]
-        # Of equals the earlier one strayed: a clock that loses its time falls back.
+        # Of equals the earlier one is wrong: a clock that loses its time falls back.
         for bag in min(sides, key=len):
             if bag.file not in named and bag.file not in known:
                 named.add(bag.file)
                 yield ClockFault(bag, FaultyClock.STRAY)
 
 
-def _span(parts: Sequence[Part], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
-    """The first start and the last end of the bags that are not left out."""
+def _span(parts: Sequence[DatedBags], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
+    """Returns the first start and the last end of the bags that are not left out."""
     starts = sorted(bag.start for bag in left_out)
     files = {bag.file for bag in left_out}
     spans: list[tuple[Ns, Ns]] = []

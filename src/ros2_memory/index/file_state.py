@@ -1,14 +1,14 @@
-"""How a bag file stands: closed, still being written, left open by a crash, or unreadable.
+"""The state of a bag file: closed, still being written, left open by a crash, or unreadable.
 
-The file says of itself whether its writer has finished. Where it does not say so, either a
-recorder still writes it or a crash left it:
+The file itself shows whether its writer has finished. Where it does not, either a recorder is still
+writing it or a crash left it open:
 
-    open      live heartbeat  names the recording                -> active, however still it lies
+    open      live heartbeat  names the recording                -> active, however long unchanged
     open      live heartbeat  names others only                  -> left open by a crash
     open      no heartbeat    grew within the last three splits  -> active
-    open      no heartbeat    lay still for longer               -> left open by a crash
+    open      no heartbeat    has not grown for longer           -> left open by a crash
 
-A file "grew" when its mtime says so, or when two scans saw it grow. An mtime in the future says
+A file "grew" when its mtime shows that, or when two scans saw it grow. An mtime in the future shows
 nothing (the clock was set back), so there only what was seen counts.
 
 Where nothing is recorded (`recorder=none`) an mtime alone is no evidence, since a copy has that of
@@ -19,12 +19,12 @@ crash until it was seen to grow.
 
 A `.db3` has no closing mark: between two transactions of its recorder it looks finished. One that
 grew within the last three splits is active unless the `metadata.yaml` beside it, which a recorder
-writes last, mentions it, or a live heartbeat names other recordings only. A `.zstd` is written
-after the bag in it was closed; it is open until its last frame is whole.
+writes last, lists it, or a live heartbeat names other recordings only. A `.zstd` is written after
+the bag in it was closed; it is open until its last frame is complete.
 
-Where a scan includes active files an active `.mcap` is a bag as well as set aside: what of it is
-whole answers. Bytes of such a file never change once they are there. Of a `.db3` they do: it is
-read as a file that nobody writes, and read meanwhile its pages would contradict each other.
+Where a scan includes active files an active `.mcap` is a bag as well as set aside: its complete
+chunks answer, since bytes of such a file never change once they are there. Those of a `.db3` do: it
+is read as a file that nobody writes, and read meanwhile its pages would contradict each other.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
-"""After this long an unreadable file is tried again: the fault may have been the machine's."""
+"""How long until an unreadable file is tried again: the fault may have been the machine's."""
 RETRY_SOON_NS: Final[Ns] = 5 * NS_PER_S
-"""The same where it certainly was: a disk that failed, or too many open files."""
+"""The same where it certainly was the machine's: a failed disk, or too many open files."""
 
 _ACTIVE = "still being written"
 _ANSWERS = "still being written: its complete chunks answer"
@@ -62,7 +62,7 @@ _METADATA_LIMIT: Final = 1 << 26
 
 
 class FileState(IntEnum):
-    """What a file is to the index. Of two forms of one bag the higher standing answers."""
+    """What a file is to the index. Of two forms of one bag the higher state counts."""
 
     UNREAD = 0
     DAMAGED = 1
@@ -74,13 +74,13 @@ class FileState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Classification:
-    """How one file stands: as a bag, set aside with a reason, or without a message.
+    """What one file is: a bag, set aside with a reason, or without a message.
 
-    Both a bag and set aside is only an active file that answers. `silent` are the topics that a bag
+    Only an active file that answers is both a bag and set aside. `silent` are the topics that a bag
     without a message declares.
     """
 
-    standing: FileState
+    state: FileState
     bag: BagFile | None = None
     aside: SetAside | None = None
     silent: tuple[str, ...] = ()
@@ -90,9 +90,13 @@ class Classification:
 class ScanContext:
     """What one scan knows besides the files themselves.
 
-    `open_recordings` are those that a live heartbeat names; None without a live heartbeat.
-    `include_active`: what is whole of a file that is still being written answers. `trusts_mtime`:
-    a young mtime shows that a file is being written, and not only that it was copied.
+    Attributes:
+        root: the bag directory.
+        now: the time of the scan.
+        three_splits: how long three splits take.
+        open_recordings: the recordings that a live heartbeat names; None without one.
+        include_active: whether the complete chunks of a file that is being written answer.
+        trusts_mtime: whether a young mtime shows that a file is being written, not copied.
     """
 
     root: Path
@@ -104,16 +108,16 @@ class ScanContext:
     _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
 
     def may_be_recorded(self, path: Path) -> bool:
-        """Whether no live heartbeat says that this file's recording is over."""
+        """Returns whether no live heartbeat shows that this file's recording is over."""
         return self.open_recordings is None or self.names(path)
 
     def names(self, path: Path) -> bool:
-        """Whether a live heartbeat names this file's recording."""
+        """Returns whether a live heartbeat names this file's recording."""
         recording = path.parent.relative_to(self.root).as_posix()
         return self.open_recordings is not None and recording in self.open_recordings
 
     def is_finished(self, path: Path) -> bool:
-        """Whether the metadata.yaml beside the file mentions it."""
+        """Returns whether the metadata.yaml beside the file lists it."""
         folder = path.parent
         if folder not in self._finished:
             self._finished[folder] = files_in_metadata(folder / "metadata.yaml")
@@ -121,7 +125,7 @@ class ScanContext:
 
 
 class KnownFile(NamedTuple):
-    """A closed file as it looked when it was read, and what it held then.
+    """A closed file as it was when it was read, and its content then.
 
     `start` and `end` are log times (inclusive); 0 where it holds no message.
     """
@@ -133,18 +137,27 @@ class KnownFile(NamedTuple):
     start: Ns
     end: Ns
 
-    def looks_like(self, stamp: Stamp) -> bool:
-        """Whether a file still looks as it did."""
-        return (self.size, self.mtime_ns, self.sidecar_ns) == (
-            stamp.size,
-            stamp.mtime_ns,
-            stamp.sidecar_ns,
-        )
+    def matches(self, stamp: Stamp) -> bool:
+        """Returns whether a file is as it was."""
+        return self[:3] == stamp.content
 
 
 @dataclass(slots=True)
 class FileNotes:
-    """What is known of one bag file, from outside and, as far as it was read, from inside."""
+    """What is known of one bag file, from outside and, as far as it was read, from inside.
+
+    Attributes:
+        path: of the file.
+        kind: its suffix, one of `layout.BAG_KINDS`.
+        stamp: its stat result.
+        seen_at: when it was first seen like this.
+        trusted: whether a later change would show in its mtime.
+        grew_at: when a scan last saw it grow.
+        closing: whether its writer has finished; None while unknown.
+        summary: its content; None while unknown.
+        fault: why it cannot be read.
+        is_transient: the fault may be the machine's, not the file's.
+    """
 
     path: Path
     kind: str
@@ -155,93 +168,85 @@ class FileNotes:
     closing: Closing | None = None
     summary: BagSummary | None = None
     fault: str | None = None
-    passing: bool = False
+    is_transient: bool = False
 
     @classmethod
     def first(cls, path: Path, stamp: Stamp, now: Ns) -> FileNotes:
-        """The notes of a bag file that was not known before."""
+        """Returns the notes on a bag file that was not known before."""
         return cls(path, bag_kind(path.name) or "", stamp, now, settled(stamp.mtime_ns, now))
 
-    def recall(self, summary: BagSummary) -> None:
-        """Takes in what was found earlier in a closed file that looked just like this one."""
+    def restore(self, summary: BagSummary) -> None:
+        """Sets what was read earlier from a closed file, which has not changed since."""
         self.closing, self.summary = Closing.CLOSED, summary
 
-    def look(self, stamp: Stamp, now: Ns) -> bool:
-        """Takes in how the file looks at this scan, and forgets what may not hold any more.
-
-        Gives whether anything had to be forgotten.
-        """
+    def update(self, stamp: Stamp, now: Ns) -> bool:
+        """Updates the stamp, and drops what may be outdated; returns whether it dropped it."""
         if stamp.inode != self.stamp.inode:
             self.grew_at = None  # another file under the same name
         elif stamp.size > self.stamp.size or (self.grew_at is not None and self.grew_at > now):
             self.grew_at = now  # also anew after the clock was set back
-        outdated = self._outdated(stamp, now)
-        if outdated:
+        is_outdated = self._is_outdated(stamp, now)
+        if is_outdated:
             self.closing, self.summary, self.fault = None, None, None
-            self.passing = False
+            self.is_transient = False
             self.seen_at = now
         self.stamp = stamp
         self.trusted = settled(stamp.mtime_ns, now)
-        return outdated
+        return is_outdated
 
-    def grew_lately(self, scene: ScanContext) -> bool:
-        """Whether the file grew within the last three splits."""
-        age = scene.now - self.stamp.mtime_ns
-        return self.was_seen_growing(scene) or -YOUNG_NS < age <= scene.three_splits
+    def grew_lately(self, context: ScanContext) -> bool:
+        """Returns whether the file grew within the last three splits."""
+        age = context.now - self.stamp.mtime_ns
+        return self.was_seen_growing(context) or -YOUNG_NS < age <= context.three_splits
 
-    def was_seen_growing(self, scene: ScanContext) -> bool:
-        """Whether two scans saw the file grow, within the last three splits."""
-        return self.grew_at is not None and scene.now - self.grew_at <= scene.three_splits
+    def was_seen_growing(self, context: ScanContext) -> bool:
+        """Returns whether two scans saw the file grow, within the last three splits."""
+        return self.grew_at is not None and context.now - self.grew_at <= context.three_splits
 
-    def must_be_watched(self, verdict: Classification, scene: ScanContext) -> bool:
-        """Whether the next scan must look at the file though its directory did not change."""
-        if verdict.standing is FileState.UNREAD:
+    def must_be_watched(self, classification: Classification, context: ScanContext) -> bool:
+        """Returns whether the next scan must look at the file in an unchanged directory."""
+        if classification.state is FileState.UNREAD:
             return False
         return (
             not self.trusted
-            or verdict.standing in {FileState.ACTIVE, FileState.DAMAGED}
+            or classification.state in {FileState.ACTIVE, FileState.DAMAGED}
             or self.closing is Closing.OPEN
-            or (self.kind == ".db3" and scene.now - self.stamp.mtime_ns <= scene.three_splits)
+            or (self.kind == ".db3" and context.now - self.stamp.mtime_ns <= context.three_splits)
         )
 
-    def _outdated(self, stamp: Stamp, now: Ns) -> bool:
-        before = self.stamp
-        if not self.trusted or (stamp.size, stamp.mtime_ns, stamp.sidecar_ns) != (
-            before.size,
-            before.mtime_ns,
-            before.sidecar_ns,
-        ):
+    def _is_outdated(self, stamp: Stamp, now: Ns) -> bool:
+        if not self.trusted or stamp.content != self.stamp.content:
             return True
         # Permissions change only the ctime.
-        patience = RETRY_SOON_NS if self.passing else RETRY_NS
+        patience = RETRY_SOON_NS if self.is_transient else RETRY_NS
         return self.fault is not None and (
-            stamp.ctime_ns != before.ctime_ns or abs(now - self.seen_at) >= patience
+            stamp.ctime_ns != self.stamp.ctime_ns or abs(now - self.seen_at) >= patience
         )
 
 
-def classify(notes: FileNotes, reader: BagReader, scene: ScanContext) -> Classification:
-    """How the file stands; reads of it only what the notes do not have.
+def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classification:
+    """Returns the state of a file; reads only what the notes do not have.
 
     Raises:
-        BagVanishedError: the file is not there any more.
+        BagVanishedError: the file does not exist any more.
     """
     if not reader.reads(notes.path):
-        return _aside(FileState.UNREAD, notes, _not_read(notes))
+        return _set_aside(FileState.UNREAD, notes, _not_read(notes))
     try:
         if notes.closing is None and notes.fault is None:
             # An open MCAP is 0 bytes until its first chunk is full.
             empty = notes.stamp.size == 0
             notes.closing = Closing.OPEN if empty else reader.closing(notes.path)
-        if _is_active(notes, scene) and not _is_copy(notes, reader, scene):
-            return _active(notes, reader, scene)
+        if _is_active(notes, context) and not _is_copy(notes, reader, context):
+            return _active(notes, reader, context)
         if notes.summary is None and notes.fault is None:
             notes.summary = reader.summarize(notes.path)
     except BagVanishedError:
         raise
     except BagError as error:
-        notes.fault, notes.passing = error.reason, isinstance(error, BagUnreachableError)
+        notes.fault, notes.is_transient = error.reason, isinstance(error, BagUnreachableError)
     if notes.summary is None:
-        return _aside(FileState.DAMAGED, notes, notes.fault or "it cannot be read")
+        return _set_aside(FileState.DAMAGED, notes, notes.fault or "it cannot be read")
     return _readable(notes, notes.summary)
 
 
@@ -255,82 +260,86 @@ def files_in_metadata(path: Path) -> frozenset[str]:
     return frozenset(parse_listing(text).names)
 
 
-def _is_active(notes: FileNotes, scene: ScanContext) -> bool:
+def _is_active(notes: FileNotes, context: ScanContext) -> bool:
     if notes.closing is Closing.OPEN:
-        if scene.open_recordings is not None:
-            return scene.names(notes.path)
-        return notes.grew_lately(scene)
+        if context.open_recordings is not None:
+            return context.names(notes.path)
+        return notes.grew_lately(context)
     return (
         notes.closing is Closing.CLOSED
         and notes.kind == ".db3"
-        and scene.may_be_recorded(notes.path)
-        and notes.grew_lately(scene)
-        and not scene.is_finished(notes.path)
+        and context.may_be_recorded(notes.path)
+        and notes.grew_lately(context)
+        and not context.is_finished(notes.path)
     )
 
 
-def _is_copy(notes: FileNotes, reader: BagReader, scene: ScanContext) -> bool:
-    """Whether a file looks as being written for no other reason than when it was copied.
+def _is_copy(notes: FileNotes, reader: BagReader, context: ScanContext) -> bool:
+    """Returns whether a file looks as being written only because it was copied just now.
 
     Raises:
-        BagVanishedError: the file is not there any more.
+        BagVanishedError: the file does not exist any more.
     """
-    if scene.trusts_mtime or scene.open_recordings is not None or notes.was_seen_growing(scene):
+    if context.trusts_mtime or context.open_recordings is not None:
         return False
-    if notes.summary is None and notes.stamp.size:
-        try:
-            notes.summary = reader.summarize(notes.path)
-        except BagVanishedError:
-            raise
-        except BagError:
-            return False
-    if notes.summary is None or notes.summary.empty:
+    if notes.was_seen_growing(context):
         return False
-    return abs(notes.stamp.mtime_ns - notes.summary.end) > scene.three_splits
+    summary = _summary_so_far(notes, reader)
+    if summary is None or summary.empty:
+        return False
+    return abs(notes.stamp.mtime_ns - summary.end) > context.three_splits
 
 
-def _active(notes: FileNotes, reader: BagReader, scene: ScanContext) -> Classification:
-    """An active file; as a bag, too, as far as it can be one.
+def _active(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classification:
+    """Returns the state of an active file; as a bag, too, as far as it can be one.
 
     Raises:
-        BagVanishedError: the file is not there any more.
+        BagVanishedError: the file does not exist any more.
     """
     aside = SetAside(notes.path, _ACTIVE)
-    if not scene.include_active or notes.kind != ".mcap":
+    if not context.include_active or notes.kind != ".mcap":
         return Classification(FileState.ACTIVE, aside=aside)
-    nothing_yet = Classification(FileState.ACTIVE, aside=replace(aside, answers=True))
-    if notes.stamp.size == 0:
-        return nothing_yet
-    if notes.summary is None:
-        try:
-            notes.summary = reader.summarize(notes.path)
-        except BagVanishedError:
-            raise
-        except BagError:
-            # The file may be about to be one. If it is none, that is found when it stays so.
-            return Classification(FileState.ACTIVE, aside=aside)
-    summary = notes.summary
+    summary = _summary_so_far(notes, reader)
+    if summary is None and notes.stamp.size:
+        # It may become a bag. If it is none, that is found once it is not active any more.
+        return Classification(FileState.ACTIVE, aside=aside)
+    if summary is None or summary.empty:
+        return Classification(FileState.ACTIVE, aside=replace(aside, answers=True))
     if not summary.complete:
-        # The first note tells how the file ends; it goes on.
+        # The first note is on the early end of the file, which goes on.
         summary = summary.replaced(notes=summary.notes[1:])
-    if summary.empty:
-        return nothing_yet
     bag = _bag(notes, BagState.ACTIVE, summary)
     return Classification(
         FileState.ACTIVE, bag, SetAside(notes.path, _ANSWERS, answers=True, until=bag.end)
     )
 
 
+def _summary_so_far(notes: FileNotes, reader: BagReader) -> BagSummary | None:
+    """Returns what can be read of a file that may be growing; None where nothing can.
+
+    Raises:
+        BagVanishedError: the file does not exist any more.
+    """
+    if notes.summary is None and notes.stamp.size:
+        try:
+            notes.summary = reader.summarize(notes.path)
+        except BagVanishedError:
+            raise
+        except BagError:
+            return None
+    return notes.summary
+
+
 def _readable(notes: FileNotes, summary: BagSummary) -> Classification:
-    closed = notes.closing is Closing.CLOSED and summary.complete
+    is_closed = notes.closing is Closing.CLOSED and summary.complete
     if summary.empty:
-        if closed and not summary.notes:
+        if is_closed and not summary.notes:
             return Classification(FileState.EMPTY, silent=summary.silent)
-        if closed:
-            return _aside(FileState.DAMAGED, notes, "; ".join(summary.notes))
-        return _aside(FileState.DAMAGED, notes, _NO_MESSAGE)
-    bag = _bag(notes, BagState.CLOSED if closed else BagState.INCOMPLETE, summary)
-    return Classification(FileState.CLOSED if closed else FileState.INCOMPLETE, bag=bag)
+        if is_closed:
+            return _set_aside(FileState.DAMAGED, notes, "; ".join(summary.notes))
+        return _set_aside(FileState.DAMAGED, notes, _NO_MESSAGE)
+    bag = _bag(notes, BagState.CLOSED if is_closed else BagState.INCOMPLETE, summary)
+    return Classification(FileState.CLOSED if is_closed else FileState.INCOMPLETE, bag=bag)
 
 
 def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
@@ -347,8 +356,8 @@ def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
     )
 
 
-def _aside(standing: FileState, notes: FileNotes, reason: str) -> Classification:
-    return Classification(standing, aside=SetAside(notes.path, reason, notes.stamp.mtime_ns))
+def _set_aside(state: FileState, notes: FileNotes, reason: str) -> Classification:
+    return Classification(state, aside=SetAside(notes.path, reason, notes.stamp.mtime_ns))
 
 
 def _not_read(notes: FileNotes) -> str:

@@ -66,17 +66,17 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
     A recorder of ours deletes the oldest splits of its recordings, whose metadata.yaml still lists
     them: those before the first split that is left are not missing.
     """
-    if not snapshot.described:
+    if not snapshot.metadata_folders:
         return []
     own = OwnRecordings(bag_dir)
     bags: Counter[str] = Counter()
     messages: Counter[str] = Counter()
-    for run in snapshot.runs:
-        for name, tally in run.tallies.items():
+    for segment in snapshot.segments:
+        for name, tally in segment.tallies.items():
             bags[name] += tally.bags
             messages[name] += tally.messages
     absent = []
-    for path in snapshot.described:
+    for path in snapshot.metadata_folders:
         try:
             folder = _folder(bag_dir, Path(path), snapshot.scanned_at)
         except FileNotFoundError:

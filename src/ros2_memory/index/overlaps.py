@@ -1,8 +1,8 @@
-"""Recordings of several runs that overlap in time, and are answered together without being one.
+"""Recordings of different runs that overlap in time, and answer together all the same.
 
 Bags that were copied into one folder, two robots' for instance, answer as one memory. Where one
-recording took over from another they overlap too: that is written down (see `handover`), each
-message counts once, and it is nothing to report.
+recording took over from another they overlap too: that is written down in `handover.json`, each
+message counts once, and there is nothing to report.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
 
 LONG_NS: Final[Ns] = 30 * NS_PER_S
-"""No handover takes longer; a shorter overlap is one where it is half of a recording."""
+"""No handover takes longer; a shorter overlap counts where it is half of a recording."""
 SHORT_NS: Final[Ns] = NS_PER_S
-_KEPT: Final = f"/{MOMENTS_FOLDER}/"
-_MOMENT: Final = re.compile(rf"(?P<bag_dir>.*){_KEPT}\d{{8}}T\d{{6}}Z[^/]*/(?P<recording>.+)")
-_MOST_READ: Final = 200
-"""Of so many pairs it is looked whether one took over from the other; each costs two files."""
+_IN_MOMENTS: Final = f"/{MOMENTS_FOLDER}/"
+_MOMENT: Final = re.compile(rf"(?P<bag_dir>.*){_IN_MOMENTS}\d{{8}}T\d{{6}}Z[^/]*/(?P<recording>.+)")
+_MAX_READ: Final = 200
+"""How many pairs are checked for a handover; each costs two files."""
 
 
-class Together(NamedTuple):
+class Overlapping(NamedTuple):
     """Two recordings, by their folders, and when (log times, inclusive) they overlap."""
 
     first: Path
@@ -38,26 +38,26 @@ class Together(NamedTuple):
     end: Ns
 
 
-def overlapping_recordings(snapshot: Snapshot) -> tuple[Together, ...]:
-    """The pairs of recordings that overlap and that no handover joins, in order of time.
+def overlapping_recordings(snapshot: Snapshot) -> tuple[Overlapping, ...]:
+    """Returns the pairs of recordings that overlap and that no handover joins, in order of time.
 
-    Bags that a wrong clock dated are left out: their own dates say nothing. Those of a moment that
-    is kept are of the recording that they were taken from.
+    Bags that a wrong clock dated are left out. Those in a saved moment count with the recording
+    that they were saved from.
     """
-    spans, pairs = _swept(snapshot)
+    spans, pairs = _sweep(snapshot)
     found = []
     for (one, other), (start, end, shared) in pairs.items():
         shorter = min(spans[one], spans[other])
         if shared > LONG_NS or (shared > SHORT_NS and 2 * shared >= shorter):
-            found.append(Together(Path(one), Path(other), start, end))
-    asked = sorted(found, key=lambda each: each.start)[:_MOST_READ]
+            found.append(Overlapping(Path(one), Path(other), start, end))
+    asked = sorted(found, key=lambda each: each.start)[:_MAX_READ]
     return tuple(each for each in asked if not _took_over(each))
 
 
-def _swept(
+def _sweep(
     snapshot: Snapshot,
 ) -> tuple[dict[str, Ns], dict[tuple[str, str], tuple[Ns, Ns, Ns]]]:
-    """How long each recording is, and for each pair when, and for how long, both have a bag."""
+    """Returns how long each recording is, and when and for how long two have a bag at once."""
     left_out, spans = snapshot.dating.misdated, dict[str, Ns]()
     pairs: dict[tuple[str, str], tuple[Ns, Ns, Ns]] = {}
     reach: dict[str, Ns] = {}
@@ -65,8 +65,8 @@ def _swept(
         if bag.file in left_out:
             continue
         own, start, end = bag.file.rpartition("/")[0], bag.start, bag.end
-        if _KEPT in own:
-            own = _home(own)
+        if _IN_MOMENTS in own:
+            own = _recorded_folder(own)
         before = reach.get(own)
         if len(reach) > (before is not None):
             for other, until in [*reach.items()]:
@@ -84,14 +84,14 @@ def _swept(
     return spans, pairs
 
 
-def _home(folder: str) -> str:
-    """The recording that a folder of a kept moment has bags of, where it lies or lay."""
+def _recorded_folder(folder: str) -> str:
+    """Returns the folder of the recording that a folder in a saved moment has bags of."""
     found = _MOMENT.fullmatch(folder)
     return f"{found['bag_dir']}/{found['recording']}" if found else folder
 
 
-def _took_over(pair: Together) -> bool:
-    """Whether the recorder wrote down that one of two recordings goes on with the other."""
+def _took_over(pair: Overlapping) -> bool:
+    """Returns whether a handover joins the two recordings."""
     names = {pair.first.name, pair.second.name}
     if pair.first.parent != pair.second.parent:
         return False
@@ -102,8 +102,8 @@ def _took_over(pair: Together) -> bool:
     return False
 
 
-def named(pairs: Sequence[Together]) -> Iterator[tuple[str, str]]:
-    """The names of each pair: their folders, and where those are alike, what stands above them."""
+def pair_names(pairs: Sequence[Overlapping]) -> Iterator[tuple[str, str]]:
+    """Yields the names of each pair: of their folders, with the parents where those are equal."""
     for first, second, *_ in pairs:
         if first.name != second.name:
             yield first.name, second.name

@@ -1,6 +1,7 @@
 """Some consecutive bags of a timeline, and what follows from their summaries.
 
-It is worked out once, when it is first asked for, and serves for as long as the bags stay together.
+Everything is computed when it is first asked for, and serves for as long as the bags stay together.
+A query looks at few topics of many bags, so the numbers of their summaries are kept as columns.
 """
 
 from __future__ import annotations
@@ -9,30 +10,41 @@ from functools import cached_property, lru_cache, reduce
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
+import numpy as np
+
 from ros2_memory.bag_dir.layout import CARRY_FILE, is_carried
 from ros2_memory.core.model import BagState
-from ros2_memory.index.columns import all_alike, column_of, rows_in
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.split_order import split_ranges_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile, TimeWindow, TopicSummary
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.columns import Alike, Column
     from ros2_memory.index.split_order import Series, SplitRange
 
-_RUNS_AT_HAND: Final = 64
+RARE_NS: Final[Ns] = 5 * NS_PER_S
+"""A topic with a message this often, or less often, is rare."""
+_JITTER_NS: Final[Ns] = 50 * NS_PER_MS
+"""The mean spacing may be shorter by this: publishers and transports are not exact."""
+_FEW_MESSAGES: Final = 5
+"""Fewer have no usual spacing: a map may be published twice when its node starts."""
+
+_CACHED_SEGMENTS: Final = 64
 """Two days of splits."""
 
-HeldMessages: TypeAlias = "tuple[BagFile, TopicSummary]"
+TopicInBag: TypeAlias = "tuple[BagFile, TopicSummary]"
 """A bag, and what it holds of one topic under one type."""
+Span: TypeAlias = "tuple[Ns, Ns]"
+"""Log times of a first and a last message, both inclusive."""
 
 
 class Extent(NamedTuple):
-    """A bag, and the log times (inclusive) of the first and last message that it holds of a topic.
+    """A bag, and the log times (inclusive) of the first and last message of a topic in it.
 
     A bag in which the topic has two types has two extents.
     """
@@ -42,26 +54,42 @@ class Extent(NamedTuple):
     last: Ns
 
 
-Span: TypeAlias = "tuple[Ns, Ns]"
-"""Log times of a first and a last message, both inclusive."""
-
-
-def in_time(bag: BagFile) -> tuple[Ns, Ns, str]:
-    """What orders bags: the times inside them, never their names; the file only breaks ties."""
-    return bag.start, bag.end, bag.file
-
-
-class Stated(NamedTuple):
-    """What summaries say of one topic under one type."""
+class TopicTotals(NamedTuple):
+    """What summaries add up to for one topic under one type; times are inclusive."""
 
     first: Ns
     last: Ns
     messages: int
 
-    def with_more(self, other: Stated) -> Stated:
-        """Both together."""
-        return Stated(
+    def __or__(self, other: TopicTotals) -> TopicTotals:
+        """Returns the totals of both."""
+        return TopicTotals(
             min(self.first, other.first), max(self.last, other.last), self.messages + other.messages
+        )
+
+
+class Pace(NamedTuple):
+    """What a recording holds of a topic, and the times (inclusive) between which it has bags."""
+
+    topic: TopicTotals
+    begin: Ns
+    end: Ns
+
+    @property
+    def is_rare(self) -> bool:
+        """Whether the topic has a message every `RARE_NS` or less often, as a map has.
+
+        That is the spacing between its first and last message, so that telemetry which fell silent
+        stays frequent. Few messages are rare if the recording went on for long enough.
+        """
+        messages, span = self.topic.messages, self.topic.last - self.topic.first
+        if span >= (messages - 1) * (RARE_NS - _JITTER_NS):
+            return True
+        length = self.end - self.begin
+        return (
+            messages < _FEW_MESSAGES
+            and length >= messages * RARE_NS
+            and length - span >= 2 * RARE_NS
         )
 
 
@@ -70,6 +98,11 @@ class Tally(NamedTuple):
 
     bags: int
     messages: int
+
+
+def in_time(bag: BagFile) -> tuple[Ns, Ns, str]:
+    """Returns the sort key of bags: the times inside them; the path only breaks ties."""
+    return bag.start, bag.end, bag.file
 
 
 class Segment:
@@ -92,83 +125,88 @@ class Segment:
         return self.bags
 
     @cached_property
-    def taken(self) -> tuple[int, int]:
-        """As `taken_by`, of those."""
-        return taken_by(self.recorded)
+    def disk_use(self) -> tuple[int, int]:
+        """The bytes of the recorded bags, and how many of them a crash left open."""
+        return disk_use(self.recorded)
 
     @cached_property
-    def taken_in(self) -> dict[str, int]:
-        """The bytes that those take on disk, by the folder in which they lie."""
-        taken: dict[str, int] = {}
+    def bytes_in(self) -> dict[str, int]:
+        """The bytes of the recorded bags, by folder."""
+        sizes: dict[str, int] = {}
         for bag in self.recorded:
-            folder = bag.file[: bag.file.rfind("/")]
-            taken[folder] = taken.get(folder, 0) + bag.size
-        return taken
+            folder = _folder_of(bag)
+            sizes[folder] = sizes.get(folder, 0) + bag.size
+        return sizes
 
     @cached_property
     def folders(self) -> frozenset[str]:
-        """The folders in which the bags lie."""
-        return frozenset([bag.file[: bag.file.rfind("/")] for bag in self.bags])
+        """The folders of the bags."""
+        return frozenset(map(_folder_of, self.bags))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
-        """How many bags of the run lie in each folder, and how many messages those hold."""
+        """How many bags lie in each folder, and how many messages they hold."""
         found: dict[str, Tally] = {}
         for bag in self.bags:
-            folder = bag.file[: bag.file.rfind("/")]
+            folder = _folder_of(bag)
             bags, messages = found.get(folder, (0, 0))
             found[folder] = Tally(bags + 1, messages + bag.summary.count)
         return found
 
     @cached_property
-    def courses(self) -> dict[Series, SplitRange]:
-        """How far each recording's splits reach among the bags, by their count."""
+    def split_ranges(self) -> dict[Series, SplitRange]:
+        """Which splits of each recording are among the bags, by their number."""
         return split_ranges_of(self.bags)
 
     @cached_property
-    def odd(self) -> tuple[BagFile, ...]:
-        """The bags of which not all could be read, or that contradict themselves."""
+    def faulty(self) -> tuple[BagFile, ...]:
+        """The bags that are not readable as a whole, or that contradict themselves."""
         return tuple(
             bag
             for bag in self.bags
-            if bag.summary.shape.remarks or bag.state is BagState.INCOMPLETE
+            if bag.summary.schema.remarks or bag.state is BagState.INCOMPLETE
         )
 
     @cached_property
     def set_back(self) -> tuple[BagFile, ...]:
-        """The bags in which times go back."""
-        return tuple(bag for bag in self.recorded if bag.summary.shape.set_back)
+        """The bags in which log times go back."""
+        return tuple(bag for bag in self.recorded if bag.summary.schema.set_back)
 
     @cached_property
-    def _shapes(self) -> tuple[SummarySchema, ...]:
-        """The shapes of the bags. Most runs have one."""
-        return tuple({id(bag.summary.shape): bag.summary.shape for bag in self.bags}.values())
+    def _schemas(self) -> tuple[SummarySchema, ...]:
+        """The different schemas of the summaries; mostly one."""
+        return tuple({id(bag.summary.schema): bag.summary.schema for bag in self.bags}.values())
 
     @cached_property
-    def stated(self) -> dict[str, dict[str, Stated]]:
-        """By topic and type, what the summaries of the bags say."""
-        stated: dict[str, dict[str, Stated]] = {}
-        for shape, _, numbers in _at_hand(self).alike:
+    def totals(self) -> dict[str, dict[str, TopicTotals]]:
+        """By topic and type, the totals of the bags."""
+        totals: dict[str, dict[str, TopicTotals]] = {}
+        for schema, _, numbers in _columns(self).groups:
             rows = zip(
-                shape.topics,
+                schema.topics,
                 numbers[:, :, 1].min(axis=0).tolist(),
                 numbers[:, :, 2].max(axis=0).tolist(),
                 numbers[:, :, 0].sum(axis=0).tolist(),
                 strict=True,
             )
             for (topic, type_name, *_), first, last, messages in rows:
-                by_type = stated.setdefault(topic, {})
-                here = Stated(first, last, messages)
-                known = by_type.get(type_name)
-                by_type[type_name] = here if known is None else known.with_more(here)
-        return stated
+                add_totals(totals.setdefault(topic, {}), type_name, (first, last, messages))
+        return totals
+
+    @cached_property
+    def spans(self) -> dict[str, Span]:
+        """By topic, the log times of its first and last message (inclusive)."""
+        return {
+            topic: reduce(TopicTotals.__or__, by_type.values())[:2]
+            for topic, by_type in self.totals.items()
+        }
 
     def recordings(self, topic: str) -> dict[Path, Span]:
-        """The recordings that hold the topic, each with the times of its first and last message."""
-        column = self._column(topic)
+        """Returns the recordings that hold the topic, with its first and last log time in each."""
+        column = _columns(self).of(topic)
         if column is None:
             return {}
-        folders = [self.bags[at].recording for at in column.at.tolist()]
+        folders = [self.bags[row].recording for row in column.bags.tolist()]
         if folders.count(folders[0]) == len(folders):
             return {folders[0]: self.spans[topic]}
         spans: dict[Path, Span] = {}
@@ -177,100 +215,72 @@ class Segment:
             spans[folder] = wider(spans.get(folder), (first, last))
         return spans
 
-    def holding(self, topic: str, window: TimeWindow | None = None) -> Iterator[HeldMessages]:
-        """The bags that hold messages of the topic, one entry for each type, in bag order.
-
-        With a window, those that may hold some in it.
-        """
-        column = self._column(topic)
-        if column is None:
-            return
-        rows = rows_in(column, window)
-        for at, place in zip(column.at[rows].tolist(), column.places[rows].tolist(), strict=True):
-            bag = self.bags[at]
-            yield bag, bag.summary.at(place)
+    def with_topic(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicInBag]:
+        """Yields the bags that hold the topic (in a window), in order, once for each type."""
+        column = _columns(self).of(topic, window)
+        if column is not None:
+            for row, position in zip(column.bags.tolist(), column.topics.tolist(), strict=True):
+                bag = self.bags[row]
+                yield bag, bag.summary.at(position)
 
     def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[Extent]:
-        """As `holding`, but of the summaries only the times of the first and last message."""
-        column = self._column(topic)
-        if column is None:
-            return
-        rows = rows_in(column, window)
-        columns = (column.at, column.firsts, column.lasts)
-        for at, first, last in zip(*(each[rows].tolist() for each in columns), strict=True):
-            yield Extent(self.bags[at], first, last)
+        """Yields what `with_topic` yields, but only the first and last times; that is faster."""
+        column = _columns(self).of(topic, window)
+        if column is not None:
+            rows = zip(*(each.tolist() for each in column[:3]), strict=True)
+            for row, first, last in rows:
+                yield Extent(self.bags[row], first, last)
 
     def bags_with(self, topic: str) -> tuple[BagFile, ...]:
-        """The bags that hold messages of the topic, in order; `bags` itself where all do."""
-        if all(topic in shape.places for shape in self._shapes):
+        """Returns the bags that hold the topic, in order; `bags` itself where all do."""
+        if all(topic in schema.positions for schema in self._schemas):
             return self.bags
-        column = self._column(topic)
-        places = [] if column is None else column.at.tolist()
-        return tuple(self.bags[at] for at in dict.fromkeys(places))
-
-    def _column(self, topic: str) -> Column | None:
-        """What is held of a topic; None where nothing is."""
-        numbers = _at_hand(self)
-        if topic not in numbers.columns:
-            numbers.columns[topic] = column_of(numbers.alike, topic)
-        return numbers.columns[topic]
-
-    @cached_property
-    def spans(self) -> dict[str, Span]:
-        """By topic, the log times of its first and last message (inclusive)."""
-        return {
-            topic: (
-                min(each.first for each in by_type.values()),
-                max(each.last for each in by_type.values()),
-            )
-            for topic, by_type in self.stated.items()
-        }
+        column = _columns(self).of(topic)
+        rows = [] if column is None else column.bags.tolist()
+        return tuple(self.bags[row] for row in dict.fromkeys(rows))
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
-        """By topic, the types that its messages have."""
+        """By topic, the types of its messages."""
         types: dict[str, set[str]] = {}
-        for shape in self._shapes:
-            for heading in shape.topics:
-                types.setdefault(heading.topic, set()).add(heading.type)
+        for schema in self._schemas:
+            for header in schema.topics:
+                types.setdefault(header.topic, set()).add(header.type)
         return {topic: frozenset(names) for topic, names in types.items()}
 
     @cached_property
-    def latched(self) -> frozenset[str]:
+    def transient_local(self) -> frozenset[str]:
         """The topics that some publisher offered as transient local."""
         return frozenset(
-            heading.topic for shape in self._shapes for heading in shape.topics if heading.latched
+            header.topic for schema in self._schemas for header in schema.topics if header.latched
         )
 
     @cached_property
-    def held(self) -> frozenset[str]:
-        """Those of them that are no logs: `/rosout` is transient local everywhere."""
+    def transient_state(self) -> frozenset[str]:
+        """The transient local topics without logs: `/rosout` is transient local everywhere."""
         return frozenset(
-            heading.topic
-            for shape in self._shapes
-            for heading in shape.topics
-            if heading.latched and not is_log(heading.type)
+            header.topic
+            for schema in self._schemas
+            for header in schema.topics
+            if header.latched and not is_log(header.type)
         )
 
-    def stated_in(self, topic: str, recording: Path) -> Stated | None:
-        """What the summaries of a recording's bags say of a topic, under all of its types."""
-        folder = str(recording)
-        if folder not in self.folders or topic not in self.stated:
+    def totals_in(self, topic: str, recording: Path) -> TopicTotals | None:
+        """Returns what a recording's bags hold of a topic, under all of its types."""
+        if str(recording) not in self.folders or topic not in self.totals:
             return None
-        if len(self.folders) == 1:
-            said = [*self.stated[topic].values()]
-        else:
-            said = [
-                Stated(held.first, held.last, held.count)
-                for bag, held in self.holding(topic)
+        totals = [*self.totals[topic].values()]
+        if len(self.folders) > 1:
+            totals = [
+                TopicTotals(summary.first, summary.last, summary.count)
+                for bag, summary in self.with_topic(topic)
                 if bag.recording == recording
             ]
-        return reduce(Stated.with_more, said) if said else None
+        return reduce(TopicTotals.__or__, totals) if totals else None
 
     def extent_of(self, recording: Path) -> Span | None:
-        """The times (inclusive) between which a recording has bags among these."""
-        folder = str(recording)
-        if folder not in self.folders:
+        """Returns the times (inclusive) between which a recording has bags among these."""
+        if str(recording) not in self.folders:
             return None
         if len(self.folders) == 1:
             return self.bags[0].start, self.latest
@@ -280,34 +290,101 @@ class Segment:
     @cached_property
     def silent(self) -> frozenset[str]:
         """The topics that some bag declares without a message."""
-        return frozenset(chain.from_iterable(shape.silent for shape in self._shapes))
+        return frozenset(chain.from_iterable(schema.silent for schema in self._schemas))
 
 
 def is_log(type_name: str) -> bool:
-    """Whether messages of a type are lines of a log."""
+    """Returns whether messages of a type are lines of a log."""
     return type_name in {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}
 
 
-def taken_by(bags: Sequence[BagFile]) -> tuple[int, int]:
-    """The bytes that bags take on disk, and how many of them a crash left open."""
+def disk_use(bags: Sequence[BagFile]) -> tuple[int, int]:
+    """Returns the bytes of bags, and how many of them a crash left open."""
     left_open = [bag.state is BagState.INCOMPLETE for bag in bags]
     return sum([bag.size for bag in bags]), sum(left_open)
 
 
 def wider(known: Span | None, span: Span) -> Span:
-    """The span of both, where one is known."""
+    """Returns the span of both, where one is known."""
     return span if known is None else (min(known[0], span[0]), max(known[1], span[1]))
 
 
-class _Numbers:
-    """The numbers of a run's bags, and what of them was asked for."""
-
-    def __init__(self, alike: tuple[Alike, ...]) -> None:
-        self.alike = alike
-        self.columns: dict[str, Column | None] = {}
+def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, Ns, int]) -> None:
+    """Adds totals of a type to those that are known."""
+    known, added = totals.get(type_name), TopicTotals(*more)
+    totals[type_name] = added if known is None else known | added
 
 
-@lru_cache(maxsize=_RUNS_AT_HAND)
-def _at_hand(run: Segment) -> _Numbers:
-    """The numbers of a run: a copy of what its summaries say, so of a week few are held."""
-    return _Numbers(all_alike(run.bags))
+def _folder_of(bag: BagFile) -> str:
+    return bag.file[: bag.file.rfind("/")]
+
+
+class _SchemaGroup(NamedTuple):
+    """Bags of one schema: their positions in the segment, and their numbers by bag and topic."""
+
+    schema: SummarySchema
+    bags: NDArray[np.intp]
+    numbers: NDArray[np.int64]
+
+
+class _Column(NamedTuple):
+    """What the bags of a segment hold of one topic, in bag order, a row for each of its types.
+
+    `bags` are positions in the segment, `topics` positions in the schema of the bag's summary.
+    """
+
+    bags: NDArray[np.intp]
+    firsts: NDArray[np.int64]
+    lasts: NDArray[np.int64]
+    topics: NDArray[np.intp]
+
+
+class _Columns:
+    """The numbers of a segment's summaries, and the columns that were asked for."""
+
+    def __init__(self, bags: Sequence[BagFile]) -> None:
+        rows: dict[int, list[int]] = {}
+        for row, bag in enumerate(bags):
+            rows.setdefault(id(bag.summary.schema), []).append(row)
+        self.groups = tuple(_group([bags[row] for row in each], each) for each in rows.values())
+        self._columns: dict[str, _Column | None] = {}
+
+    def of(self, topic: str, window: TimeWindow | None = None) -> _Column | None:
+        """Returns what the bags hold of a topic, or can in a window; None where nothing."""
+        if topic not in self._columns:
+            self._columns[topic] = self._merged(topic)
+        column = self._columns[topic]
+        if column is None or window is None:
+            return column
+        rows = np.flatnonzero((column.firsts < window.stop) & (column.lasts >= window.start))
+        return _Column(*(each[rows] for each in column))
+
+    def _merged(self, topic: str) -> _Column | None:
+        columns = [
+            _Column(
+                bags,
+                numbers[:, position, 1],
+                numbers[:, position, 2],
+                np.broadcast_to(np.intp(position), bags.shape),
+            )
+            for schema, bags, numbers in self.groups
+            for position in schema.positions.get(topic, ())
+        ]
+        if len(columns) < 2:
+            return columns[0] if columns else None
+        merged = _Column(*map(np.concatenate, zip(*columns, strict=True)))
+        order = np.lexsort((merged.topics, merged.bags))
+        return _Column(*(each[order] for each in merged))
+
+
+def _group(bags: Sequence[BagFile], rows: Sequence[int]) -> _SchemaGroup:
+    schema = bags[0].summary.schema
+    data = b"".join([bag.summary.numbers for bag in bags])
+    numbers = np.frombuffer(data, "<i8").reshape(len(bags), len(schema.topics), 3)
+    return _SchemaGroup(schema, np.array(rows, np.intp), numbers)
+
+
+@lru_cache(maxsize=_CACHED_SEGMENTS)
+def _columns(segment: Segment) -> _Columns:
+    """Returns the columns of a segment: a copy of its summaries, so few of a week are kept."""
+    return _Columns(segment.bags)

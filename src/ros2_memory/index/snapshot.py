@@ -1,43 +1,64 @@
-"""What is known of the bag directory at one moment."""
+"""The bag directory as it is known at one moment."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.index import bearings
+from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.index.clock_faults import DatedBags, check_dates
 from ros2_memory.index.segment import is_log
-from ros2_memory.index.timeline import RUN_LIMIT, Timeline
+from ros2_memory.index.split_order import (
+    Neighbours,
+    StepBack,
+    is_recording,
+    neighbours,
+    split_of,
+    steps_of,
+)
+from ros2_memory.index.timeline import Timeline
+from ros2_memory.index.unreadable_span import MAX_FILE_NS, unreadable_bounds, unreadable_span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile, SetAside, TimeWindow
+    from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.clock_faults import ClockFault, Dating
-    from ros2_memory.index.pace import Pace
-    from ros2_memory.index.segment import Extent, HeldMessages, Segment, Span, Stated
+    from ros2_memory.index.segment import (
+        Extent,
+        Pace,
+        Segment,
+        Span,
+        TopicInBag,
+        TopicTotals,
+    )
 
-__all__ = ["RUN_LIMIT", "Snapshot", "Timeline"]
-
-_PLACED: Final = 500
+_MAX_PLACED: Final = 500
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The bag directory at one moment. Never changes, so threads share it freely.
+    """The bag directory at one moment. Immutable, so threads share it freely.
 
-    `bags` answer questions: closed, or left incomplete by a crash, and never empty; sorted by
-    (start, end, path). The one of latched messages that outlive their own bags is not among them,
-    but found wherever a topic is asked for. Set aside, each with its reason and sorted by path:
-    `active` files are still being written (those that answer as far as they are whole are among
-    `bags` too); `damaged` ones cannot be read at all (among them directories that cannot be
-    listed); `unread` ones are of a kind that another storage reads, or symbolic links, which are
-    not followed. `empty` counts closed bags without a message. `silent_topics` are declared in some
-    bag and heard in none. `described` are the folders with a metadata.yaml.
-    `problem` says why the bag directory itself could not be read.
+    Attributes:
+        bags: what answers queries: bags that are closed, or left open by a crash, and not empty, in
+            the order (start, end, path). The bag of carried latched messages is not among them, but
+            is found wherever a topic is asked for.
+        active: files that are still being written, with the reason, by path; those that answer as
+            far as they are complete are among `bags` too.
+        damaged: files and directories that cannot be read at all, likewise.
+        unread: files of a kind that another adapter reads, and symbolic links, likewise.
+        empty: number of closed bags without a message.
+        silent_topics: topics that some bag declares and none has a message of.
+        scanned_at: when the directory was scanned.
+        problem: why the bag directory itself could not be read.
+        metadata_folders: folders with a metadata.yaml.
+        timeline: the bags in time order; made from `bags` where None.
     """
 
     bags: tuple[BagFile, ...] = ()
@@ -48,7 +69,7 @@ class Snapshot:
     silent_topics: frozenset[str] = frozenset()
     scanned_at: Ns = 0
     problem: str | None = None
-    described: tuple[str, ...] = ()
+    metadata_folders: tuple[str, ...] = ()
     timeline: Timeline | None = field(default=None, repr=False, compare=False)
 
     @cached_property
@@ -57,7 +78,7 @@ class Snapshot:
 
     @property
     def earliest(self) -> Ns | None:
-        """Log time of the first message in any bag that its date does not refute; None without."""
+        """Log time of the first message in any correctly dated bag; None without one."""
         return self._dates.earliest
 
     @property
@@ -67,7 +88,7 @@ class Snapshot:
 
     @cached_property
     def _dates(self) -> Dating:
-        return bearings.dating(self._timeline, self.scanned_at, with_steps=False)
+        return self._check_dates(())
 
     @property
     def misdated(self) -> Sequence[ClockFault]:
@@ -76,126 +97,179 @@ class Snapshot:
 
     @cached_property
     def dating(self) -> Dating:
-        """What the dates and the order of all bags tell of the clocks that dated them."""
-        return bearings.dating(self._timeline, self.scanned_at, with_steps=True)
+        """What the dates and the order of all bags show about the clocks that dated them."""
+        segments = self.segments
+        between = steps_of([each.split_ranges for each in segments], self._bags_of)
+        within = chain.from_iterable(segment.set_back for segment in segments)
+        steps = [StepBack(bag, bag, bag.summary.schema.set_back) for bag in within]
+        return self._check_dates([*between, *steps])
+
+    def _check_dates(self, steps: Sequence[StepBack]) -> Dating:
+        """Checks the dates of the bags; that of carried messages shows nothing about clocks."""
+        dated = [
+            DatedBags(
+                each.recorded,
+                each.latest
+                if each.recorded is each.bags
+                else max(bag.end for bag in each.recorded),
+            )
+            for each in self.segments
+            if each.recorded
+        ] or [DatedBags(each.bags, each.latest) for each in self.segments]
+        return check_dates(
+            dated,
+            steps,
+            self.scanned_at,
+            lambda first, last: self.overlapping(TimeWindow(first, min(last + 1, MAX_NS))),
+        )
 
     @cached_property
-    def places(self) -> Mapping[SetAside, TimeWindow | None]:
-        """Of the files set aside, when messages may have been recorded that do not answer.
+    def unread_spans(self) -> Mapping[SetAside, TimeWindow | None]:
+        """When messages of the files that do not answer may have been recorded; None: unknown.
 
-        None: unknown. Of very many files that cannot be read only the last ones are placed.
+        Of very many files that cannot be read only the last ones are looked at.
         """
-        timeline, now = self._timeline, self.scanned_at
-        asides = [(aside, True) for aside in self.active]
-        asides += [(aside, False) for aside in (*self.damaged, *self.unread)]
+        closed = (*self.damaged, *self.unread)
+        skipped = max(len(self.active) + len(closed) - _MAX_PLACED, len(self.active))
         return {
-            aside: bearings.place(timeline, aside, now, growing=growing)
-            if growing or number >= len(asides) - _PLACED
-            else None
-            for number, (aside, growing) in enumerate(asides)
+            **{aside: self._unread_span(aside, growing=True) for aside in self.active},
+            **dict.fromkeys(closed),
+            **{
+                aside: self._unread_span(aside, growing=False)
+                for aside in closed[skipped - len(self.active) :]
+            },
         }
 
-    @cached_property
-    def bounds(self) -> Mapping[SetAside, TimeWindow | None]:
-        """Of the closed files that do not answer, outside of which times they hold no message.
+    def _unread_span(self, aside: SetAside, *, growing: bool) -> TimeWindow | None:
+        if aside.until is not None:
+            return TimeWindow(min(aside.until + 1, MAX_NS), MAX_NS)
+        near = self._neighbours(aside)
+        recording = aside.path.parent.name
+        return unreadable_span(recording, near, aside.written, self.scanned_at, growing=growing)
 
-        Wider than `places`, which guess how much a file holds. None: they may hold any.
+    @cached_property
+    def unread_bounds(self) -> Mapping[SetAside, TimeWindow | None]:
+        """Bounds outside of which the closed files that do not answer contain no message.
+
+        Wider than `unread_spans`, which estimate how much a file holds. None: anywhere.
         """
         return self.bounds_of((*self.damaged, *self.unread))
 
     def bounds_of(self, files: Sequence[SetAside]) -> Mapping[SetAside, TimeWindow | None]:
-        """As `bounds`, of any closed files, be they not there any more."""
-        placed = files[-_PLACED:]
-        known = {each: bearings.bounds(self._timeline, each, self.scanned_at) for each in placed}
-        return {**dict.fromkeys(files), **known}
+        """Returns `unread_bounds` of any closed files, even if they do not exist any more."""
+        return {
+            **dict.fromkeys(files),
+            **{each: self._bounds(each) for each in files[-_MAX_PLACED:]},
+        }
+
+    def _bounds(self, aside: SetAside) -> TimeWindow | None:
+        split = split_of(str(aside.path))
+        # Files that `ros2 bag record` did not number may lie in any order.
+        is_split = split is not None and is_recording(split[0])
+        near = self._neighbours(aside) if is_split else Neighbours()
+        return unreadable_bounds(aside.path.parent.name, near, aside.written, self.scanned_at)
+
+    def _neighbours(self, aside: SetAside) -> Neighbours:
+        folder = str(aside.path.parent)
+        numbers = [nth for nth, each in enumerate(self.segments) if folder in each.folders]
+        ranges = [self.segments[nth].split_ranges for nth in numbers]
+        return neighbours(
+            str(aside.path), ranges, lambda at: self._bags_of([numbers[each] for each in at])
+        )
+
+    def _bags_of(self, segments: Sequence[int]) -> Iterator[BagFile]:
+        return chain.from_iterable(self.segments[nth].bags for nth in segments)
 
     def topics(self) -> tuple[str, ...]:
-        """The topics of which some bag holds a message, sorted."""
+        """Returns the topics of which some bag holds a message, sorted."""
         return tuple(self._timeline.types)
 
-    def holding(self, topic: str, window: TimeWindow | None = None) -> tuple[HeldMessages, ...]:
-        """Every bag that holds messages of the topic, in bag order, one entry for each type.
+    def with_topic(self, topic: str, window: TimeWindow | None = None) -> tuple[TopicInBag, ...]:
+        """Returns every bag that holds messages of the topic, in order, once for each type.
 
-        With a window, only those that may hold some in it: by the topic's own first and last time
-        in each bag.
+        With a window, only those that can contain some in it, by the topic's first and last time in
+        each bag.
         """
-        return self._timeline.holding(topic, window)
+        return self._timeline.with_topic(topic, window)
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[Extent]:
-        """As `holding`, but of the summaries only the times of the first and last message."""
+        """Returns what `with_topic` returns, but only the first and last times; that is faster."""
         return self._timeline.extents(topic, window)
 
     def overlapping(self, window: TimeWindow) -> tuple[BagFile, ...]:
-        """The bags whose span has a moment in the window, in bag order."""
+        """Returns the bags whose span overlaps the window, in order."""
         return self._timeline.overlapping(window)
 
-    def odd(self, window: TimeWindow) -> list[BagFile]:
-        """The bags of which something is amiss and may bear on the window, in bag order.
+    def faulty(self, window: TimeWindow) -> list[BagFile]:
+        """Returns the bags whose faults may bear on the window, in order.
 
-        That of a bag which a crash left open reaches on to the last time its file was written to,
+        Those of a bag that a crash left open reach to the last time that its file was written to,
         if that was within a day.
         """
         return [
             bag
-            for run in self._odd_runs
-            if run.bags[0].start < window.stop
-            for bag in run.odd
-            if window.overlaps(bag.start, bearings.lost_until(bag))
+            for segment in self._faulty_segments
+            if segment.bags[0].start < window.stop
+            for bag in segment.faulty
+            if window.overlaps(bag.start, _lost_until(bag))
         ]
 
     @cached_property
-    def _odd_runs(self) -> list[Segment]:
-        return [run for run in self.runs if run.odd]
+    def _faulty_segments(self) -> list[Segment]:
+        return [segment for segment in self.segments if segment.faulty]
 
     def types_of(self, topic: str) -> tuple[str, ...]:
-        """The message types under which the topic was heard, sorted; empty where it was not."""
+        """Returns the message types of the topic, sorted; empty where it has no message."""
         return self._timeline.types.get(topic, ())
 
     def is_transient_local(self, topic: str) -> bool:
-        """Whether some publisher offered the topic as transient local.
+        """Returns whether some publisher offered the topic as transient local.
 
         Then a subscriber may receive its last messages again, long after they were published.
         """
-        return topic in self._timeline.latched
+        return topic in self._timeline.transient_local
 
-    def is_held(self, topic: str) -> bool:
-        """Whether that may have been for its last message to hold: it is no log.
-
-        Which topics are latched `latching` says.
-        """
-        return topic in self._timeline.held
+    def is_transient_state(self, topic: str) -> bool:
+        """Returns whether the topic is transient local, and no log."""
+        return topic in self._timeline.transient_state
 
     def is_log(self, topic: str) -> bool:
-        """Whether the topic is a log, whose lines come when something happens."""
+        """Returns whether the topic is a log, whose lines come when something happens."""
         return all(map(is_log, self.types_of(topic)))
 
     def pace(self, topic: str, recording: Path) -> Pace:
-        """How often a recording has messages of a topic; it must hold some."""
+        """Returns how often a recording has messages of a topic; it must hold some."""
         return self._timeline.pace(topic, recording)
 
     @property
-    def taken(self) -> tuple[int, int]:
-        """The bytes that the bags take on disk, and how many of them a crash left open."""
-        return self._timeline.taken
+    def disk_use(self) -> tuple[int, int]:
+        """The bytes of the bags, and how many of them a crash left open."""
+        return self._timeline.disk_use
 
     @property
-    def runs(self) -> Sequence[Segment]:
-        """The bags, some at a time, in order; what is worked out for a run holds while it stays."""
-        return self._timeline.runs
+    def segments(self) -> Sequence[Segment]:
+        """The bags in order, some at a time."""
+        return self._timeline.segments
 
-    def run_of(self, bag: BagFile) -> Segment:
-        """The run in which a bag lies."""
-        return self._timeline.run_of(bag)
+    def segment_of(self, bag: BagFile) -> Segment:
+        """Returns the segment of a bag."""
+        return self._timeline.segment_of(bag)
 
-    def stated(self, topic: str) -> Mapping[str, Stated]:
-        """By type, what the summaries say of a topic; copies count in each bag that has one."""
-        return self._timeline.stated(topic)
+    def totals(self, topic: str) -> Mapping[str, TopicTotals]:
+        """Returns by type what summaries state of a topic; copies count in each bag with one."""
+        return self._timeline.totals(topic)
 
     def recordings(self, topic: str) -> Mapping[Path, Span]:
-        """The recordings that hold the topic, each with the times of its first and last message."""
+        """Returns the recordings that hold the topic, with its first and last log time in each."""
         return self._timeline.recordings(topic)
 
     def first_with(self, topic: str, type_name: str) -> BagFile:
-        """The first bag, in bag order, that holds the topic under a type; there must be one."""
-        run = next(run for run in self.runs if type_name in run.types.get(topic, ()))
-        return next(bag for bag, held in run.holding(topic) if held.type == type_name)
+        """Returns the first bag that holds the topic under a type; there must be one."""
+        segment = next(each for each in self.segments if type_name in each.types.get(topic, ()))
+        return next(bag for bag, held in segment.with_topic(topic) if held.type == type_name)
+
+
+def _lost_until(bag: BagFile) -> Ns:
+    """Returns until when (inclusive) a bag may have recorded what cannot be read of it."""
+    is_cut = bag.state is BagState.INCOMPLETE and bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
+    return bag.mtime_ns if is_cut else bag.end

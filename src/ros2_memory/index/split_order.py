@@ -1,14 +1,15 @@
-"""The splits of a recording in the order in which they were written, whatever their times say.
+"""The splits of a recording in the order in which they were written, whatever their times are.
 
-`ros2 bag record` names its files after the folder and counts them (`rec_3.mcap`). That count is the
-only order that a clock cannot spoil. So it tells where the clock stepped back, and which splits
-lie on both sides of one that cannot be read.
+`ros2 bag record` names its files after the folder and numbers them (`rec_3.mcap`). Those numbers
+are the only order that a clock cannot spoil: they show where the clock was set back, and which
+splits lie on both sides of one that cannot be read.
 """
 
 from __future__ import annotations
 
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.bag_dir.layout import COMPRESSED
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
@@ -19,14 +20,15 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
 
-Bags: TypeAlias = "Callable[[Sequence[int]], Iterable[BagFile]]"
+BagsOf: TypeAlias = "Callable[[Sequence[int]], Iterable[BagFile]]"
+"""Returns all bags of some segments, which are given by their positions."""
 
 Series: TypeAlias = str
-"""The path of a bag file up to its count: what the files of one recording share."""
+"""The path of a bag file without its number: what the files of one recording share."""
 
 
 class Split(NamedTuple):
-    """A bag with its count in its series."""
+    """A bag with its number in its series."""
 
     number: int
     bag: BagFile
@@ -42,7 +44,7 @@ class Neighbours(NamedTuple):
 class StepBack(NamedTuple):
     """A clock that was set back while a recording ran: `after` begins `by` before `before` ends.
 
-    Both are one bag where that was while it was being written.
+    Both are one bag where that happened while it was being written.
     """
 
     before: BagFile
@@ -51,15 +53,18 @@ class StepBack(NamedTuple):
 
 
 class SplitRange(NamedTuple):
-    """A series among some bags: its first and last split by count, and the steps between."""
+    """A series within a segment: its first and last split by number, and the steps between."""
 
     first: Split
     last: Split
     steps: tuple[StepBack, ...]
 
 
-def place_of(file: str) -> tuple[Series, int] | None:
-    """The series of a bag file and its count there; None where its name has no count."""
+_BY_NUMBER: Final = attrgetter("number")
+
+
+def split_of(file: str) -> tuple[Series, int] | None:
+    """Returns the series of a bag file and its number there; None where its name has no number."""
     stem = file.removesuffix(COMPRESSED)
     stem = stem[: stem.rfind(".")]
     series = stem.rstrip("0123456789")
@@ -67,79 +72,74 @@ def place_of(file: str) -> tuple[Series, int] | None:
 
 
 def is_recording(series: Series) -> bool:
-    """Whether files are called as `ros2 bag record` calls the splits of one recording."""
+    """Returns whether files are named as `ros2 bag record` names the splits of a recording."""
     folder, _, prefix = series.rpartition("/")
     return prefix == f"{folder.rpartition('/')[2]}_"
 
 
 def split_ranges_of(bags: Iterable[BagFile]) -> dict[Series, SplitRange]:
-    """The course of each series among these bags."""
-    series: dict[Series, list[Split]] = {}
-    for bag in bags:
-        place = place_of(bag.file)
-        if place is not None:
-            series.setdefault(place[0], []).append(Split(place[1], bag))
-    return {each: _course(each, splits) for each, splits in series.items()}
+    """Returns the range of each series among these bags."""
+    ranges: dict[Series, SplitRange] = {}
+    for series, splits in _by_series(bags).items():
+        steps = _steps(splits) if is_recording(series) else []
+        ranges[series] = SplitRange(splits[0], splits[-1], tuple(steps))
+    return ranges
 
 
-def steps_of(parts: Sequence[Mapping[Series, SplitRange]], bags: Bags) -> list[StepBack]:
-    """Where the clock stepped back, from the courses of all parts of a history in order.
+def steps_of(segments: Sequence[Mapping[Series, SplitRange]], bags_of: BagsOf) -> list[StepBack]:
+    """Returns where the clock was set back, from the ranges of all segments in order.
 
-    `bags` gives all bags of some parts; it is asked only where those of a series do not follow each
-    other.
+    `bags_of` is called only for series whose ranges do not follow each other.
     """
     found: dict[Series, list[int]] = {}
-    for number, part in enumerate(parts):
-        for series in part:
+    for number, ranges in enumerate(segments):
+        for series in ranges:
             if is_recording(series):
                 found.setdefault(series, []).append(number)
     steps: list[StepBack] = []
     for series, numbers in found.items():
-        courses = [parts[number][series] for number in numbers]
-        if all(a.last.number < b.first.number for a, b in pairwise(courses)):
-            steps.extend(chain.from_iterable(course.steps for course in courses))
-            for a, b in pairwise(courses):
+        ranges_of_series = [segments[number][series] for number in numbers]
+        if all(a.last.number < b.first.number for a, b in pairwise(ranges_of_series)):
+            steps.extend(chain.from_iterable(each.steps for each in ranges_of_series))
+            for a, b in pairwise(ranges_of_series):
                 steps.extend(_steps((a.last, b.first)))
         else:
-            steps.extend(_steps(in_series(series, bags(numbers))))
+            steps.extend(_steps(_by_series(bags_of(numbers))[series]))
     return steps
 
 
-def in_series(series: Series, bags: Iterable[BagFile]) -> list[Split]:
-    """The bags of a series, by their count."""
-    places = ((place_of(bag.file), bag) for bag in bags)
-    splits = [Split(place[1], bag) for place, bag in places if place and place[0] == series]
-    return sorted(splits, key=_by_count)
+def neighbours(
+    file: str, segments: Sequence[Mapping[Series, SplitRange]], bags_of: BagsOf
+) -> Neighbours:
+    """Returns the nearest splits on both sides of a file in its series.
 
-
-def neighbours(file: str, parts: Sequence[Mapping[Series, SplitRange]], bags: Bags) -> Neighbours:
-    """What lies on both sides of a file in its series, as near as there is something.
-
-    `bags` gives all bags of some parts; it is asked only for those that the file's count falls in.
+    `bags_of` is called only for segments that the file's number falls into.
     """
-    place = place_of(file)
-    if place is None:
+    split = split_of(file)
+    if split is None:
         return Neighbours()
-    series, number = place
+    series, number = split
     splits: list[Split] = []
-    for at, part in enumerate(parts):
-        course = part.get(series)
-        if course is not None:
-            inside = course.first.number < number < course.last.number
-            splits += in_series(series, bags([at])) if inside else (course.first, course.last)
-    before = max((each for each in splits if each.number < number), key=_by_count, default=None)
-    after = min((each for each in splits if each.number > number), key=_by_count, default=None)
+    for at, ranges in enumerate(segments):
+        known = ranges.get(series)
+        if known is not None:
+            is_inside = known.first.number < number < known.last.number
+            splits += _by_series(bags_of([at]))[series] if is_inside else known[:2]
+    before = max((each for each in splits if each.number < number), key=_BY_NUMBER, default=None)
+    after = min((each for each in splits if each.number > number), key=_BY_NUMBER, default=None)
     return Neighbours(before and before.bag.end, after and after.bag.start)
 
 
-def _course(series: Series, splits: list[Split]) -> SplitRange:
-    splits.sort(key=_by_count)
-    steps = _steps(splits) if is_recording(series) else []
-    return SplitRange(splits[0], splits[-1], tuple(steps))
-
-
-def _by_count(split: Split) -> int:
-    return split.number
+def _by_series(bags: Iterable[BagFile]) -> dict[Series, list[Split]]:
+    """Returns the splits of each series among these bags, by number."""
+    found: dict[Series, list[Split]] = {}
+    for bag in bags:
+        split = split_of(bag.file)
+        if split is not None:
+            found.setdefault(split[0], []).append(Split(split[1], bag))
+    for splits in found.values():
+        splits.sort(key=_BY_NUMBER)
+    return found
 
 
 def _steps(splits: Iterable[Split]) -> list[StepBack]:

@@ -48,7 +48,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         never_heard=() if heartbeat is None else heartbeat.silent,
         fell_silent=tuple(_fallen_silent(snapshot, memory.limits.latching)),
         damaged=len(snapshot.damaged),
-        incomplete=snapshot.taken[1],
+        incomplete=snapshot.disk_use[1],
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot, heartbeat, wall),
         problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
@@ -84,7 +84,7 @@ def lacking_in(view: View) -> Iterator[str]:
     snapshot = view.snapshot
     if snapshot.problem is None and not snapshot.bags:
         yield nothing_here(snapshot)
-    if left_open := snapshot.taken[1]:
+    if left_open := snapshot.disk_use[1]:
         bags = counted(left_open, "bag was", "bags were")
         yield f"{bags} left open by a crash: what did not reach the disk is lost"
     if snapshot.unread:
@@ -113,7 +113,7 @@ def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[Stillness
     for topic in snapshot.topics():
         if snapshot.is_log(topic) or latching.is_latched(snapshot, topic):
             continue
-        stated = [*snapshot.stated(topic).values()]
+        stated = [*snapshot.totals(topic).values()]
         messages = sum(each.messages for each in stated)
         first, last = min(each.first for each in stated), max(each.last for each in stated)
         if messages < _FEW:
@@ -130,7 +130,7 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     budget either.
     """
     kept, latest = memory.limits.kept, snapshot.dating.latest
-    used, _ = snapshot.taken
+    used, _ = snapshot.disk_use
     if kept is None:
         return Budget(used, None, None, None)
     foreign = memory.foreign(snapshot)
@@ -161,14 +161,14 @@ def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
     """The bags that a crash left open, each with what is lost of it."""
     return tuple(
         SetAside(bag.path, "; ".join(bag.summary.remarks) or "left open by a crash")
-        for bag in snapshot.odd(TimeWindow.everything())
+        for bag in snapshot.faulty(TimeWindow.everything())
         if bag.state is BagState.INCOMPLETE
     )
 
 
 def odd_bags(snapshot: Snapshot) -> list[BagFile]:
     """The bags of which something is amiss, be it no crash and no clock, in bag order."""
-    bags = snapshot.odd(TimeWindow.everything())
+    bags = snapshot.faulty(TimeWindow.everything())
     return [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
 
 

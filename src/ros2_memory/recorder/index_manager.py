@@ -160,8 +160,10 @@ class IndexManager:
 
     def _new_survey(self) -> BagTable:
         # Disposal weighs more than bags.
-        all_awake = self._disposal is not None
-        return BagTable(self.bag_dir, self._reader, known=self._known, all_awake=all_awake)
+        keep_all_notes = self._disposal is not None
+        return BagTable(
+            self.bag_dir, self._reader, known=self._known, keep_all_notes=keep_all_notes
+        )
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
         if self.published is not None:
@@ -173,13 +175,13 @@ class IndexManager:
         begun = time.perf_counter_ns()
         scene = self._scene()
         try:
-            change = self._survey.look(scene, patrolling=patrolling)
+            change = self._survey.update(scene, patrolling=patrolling)
         except BaseException:
             # The walk does not show a second time what it has shown once.
             self._survey = self._new_survey()
             raise
         before = self.published
-        if before is not None and not change.news:
+        if before is not None and not change.is_new:
             self.published = replace(before, scanned_at=scene.now)
             return self.published
         self.published = self._survey.snapshot(scene.now)

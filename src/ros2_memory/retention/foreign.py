@@ -62,8 +62,8 @@ class ForeignBags:
 
     def _measured(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
         sizes: dict[str, int] = {}
-        for run in snapshot.runs:
-            for folder, size in run.taken_in.items():
+        for run in snapshot.segments:
+            for folder, size in run.bytes_in.items():
                 sizes[folder] = sizes.get(folder, 0) + size
         asides = [
             aside

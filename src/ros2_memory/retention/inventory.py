@@ -26,8 +26,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.file_state import FileState
-from ros2_memory.index.pace import Pace, is_rare
-from ros2_memory.index.segment import Stated
+from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.retention.delete import beside_bags
 from ros2_memory.retention.policy import RetentionStock, Span, StoredBag, StoredFile
 
@@ -186,18 +185,18 @@ class Inventory:
 
     def _entry(self, path: str, classification: Classification, known: KnownBags) -> _Entry:
         bag = self._stored(path, classification, known)
-        deletable = Deletable.SAVED if path in known.kept else _deletable(classification, bag)
+        deletable = Deletable.SAVED if path in known.saved else _deletable(classification, bag)
         return _Entry(classification, known.files[path].stamp, bag, deletable)
 
     def _saved(self, known: KnownBags) -> tuple[StoredFile, ...]:
         """Returns the files of moments, each once."""
-        if not known.kept:
+        if not known.saved:
             return ()
         try:
             device = (self._root / MOMENTS_FOLDER).stat().st_dev
         except OSError:
             device = -1
-        stamps = {known.files[path].stamp.inode: known.files[path].stamp for path in known.kept}
+        stamps = {known.files[path].stamp.inode: known.files[path].stamp for path in known.saved}
         return tuple(
             StoredFile((device, inode), stamp.size, _on_disk(stamp.size))
             for inode, stamp in stamps.items()
@@ -230,8 +229,8 @@ class Inventory:
 
     def _is_received_again(self, topic: TopicSummary) -> bool:
         """Whether all messages of a topic in a bag may be repeated by each recording."""
-        pace = Pace(Stated(topic.first, topic.last, topic.count), topic.first, topic.last)
-        rare = topic.latched and is_rare(pace)
+        pace = Pace(TopicTotals(topic.first, topic.last, topic.count), topic.first, topic.last)
+        rare = topic.latched and pace.is_rare
         return rare or topic.topic in self._static_topics
 
     def _folder(self, path: str, now: Ns) -> _Folder:
@@ -280,7 +279,7 @@ class Inventory:
 
 
 def _deletable(classification: Classification, bag: StoredBag) -> Deletable:
-    state = classification.standing
+    state = classification.state
     if state in _WHOLE:
         return Deletable.NO if is_carried(Path(bag.path)) else Deletable.YES
     return _OTHERS.get(state, Deletable.NO)

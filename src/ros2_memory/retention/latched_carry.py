@@ -38,7 +38,6 @@ from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.index.pace import is_rare
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -196,7 +195,7 @@ class Carrier:
         return tuple(
             topic
             for topic in snapshot.topics()
-            if topic in self._static_topics or snapshot.is_held(topic)
+            if topic in self._static_topics or snapshot.is_transient_state(topic)
         )
 
     def _carried(self, topics: Collection[str]) -> Iterator[tuple[Latched, Origin | None]]:
@@ -236,7 +235,7 @@ class Carrier:
         """Whether a recording has messages of a topic often; transforms are of many frames."""
         if topic in self._static_topics or any(map(_is_tf, snapshot.types_of(topic))):
             return False
-        return not is_rare(snapshot.pace(topic, recording))
+        return not snapshot.pace(topic, recording).is_rare
 
     def _folder(self, bag: Path) -> str:
         """The folder of a bag's recording, from the bag directory on; also of a moment's bag."""

@@ -274,7 +274,7 @@ class MomentKeeper:
 
     def _needed(self, moment: SaveRequest | SavedMoment, snapshot: Snapshot) -> NeededBags:
         window = window_of(moment.start, moment.end)
-        open_files = [snapshot.places[aside] for aside in snapshot.active]
+        open_files = [snapshot.unread_spans[aside] for aside in snapshot.active]
         bags = snapshot.overlapping(window)
         return needed_bags(window, moment.asked, bags, open_files, self._clock.now())
 
@@ -282,7 +282,7 @@ class MomentKeeper:
         """Returns the present size of the open files that may belong to the moment, in bytes."""
         window, size = window_of(request.start, request.end), 0
         for aside in snapshot.active:
-            if _may_overlap(snapshot.places[aside], window):
+            if _may_overlap(snapshot.unread_spans[aside], window):
                 with suppress(OSError):
                     size += aside.path.lstat().st_size
         return size

@@ -85,7 +85,7 @@ class Backfill:
         recall = self._memory.recall
         if recall is None:
             return []
-        missing = bags_without_entry(self._memory.index.snapshot().runs, recall)
+        missing = bags_without_entry(self._memory.index.snapshot().segments, recall)
         return [bag for bag in reversed(missing) if not self._is_refused(self._key(bag))]
 
     def progress(self) -> Progress:
@@ -167,7 +167,7 @@ class Backfill:
         # Where no bag is left the disk of the bags is rather missing than empty.
         if recall is None or snapshot.problem is not None or not snapshot.bags:
             return
-        there = {self._key(bag).path for run in snapshot.runs for bag in run.bags}
+        there = {self._key(bag).path for run in snapshot.segments for bag in run.bags}
         recall.catalogue.forget([path for path in recall.catalogue.paths() if path not in there])
         recall.catalogue.forget_older_configurations()
 

@@ -298,7 +298,7 @@ def bag_summary(
         headings.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
         numbers += stated
     shape = shared_schema(tuple(headings), tuple(sorted(silent)), complete, notes, set_back)
-    return BagSummary.packed(shape, shape.layout.pack(*numbers))
+    return BagSummary.decoded(shape, shape.numbers.pack(*numbers))
 
 
 def _together(one: Held, other: Held) -> Held:

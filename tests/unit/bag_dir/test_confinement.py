@@ -205,14 +205,14 @@ def test_a_folder_that_a_link_replaces_during_a_look_is_not_listed(
     bags: Path, outside: Path
 ) -> None:
     tree = Tree(bags)
-    tree.walk(T0, ())
+    tree.scan(T0, ())
     (bags / "run").rename(bags / "gone")
     (bags / "run").symlink_to(outside)
     # As if the link had come after the bag directory was listed.
     tree._folders[str(bags)].mtime_ns = bags.stat().st_mtime_ns
     tree._folders[str(bags)].trusted = True
-    walked = tree.walk(T0, ())
-    assert not [path for path in walked.looked_at if "rec_0" in path]
+    walked = tree.scan(T0, ())
+    assert not [path for path in walked.stamps if "rec_0" in path]
     assert str(bags / "run/run_0.mcap") in walked.gone
 
 

@@ -212,7 +212,7 @@ def test_few_latched_messages_are_kept_whole_and_many_are_not() -> None:
 
 def test_a_summary_schema_is_the_same_after_it_was_encoded() -> None:
     summary = digest_of([odom(T0, 0, 0), text(T0 + S, "a"), text(T0 + 2 * S, "b")]).summary
-    assert decode_schema(encode_schema(summary.shape)) == summary.shape
+    assert decode_schema(encode_schema(summary.schema)) == summary.schema
 
 
 def test_bytes_that_are_no_digest_are_refused() -> None:

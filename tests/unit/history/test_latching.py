@@ -15,8 +15,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.time_arguments import AtTime
-from ros2_memory.index.pace import Pace, is_rare
-from ros2_memory.index.segment import Stated
+from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.insights.status import memory_status
 from ros2_memory.queries import position, topic_value, value_when
 from ros2_memory.storage.mcap_reader import McapReader
@@ -117,8 +116,8 @@ def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:
 def test_a_topic_is_rare_by_its_pace_over_its_recording(
     messages: int, span_s: float, length_s: float, rare: bool
 ) -> None:
-    said = Stated(T0, T0 + round(span_s * S), messages)
-    assert is_rare(Pace(said, T0, T0 + round(length_s * S))) is rare
+    said = TopicTotals(T0, T0 + round(span_s * S), messages)
+    assert Pace(said, T0, T0 + round(length_s * S)).is_rare is rare
 
 
 @each_way

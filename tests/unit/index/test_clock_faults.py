@@ -10,11 +10,11 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import (
     FIRST_BAGS_NS,
     FUTURE_NS,
+    DatedBags,
     Dating,
     FaultyClock,
-    Part,
-    dating_of,
-    last_believed,
+    check_dates,
+    max_plausible,
 )
 from ros2_memory.index.split_order import StepBack
 
@@ -35,8 +35,8 @@ def dating(
 ) -> Dating:
     ordered = sorted(bags, key=lambda each: (each.start, each.end, each.file))
     groups = [ordered[at : at + size] for at in range(0, len(ordered), size)]
-    parts = [Part(group, max(each.end for each in group)) for group in groups]
-    return dating_of(
+    parts = [DatedBags(group, max(each.end for each in group)) for group in groups]
+    return check_dates(
         parts,
         steps,
         now,
@@ -104,7 +104,7 @@ def test_where_all_bags_are_in_the_future_this_machines_clock_may_be_behind() ->
 
 
 def test_a_clock_that_is_not_set_now_tells_nothing_of_the_future() -> None:
-    assert last_believed(5 * S) == MAX_NS
+    assert max_plausible(5 * S) == MAX_NS
     found = dating(*GOOD, bag("boot", 2 * S), now=15 * S)
     assert (span(found), kinds(found)) == (SPAN, {"boot": FaultyClock.UNSET})
 
@@ -177,7 +177,7 @@ def test_one_sound_bag_keeps_all_others_from_spoiling_the_span(
     assert found.earliest is not None
     assert found.latest is not None
     assert FIRST_BAGS_NS <= found.earliest <= sound.start
-    assert sound.end <= found.latest <= last_believed(NOW)
+    assert sound.end <= found.latest <= max_plausible(NOW)
 
 
 @given(SPANS)

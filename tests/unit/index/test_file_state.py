@@ -66,13 +66,13 @@ class Eye:
         if self.notes is None:
             self.notes = FileNotes.first(path, stamp, now)
         else:
-            self.notes.look(stamp, now)
+            self.notes.update(stamp, now)
         recordings = None if names is None else frozenset(names)
         self.scene = ScanContext(
             self.root, now, THREE_SPLITS, recordings, trusts_mtime=self.trusts_mtime
         )
         self.verdict = classify(self.notes, self.reader, self.scene)
-        return self.verdict.standing
+        return self.verdict.state
 
     def reason(self) -> str:
         assert self.verdict is not None

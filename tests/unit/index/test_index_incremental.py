@@ -206,7 +206,7 @@ def _views(snapshot: Snapshot) -> tuple[object, ...]:
         snapshot.earliest,
         snapshot.latest,
         snapshot.topics(),
-        [snapshot.holding(topic) for topic in snapshot.topics()],
+        [snapshot.with_topic(topic) for topic in snapshot.topics()],
         [snapshot.types_of(topic) for topic in snapshot.topics()],
         [snapshot.is_transient_local(topic) for topic in snapshot.topics()],
         snapshot.overlapping(TimeWindow(20, 60)),

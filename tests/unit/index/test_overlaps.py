@@ -9,7 +9,7 @@ import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.index.overlaps import Together, named, overlapping_recordings
+from ros2_memory.index.overlaps import Overlapping, overlapping_recordings, pair_names
 from ros2_memory.index.snapshot import Snapshot
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of
@@ -29,7 +29,7 @@ def snapshot(folder: Path, spans: Mapping[str, Sequence[tuple[float, float]]]) -
     return memory.index.snapshot()
 
 
-def pairs(found: tuple[Together, ...]) -> list[tuple[str, str, float, float]]:
+def pairs(found: tuple[Overlapping, ...]) -> list[tuple[str, str, float, float]]:
     return [
         (one.first.name, one.second.name, one.start / NS_PER_S - T0, one.end / NS_PER_S - T0)
         for one in found
@@ -75,6 +75,6 @@ def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
 
 
 def test_folders_of_one_name_are_told_apart() -> None:
-    pair = Together(Path("/bags/robin/run"), Path("/bags/wren/run"), 0, 1)
-    other = Together(Path("/bags/a"), Path("/bags/b"), 0, 1)
-    assert [*named([pair, other])] == [("robin/run", "wren/run"), ("a", "b")]
+    pair = Overlapping(Path("/bags/robin/run"), Path("/bags/wren/run"), 0, 1)
+    other = Overlapping(Path("/bags/a"), Path("/bags/b"), 0, 1)
+    assert [*pair_names([pair, other])] == [("robin/run", "wren/run"), ("a", "b")]

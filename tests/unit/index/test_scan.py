@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.bag_dir.layout import bag_kind
-from ros2_memory.index.scan import Tree, Walked
+from ros2_memory.index.scan import ScanResult, Tree
 
 S = 10**9
 NOW = 1_800_000_000 * S
@@ -29,8 +29,8 @@ def _aged(root: Path, at: int = LONG_AGO) -> Path:
     return root
 
 
-def _names(walked: Walked) -> list[str]:
-    return sorted(Path(path).name for path in walked.looked_at)
+def _names(walked: ScanResult) -> list[str]:
+    return sorted(Path(path).name for path in walked.stamps)
 
 
 @pytest.mark.parametrize(
@@ -63,13 +63,13 @@ def test_bags_are_found_at_any_depth_and_foreign_files_are_not(tmp_path: Path) -
         _file(tmp_path / name)
     for name in ("recorder.json", "rec/metadata.yaml", "rec/b.db3-shm", "notes.txt"):
         _file(tmp_path / name)
-    assert _names(Tree(tmp_path).walk(NOW, ())) == ["a.mcap", "b.db3", "c.mcap.zstd", "d.db3.zstd"]
+    assert _names(Tree(tmp_path).scan(NOW, ())) == ["a.mcap", "b.db3", "c.mcap.zstd", "d.db3.zstd"]
 
 
 def test_what_a_file_system_check_put_aside_is_left_out(tmp_path: Path) -> None:
     _file(tmp_path / "lost+found" / "a.mcap")
     _file(tmp_path / "b.mcap")
-    walked = Tree(tmp_path).walk(NOW, ())
+    walked = Tree(tmp_path).scan(NOW, ())
     assert (_names(walked), walked.damaged) == (["b.mcap"], [])
 
 
@@ -77,24 +77,24 @@ def test_folders_and_files_that_begin_with_a_dot_are_left_out(tmp_path: Path) ->
     _file(tmp_path / ".trash" / "rec" / "a.mcap")
     _file(tmp_path / "rec" / ".cache" / "b.mcap")
     _file(tmp_path / "rec" / ".c.mcap")
-    assert _names(Tree(tmp_path).walk(NOW, ())) == []
+    assert _names(Tree(tmp_path).scan(NOW, ())) == []
 
 
 def test_a_second_walk_looks_at_nothing_that_lies_in_unchanged_folders(tmp_path: Path) -> None:
     _file(tmp_path / "rec_1" / "a.mcap")
     _file(tmp_path / "rec_2" / "b.mcap")
     tree = Tree(_aged(tmp_path))
-    assert _names(tree.walk(NOW, ())) == ["a.mcap", "b.mcap"]
-    assert tree.walk(NOW, ()) == Walked({}, set(), [], [])
+    assert _names(tree.scan(NOW, ())) == ["a.mcap", "b.mcap"]
+    assert tree.scan(NOW, ()) == ScanResult({}, set(), [], [])
 
 
 def test_only_the_folder_into_which_a_file_came_is_listed_again(tmp_path: Path) -> None:
     _file(tmp_path / "rec_1" / "a.mcap")
     _file(tmp_path / "rec_2" / "b.mcap")
     tree = Tree(_aged(tmp_path))
-    tree.walk(NOW, ())
+    tree.scan(NOW, ())
     _file(tmp_path / "rec_2" / "c.mcap")
-    assert _names(tree.walk(NOW, ())) == ["b.mcap", "c.mcap"]
+    assert _names(tree.scan(NOW, ())) == ["b.mcap", "c.mcap"]
 
 
 @pytest.mark.parametrize("age_s", [0.0, 1.9, -1.9])
@@ -104,58 +104,58 @@ def test_a_folder_whose_mtime_is_younger_than_2_s_is_listed_again(
     first = NOW - round(age_s * S)
     _file(tmp_path / "a.mcap")
     tree = Tree(_aged(tmp_path, first))
-    tree.walk(NOW, ())
+    tree.scan(NOW, ())
     _file(tmp_path / "b.mcap")
     _aged(tmp_path, first)  # the same tick of the file system
-    assert _names(tree.walk(NOW + 10 * S, ())) == ["a.mcap", "b.mcap"]
+    assert _names(tree.scan(NOW + 10 * S, ())) == ["a.mcap", "b.mcap"]
 
 
 @pytest.mark.parametrize("age_s", [2.0, 3600.0, -2.0, -3600.0])
 def test_an_mtime_further_from_the_clock_is_trusted(tmp_path: Path, age_s: float) -> None:
     _file(tmp_path / "a.mcap")
     tree = Tree(_aged(tmp_path, NOW - round(age_s * S)))
-    tree.walk(NOW, ())
-    assert _names(tree.walk(NOW, ())) == []
+    tree.scan(NOW, ())
+    assert _names(tree.scan(NOW, ())) == []
 
 
 def test_a_watched_file_is_looked_at_though_its_folder_did_not_change(tmp_path: Path) -> None:
     path = _file(tmp_path / "a.mcap", "x")
     _file(tmp_path / "b.mcap", "x")
     tree = Tree(_aged(tmp_path))
-    tree.walk(NOW, ())
+    tree.scan(NOW, ())
     _file(path, "longer")
-    walked = tree.walk(NOW, [str(path)])
-    assert {key: stamp.size for key, stamp in walked.looked_at.items()} == {str(path): 6}
+    walked = tree.scan(NOW, [str(path)])
+    assert {key: stamp.size for key, stamp in walked.stamps.items()} == {str(path): 6}
 
 
 def test_what_vanished_is_named_once(tmp_path: Path) -> None:
     path = _file(tmp_path / "rec" / "a.mcap")
     _file(tmp_path / "rec" / "b.mcap")
     tree = Tree(_aged(tmp_path))
-    tree.walk(NOW, ())
+    tree.scan(NOW, ())
     path.unlink()
-    assert tree.walk(NOW, ()).gone == {str(path)}
-    assert tree.walk(NOW, ()).gone == set()
+    assert tree.scan(NOW, ()).gone == {str(path)}
+    assert tree.scan(NOW, ()).gone == set()
 
 
 def test_a_whole_tree_that_vanished_is_gone_to_the_last_file(tmp_path: Path) -> None:
     paths = {str(_file(tmp_path / "day" / name / "a.mcap")) for name in ("rec_1", "rec_2")}
     tree = Tree(_aged(tmp_path))
-    tree.walk(NOW, ())
+    tree.scan(NOW, ())
     (tmp_path / "day").rename(tmp_path / ".trash")
-    assert tree.walk(NOW, ()).gone == paths
+    assert tree.scan(NOW, ()).gone == paths
 
 
 def test_a_watched_file_that_left_and_came_back_within_one_tick_is_found(tmp_path: Path) -> None:
     path = _file(tmp_path / "a.mcap")
     tree = Tree(_aged(tmp_path))
-    tree.walk(NOW, ())
+    tree.scan(NOW, ())
     path.unlink()
     _aged(tmp_path)
-    assert tree.walk(NOW, [str(path)]).gone == {str(path)}
+    assert tree.scan(NOW, [str(path)]).gone == {str(path)}
     _file(path)
     _aged(tmp_path)
-    assert _names(tree.walk(NOW, ())) == ["a.mcap"]
+    assert _names(tree.scan(NOW, ())) == ["a.mcap"]
 
 
 def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
     (bags / "README").symlink_to(_file(tmp_path / "readme.txt"))
     (bags / ".hidden").symlink_to(tmp_path, target_is_directory=True)
     tree = Tree(_aged(bags))
-    first, second = tree.walk(NOW, ()), tree.walk(NOW, ())
+    first, second = tree.scan(NOW, ()), tree.scan(NOW, ())
     assert _names(first) == ["b.mcap"]
     for walked in (first, second):
         assert sorted(each.path.name for each in walked.links) == [
@@ -184,7 +184,7 @@ def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
 def test_the_bag_directory_itself_may_be_a_link(tmp_path: Path) -> None:
     _file(tmp_path / "disk" / "rec" / "a.mcap")
     (tmp_path / "bags").symlink_to(tmp_path / "disk", target_is_directory=True)
-    assert list(Tree(tmp_path / "bags").walk(NOW, ()).looked_at) == [
+    assert list(Tree(tmp_path / "bags").scan(NOW, ()).stamps) == [
         str(tmp_path / "bags" / "rec" / "a.mcap")
     ]
 
@@ -192,8 +192,8 @@ def test_the_bag_directory_itself_may_be_a_link(tmp_path: Path) -> None:
 def test_a_pipe_with_the_name_of_a_bag_is_damaged_and_never_opened(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.mcap")
     tree = Tree(_aged(tmp_path))
-    for walked in (tree.walk(NOW, ()), tree.walk(NOW, ())):
-        assert walked.looked_at == {}
+    for walked in (tree.scan(NOW, ()), tree.scan(NOW, ())):
+        assert walked.stamps == {}
         assert [(each.path.name, each.reason) for each in walked.damaged] == [
             ("a.mcap", "not a regular file")
         ]
@@ -203,7 +203,7 @@ def test_a_folder_that_cannot_be_listed_is_damaged_and_hides_no_other(tmp_path: 
     _file(tmp_path / "rec" / "a.mcap")
     deep = _beyond_the_longest_path(tmp_path)
     tree = Tree(tmp_path)
-    first, second = tree.walk(NOW, ()), tree.walk(NOW, ())
+    first, second = tree.scan(NOW, ()), tree.scan(NOW, ())
     assert _names(first) == ["a.mcap"]
     assert second.gone == set()
     for walked in (first, second):
@@ -218,19 +218,19 @@ def test_a_root_that_is_no_directory_is_a_problem_and_empties_the_tree(
     bags = tmp_path / "bags"
     path = _file(bags / "rec" / "a.mcap")
     tree = Tree(_aged(bags))
-    tree.walk(NOW, ())
+    tree.scan(NOW, ())
     bags.rename(tmp_path / "aside")
     if kind == "file":
         bags.write_text("", encoding="utf-8")
-    walked = tree.walk(NOW, [str(path)])
+    walked = tree.scan(NOW, [str(path)])
     assert walked.gone == {str(path)}
-    assert walked.looked_at == {}
+    assert walked.stamps == {}
     assert ("does not exist" if kind == "missing" else "recording.bag_dir") in (
         walked.problem or ""
     )
     bags.unlink(missing_ok=True)
     (tmp_path / "aside").rename(bags)
-    assert _names(tree.walk(NOW, ())) == ["a.mcap"]
+    assert _names(tree.scan(NOW, ())) == ["a.mcap"]
 
 
 def _beyond_the_longest_path(root: Path) -> str:

@@ -36,7 +36,7 @@ def said(seconds: float) -> Msg:
 
 def set_back(path: Path, messages: list[Msg], layout: McapLayout) -> int:
     write_mcap(path, messages, layout)
-    return McapReader().summarize(path).shape.set_back
+    return McapReader().summarize(path).schema.set_back
 
 
 @pytest.fixture(params=list(LAYOUTS))
@@ -96,6 +96,6 @@ def test_it_is_listed_and_told_where_it_matters_and_changes_no_span(tmp_path: Pa
 def test_the_catalogue_keeps_it(tmp_path: Path) -> None:
     way = [said(n) for n in range(20)] + [said(n - STEP) for n in range(20, 40)]
     write_mcap(tmp_path / "a.mcap", way, LAYOUTS["indexed"])
-    shape = McapReader().summarize(tmp_path / "a.mcap").shape
+    shape = McapReader().summarize(tmp_path / "a.mcap").schema
     assert shape.set_back
     assert decode_schema(encode_schema(shape)) == shape

@@ -17,7 +17,8 @@ from ros2_memory.core.model import (
     TimeWindow,
     TopicSummary,
 )
-from ros2_memory.index.snapshot import RUN_LIMIT, Snapshot, Timeline
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import SEGMENT_BAGS, Timeline
 
 ODOM = "nav_msgs/msg/Odometry"
 
@@ -50,7 +51,7 @@ def test_ties_are_broken_by_end_and_then_by_path() -> None:
 def test_an_empty_timeline_has_neither_beginning_nor_end() -> None:
     empty = Snapshot()
     assert (empty.earliest, empty.latest, empty.topics()) == (None, None, ())
-    assert empty.holding("/odom") == ()
+    assert empty.with_topic("/odom") == ()
     assert empty.overlapping(TimeWindow.everything()) == ()
 
 
@@ -59,16 +60,16 @@ def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> No
         _bag(f"rec/rec_{nth}.mcap", ("/odom", nth, nth))._replace(
             size=nth, state=BagState.INCOMPLETE if nth % 3 == 0 else BagState.CLOSED
         )
-        for nth in range(RUN_LIMIT + 10)
+        for nth in range(SEGMENT_BAGS + 10)
     ]
     carried = _bag(f"{CARRY_FOLDER}/{CARRY_FILE}", ("/tf_static", -5, -5))._replace(size=7)
     whole = Timeline.of([carried, *bags])
     snapshot = Snapshot(bags=whole.recorded, timeline=whole)
     left_open = sum(bag.state is BagState.INCOMPLETE for bag in snapshot.bags)
-    assert snapshot.taken == (sum(bag.size for bag in snapshot.bags), left_open)
+    assert snapshot.disk_use == (sum(bag.size for bag in snapshot.bags), left_open)
     assert len(snapshot.bags) == len(bags)
-    assert Timeline.of([carried]).taken == (7, 0)
-    assert Snapshot().taken == (0, 0)
+    assert Timeline.of([carried]).disk_use == (7, 0)
+    assert Snapshot().disk_use == (0, 0)
 
 
 def test_the_latest_message_may_stand_in_a_bag_that_began_earlier() -> None:
@@ -82,7 +83,7 @@ def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> No
     both = both._replace(summary=BagSummary((*both.summary.topics, second)))
     first = _bag("a", ("/x", 0, 9))
     snapshot = Snapshot(bags=(first, both))
-    assert snapshot.holding("/x") == (
+    assert snapshot.with_topic("/x") == (
         (first, first.summary.topics[0]),
         (both, both.summary.topics[0]),
         (both, second),
@@ -121,14 +122,14 @@ def test_a_window_overlaps_the_bags_that_have_a_moment_in_it(
 ) -> None:
     snapshot = Snapshot(bags=(_bag("a", ("/odom", 0, 9)), _bag("b", ("/odom", 10, 19))))
     assert [bag.path.name for bag in snapshot.overlapping(TimeWindow(*window))] == names
-    held = snapshot.holding("/odom", TimeWindow(*window))
+    held = snapshot.with_topic("/odom", TimeWindow(*window))
     assert [bag.path.name for bag, _ in held] == names
 
 
 def test_a_window_counts_for_a_topic_by_the_times_of_that_topic_alone() -> None:
     snapshot = Snapshot(bags=(_bag("a", ("/odom", 0, 99), ("/tf_static", 3, 3)),))
-    assert len(snapshot.holding("/tf_static", TimeWindow(3, 4))) == 1
-    assert snapshot.holding("/tf_static", TimeWindow(4, 99)) == ()
+    assert len(snapshot.with_topic("/tf_static", TimeWindow(3, 4))) == 1
+    assert snapshot.with_topic("/tf_static", TimeWindow(4, 99)) == ()
 
 
 def test_removing_a_bag_that_is_not_there_is_refused() -> None:
@@ -144,12 +145,12 @@ def test_a_timeline_that_changed_is_the_timeline_of_what_it_holds(
     seed: int, rounds: int, windows: list[tuple[int, int]]
 ) -> None:
     chance = random.Random(seed)
-    pool = [_random_bag(chance, number) for number in range(3 * RUN_LIMIT)]
-    present = set(chance.sample(range(len(pool)), chance.choice([0, 1, 40, 2 * RUN_LIMIT])))
+    pool = [_random_bag(chance, number) for number in range(3 * SEGMENT_BAGS)]
+    present = set(chance.sample(range(len(pool)), chance.choice([0, 1, 40, 2 * SEGMENT_BAGS])))
     timeline = Timeline.of(pool[number] for number in present)
     for _ in range(rounds):
-        timeline.holding("/odom")
-        chosen = set(chance.sample(range(len(pool)), chance.choice([0, 1, 5, 2 * RUN_LIMIT])))
+        timeline.with_topic("/odom")
+        chosen = set(chance.sample(range(len(pool)), chance.choice([0, 1, 5, 2 * SEGMENT_BAGS])))
         removed, added = present & chosen, chosen - present
         present = (present - removed) | added
         timeline = timeline.changed(
@@ -176,20 +177,20 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
     assert snapshot.earliest == min((bag.start for bag in bags), default=None)
     assert snapshot.latest == max((bag.end for bag in bags), default=None)
     assert timeline.silent == {name for bag in bags for name in bag.summary.silent}
-    assert timeline.latched == {topic.topic for _, topic in held if topic.latched}
+    assert timeline.transient_local == {topic.topic for _, topic in held if topic.latched}
     assert timeline.types == {
         name: tuple(sorted({topic.type for _, topic in held if topic.topic == name}))
         for name in names
     }
     for name in (*names, "/nothing"):
-        assert timeline.holding(name) == tuple(each for each in held if each[1].topic == name)
+        assert timeline.with_topic(name) == tuple(each for each in held if each[1].topic == name)
     for start, length in windows:
         window = TimeWindow(start, start + length)
         overlaps = ordered if length else []
         assert timeline.overlapping(window) == tuple(
             bag for bag in overlaps if bag.start < window.stop and bag.end >= start
         )
-        assert timeline.holding("/odom", window) == tuple(
+        assert timeline.with_topic("/odom", window) == tuple(
             (bag, topic)
             for bag, topic in held
             if topic.topic == "/odom"
@@ -209,13 +210,13 @@ def test_which_recordings_hold_a_topic_is_known_anew_whatever_changes() -> None:
         folder = f"rec_{number // 100}"
         return _bag(f"{folder}/{number}.mcap", ("/odom", number * 10, number * 10 + until))
 
-    first = 2 * RUN_LIMIT - 3
+    first = 2 * SEGMENT_BAGS - 3
     timeline = Timeline.of(split(number) for number in range(first))
     for number in range(first, first + 6):  # past the end of a run
         timeline = timeline.changed([], [split(number, 0)])
         for before, until in ((0, 4), (4, 9)):
             timeline = timeline.changed([split(number, before)], [split(number, until)])
             assert timeline.recordings("/odom") == Timeline.of(timeline.bags).recordings("/odom")
-    for number in (0, RUN_LIMIT, first + 5):
+    for number in (0, SEGMENT_BAGS, first + 5):
         timeline = timeline.changed([split(number)], [])
         assert timeline.recordings("/odom") == Timeline.of(timeline.bags).recordings("/odom")

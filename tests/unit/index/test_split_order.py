@@ -13,7 +13,7 @@ from ros2_memory.index.split_order import (
     Neighbours,
     is_recording,
     neighbours,
-    place_of,
+    split_of,
     split_ranges_of,
     steps_of,
 )
@@ -67,12 +67,12 @@ def near(name: str, bags: list[BagFile], size: int = 256) -> Neighbours:
     ],
 )
 def test_a_split_is_known_by_the_count_in_its_name(name: str, number: int | None) -> None:
-    place = place_of(f"/bags/rec/{name}")
+    place = split_of(f"/bags/rec/{name}")
     assert (None if place is None else place[1]) == number
 
 
 def test_only_files_named_after_their_folder_are_splits_of_one_recording() -> None:
-    places = [place_of(f"/bags/{name}") for name in ("run/run_1.mcap", "drives/drive_1.mcap")]
+    places = [split_of(f"/bags/{name}") for name in ("run/run_1.mcap", "drives/drive_1.mcap")]
     assert [place is not None and is_recording(place[0]) for place in places] == [True, False]
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.bag_dir.layout import named_start
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index.split_order import Neighbours
 from ros2_memory.index.unreadable_span import (
-    LONGEST_NS,
-    begun,
-    bounds,
+    MAX_FILE_NS,
+    unreadable_bounds,
     unreadable_span,
 )
 
@@ -38,7 +38,7 @@ def test_a_file_that_was_copied_here_later_is_taken_to_hold_a_day() -> None:
 
 
 def test_before_the_first_split_it_begins_with_its_recording() -> None:
-    begin = begun(OWN)
+    begin = named_start(OWN)
     assert begin is not None
     found = unreadable_span(OWN, Neighbours(after=begin + 20 * S), NOW, NOW)
     assert found == TimeWindow(begin, begin + 20 * S + 1)
@@ -64,14 +64,14 @@ def test_a_file_that_is_still_being_written_has_no_end() -> None:
 
 def test_simulated_times_and_a_file_of_today_hold_a_day_from_the_split_before() -> None:
     found = unreadable_span("sim", Neighbours(before=30 * S), 20 * S, NOW)
-    assert found == TimeWindow(30 * S, 30 * S + LONGEST_NS)
+    assert found == TimeWindow(30 * S, 30 * S + MAX_FILE_NS)
 
 
 def test_a_recording_tells_when_it_began_only_in_the_names_that_the_recorder_gives() -> None:
-    assert begun(OWN) == 1_789_995_600 * S
-    assert begun(f"{OWN}_2") == 1_789_995_600 * S
-    assert begun("rec_20269921T130000Z") is None
-    assert begun("rosbag2_2025_09_10-13_03_56") is None
+    assert named_start(OWN) == 1_789_995_600 * S
+    assert named_start(f"{OWN}_2") == 1_789_995_600 * S
+    assert named_start("rec_20269921T130000Z") is None
+    assert named_start("rosbag2_2025_09_10-13_03_56") is None
 
 
 MOMENTS = st.integers(MIN_NS, MAX_NS)
@@ -102,29 +102,33 @@ def test_a_window_that_is_found_holds_the_neighbouring_ends_and_fits_64_bits(
         assert found.start == min(before, after)
         assert found.stop == min(max(before, after) + 1, MAX_NS)
     elif not growing:
-        assert found.stop - found.start <= LONGEST_NS + 1 or recording == OWN
+        assert found.stop - found.start <= MAX_FILE_NS + 1 or recording == OWN
 
 
 def test_a_copy_of_yesterday_may_hold_anything_from_before_it_was_made() -> None:
-    assert bounds("someones", Neighbours(), NOW - HOUR, NOW) == TimeWindow(
+    assert unreadable_bounds("someones", Neighbours(), NOW - HOUR, NOW) == TimeWindow(
         MIN_NS, NOW - HOUR + 60 * S
     )
-    assert bounds("someones", Neighbours(), None, NOW) is None
-    assert bounds("someones", Neighbours(), 5 * S, NOW) is None
+    assert unreadable_bounds("someones", Neighbours(), None, NOW) is None
+    assert unreadable_bounds("someones", Neighbours(), 5 * S, NOW) is None
 
 
 def test_splits_around_a_file_bound_it_and_so_does_the_name_of_its_recording() -> None:
-    begin = begun(OWN)
+    begin = named_start(OWN)
     assert begin is not None
-    assert bounds("rec", Neighbours(100 * S, 200 * S), NOW, NOW) == TimeWindow(100 * S, 200 * S + 1)
-    assert bounds("rec", Neighbours(100 * S), None, NOW) == TimeWindow(100 * S, MAX_NS)
-    assert bounds("rec", Neighbours(after=9 * S), NOW, NOW) == TimeWindow(MIN_NS, 9 * S + 1)
-    assert bounds(OWN, Neighbours(), NOW, NOW) == TimeWindow(begin, NOW + 60 * S)
+    assert unreadable_bounds("rec", Neighbours(100 * S, 200 * S), NOW, NOW) == TimeWindow(
+        100 * S, 200 * S + 1
+    )
+    assert unreadable_bounds("rec", Neighbours(100 * S), None, NOW) == TimeWindow(100 * S, MAX_NS)
+    assert unreadable_bounds("rec", Neighbours(after=9 * S), NOW, NOW) == TimeWindow(
+        MIN_NS, 9 * S + 1
+    )
+    assert unreadable_bounds(OWN, Neighbours(), NOW, NOW) == TimeWindow(begin, NOW + 60 * S)
 
 
 def test_times_that_contradict_each_other_bound_nothing() -> None:
-    assert bounds("rec", Neighbours(200 * S, 100 * S), NOW, NOW) is None
-    assert bounds("rec", Neighbours(NOW), NOW - HOUR, NOW) is None
+    assert unreadable_bounds("rec", Neighbours(200 * S, 100 * S), NOW, NOW) is None
+    assert unreadable_bounds("rec", Neighbours(NOW), NOW - HOUR, NOW) is None
 
 
 @given(
@@ -139,7 +143,7 @@ def test_what_may_be_there_includes_all_that_is_likely_up_to_the_last_write(
 ) -> None:
     near = Neighbours(before, after)
     likely = unreadable_span(recording, near, written, now)
-    possible = bounds(recording, near, written, now)
+    possible = unreadable_bounds(recording, near, written, now)
     if possible is not None:
         assert likely is not None
         assert MIN_NS <= possible.start <= likely.start

@@ -89,7 +89,7 @@ def test_several_recordings_are_indexed_in_the_order_of_their_times(yard: Yard) 
     assert (snapshot.earliest, snapshot.latest) == (0, 209)
     assert snapshot.topics() == ("/odom",)
     assert _names(snapshot.overlapping(TimeWindow(109, 111))) == ["rec_b_10.mcap", "rec_b_11.mcap"]
-    assert len(snapshot.holding("/odom")) == 13
+    assert len(snapshot.with_topic("/odom")) == 13
     assert (snapshot.problem, snapshot.scanned_at) == (None, NOW)
 
 
@@ -422,7 +422,7 @@ def test_nothing_is_written_into_the_bag_directory(yard: Yard) -> None:
     yard.age()
     before = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
     for _ in range(3):
-        yard.scan_after(5).holding("/odom")
+        yard.scan_after(5).with_topic("/odom")
     after = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
     assert {path: (stat.st_size, stat.st_mtime_ns) for path, stat in after.items()} == {
         path: (stat.st_size, stat.st_mtime_ns) for path, stat in before.items()

@@ -15,7 +15,8 @@ from ros2_memory.core.model import (
     TimeWindow,
     TopicSummary,
 )
-from ros2_memory.index.snapshot import RUN_LIMIT, Snapshot
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import SEGMENT_BAGS
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, text, write_mcap
@@ -61,7 +62,7 @@ def test_a_split_that_cannot_be_read_lies_between_its_neighbours(tmp_path: Path)
     splits[1].write_bytes(b"no bag at all, however long it is")
     snapshot = snapshot_of(tmp_path, T0 + DAY)
     [damaged] = snapshot.damaged
-    assert snapshot.places[damaged] == TimeWindow(T0 + 9 * S, T0 + 20 * S + 1)
+    assert snapshot.unread_spans[damaged] == TimeWindow(T0 + 9 * S, T0 + 20 * S + 1)
 
 
 def test_the_last_split_that_cannot_be_read_ends_with_its_file(tmp_path: Path) -> None:
@@ -71,7 +72,7 @@ def test_the_last_split_that_cannot_be_read_ends_with_its_file(tmp_path: Path) -
     snapshot = snapshot_of(tmp_path, T0 + DAY)
     [damaged] = snapshot.damaged
     assert damaged.written == T0 + 20 * S
-    assert snapshot.places[damaged] == TimeWindow(T0 + 9 * S, T0 + 80 * S)
+    assert snapshot.unread_spans[damaged] == TimeWindow(T0 + 9 * S, T0 + 80 * S)
 
 
 def test_the_split_being_written_begins_where_the_one_before_ends(tmp_path: Path) -> None:
@@ -81,14 +82,14 @@ def test_the_split_being_written_begins_where_the_one_before_ends(tmp_path: Path
     )
     os.utime(active, ns=(T0 + 12 * S, T0 + 12 * S))
     snapshot = snapshot_of(tmp_path, T0 + 15 * S)
-    place = snapshot.places[snapshot.active[0]]
+    place = snapshot.unread_spans[snapshot.active[0]]
     assert place is not None
     assert place.start == T0 + 9 * S
 
 
 def test_the_time_of_what_was_never_looked_into_is_unknown() -> None:
     link = SetAside(Path("/bags/link.mcap"), "a symbolic link")
-    assert Snapshot(unread=(link,), scanned_at=T0).places == {link: None}
+    assert Snapshot(unread=(link,), scanned_at=T0).unread_spans == {link: None}
 
 
 def test_the_span_leaves_out_what_a_wrong_clock_dated(tmp_path: Path) -> None:
@@ -136,13 +137,13 @@ def test_what_is_amiss_in_a_window_reaches_on_to_the_end_of_an_open_file(
         bag("/r/odd", T0 + 40 * S, T0 + 41 * S, written=T0 + DAY, notes=("torn",)),
     )
     window = TimeWindow(T0 + start * S, T0 + stop * S)
-    assert [each.path.name for each in Snapshot(bags=bags).odd(window)] == found
+    assert [each.path.name for each in Snapshot(bags=bags).faulty(window)] == found
 
 
 def test_neighbours_are_found_across_the_parts_of_a_long_history() -> None:
-    numbers = [n for n in range(3 * RUN_LIMIT) if n != RUN_LIMIT]
+    numbers = [n for n in range(3 * SEGMENT_BAGS) if n != SEGMENT_BAGS]
     bags = tuple(bag(f"/b/rec/rec_{n}.mcap", T0 + n * S, T0 + n * S + 5) for n in numbers)
-    lost = SetAside(Path(f"/b/rec/rec_{RUN_LIMIT}.mcap"), "torn", T0)
+    lost = SetAside(Path(f"/b/rec/rec_{SEGMENT_BAGS}.mcap"), "torn", T0)
     snapshot = Snapshot(bags=bags, damaged=(lost,), scanned_at=T0 + DAY)
-    window = TimeWindow(T0 + (RUN_LIMIT - 1) * S + 5, T0 + (RUN_LIMIT + 1) * S + 1)
-    assert snapshot.places[lost] == window
+    window = TimeWindow(T0 + (SEGMENT_BAGS - 1) * S + 5, T0 + (SEGMENT_BAGS + 1) * S + 1)
+    assert snapshot.unread_spans[lost] == window
