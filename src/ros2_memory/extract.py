@@ -1,12 +1,11 @@
-"""Messages into plain values, by a map of dot-paths for each message type.
+"""Extracts plain values from messages, by a map of dot-paths for each message type.
 
 The schema map (`config/message_schemas.yaml`) names, for a type, the fields that a reply shows
-and the path at which each stands in the message. Some names have a meaning. A pose is read from
-`position` and `orientation`, from `translation` and `rotation`, or from `x`, `y`, `z` and a heading
-in radians (`theta`, `yaw` or `heading`); a twist from `linear_velocity` and `angular_velocity`; a
-place on the Earth in degrees from `latitude`, `longitude` and `altitude`; `pose_frame` and
-`velocity_frame` are PX4's numbers of frames. Types that are not in the map are shown with all
-their fields.
+and the path of each in the message. Some names have a meaning. A pose is read from `position` and
+`orientation`, from `translation` and `rotation`, or from `x`, `y`, `z` and a heading in radians
+(`theta`, `yaw` or `heading`); a twist from `linear_velocity` and `angular_velocity`; a position on
+the Earth in degrees from `latitude`, `longitude` and `altitude`; `pose_frame` and `velocity_frame`
+are PX4's numbers of frames. Types that are not in the map are shown with all their fields.
 """
 
 from __future__ import annotations
@@ -47,52 +46,48 @@ from ros2_memory.messages.fields import (
     names_of,
     parse_path,
 )
-from ros2_memory.messages.to_json import MAX_SQUEEZE, ExactJson, Rendering, ReplyJson
+from ros2_memory.messages.to_json import MAX_SQUEEZE, ExactJson, ReplyJson
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from ros2_memory.core.model import Quaternion, Vector3
     from ros2_memory.core.timebase import Ns
 
 MAX_SHOWN_CHARS: Final = 20_000
-"""A shown value longer than this would fill a reply alone, and is thinned harder."""
+"""A longer value would fill a reply alone, and is thinned harder."""
 
 _LISTED_NAMES: Final = 40
-_NOWHERE: Final = Route("")
 
 
 @dataclass(frozen=True, slots=True)
 class Extracted:
-    """A value as it leaves, and sentences on what was left out of it."""
+    """A value for a reply, and sentences on what was left out of it."""
 
     value: JsonValue
     notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class _Point:
-    """A pose as a point and a rotation; `arrays`: they may be arrays, as PX4 writes them."""
+class _PointPose:
+    """Reads a pose from a point and a rotation; PX4 writes them as arrays, if `arrays`."""
 
     position: Route
     orientation: Route
     arrays: bool = False
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
-        node = self.position.of(message)
-        where = xyz(node)
-        if where is None and self.arrays:
-            where = _triple(node)
-        if where is None:
-            return None
-        turned = self.orientation.of(message)
-        turn = rotation(turned)
-        return where, _px4_rotation(turned) if turn is None and self.arrays else turn
+        found, turned = self.position.of(message), self.orientation.of(message)
+        position, turn = xyz(found), rotation(turned)
+        if self.arrays:
+            position = _triple(found) if position is None else position
+            turn = _px4_rotation(turned) if turn is None else turn
+        return None if position is None else (position, turn)
 
 
 @dataclass(frozen=True, slots=True)
-class _Planar:
-    """A pose as x, y, perhaps z (m; 0 without one) and a heading (rad) in fields of their own."""
+class _PlanarPose:
+    """Reads a pose from x, y, perhaps z (m; 0 without one) and a heading (rad)."""
 
     x: Route
     y: Route
@@ -111,35 +106,30 @@ class _Planar:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """What the schema map says of one type, compiled. Poses and twists are tried in order."""
+    """The compiled schema map of one type. Poses and twists are tried in order."""
 
-    fields: tuple[tuple[str, Segments], ...]
-    poses: tuple[_Point | _Planar, ...]
+    fields: Mapping[str, Segments]
+    poses: tuple[_PointPose | _PlanarPose, ...]
     twists: tuple[tuple[Route, Route], ...]
     geodetic: tuple[Route, Route, Route] | None = None
     pose_frame: Route | None = None
     velocity_frame: Route | None = None
 
-    def path(self, name: str) -> Segments | None:
-        """The path of a field."""
-        return next((path for field, path in self.fields if field == name), None)
 
-
-def _pair(*segments: str, of: tuple[str, str]) -> tuple[Route, Route]:
-    return Route(*segments, of[0]), Route(*segments, of[1])
-
-
+_NOWHERE: Final = Route("")
 _HEADINGS: Final = ("theta", "yaw", "heading")
 _UNMAPPED: Final = _Plan(
-    fields=(),
+    fields={},
     poses=tuple(
-        _Point(*_pair(*prefix, of=("position", "orientation")))
+        _PointPose(Route(*prefix, "position"), Route(*prefix, "orientation"))
         for prefix in (("pose", "pose"), ("pose",), ())
     ),
     twists=tuple(
-        _pair(*prefix, of=("linear", "angular")) for prefix in (("twist", "twist"), ("twist",))
+        (Route(*prefix, "linear"), Route(*prefix, "angular"))
+        for prefix in (("twist", "twist"), ("twist",))
     ),
 )
+"""For a type that is not in the schema map."""
 _FRAME: Final = Route("header", "frame_id")
 _CHILD_FRAME: Final = Route("child_frame_id")
 _STAMP: Final = Route("header", "stamp")
@@ -153,7 +143,7 @@ _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 3: "body FRD"}
 
 
 class SchemaExtractor:
-    """Reads decoded messages: ROS messages by the schema map, JSON as what it says.
+    """Extracts values from decoded messages: ROS messages by the schema map, JSON by its own names.
 
     Args:
         schemas: for each message type, the name of each field and its dot-path.
@@ -179,7 +169,7 @@ class SchemaExtractor:
         self._plans = {name: _compile(name, fields) for name, fields in schemas.items()}
 
     def exact(self, message: object, type_name: str) -> JsonValue:
-        """The whole extracted value, neither thinned nor rounded: what conditions are tested on.
+        """Returns the whole extracted value, neither thinned nor rounded, for conditions.
 
         NaN and infinities stay; angles are in degrees, times in seconds. Byte arrays longer than
         the limit, and the data of images, point clouds and maps, are summaries here too, and what
@@ -188,12 +178,12 @@ class SchemaExtractor:
         return self._whole(ExactJson(self._limit), message, type_name)
 
     def exact_at(self, message: object, type_name: str, path: str) -> JsonValue:
-        """What `shown` means by one of its `fields`, exactly; null where this message has none."""
-        found = self._sought(message, type_name, path)
+        """Returns one of the `fields` of `shown`, exactly; null where this message has none."""
+        found = self._find(message, type_name, path)
         return None if found is ABSENT else ExactJson(self._limit).value(found, path)
 
     def shown(self, message: object, type_name: str, fields: Sequence[str] = ()) -> Extracted:
-        """The value as it leaves in a reply: strict JSON, thinned and rounded, with notes.
+        """Returns the value for a reply: strict JSON, thinned and rounded, with notes.
 
         Args:
             message: the decoded message.
@@ -202,9 +192,13 @@ class SchemaExtractor:
                 means the extracted value's own field, or else the full path in the message.
 
         Raises:
-            InvalidArgumentsError: a path of `fields` leads nowhere; says what there is.
+            InvalidArgumentsError: there is no such field; the sentence lists those there are.
         """
         nodes = {path: self._find(message, type_name, path) for path in fields}
+        for path, node in nodes.items():
+            if node is ABSENT:
+                plan = self._plan(type_name)
+                raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
         limit, squeeze = self._limit, 1
         while True:
             rendering = ReplyJson(limit, squeeze)
@@ -219,22 +213,22 @@ class SchemaExtractor:
             limit, squeeze = max(limit // 2, 1), squeeze * 2
 
     def pose(self, message: object, type_name: str) -> Pose | None:
-        """The pose that a message carries, in its header's frame; None where it carries none.
+        """Returns the pose of a message, in its header's frame; None where it has none.
 
         By the schema map's names; for a type that is not in the map, by a point at
         `pose.pose.position`, `pose.position` or `position`, or by `x`, `y` and a heading.
-        Coordinates are as they stand, NaN included.
+        Coordinates are those of the message, NaN included.
         """
         plan = self._plan(type_name)
         for route in plan.poses:
             found = route.of(message)
             if found is not None:
-                frame = _text(_FRAME.of(message)) or _frame(plan.pose_frame, message, _POSE_FRAMES)
-                return Pose(*found, frame)
-        return _headed(message) if plan is _UNMAPPED else None
+                px4_frame = _px4_frame(plan.pose_frame, message, _POSE_FRAMES)
+                return Pose(*found, _text(_FRAME.of(message)) or px4_frame)
+        return _planar_pose(message) if plan is _UNMAPPED else None
 
     def geodetic(self, message: object, type_name: str) -> Geodetic | None:
-        """The place on the Earth that a message carries; None where it carries none."""
+        """Returns the position on the Earth of a message; None where it has none."""
         routes = self._plan(type_name).geodetic
         if routes is None:
             return None
@@ -245,19 +239,23 @@ class SchemaExtractor:
         return Geodetic(latitude, longitude, above, _text(_FRAME.of(message)))
 
     def kinds_of(self, type_name: str) -> frozenset[str]:
-        """What messages of a mapped type carry: `position`, `velocity`, `geodetic`."""
+        """Returns what messages of a mapped type have: `position`, `velocity`, `geodetic`."""
         plan = self._plan(type_name)
         if plan is _UNMAPPED:
             return frozenset()
         has = {
-            "position": any(not _is_bare(route) for route in plan.poses),
+            # Not a point without an orientation, such as one that somebody clicked.
+            "position": any(
+                isinstance(route, _PlanarPose) or route.orientation is not _NOWHERE
+                for route in plan.poses
+            ),
             "velocity": bool(plan.twists),
             "geodetic": plan.geodetic is not None,
         }
-        return frozenset(kind for kind, carried in has.items() if carried)
+        return frozenset(kind for kind, is_there in has.items() if is_there)
 
     def twist(self, message: object, type_name: str) -> Twist | None:
-        """The velocity that a message carries; None where it carries none.
+        """Returns the velocity of a message; None where it has none.
 
         By the schema map's `linear_velocity` and `angular_velocity`; for a type that is not in the
         map, by vectors at `twist.twist` or `twist`. It is expressed in the child frame where the
@@ -265,28 +263,28 @@ class SchemaExtractor:
         """
         plan = self._plan(type_name)
         for linear, angular in plan.twists:
-            ahead, turning = linear.of(message), angular.of(message)
-            along, about = xyz(ahead), xyz(turning)
+            found, turning = linear.of(message), angular.of(message)
+            along, about = xyz(found), xyz(turning)
             if along is None and plan is not _UNMAPPED:
-                along, about = _velocity(ahead, 0), _velocity(turning, 2)
+                along, about = _velocity(found, 0), _velocity(turning, 2)
             if along is not None and about is not None:
                 frame = _text(_CHILD_FRAME.of(message)) or _text(_FRAME.of(message))
-                numbered = _frame(plan.velocity_frame, message, _VELOCITY_FRAMES)
-                return Twist(along, about, frame or numbered)
+                px4_frame = _px4_frame(plan.velocity_frame, message, _VELOCITY_FRAMES)
+                return Twist(along, about, frame or px4_frame)
         return None
 
     def frame(self, message: object) -> str:
-        """The frame in a message's header; empty where it has none."""
+        """Returns the frame in a message's header; empty where it has none."""
         return _text(_FRAME.of(message))
 
     def stamp(self, message: object) -> Ns | None:
-        """The time in a message's header; None where it has none."""
+        """Returns the time in a message's header; None where it has none."""
         return nanoseconds(_STAMP.of(message))
 
     def transforms(
         self, message: object, log_time: Ns, *, static: bool
     ) -> tuple[StampedTransform, ...]:
-        """The edges of a tf2_msgs/TFMessage, rotations normalised, frames without leading slash.
+        """Returns the edges of a TFMessage, rotations normalised, frames without leading slash.
 
         Left out, as tf2's buffer refuses them: an edge without a frame name or from a frame to
         itself, and one whose numbers are not finite or whose quaternion is zero.
@@ -303,30 +301,23 @@ class SchemaExtractor:
             plan = self._plans.get(type_name.replace("/", "/msg/"))
         return _UNMAPPED if plan is None else plan
 
-    def _whole(self, rendering: Rendering, message: object, type_name: str) -> JsonValue:
+    def _whole(self, rendering: ExactJson, message: object, type_name: str) -> JsonValue:
         plan = self._plan(type_name)
-        nodes = [(name, _meant(name, _at(message, path))) for name, path in plan.fields]
+        nodes = [(name, _converted(name, _at(message, path))) for name, path in plan.fields.items()]
         absent = [name for name, node in nodes if node is ABSENT]
         for name in absent:
-            rendering.say("absent", name, f"{name}: this message has no such field")
+            rendering.note("absent", name, f"{name}: this message has no such field")
         if len(absent) == len(nodes):
             return rendering.value(message, "")
         return {name: rendering.value(node, name) for name, node in nodes}
 
     def _find(self, message: object, type_name: str, path: str) -> object:
-        found = self._sought(message, type_name, path)
-        if found is ABSENT:
-            plan = self._plan(type_name)
-            raise InvalidArgumentsError(_no_such_field(type_name, path, plan, message))
-        return found
-
-    def _sought(self, message: object, type_name: str, path: str) -> object:
-        """What stands at one of `fields` in a message, or `ABSENT`."""
+        """Returns what is at one of `fields` in a message, or `ABSENT`."""
         plan = self._plan(type_name)
         segments = tuple(path.split("."))
-        mapped = plan.path(segments[0])
+        mapped = plan.fields.get(segments[0])
         if mapped is not None:
-            found = descend(_meant(segments[0], _at(message, mapped)), segments[1:], view)
+            found = descend(_converted(segments[0], _at(message, mapped)), segments[1:], view)
         else:
             found = ABSENT if plan.fields else descend(message, segments, view)
         return _plain(_at(message, segments)) if found is ABSENT else found
@@ -342,51 +333,44 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> _Plan:
                 "give field names joined by dots, such as pose.pose.position"
             )
         paths[name] = segments
+
+    def route(name: str) -> Route:
+        return Route(*paths[name]) if name in paths else _NOWHERE
+
+    has_twist = paths.keys() >= {"linear_velocity", "angular_velocity"}
+    has_geodetic = paths.keys() >= {"latitude", "longitude"}
     return _Plan(
-        fields=tuple(paths.items()),
-        poses=_poses(paths),
-        twists=((_route(paths, "linear_velocity"), _route(paths, "angular_velocity")),)
-        if paths.keys() >= {"linear_velocity", "angular_velocity"}
-        else (),
-        geodetic=(
-            _route(paths, "latitude"),
-            _route(paths, "longitude"),
-            _route(paths, "altitude"),
-        )
-        if paths.keys() >= {"latitude", "longitude"}
+        fields=paths,
+        poses=_poses(paths.keys(), route),
+        twists=((route("linear_velocity"), route("angular_velocity")),) if has_twist else (),
+        geodetic=(route("latitude"), route("longitude"), route("altitude"))
+        if has_geodetic
         else None,
-        pose_frame=_route(paths, "pose_frame") if "pose_frame" in paths else None,
-        velocity_frame=_route(paths, "velocity_frame") if "velocity_frame" in paths else None,
+        pose_frame=route("pose_frame") if "pose_frame" in paths else None,
+        velocity_frame=route("velocity_frame") if "velocity_frame" in paths else None,
     )
 
 
-def _poses(paths: Mapping[str, Segments]) -> tuple[_Point | _Planar, ...]:
-    if "position" in paths:
-        return (_Point(_route(paths, "position"), _route(paths, "orientation"), arrays=True),)
-    if paths.keys() >= {"translation", "rotation"}:
-        return (_Point(_route(paths, "translation"), _route(paths, "rotation")),)
-    if paths.keys() >= {"x", "y"}:
-        heading = next((name for name in _HEADINGS if name in paths), "heading")
-        return (_Planar(*(_route(paths, name) for name in ("x", "y", "z", heading))),)
+def _poses(
+    names: Collection[str], route: Callable[[str], Route]
+) -> tuple[_PointPose | _PlanarPose, ...]:
+    if "position" in names:
+        return (_PointPose(route("position"), route("orientation"), arrays=True),)
+    if "translation" in names and "rotation" in names:
+        return (_PointPose(route("translation"), route("rotation")),)
+    if "x" in names and "y" in names:
+        heading = next((name for name in _HEADINGS if name in names), "heading")
+        return (_PlanarPose(route("x"), route("y"), route("z"), route(heading)),)
     return ()
 
 
-def _route(paths: Mapping[str, Segments], name: str) -> Route:
-    return Route(*paths[name]) if name in paths else _NOWHERE
-
-
-def _is_bare(route: _Point | _Planar) -> bool:
-    """Whether it leads to a point without an orientation, such as one that somebody clicked."""
-    return isinstance(route, _Point) and route.orientation is _NOWHERE
-
-
-def _headed(message: object) -> Pose | None:
-    """The pose of a message that has x, y and a heading in radians as fields of its own."""
+def _planar_pose(message: object) -> Pose | None:
+    """Returns the pose of a message that has x, y and a heading (rad) as fields of its own."""
     names = names_of(message) if not isinstance(message, list) else ()
     heading = next((name for name in _HEADINGS if name in names), None)
     if heading is None:
         return None
-    found = _Planar(Route("x"), Route("y"), Route("z"), Route(heading)).of(message)
+    found = _PlanarPose(Route("x"), Route("y"), Route("z"), Route(heading)).of(message)
     return None if found is None else Pose(*found, _text(_FRAME.of(message)))
 
 
@@ -400,7 +384,7 @@ def _number(node: object) -> float | None:
 
 
 def _numbers(node: object, count: int) -> list[float] | None:
-    """The numbers of an array of so many."""
+    """Returns the numbers of an array of this length; None for any other."""
     if not isinstance(node, list | np.ndarray) or len(node) != count:
         return None
     numbers = [_number(part) for part in node]
@@ -413,26 +397,26 @@ def _triple(node: object) -> Vector3 | None:
 
 
 def _px4_rotation(node: object) -> Quaternion | None:
-    """The unit quaternion of an array in PX4's order: w, x, y, z."""
+    """Returns the unit quaternion of an array in PX4's order: w, x, y, z."""
     numbers = _numbers(node, 4)
     return None if numbers is None else unit((numbers[1], numbers[2], numbers[3], numbers[0]))
 
 
 def _velocity(node: object, axis: int) -> Vector3 | None:
-    """A velocity as an array, or as one number: along or about this axis."""
+    """Returns a velocity that is an array, or one number: along or about this axis."""
     one = _number(node)
     if one is None:
         return _triple(node)
     return (one, 0.0, 0.0) if axis == 0 else (0.0, 0.0, one)
 
 
-def _frame(route: Route | None, message: object, named: Mapping[int, str]) -> str:
+def _px4_frame(route: Route | None, message: object, named: Mapping[int, str]) -> str:
     number = None if route is None else _number(route.of(message))
     return "" if number is None else named.get(int(number), "")
 
 
-def _meant(name: str, node: object) -> object:
-    """What stands under a name of the schema map: an array as the point or rotation that it is."""
+def _converted(name: str, node: object) -> object:
+    """Returns the value of a name of the schema map: an array as the point or rotation it is."""
     if not isinstance(node, np.ndarray):
         return node
     if name in _POINTS:
@@ -450,7 +434,7 @@ def _at(message: object, path: Segments) -> object:
 
 
 def _plain(node: object) -> object:
-    """A node that was named by its full path: a quaternion so named is wanted as x, y, z, w."""
+    """Returns a node that was asked for by its full path: a quaternion then stays x, y, z, w."""
     if isinstance(node, list):
         return [_plain(one) for one in node]
     numbers = xyzw(node) if kind_of(node) is ValueKind.QUATERNION else None
@@ -458,15 +442,14 @@ def _plain(node: object) -> object:
 
 
 def _no_such_field(type_name: str, path: str, plan: _Plan, message: object) -> str:
-    standing = names_of(message)
-    more = len(standing) - _LISTED_NAMES
-    listed = ", ".join(standing[:_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
+    names = names_of(message)
+    more = len(names) - _LISTED_NAMES
+    listed = ", ".join(names[:_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
     if not plan.fields:
         there = f"its fields are: {listed}" if listed else "it has no fields"
         return f"{type_name} has no field {path!r}; {there}"
-    shown = ", ".join(name for name, _ in plan.fields)
     return (
-        f"{type_name} has no field {path!r}; its fields are: {shown}; "
+        f"{type_name} has no field {path!r}; its fields are: {', '.join(plan.fields)}; "
         f"or give a full path in the message, which begins with one of: {listed}"
     )
 
@@ -482,10 +465,6 @@ def _edge(node: object, log_time: Ns, *, static: bool) -> StampedTransform | Non
     translation, turn = xyz(_TRANSLATION.of(node)), rotation(_ROTATION.of(node))
     if not child or parent == child or stamp is None:
         return None
-    if translation is None or turn is None or not _finite(translation):
+    if translation is None or turn is None or not all(map(math.isfinite, translation)):
         return None
     return StampedTransform(parent, child, stamp, log_time, Transform(translation, turn), static)
-
-
-def _finite(vector: Vector3) -> bool:
-    return all(part - part == 0 for part in vector)

@@ -1,8 +1,8 @@
-"""What a message means, beyond its fields: rotations, points, times, pictures.
+"""Converts parts of messages: rotations, points, times, images.
 
-The extracted view, which replies and conditions see, is the message with a quaternion as
-`roll_deg`, `pitch_deg` and `yaw_deg`, a time as one number, and the data of images, point clouds
-and maps as summaries. `view` steps through it; `kind_of` and `summaries_of` say what differs.
+Replies and conditions see the extracted view of a message: a quaternion as `roll_deg`, `pitch_deg`
+and `yaw_deg`, a time as one number, and the data of images, point clouds and maps as summaries.
+`view` steps through it; `kind_of` and `summaries_of` return what differs from the message.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ ANGLES: Final = ("roll_deg", "pitch_deg", "yaw_deg")
 
 
 class Metric(float):
-    """A component of a point or vector of geometry_msgs: metres, m/s, rad/s and their kin."""
+    """A component of a point or vector of geometry_msgs: metres, m/s, rad/s and the like."""
 
     __slots__ = ()
 
 
 class Degrees(float):
-    """An angle that came from a quaternion."""
+    """An angle in degrees that was computed from a quaternion."""
 
     __slots__ = ()
 
 
 class ValueKind(Enum):
-    """How the extracted view sees a message."""
+    """How the extracted view shows a message."""
 
     PLAIN = auto()  # field by field
     VECTOR = auto()  # field by field, each a `Metric`
@@ -58,23 +58,23 @@ class ValueKind(Enum):
 
 
 def kind_of(node: object) -> ValueKind:
-    """How the extracted view sees a node; PLAIN for what is no message."""
+    """Returns how the extracted view shows a node; PLAIN for what is no message."""
     cls: type = type(node)
     return _kind_of_class(cls)
 
 
 @lru_cache(maxsize=4096)
 def _kind_of_class(cls: type) -> ValueKind:
-    layout = field_table_of_class(cls)
-    if layout is None:
+    table = field_table_of_class(cls)
+    if table is None:
         return ValueKind.PLAIN
-    kind, fields = _KINDS.get(layout.type, (ValueKind.PLAIN, ""))
-    # A bag may bring a definition of its own under the name of a standard type.
-    return kind if fields.split() == list(layout.attributes) else ValueKind.PLAIN
+    kind, fields = _KINDS.get(table.type, (ValueKind.PLAIN, ""))
+    # A bag may contain a definition of its own under the name of a standard type.
+    return kind if fields.split() == list(table.attributes) else ValueKind.PLAIN
 
 
 def view(node: object, name: str) -> object:
-    """What stands under this name in the extracted view of a message; else ABSENT."""
+    """Returns a field of the extracted view of a message; else ABSENT."""
     kind = kind_of(node)
     if kind is ValueKind.TIME:
         return ABSENT
@@ -84,14 +84,14 @@ def view(node: object, name: str) -> object:
     found = field_of(node, name)
     if kind is ValueKind.VECTOR:
         return Metric(found) if isinstance(found, float) else found
-    layout = None if found is ABSENT else field_table_of(node)
-    summaries = _NONE if layout is None else summaries_of(layout)
+    table = None if found is ABSENT else field_table_of(node)
+    summaries = _NONE if table is None else summaries_of(table)
     return summaries[name](node, found) if name in summaries else found
 
 
-def summaries_of(layout: FieldTable) -> Mapping[str, Callable[[object, object], object]]:
-    """By field of such messages, what makes a summary of the message and what was found there."""
-    return _VIEWS.get(layout.type, _NONE)
+def summaries_of(table: FieldTable) -> Mapping[str, Callable[[object, object], object]]:
+    """Returns, by field, the function that summarizes a message and the value of that field."""
+    return _SUMMARIES.get(table.type, _NONE)
 
 
 _XYZ: Final = attrgetter("x", "y", "z")
@@ -99,7 +99,7 @@ _XYZW: Final = attrgetter("x", "y", "z", "w")
 
 
 def xyz(node: object) -> Vector3 | None:
-    """The numbers of a message or JSON object shaped like a point; None where it is not."""
+    """Returns the numbers of a message or JSON object with x, y and z; None for any other."""
     try:
         x, y, z = _XYZ(node)
     except AttributeError:
@@ -111,7 +111,7 @@ def xyz(node: object) -> Vector3 | None:
 
 
 def xyzw(node: object) -> Quaternion | None:
-    """The numbers of a message or JSON object shaped like a quaternion, not normalised."""
+    """Returns the numbers of a message or JSON object with x, y, z and w, not normalised."""
     try:
         x, y, z, w = _XYZW(node)
     except AttributeError:
@@ -132,22 +132,22 @@ def _floats(*values: object) -> list[float] | None:
 
 
 def rotation(node: object) -> Quaternion | None:
-    """The unit quaternion of a node; None where it is no rotation: zero, not finite, no numbers."""
+    """Returns the unit quaternion of a node; None where it has no numbers, or zero or NaN ones."""
     numbers = xyzw(node)
     return None if numbers is None else unit(numbers)
 
 
 def unit(numbers: Quaternion) -> Quaternion | None:
-    """The unit quaternion of four numbers; None where they are no rotation."""
+    """Returns the unit quaternion of four numbers; None where they are zero or not finite."""
     x, y, z, w = numbers
-    # Nearly every quaternion of a robot is a unit one; this door is passed for each pose.
+    # Called for each pose, and nearly every quaternion of a robot is of unit length already.
     if abs(x * x + y * y + z * z + w * w - 1) < 1e-12:
         return numbers
     return geometry.normalised(numbers)
 
 
 def euler(node: object) -> dict[str, Degrees] | None:
-    """Roll, pitch and yaw (REP-103, degrees) of a quaternion; None where it is no rotation."""
+    """Returns roll, pitch and yaw (REP-103, degrees) of a quaternion; None if it is no rotation."""
     unit = rotation(node)
     if unit is None:
         return None
@@ -160,7 +160,7 @@ def euler(node: object) -> dict[str, Degrees] | None:
 
 
 def nanoseconds(node: object) -> Ns | None:
-    """The nanoseconds of a Time or Duration (or its JSON likeness); None where it is none."""
+    """Returns the nanoseconds of a Time or Duration, or of the same in JSON; None for any other."""
     for names in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs")):
         sec, rest = (field_of(node, name) for name in names)
         if isinstance(sec, int) and isinstance(rest, int):
@@ -171,13 +171,19 @@ def nanoseconds(node: object) -> Ns | None:
 
 def _image(message: object, data: object) -> object:
     encoding = field_of(message, "encoding")
-    size = [field_of(message, "height"), field_of(message, "width")]
-    shape = [n for n in (*size, _channels(str(encoding))) if isinstance(n, int)]
+    channels = _channels(str(encoding))
+    shape = [*_shape(message), channels] if channels is not None else _shape(message)
     return {**_bytes(data), "encoding": _or_null(encoding), "shape": shape}
 
 
+def _shape(message: object, *path: str) -> list[int]:
+    """Returns height and width, as far as the message has them."""
+    size = [descend(message, (*path, name)) for name in ("height", "width")]
+    return [each for each in size if isinstance(each, int)]
+
+
 def _channels(encoding: str) -> int | None:
-    """Channels by the names of sensor_msgs/image_encodings.hpp; None for one without (yuv)."""
+    """Returns the channels of an encoding of sensor_msgs/image_encodings.hpp; None for yuv."""
     typed = re.fullmatch(r"\d+[USF]C(\d{1,3})", encoding)
     if typed:
         return int(typed[1])
@@ -190,18 +196,16 @@ def _compressed_image(message: object, data: object) -> object:
 
 
 def _point_cloud(message: object, data: object) -> object:
-    size = [field_of(message, "height"), field_of(message, "width")]
-    shape = [n for n in size if isinstance(n, int)]
+    shape = _shape(message)
     return {**_bytes(data), "points": math.prod(shape), "shape": shape}
 
 
 def _occupancy_grid(message: object, data: object) -> object:
-    size = [descend(message, ("info", name)) for name in ("height", "width")]
-    return {**_bytes(data), "shape": [n for n in size if isinstance(n, int)]}
+    return {**_bytes(data), "shape": _shape(message, "info")}
 
 
 def _magnetic_field(_message: object, field: object) -> object:
-    """Without the decimals that suit metres: in Tesla, the field of the Earth would vanish."""
+    """Returns plain floats: rounded as metres, the Earth's field in tesla would be zero."""
     numbers = xyz(field)
     return field if numbers is None else dict(zip("xyz", numbers, strict=True))
 
@@ -223,7 +227,7 @@ _KINDS: Final[Mapping[str, tuple[ValueKind, str]]] = {
     "builtin_interfaces/msg/Duration": (ValueKind.TIME, "sec nanosec"),
 }
 _NONE: Final[Mapping[str, Callable[[object, object], object]]] = {}
-_VIEWS: Final[Mapping[str, Mapping[str, Callable[[object, object], object]]]] = {
+_SUMMARIES: Final[Mapping[str, Mapping[str, Callable[[object, object], object]]]] = {
     "sensor_msgs/msg/Image": {"data": _image},
     "sensor_msgs/msg/CompressedImage": {"data": _compressed_image},
     "sensor_msgs/msg/PointCloud2": {"data": _point_cloud},

@@ -1,9 +1,9 @@
-"""The things that a message tells of: what a detector saw, by name, and where where it says so.
+"""Reads detections from messages: what a detector saw, by name, and where if the message says so.
 
-A thing is an object with a name under one of `NAMES`: an entry of a list, or the whole message; a
-text that is JSON is looked into. Detections of vision_msgs name their best hypothesis. Its place
-is a point in metres: `point` or `position`, vision_msgs' pose or the centre of a 3D box. Boxes in
-an image are in pixels, and no place.
+A detection is an object with a name under one of `NAMES`: an entry of a list, or the whole message.
+A string that is JSON is parsed. Detections of vision_msgs are named by their best hypothesis. The
+position is a point in metres: `point` or `position`, vision_msgs' pose or the centre of a 3D box.
+Boxes in an image are in pixels, and give no position.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
 
 NAMES: Final = ("label", "class_id", "class_name", "class", "object")
 LISTS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
-"""A list of texts under one of these names is a list of things."""
+"""A list of strings under one of these names is a list of detections."""
 
-_PLACES: Final = (
+_POSITIONS: Final = (
     ("point",),
     ("position",),
     ("pose", "position"),
     ("pose", "pose", "position"),
     ("bbox", "center", "position"),
 )
-_LONGEST_JSON: Final = 1 << 16
-_DEEPEST: Final = 4
+_MAX_JSON_CHARS: Final = 1 << 16
+_MAX_DEPTH: Final = 4
 
 
 class Detection(NamedTuple):
-    """Something that was seen: `place` (m) is in `frame_id`, empty where the message names none."""
+    """An object that was seen: `place` (m) is in `frame_id`, empty where the message names none."""
 
     label: str
     place: Vector3 | None = None
@@ -41,63 +41,54 @@ class Detection(NamedTuple):
 
 
 def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]:
-    """The things in an extracted value, in order; `frame_id` is the message's own."""
-    return tuple(_things(value, frame_id, _DEEPEST))
+    """Returns the detections in an extracted value, in order; `frame_id` is the message's own."""
+    return tuple(_detections(value, frame_id, _MAX_DEPTH))
 
 
 def depends_on_numbers(value: JsonValue) -> bool:
-    """Whether other scores in the same message may give things other names."""
-    waiting = [value]
-    while waiting:
-        held = waiting.pop()
-        if isinstance(held, dict):
-            results = held.get("results")
-            if isinstance(results, list) and len(results) > 1:
-                return True
-            waiting.extend(held.values())
-        elif isinstance(held, list):
-            waiting.extend(held)
-    return False
+    """Returns whether other scores in the same message could change the detections' names."""
+    if isinstance(value, list):
+        return any(map(depends_on_numbers, value))
+    if not isinstance(value, dict):
+        return False
+    results = value.get("results")
+    several = isinstance(results, list) and len(results) > 1
+    return several or any(map(depends_on_numbers, value.values()))
 
 
-def _things(value: JsonValue, frame_id: str, depth: int) -> Iterator[Detection]:
+def _detections(value: JsonValue, frame_id: str, depth: int) -> Iterator[Detection]:
     if depth == 0:
         return
     if isinstance(value, str):
-        yield from _things(_from_json(value), frame_id, depth - 1)
+        yield from _detections(_from_json(value), frame_id, depth - 1)
     elif isinstance(value, list):
         for each in value:
             if isinstance(each, dict):
-                yield from _things(each, frame_id, depth - 1)
+                yield from _detections(each, frame_id, depth - 1)
     elif isinstance(value, dict):
-        thing = _thing(value, frame_id)
-        if thing is not None:
-            yield thing
-        else:
-            yield from _within(value, frame_id, depth)
+        frame = _frame(value) or frame_id
+        detection = _detection(value, frame)
+        if detection is not None:
+            yield detection
+            return
+        for name, inner in value.items():
+            if name in LISTS and isinstance(inner, list):
+                yield from (Detection(each) for each in inner if isinstance(each, str) and each)
+            yield from _detections(inner, frame, depth - 1)
 
 
-def _within(value: dict[str, JsonValue], frame_id: str, depth: int) -> Iterator[Detection]:
-    """The things in the fields of an object that is none itself."""
-    frame = _frame(value) or frame_id
-    for name, inner in value.items():
-        if name in LISTS and isinstance(inner, list):
-            yield from (Detection(each) for each in inner if isinstance(each, str) and each)
-        yield from _things(inner, frame, depth - 1)
-
-
-def _thing(value: dict[str, JsonValue], frame_id: str) -> Detection | None:
-    """The thing that an object is; None where it is none."""
-    frame = _frame(value) or frame_id
+def _detection(value: dict[str, JsonValue], frame_id: str) -> Detection | None:
+    """Returns the detection that an object is; None where it is none."""
     label = _label(value)
     if label is not None:
-        return Detection(label, _place(value), frame)
+        return Detection(label, _position(value), frame_id)
     best = _best_result(value.get("results"))
     if best is None:
         return None
     hypothesis = best.get("hypothesis")
     label = _label(hypothesis if isinstance(hypothesis, dict) else best)
-    return None if label is None else Detection(label, _place(best) or _place(value), frame)
+    position = _position(best) or _position(value)
+    return None if label is None else Detection(label, position, frame_id)
 
 
 def _label(value: dict[str, JsonValue]) -> str | None:
@@ -111,7 +102,7 @@ def _label(value: dict[str, JsonValue]) -> str | None:
 
 
 def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
-    """The hypothesis of the highest score; the first of several."""
+    """Returns the hypothesis of the highest score; the first of several."""
     among = (
         [each for each in results if isinstance(each, dict)] if isinstance(results, list) else []
     )
@@ -130,35 +121,33 @@ def _frame(value: dict[str, JsonValue]) -> str:
     return frame if isinstance(frame, str) else ""
 
 
-def _place(value: dict[str, JsonValue]) -> Vector3 | None:
-    """The first of the points that is one; all zeros is what nobody filled in."""
-    for path in _PLACES:
-        held: JsonValue = value
+def _position(value: dict[str, JsonValue]) -> Vector3 | None:
+    """Returns the first valid point; all zeros means that nobody filled it in."""
+    for path in _POSITIONS:
+        found: JsonValue = value
         for name in path:
-            held = held.get(name) if isinstance(held, dict) else None
-        place = _point(held)
-        if place is not None and any(place):
-            return place
+            found = found.get(name) if isinstance(found, dict) else None
+        point = _point(found)
+        if point is not None and any(point):
+            return point
     return None
 
 
 def _point(value: JsonValue) -> Vector3 | None:
     if isinstance(value, dict):
-        parts = [value.get("x"), value.get("y"), value.get("z")]
-    elif isinstance(value, list) and len(value) == 3:
-        parts = list(value)
-    else:
+        value = [value.get("x"), value.get("y"), value.get("z")]
+    if not isinstance(value, list) or len(value) != 3:
         return None
     x, y, z = (
         float(part) if isinstance(part, int | float) and not isinstance(part, bool) else math.nan
-        for part in parts
+        for part in value
     )
     return (x, y, z) if all(map(math.isfinite, (x, y, z))) else None
 
 
 def _from_json(text: str) -> JsonValue:
-    """What a text says that is JSON; None for any other."""
-    if len(text) > _LONGEST_JSON or text[:1] not in {"[", "{"}:
+    """Parses a string that is JSON; None for any other."""
+    if len(text) > _MAX_JSON_CHARS or text[:1] not in {"[", "{"}:
         return None
     try:
         value: JsonValue = json.loads(text)

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 
 def evenly(count: int, at_most: int) -> list[int]:
-    """Strictly increasing indices into `count` values, at most `at_most`, evenly spaced.
+    """Returns at most `at_most` evenly spaced indices into `count` values, strictly increasing.
 
-    The first and the last are kept, and the distances between neighbours differ by at most one.
-    A single place goes to the last value: the newest.
+    The first and the last value are kept, and the distances between neighbours differ by at most
+    one. If only one may be kept it is the last: the newest.
 
     Raises:
         ValueError: `at_most` is below 1.
@@ -25,10 +25,10 @@ def evenly(count: int, at_most: int) -> list[int]:
 
 
 def array_note(name: str, kept: int, total: int) -> str:
-    """What is said of an array inside a message that was thinned."""
+    """Returns the note on an array inside a message that was thinned."""
     return f"{name}: {kept} of {total} values, evenly spaced"
 
 
 def samples_note(kept: int, total: int) -> str:
-    """What is said of a window whose samples were thinned."""
+    """Returns the note on a window whose samples were thinned."""
     return f"{kept} of {total} samples, evenly spaced over the window"

@@ -1,19 +1,19 @@
-"""A message in the extracted view as JSON: exactly, for conditions, or shown, for replies.
+"""Renders a decoded message as JSON: exactly, for conditions, or shortened, for replies.
 
-Shown means: thinned evenly, cut, rounded by context, finite, and each loss noted once for its
-path. Exact means the whole value, NaN included; only what is not for reading (the data of images
-and their like, long byte arrays, a million numbers) is a summary there too.
+`ReplyJson` thins arrays evenly, cuts strings, rounds numbers by what they measure, writes NaN and
+infinity as null, and notes each loss once for its path. `ExactJson` keeps the whole value, NaN
+included; only what nobody reads (the data of images and point clouds, long byte arrays, a million
+numbers) is a summary there too.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
-from ros2_memory.messages import rounding
 from ros2_memory.messages.conversions import (
     Degrees,
     Metric,
@@ -38,19 +38,32 @@ MAX_DEPTH: Final = 24
 MAX_NOTES: Final = 20
 MAX_SQUEEZE: Final = 64
 MAX_EXACT_NUMBERS: Final = 1_000_000
-"""A longer array is no list to look for something in, and as one takes ten times its memory."""
+"""A longer array is not searched by any condition, and as a list takes ten times its memory."""
 MAX_TEXT: Final = 2000
-"""Characters of one string that leave in a reply."""
+"""Characters of one string in a reply."""
+
+_METRIC_DECIMALS: Final = 4
+_DEGREE_DECIMALS: Final = 2
+_SIGNIFICANT_DIGITS: Final = 11
+"""Of a number of unknown unit: 1e-8 of a degree, also at a longitude of three digits."""
+_LEAST_DECIMALS: Final = 6
+"""Of a number of unknown unit: a time in Unix seconds keeps its microseconds."""
+_LARGEST_WHOLE: Final = 10**15
+_LARGEST_SINGLE: Final = float(np.finfo(np.float32).max)
 
 
-class Rendering(ABC):
-    """One walk over one message. Never raises because of what the message holds."""
+class ExactJson:
+    """One walk over one message, which keeps all of it. Never raises because of its content.
+
+    Args:
+        limit: bytes of a byte array that is rendered as numbers.
+    """
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
 
     def value(self, node: object, path: str, depth: int = 0) -> JsonValue:
-        """The node as JSON; `path` is how a note would call it."""
+        """Renders a node; `path` is its name in notes."""
         if isinstance(node, str):
             return self._text(node, path)
         if node is None or node is ABSENT or isinstance(node, bool):
@@ -60,8 +73,8 @@ class Rendering(ABC):
         if isinstance(node, float):
             return self._float(node)
         if depth >= MAX_DEPTH:
-            note = f"{_called(path)}: what lies deeper than {MAX_DEPTH} levels is left out"
-            self.say("depth", path, note)
+            note = f"{_named(path)}: what lies deeper than {MAX_DEPTH} levels is left out"
+            self.note("depth", path, note)
             return None
         return self._container(node, path, depth + 1)
 
@@ -72,7 +85,7 @@ class Rendering(ABC):
 
     def _container(self, node: object, path: str, depth: int) -> JsonValue:
         if isinstance(node, list | tuple):
-            return [self.value(one, path, depth) for one in self._kept(node, path)]
+            return [self.value(one, path, depth) for one in self._elements(node, path)]
         if isinstance(node, np.ndarray):
             return self._array(node, path, depth)
         if isinstance(node, np.generic):
@@ -95,23 +108,23 @@ class Rendering(ABC):
         if vector is not None:
             x, y, z = vector
             return {"x": self._metric(x), "y": self._metric(y), "z": self._metric(z)}
-        layout = field_table_of(node)
-        if layout is None:
+        table = field_table_of(node)
+        if table is None:
             return self._text(f"<{type(node).__name__}>", path)
-        summaries = summaries_of(layout)
-        shown: dict[str, JsonValue] = {}
-        for name, attribute in layout.attributes.items():
+        summaries = summaries_of(table)
+        fields: dict[str, JsonValue] = {}
+        for name, attribute in table.attributes.items():
             found: object = getattr(node, attribute, ABSENT)
             if name in summaries:
                 found = summaries[name](node, found)
-            shown[name] = self.value(found, _join(path, name), depth)
-        return shown
+            fields[name] = self.value(found, _join(path, name), depth)
+        return fields
 
     def _rotation(self, node: object, path: str) -> JsonValue:
         angles = euler(node)
         if angles is None:
-            note = f"{_called(path)}: no rotation (a zero or NaN quaternion)"
-            self.say("rotation", path, note)
+            note = f"{_named(path)}: no rotation (a zero or NaN quaternion)"
+            self.note("rotation", path, note)
             return None
         return {name: self._degrees(angle) for name, angle in angles.items()}
 
@@ -121,7 +134,7 @@ class Rendering(ABC):
         if array.dtype == np.uint8 and array.size > self._limit:
             return {"bytes": int(array.size)}
         if array.ndim > 1 or array.dtype.kind not in "biuf":
-            return [self.value(row, path, depth) for row in self._kept(list(array), path)]
+            return [self.value(row, path, depth) for row in self._elements(list(array), path)]
         return self._numbers(array, path)
 
     def _scalar(self, scalar: np.generic[object], path: str) -> JsonValue:
@@ -133,43 +146,7 @@ class Rendering(ABC):
         known = isinstance(plain, bool | int | bytes)
         return self.value(plain if known else str(plain), path, MAX_DEPTH - 1)
 
-    @abstractmethod
-    def _text(self, text: str, path: str, /) -> JsonValue: ...
-
-    @abstractmethod
-    def _integer(self, number: int) -> JsonValue: ...
-
-    @abstractmethod
-    def _real(self, number: float) -> JsonValue: ...
-
-    @abstractmethod
-    def _metric(self, number: float) -> JsonValue: ...
-
-    @abstractmethod
-    def _degrees(self, number: float) -> JsonValue: ...
-
-    @abstractmethod
-    def _single(self, number: np.float32) -> JsonValue: ...
-
-    @abstractmethod
-    def _seconds(self, time: Ns) -> JsonValue: ...
-
-    @abstractmethod
-    def _numbers(self, array: Array, path: str, /) -> JsonValue: ...
-
-    @abstractmethod
-    def _kept(self, nodes: Sequence[object], path: str, /) -> Sequence[object]: ...
-
-    @abstractmethod
-    def _entries(self, node: Mapping[object, object], path: str, /) -> list[tuple[str, object]]: ...
-
-    @abstractmethod
-    def say(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
-        """Notes a loss at a path; of several of one kind there, the weightiest counts."""
-
-
-class ExactJson(Rendering):
-    """Everything as it is."""
+    # What a reply shortens or rounds, and what is noted of that.
 
     def _text(self, text: str, _path: str, /) -> JsonValue:
         return str(text)
@@ -195,24 +172,24 @@ class ExactJson(Rendering):
     def _numbers(self, array: Array, _path: str, /) -> JsonValue:
         if array.size > MAX_EXACT_NUMBERS:
             return {"numbers": int(array.size)}
-        numbers: JsonValue = _standard(array).tolist()
+        numbers: JsonValue = _at_most_64_bits(array).tolist()
         return numbers
 
-    def _kept(self, nodes: Sequence[object], _path: str, /) -> Sequence[object]:
+    def _elements(self, nodes: Sequence[object], _path: str, /) -> Sequence[object]:
         return nodes
 
     def _entries(self, node: Mapping[object, object], _path: str, /) -> list[tuple[str, object]]:
         return [(str(name), value) for name, value in node.items()]
 
-    def say(self, _kind: str, _path: str, _note: str, _weight: int = 0, /) -> None:
-        """Nothing is lost here that is not said of `exact`."""
+    def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
+        """Notes a loss at a path; here none is noted, since `exact` documents what is left out."""
 
 
-class ReplyJson(Rendering):
-    """What leaves in a reply, and the notes on what does not.
+class ReplyJson(ExactJson):
+    """One walk over one message for a reply.
 
-    `squeeze` divides what a string may hold and bounds JSON objects too, for messages that would
-    fill a reply alone; `notes` stands when the walk is done.
+    `squeeze` divides the length of strings and bounds JSON objects too, for messages that would
+    fill a reply alone. `notes` is complete when the walk is.
     """
 
     def __init__(self, limit: int, squeeze: int = 1) -> None:
@@ -223,7 +200,7 @@ class ReplyJson(Rendering):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One sentence for each path and loss; of several, that of the greatest."""
+        """One sentence for each path and kind of loss."""
         notes = [note for _, note in self._notes.values()]
         more = len(notes) - MAX_NOTES
         return (
@@ -232,75 +209,126 @@ class ReplyJson(Rendering):
 
     def _text(self, text: str, path: str, /) -> JsonValue:
         if len(text) > self._max_text:
-            note = f"{_called(path)}: the first {self._max_text} of {len(text)} characters"
-            self.say("text", path, note, len(text))
+            note = f"{_named(path)}: the first {self._max_text} of {len(text)} characters"
+            self.note("text", path, note, len(text))
             text = text[: self._max_text]
-        return str(text) if text.isascii() else _clean(text)
+        return str(text) if text.isascii() else _encodable(text)
 
     def _integer(self, number: int) -> JsonValue:
-        return rounding.integer(number)
+        return round_integer(number)
 
     def _real(self, number: float) -> JsonValue:
-        return rounding.real(number)
+        return round_real(number)
 
     def _metric(self, number: float) -> JsonValue:
-        return rounding.metric(number)
+        return round_metric(number)
 
     def _degrees(self, number: float) -> JsonValue:
-        return rounding.degrees(number)
+        return round_degrees(number)
 
     def _single(self, number: np.float32) -> JsonValue:
-        return rounding.single(number)
+        return round_single(number)
 
     def _seconds(self, time: Ns) -> JsonValue:
-        return rounding.short(unix_rounded_up(time))
+        return _whole_or_null(unix_rounded_up(time))
 
     def _numbers(self, array: Array, path: str, /) -> JsonValue:
         if array.size > self._limit:
-            self._thinned(array.size, path)
+            self._note_thinned(array.size, path)
             array = array[evenly(array.size, self._limit)]
         if array.dtype == np.float32:
-            return [rounding.single(number) for number in array]
+            return [round_single(number) for number in array]
         if array.dtype.kind == "f":
-            return [rounding.real(number) for number in _standard(array).tolist()]
+            return [round_real(number) for number in _at_most_64_bits(array).tolist()]
         numbers: JsonValue = array.tolist()
         return numbers
 
-    def _kept(self, nodes: Sequence[object], path: str, /) -> Sequence[object]:
+    def _elements(self, nodes: Sequence[object], path: str, /) -> Sequence[object]:
         if len(nodes) <= self._limit:
             return nodes
-        self._thinned(len(nodes), path)
+        self._note_thinned(len(nodes), path)
         return [nodes[at] for at in evenly(len(nodes), self._limit)]
 
-    def _thinned(self, total: int, path: str) -> None:
-        self.say("array", path, array_note(_called(path), self._limit, total), total)
+    def _note_thinned(self, total: int, path: str) -> None:
+        self.note("array", path, array_note(_named(path), self._limit, total), total)
 
     def _entries(self, node: Mapping[object, object], path: str, /) -> list[tuple[str, object]]:
-        entries = [(_clean(str(name)), value) for name, value in node.items()]
+        entries = [(_encodable(str(name)), value) for name, value in node.items()]
         if self._max_entries is None or len(entries) <= self._max_entries:
             return entries
-        note = f"{_called(path)}: the first {self._max_entries} of {len(entries)} entries"
-        self.say("entries", path, note, len(entries))
+        note = f"{_named(path)}: the first {self._max_entries} of {len(entries)} entries"
+        self.note("entries", path, note, len(entries))
         return entries[: self._max_entries]
 
-    def say(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
-        """Notes a loss at a path; of several of one kind there, the weightiest counts."""
-        said = self._notes.get((kind, path))
-        if said is None or said[0] < weight:
+    def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
+        """Notes a loss at a path; of several of one kind there, the one of most weight is kept."""
+        known = self._notes.get((kind, path))
+        if known is None or known[0] < weight:
             self._notes[kind, path] = (weight, note)
 
 
-def _standard(array: Array) -> Array:
-    """The array in a dtype that Python's own numbers hold: float128 is not."""
+def round_metric(number: float) -> JsonValue:
+    """Rounds metres, m/s, rad/s and their kin to 1e-4."""
+    return _whole_or_null(round(number, _METRIC_DECIMALS))
+
+
+def round_degrees(number: float) -> JsonValue:
+    """Rounds an angle in degrees to 1e-2."""
+    return _whole_or_null(round(number, _DEGREE_DECIMALS))
+
+
+def round_single(number: np.float32) -> JsonValue:
+    """Returns a float32 as the shortest decimal that reads back as the same float32."""
+    return _whole_or_null(float(str(number)))
+
+
+def round_real(number: float) -> JsonValue:
+    """Rounds a float of unknown unit.
+
+    rosbags decodes a scalar float32 to a Python float, which no longer says that it was one. Its
+    value does: it is exactly a float32 and yet needs more digits than these, which happens to a
+    measured float64 once in 2**29. It is rounded as by `round_single`.
+    """
+    if not math.isfinite(number) or number == int(number):
+        return _whole_or_null(number)
+    exponent = math.floor(math.log10(abs(number)))
+    decimal = round(number, max(_SIGNIFICANT_DIGITS - 1 - exponent, _LEAST_DECIMALS))
+    if decimal != number and abs(number) <= _LARGEST_SINGLE:
+        nearest = np.float32(number)
+        if float(nearest) == number:
+            return round_single(nearest)
+    return _whole_or_null(decimal)
+
+
+def round_integer(number: int) -> JsonValue:
+    """Returns an int of at most 64 bits; a longer one, which only JSON can hold, as a float."""
+    if number.bit_length() <= 64:
+        return number
+    try:
+        return float(number)
+    except OverflowError:
+        return None
+
+
+def _whole_or_null(number: float) -> JsonValue:
+    """Returns an int where the number is integral (so -0.0 is 0), and null where not finite."""
+    if not math.isfinite(number):
+        return None
+    whole = int(number)
+    return whole if whole == number and abs(whole) < _LARGEST_WHOLE else float(number)
+
+
+def _at_most_64_bits(array: Array) -> Array:
+    """Returns the array in a dtype that Python's own numbers hold: float128 is not one."""
     return array.astype(np.float64) if array.dtype.itemsize > 8 else array
 
 
-def _clean(text: str) -> str:
-    """The text without lone surrogates, which no encoding of JSON carries."""
+def _encodable(text: str) -> str:
+    """Returns the text without lone surrogates, which no encoding of JSON carries."""
     return text.encode("utf-8", "replace").decode()
 
 
-def _called(path: str) -> str:
+def _named(path: str) -> str:
     return path or "value"
 
 

@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.messages import rounding
+from ros2_memory.messages.to_json import (
+    round_degrees,
+    round_integer,
+    round_metric,
+    round_real,
+    round_single,
+)
 
 
 @pytest.mark.parametrize(
@@ -29,27 +35,27 @@ from ros2_memory.messages import rounding
     ],
 )
 def test_a_number_of_unknown_unit_leaves_short(number: float, leaves_as: object) -> None:
-    left = rounding.real(number)
+    left = round_real(number)
     assert left == leaves_as
     assert type(left) is type(leaves_as)
 
 
 def test_minus_zero_leaves_without_its_sign() -> None:
-    assert str(rounding.real(-0.0)) == "0"
-    assert str(rounding.metric(-0.00001)) == "0"
-    assert str(rounding.degrees(-0.001)) == "0"
+    assert str(round_real(-0.0)) == "0"
+    assert str(round_metric(-0.00001)) == "0"
+    assert str(round_degrees(-0.001)) == "0"
 
 
 def test_metres_leave_to_a_tenth_of_a_millimetre_and_degrees_to_a_hundredth() -> None:
-    assert rounding.metric(1.23456) == 1.2346
-    assert rounding.degrees(28.64788975654116) == 28.65
-    assert rounding.metric(math.nan) is None
-    assert rounding.degrees(math.inf) is None
+    assert round_metric(1.23456) == 1.2346
+    assert round_degrees(28.64788975654116) == 28.65
+    assert round_metric(math.nan) is None
+    assert round_degrees(math.inf) is None
 
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 def test_a_float32_is_read_back_from_what_leaves(number: float) -> None:
-    for left in (rounding.real(number), rounding.single(np.float32(number))):
+    for left in (round_real(number), round_single(np.float32(number))):
         assert isinstance(left, int | float)
         assert np.float32(left) == np.float32(number)
 
@@ -57,17 +63,17 @@ def test_a_float32_is_read_back_from_what_leaves(number: float) -> None:
 @given(st.integers(1, 99_999), st.integers(2, 6))
 def test_a_float32_leaves_as_the_decimal_that_was_written(digits: int, decimals: int) -> None:
     written = digits / 10**decimals
-    assert rounding.real(float(np.float32(written))) == written
+    assert round_real(float(np.float32(written))) == written
 
 
 def test_a_float64_that_is_a_float32_too_keeps_its_digits_where_they_are_few() -> None:
-    assert rounding.real(48.123046875) == 48.123046875
-    assert rounding.real(500000.03125) == 500000.03125
+    assert round_real(48.123046875) == 48.123046875
+    assert round_real(500000.03125) == 500000.03125
 
 
 @given(st.floats(-360, 360, allow_nan=False))
 def test_an_angle_on_the_globe_keeps_a_hundred_millionth_of_a_degree(degrees: float) -> None:
-    left = rounding.real(degrees)
+    left = round_real(degrees)
     assert isinstance(left, int | float)
     half_a_float32 = abs(degrees) * 2**-24 if float(np.float32(degrees)) == degrees else 0.0
     assert abs(left - degrees) <= max(1e-8, half_a_float32)
@@ -75,7 +81,7 @@ def test_an_angle_on_the_globe_keeps_a_hundred_millionth_of_a_degree(degrees: fl
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_any_finite_number_keeps_ten_digits_and_a_microsecond(number: float) -> None:
-    left = rounding.real(number)
+    left = round_real(number)
     assert isinstance(left, int | float)
     if float(np.float32(max(min(number, 1e38), -1e38))) != number:
         assert abs(left - number) <= max(abs(number) * 1e-10, 5e-324)
@@ -83,7 +89,7 @@ def test_any_finite_number_keeps_ten_digits_and_a_microsecond(number: float) -> 
 
 
 def test_ints_of_64_bits_leave_as_they_are_and_longer_ones_as_floats() -> None:
-    assert rounding.integer(2**64 - 1) == 2**64 - 1
-    assert rounding.integer(-(2**63)) == -(2**63)
-    assert rounding.integer(10**30) == 1e30
-    assert rounding.integer(10**5000) is None
+    assert round_integer(2**64 - 1) == 2**64 - 1
+    assert round_integer(-(2**63)) == -(2**63)
+    assert round_integer(10**30) == 1e30
+    assert round_integer(10**5000) is None
