@@ -208,7 +208,7 @@ def transform(
     note_unread(view, TimeWindow.around(at, found.reach))
     age = None if now is None else now - at
     return results.TransformAt(
-        parent, child, at, found.lookup.transform, found.clock, view.notes.sentences(), age
+        parent, child, at, found.transform, found.clock, view.notes.sentences(), age
     )
 
 

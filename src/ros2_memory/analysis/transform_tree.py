@@ -1,13 +1,13 @@
-"""The frame graph and its lookups, with tf2's semantics over recorded transforms.
+"""Looks up transforms between frames, with tf2's semantics over recorded transforms.
 
 As in tf2 (`buffer_core.cpp`, `time_cache.cpp`, `static_cache.cpp` of ros2/geometry2):
 
-- A child has one history, whatever its parents. At a message's own time that message holds;
+- A child has one history, whatever its parents. At a message's own time that message is used;
   between two messages the transform is interpolated, unless they name different parents: then
-  the earlier one holds until the later. Of two messages for one time the later received holds.
+  the earlier one is valid until the later. Of two messages for one time the later received is used.
 - Nothing is extrapolated. tf2 forgets after 10 s, so it never interpolates across more; neither
   does this (`TF_CACHE_NS`).
-- A static transform holds at all times; of several for one child, the newest received.
+- A static transform is valid at all times; of several for one child, the newest received is used.
 - A leading slash of a frame name is dropped; a transform from a frame to itself, with an empty
   name or with a NaN is left out.
 
@@ -47,19 +47,19 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 TfClock: TypeAlias = Literal["stamp", "log"]
-"""Which of a transform's two times counts: its header stamp, or when it was recorded."""
+"""Which of a transform's two times is used: its header stamp, or when it was recorded."""
 
 TF_CACHE_NS: Final[Ns] = 10 * NS_PER_S
 """tf2's default buffer length: messages farther apart are never interpolated."""
 
 AGREEMENT_NS: Final[Ns] = 2 * NS_PER_S
-"""How far stamps may lie from log times and still be the same clock.
+"""How far stamps may be from log times and still be of the same clock.
 
 Localisers date their transforms up to a second ahead (`transform_tolerance`); transports add some
 tenths. Simulated and replayed clocks are off by far more.
 """
 
-_MOST_NAMES: Final = 12
+_MAX_NAMES: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +72,6 @@ class FrameEdge:
 
 
 @dataclass(frozen=True, slots=True)
-class Lookup:
-    """The pose of the child in the parent, as it was at `time` (in the graph's clock)."""
-
-    transform: Transform
-    time: Ns
-
-
-@dataclass(frozen=True, slots=True)
 class _Edge:
     parent: str
     transform: Transform
@@ -87,7 +79,7 @@ class _Edge:
 
 @dataclass(slots=True)
 class _History:
-    """All that is known of one child: messages ascending in time, one for each time."""
+    """The transforms of one child: messages ascending in time, one for each time."""
 
     child: str
     times: list[Ns] = field(default_factory=list)
@@ -95,16 +87,15 @@ class _History:
     static: _Edge | None = None
 
     def newest(self) -> _Edge | None:
-        """The edge that stands for this child where no time is asked."""
+        """Returns the edge that represents this child where no time is given."""
         return self.edges[-1] if self.edges else self.static
 
     def parents(self) -> set[str]:
-        """Every parent this child ever had."""
-        named = {edge.parent for edge in self.edges}
-        return named | {self.static.parent} if self.static else named
+        """Returns every parent this child ever had."""
+        return {edge.parent for edge in (*self.edges, self.static) if edge is not None}
 
-    def at(self, time: Ns, cache_ns: Ns) -> _Edge:
-        """The edge at a time.
+    def at(self, time: Ns) -> _Edge:
+        """Returns the edge at a time.
 
         Raises:
             NoDataError: `OUTSIDE_RANGE` or `GAP`.
@@ -114,7 +105,7 @@ class _History:
             return self.edges[later - 1]
         if 0 < later < len(self.times):
             start, stop = self.times[later - 1], self.times[later]
-            if stop - start <= cache_ns:
+            if stop - start <= TF_CACHE_NS:
                 return self._between(later, (time - start) / (stop - start))
         for index in (later - 1, later):
             if 0 <= index < len(self.times):
@@ -123,7 +114,7 @@ class _History:
                     return self.edges[index]
         if self.static is not None:
             return self.static
-        raise self._nothing_at(time, later, cache_ns)
+        raise self._nothing_at(time, later)
 
     def _between(self, later: int, ratio: float) -> _Edge:
         before, after = self.edges[later - 1], self.edges[later]
@@ -131,7 +122,7 @@ class _History:
             return before
         return _Edge(before.parent, interpolate(before.transform, after.transform, ratio))
 
-    def _nothing_at(self, time: Ns, later: int, cache_ns: Ns) -> NoDataError:
+    def _nothing_at(self, time: Ns, later: int) -> NoDataError:
         first, last = self.times[0], self.times[-1]
         if 0 < later < len(self.times):
             before, after = self.times[later - 1], self.times[later]
@@ -140,7 +131,7 @@ class _History:
                 f"no transform of '{self.child}' in '{self.edges[later - 1].parent}' at"
                 f" {_unix(time)}: the nearest are at {_unix(before)} ({_s(time - before)} before)"
                 f" and {_unix(after)} ({_s(after - time)} after), and a gap longer than"
-                f" {_s(cache_ns)} is not interpolated; ask for one of these two times",
+                f" {_s(TF_CACHE_NS)} is not interpolated; ask for one of these two times",
             )
         parent = self.edges[0 if time < first else -1].parent
         off = f"{_s(first - time)} after" if time < first else f"{_s(time - last)} before"
@@ -155,7 +146,10 @@ class _History:
 
 @dataclass(frozen=True, slots=True)
 class _Walk:
-    """The way up from one frame: the frames passed, and the pose of the first in each."""
+    """The path up from one frame: the frames passed, and the pose of the first in each.
+
+    `stopped` is why the path ends where it does, if that is for lack of a transform.
+    """
 
     frames: list[str]
     poses: list[Transform]
@@ -163,25 +157,15 @@ class _Walk:
 
 
 class FrameGraph:
-    """Answers lookups between any two frames that the given transforms connect.
+    """Looks up transforms between any two frames that the given transforms connect.
 
-    Attributes:
-        clock: which time of the transforms counts, and which clock lookups are asked in.
-        skipped: transforms left out: NaN, infinite or zero rotation, an empty frame name, or a
-            frame that is its own parent.
+    Args:
+        transforms: in any order.
+        clock: which time of the transforms is used, and which clock lookups are in.
     """
 
-    def __init__(
-        self,
-        transforms: Iterable[StampedTransform],
-        clock: TfClock = "stamp",
-        *,
-        cache_ns: Ns = TF_CACHE_NS,
-    ) -> None:
-        """Takes the transforms in any order."""
-        self.clock: TfClock = clock
-        self.skipped = 0
-        self._cache_ns = cache_ns
+    def __init__(self, transforms: Iterable[StampedTransform], clock: TfClock = "stamp") -> None:
+        self._clock: TfClock = clock
         self._histories = self._histories_of(transforms)
         self._neighbours: defaultdict[str, set[str]] = defaultdict(set)
         for history in self._histories.values():
@@ -190,20 +174,11 @@ class FrameGraph:
                 self._neighbours[history.child].add(parent)
 
     def names(self) -> list[str]:
-        """Every frame, sorted."""
+        """Returns every frame, sorted."""
         return sorted(self._neighbours)
 
-    def frames(self) -> list[FrameEdge]:
-        """Every parent and child pair, sorted; a child that changed its parent has several."""
-        pairs: dict[tuple[str, str], bool] = {}
-        for history in self._histories.values():
-            if history.static is not None:
-                pairs[history.static.parent, history.child] = True
-            pairs.update(((edge.parent, history.child), False) for edge in history.edges)
-        return [FrameEdge(*pair, static) for pair, static in sorted(pairs.items())]
-
-    def lookup(self, parent: str, child: str, time: Ns) -> Lookup:
-        """The pose of `child` in `parent` at a time (tf2: target `parent`, source `child`).
+    def lookup(self, parent: str, child: str, time: Ns) -> Transform:
+        """Returns the pose of `child` in `parent` at a time (tf2: target and source).
 
         Composed along the tree through their common ancestor, in either direction.
 
@@ -215,10 +190,10 @@ class FrameGraph:
             if name not in self._neighbours:
                 raise self._unknown(name)
         up, down = self._walk(source, time), self._walk(target, time)
-        place = {frame: index for index, frame in enumerate(down.frames)}
+        target_in = dict(zip(down.frames, down.poses, strict=True))
         for frame, pose in zip(up.frames, up.poses, strict=True):
-            if frame in place:
-                return Lookup(compose(invert(down.poses[place[frame]]), pose), time)
+            if frame in target_in:
+                return compose(invert(target_in[frame]), pose)
         if source in self._tree_of(target):
             stopped = up.stopped or down.stopped
             if stopped is not None:
@@ -231,28 +206,28 @@ class FrameGraph:
         for order, entry in enumerate(transforms):
             edge, child = _usable(entry), _bare(entry.child)
             if edge is None:
-                self.skipped += 1
-            elif entry.static:
+                continue
+            if entry.static:
                 if child not in static or static[child][0] <= entry.log_time:
                     static[child] = (entry.log_time, edge)
             else:
-                time = entry.stamp if self.clock == "stamp" else entry.log_time
+                time = entry.stamp if self._clock == "stamp" else entry.log_time
                 dynamic[child].append((time, entry.log_time, order, edge))
         histories = {child: _History(child, static=edge) for child, (_, edge) in static.items()}
         for child, entries in dynamic.items():
-            # Ascending, so that of several messages for one time the last received stays.
+            # Ascending, so that of several messages for one time the last received wins.
             newest = {time: edge for time, _, _, edge in sorted(entries, key=lambda e: e[:3])}
             history = histories.setdefault(child, _History(child))
             history.times, history.edges = list(newest), list(newest.values())
         return histories
 
     def _walk(self, frame: str, time: Ns) -> _Walk:
-        """Upwards until the root, the first edge that has nothing at `time`, or a loop."""
+        """Walks up to the root, the first edge without a transform at `time`, or into a loop."""
         walk = _Walk([frame], [IDENTITY])
         seen = {frame}
         while (history := self._histories.get(walk.frames[-1])) is not None:
             try:
-                edge = history.at(time, self._cache_ns)
+                edge = history.at(time)
             except NoDataError as nothing:
                 return _Walk(walk.frames, walk.poses, nothing)
             if edge.parent in seen:
@@ -263,7 +238,7 @@ class FrameGraph:
         return walk
 
     def _tree_of(self, frame: str) -> set[str]:
-        """Every frame that some transform, at whatever time, connects to this one."""
+        """Returns every frame that some transform, at whatever time, connects to this one."""
         found, waiting = {frame}, [frame]
         while waiting:
             fresh = self._neighbours[waiting.pop()] - found
@@ -272,7 +247,7 @@ class FrameGraph:
         return found
 
     def _root_of(self, frame: str) -> str:
-        """The top of the newest known way up; in a loop, where it closes."""
+        """Returns the newest known root above a frame; in a loop, the frame where it closes."""
         seen: set[str] = set()
         while frame not in seen and (history := self._histories.get(frame)) is not None:
             seen.add(frame)
@@ -309,19 +284,18 @@ class FrameGraph:
         return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 
 
-def agreeing_clock(
-    transforms: Iterable[StampedTransform], tolerance_ns: Ns = AGREEMENT_NS
-) -> TfClock:
-    """The clock to look up in: `stamp` where header stamps agree with log time, else `log`.
+def agreeing_clock(transforms: Iterable[StampedTransform]) -> TfClock:
+    """Returns `stamp` where header stamps agree with log time, else `log`.
 
-    They agree when the median distance between the two is within the tolerance; only dynamic
-    transforms count, since a static one is stamped once and holds for ever. With none, `stamp`.
+    They agree when the median distance between the two is within `AGREEMENT_NS`; only dynamic
+    transforms count, since a static one is stamped once and is valid for ever. With none, `stamp`.
     """
     off = [abs(entry.log_time - entry.stamp) for entry in transforms if not entry.static]
-    return "stamp" if not off or statistics.median_low(off) <= tolerance_ns else "log"
+    return "stamp" if not off or statistics.median_low(off) <= AGREEMENT_NS else "log"
 
 
 def _usable(entry: StampedTransform) -> _Edge | None:
+    """Returns the edge of a transform; None where tf2 would refuse it."""
     parent, rotation = _bare(entry.parent), normalised(entry.transform.rotation)
     x, y, z = entry.transform.translation
     if rotation is None or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
@@ -336,7 +310,7 @@ def _bare(name: str) -> str:
 
 
 def _similar(name: str, known: Sequence[str]) -> list[str]:
-    """Names that hold this one or are held by it, then those spelled alike."""
+    """Returns names that contain this one or are part of it, then those spelled alike."""
     asked = name.casefold()
     by_fold = {frame.casefold(): frame for frame in known}
     parts = [frame for fold, frame in by_fold.items() if asked and (asked in fold or fold in asked)]
@@ -345,8 +319,8 @@ def _similar(name: str, known: Sequence[str]) -> list[str]:
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return ", ".join(names[:_MOST_NAMES]) + more
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return ", ".join(names[:_MAX_NAMES]) + more
 
 
 def _unix(moment: Ns) -> str:

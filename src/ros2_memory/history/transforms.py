@@ -14,7 +14,6 @@ from ros2_memory.analysis.transform_tree import (
     TF_CACHE_NS,
     FrameEdge,
     FrameGraph,
-    Lookup,
     TfClock,
     agreeing_clock,
 )
@@ -51,7 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, Transform
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
@@ -78,7 +77,7 @@ _OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAME
 class FoundTransform(NamedTuple):
     """A transform, the clock in which the moment was meant, and how far around it was read."""
 
-    lookup: Lookup
+    transform: Transform
     clock: TfClock
     reach: Ns = TF_CACHE_NS
 
@@ -150,7 +149,7 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
 
 
 def _alike(one: FoundTransform, other: FoundTransform) -> bool:
-    return alike(one.lookup.transform, other.lookup.transform)
+    return alike(one.transform, other.transform)
 
 
 def _transform_in(view: View, among: Session, frames: tuple[str, str], at: Ns) -> FoundTransform:

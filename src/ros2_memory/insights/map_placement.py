@@ -149,7 +149,7 @@ class MapPlacement:
             graph = graph_of(self.view, static, self._moving[session])
             self._graphs[session, number] = graph
         try:
-            return graph.lookup(self.frame_id, self.pose_frame, time).transform
+            return graph.lookup(self.frame_id, self.pose_frame, time)
         except NoDataError:
             return None
 
@@ -173,7 +173,7 @@ class MapPlacement:
     def _by_static_alone(self, static: list[StampedTransform]) -> Transform | None:
         graph = graph_of(self.view, holding_at(static, MIN_NS), ())
         try:
-            return graph.lookup(self.frame_id, self.pose_frame, 0).transform
+            return graph.lookup(self.frame_id, self.pose_frame, 0)
         except NoDataError:
             return None
 

@@ -363,7 +363,7 @@ def _spot(
             )
         except NoDataError:
             continue
-        pose = found_transform.lookup.transform
+        pose = found_transform.transform
         x, y, z = rotate(pose.rotation, thing.place)
         dx, dy, dz = pose.translation
         return Spot(thing.label, (x + dx, y + dy, z + dz), target)

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyp
 
 from ros2_memory.analysis.transform_tree import (
     TF_CACHE_NS,
-    FrameEdge,
     FrameGraph,
     agreeing_clock,
 )
@@ -53,7 +52,7 @@ def edge(
 
 
 def shift(graph: FrameGraph, parent: str, child: str, time: int) -> float:
-    return graph.lookup(parent, child, time).transform.translation[0]
+    return graph.lookup(parent, child, time).translation[0]
 
 
 def refusal(graph: FrameGraph, parent: str, child: str, time: int) -> NoDataError:
@@ -96,7 +95,7 @@ def test_a_lookup_is_the_product_of_the_matrices_on_the_way(
         in_root[held.child] = in_root[held.parent] @ matrix(held.transform)
     names = st.sampled_from(sorted(in_root))
     parent, child = data.draw(names), data.draw(names)
-    found = FrameGraph(tree).lookup(parent, child, 5).transform
+    found = FrameGraph(tree).lookup(parent, child, 5)
     assert np.allclose(matrix(found), np.linalg.inv(in_root[parent]) @ in_root[child], atol=1e-7)
 
 
@@ -107,12 +106,12 @@ def test_a_lookup_backwards_is_the_inverse(
     graph = FrameGraph(tree)
     names = st.sampled_from(graph.names())
     a, b = data.draw(names), data.draw(names)
-    forth, back = graph.lookup(a, b, 5).transform, graph.lookup(b, a, 5).transform
+    forth, back = graph.lookup(a, b, 5), graph.lookup(b, a, 5)
     assert np.allclose(matrix(forth), matrix(invert(back)), atol=1e-7)
 
 
 def test_a_frame_in_itself_is_the_identity_whenever_it_is_asked() -> None:
-    assert FrameGraph(moving()).lookup("base", "base", 7).transform == IDENTITY
+    assert FrameGraph(moving()).lookup("base", "base", 7) == IDENTITY
 
 
 def test_frames_on_two_branches_meet_at_their_common_ancestor() -> None:
@@ -129,10 +128,6 @@ def test_frames_on_two_branches_meet_at_their_common_ancestor() -> None:
     assert shift(graph, "odom", "camera", 100 * S) == 5.0
 
 
-def test_an_answer_carries_the_time_that_was_asked() -> None:
-    assert FrameGraph(moving()).lookup("odom", "base", 102 * S + 7).time == 102 * S + 7
-
-
 # Interpolation
 
 
@@ -142,7 +137,7 @@ def test_between_two_messages_translation_is_linear_and_rotation_slerp(
 ) -> None:
     start = 1_700_000_000 * S
     graph = FrameGraph([edge("a", "b", start, first), edge("a", "b", start + TF_CACHE_NS, second)])
-    found = graph.lookup("a", "b", start + after).transform
+    found = graph.lookup("a", "b", start + after)
     ratio = after / TF_CACHE_NS
     ends = Rotation.from_quat([first.rotation, second.rotation])
     line = np.array(first.translation) * (1 - ratio) + np.array(second.translation) * ratio
@@ -160,7 +155,7 @@ def test_messages_may_come_in_any_order(shuffled: list[StampedTransform], time: 
 def test_at_a_messages_own_time_its_transform_holds_exactly() -> None:
     odd = Transform((0.1, 0.2, 0.3), (0.5, 0.5, 0.5, 0.5))
     graph = FrameGraph([edge("a", "b", 1, 1.0), edge("a", "b", 2, odd), edge("a", "b", 3, 1.0)])
-    assert graph.lookup("a", "b", 2).transform == odd
+    assert graph.lookup("a", "b", 2) == odd
 
 
 def test_of_two_messages_for_one_time_the_later_received_holds() -> None:
@@ -175,8 +170,7 @@ def test_of_two_transforms_in_one_message_the_last_holds() -> None:
 
 def test_a_quaternion_that_is_not_of_unit_length_is_normalised() -> None:
     graph = FrameGraph([edge("a", "b", 0, Transform((0.0, 0.0, 0.0), (0.0, 0.0, 2.0, 2.0)))])
-    assert graph.lookup("a", "b", 0).transform.rotation == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
-    assert graph.skipped == 0
+    assert graph.lookup("a", "b", 0).rotation == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
 
 
 # Parents that change
@@ -203,13 +197,7 @@ def test_between_two_parents_the_earlier_message_holds_as_it_is(second: int, pla
     assert shift(picked_up(), "map", "cup", second * S) == pytest.approx(place)
 
 
-def test_every_pair_that_ever_was_is_listed() -> None:
-    assert picked_up().frames() == [
-        FrameEdge("gripper", "cup", static=False),
-        FrameEdge("map", "gripper", static=True),
-        FrameEdge("map", "table", static=True),
-        FrameEdge("table", "cup", static=False),
-    ]
+def test_every_frame_is_listed() -> None:
     assert picked_up().names() == ["cup", "gripper", "map", "table"]
 
 
@@ -254,14 +242,12 @@ def test_of_several_static_transforms_the_newest_received_holds() -> None:
     for order in ([older, newer], [newer, older]):
         graph = FrameGraph(order)
         assert shift(graph, "torso", "laser", 0) == 2.0
-        assert graph.frames() == [FrameEdge("torso", "laser", static=True)]
 
 
 def test_a_child_published_both_ways_is_dynamic_where_its_messages_reach() -> None:
     graph = FrameGraph([edge("odom", "base", 0, 9.0, static=True), *moving()])
     assert shift(graph, "odom", "base", 102 * S) == 2.0
     assert shift(graph, "odom", "base", 99 * S) == 9.0
-    assert graph.frames() == [FrameEdge("odom", "base", static=False)]
 
 
 # What is left out
@@ -279,9 +265,8 @@ def test_a_child_published_both_ways_is_dynamic_where_its_messages_reach() -> No
         edge("odom", "/", 103 * S + 1),
     ],
 )
-def test_a_transform_that_says_nothing_is_left_out_and_counted(bad: StampedTransform) -> None:
+def test_a_transform_that_says_nothing_is_left_out(bad: StampedTransform) -> None:
     graph = FrameGraph([*moving(), bad])
-    assert graph.skipped == 1
     assert graph.names() == ["base", "odom"]
     assert shift(graph, "odom", "base", 103 * S + 1) == pytest.approx(3.0)
 
@@ -360,13 +345,6 @@ def test_a_refusal_names_the_parent_of_the_nearest_message() -> None:
     assert "of 'cup' in 'a' at 5.0" in refusal(graph, "a", "cup", 5 * S).detail
 
 
-def test_the_width_of_a_gap_is_the_callers_to_choose() -> None:
-    pair = [edge("odom", "base", 100 * S, 0.0), edge("odom", "base", 104 * S, 1.0)]
-    assert shift(FrameGraph(pair), "odom", "base", 102 * S) == 0.5
-    narrow = FrameGraph(pair, cache_ns=3 * S)
-    assert refusal(narrow, "odom", "base", 102 * S).reason is NoDataReason.GAP
-
-
 @given(st.integers(1_600_000_000 * S, 1_800_000_000 * S), st.integers(11 * S, 10**6 * S))
 def test_every_time_that_a_refusal_offers_can_be_asked(first: int, width: int) -> None:
     graph = FrameGraph([edge("odom", "base", first), edge("odom", "base", first + width)])
@@ -375,7 +353,7 @@ def test_every_time_that_a_refusal_offers_can_be_asked(first: int, width: int) -
         offered = [float(text) for text in re.findall(r"\d{10}\.\d{6}", detail)]
         assert len(offered) == 3  # the time asked, and both of those offered
         for seconds in offered[1:]:
-            assert graph.lookup("odom", "base", ns_from_unix(seconds)).transform == IDENTITY
+            assert graph.lookup("odom", "base", ns_from_unix(seconds)) == IDENTITY
 
 
 # Clocks
@@ -405,13 +383,8 @@ def test_static_transforms_say_nothing_of_the_clock() -> None:
     assert agreeing_clock(latched) == "stamp"
 
 
-def test_the_tolerance_between_the_clocks_can_be_chosen() -> None:
-    assert agreeing_clock(replayed(S), tolerance_ns=S // 2) == "log"
-
-
 def test_a_graph_on_log_time_is_asked_in_log_time() -> None:
     graph = FrameGraph(replayed(1000 * S), "log")
-    assert graph.clock == "log"
     assert shift(graph, "odom", "base", 1101 * S) == 1.0
     assert refusal(graph, "odom", "base", 101 * S).reason is NoDataReason.OUTSIDE_RANGE
 
@@ -439,7 +412,7 @@ def test_lookups_on_public_bags_are_those_of_independent_tools(
     target, source, stamp = str(case["target"]), str(case["source"]), case["stamp_ns"]
     assert isinstance(stamp, int)
     if "error" not in case:
-        found = graph.lookup(target, source, stamp).transform
+        found = graph.lookup(target, source, stamp)
         assert found.translation == pytest.approx(case["translation"], abs=2e-6)
         turned = Rotation.from_quat(found.rotation).inv() * Rotation.from_quat(case["q_xyzw"])
         assert turned.magnitude() < 5e-6
@@ -461,5 +434,5 @@ def test_a_yaw_between_two_messages_turns_the_shorter_way() -> None:
     turns = [(0.0, 0.0, math.sin(half), math.cos(half)) for half in (1.5, -1.5)]
     ends = [Transform((0.0, 0.0, 0.0), turn) for turn in turns]
     graph = FrameGraph([edge("a", "b", 0, ends[0]), edge("a", "b", 2, ends[1])])
-    turned = Rotation.from_quat(graph.lookup("a", "b", 1).transform.rotation)
+    turned = Rotation.from_quat(graph.lookup("a", "b", 1).rotation)
     assert abs(turned.as_euler("xyz")[2]) == pytest.approx(math.pi)
