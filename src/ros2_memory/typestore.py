@@ -1,12 +1,12 @@
-"""Message definitions: which bytes a type is made of, and a deserializer for each.
+"""Message definitions: the fields of each type, and a deserializer for it.
 
-A definition is looked for in this order: inside the bag (the schema text, nested types included),
-in the configured `.msg` folders, among the standard types. Every distinct schema text gets a
-typestore of its own, so two bags that define one type differently are each read with their own.
+A definition is looked up in this order: in the bag (the schema text, nested types included), in the
+configured `.msg` folders, among the standard types. Every distinct schema text gets a typestore of
+its own, so two bags that define one type differently are each read with their own.
 
 Definitions are read from files that anybody may have written. Their size, nesting and arrays are
-bounded before the parser and the code generator of rosbags see them: both take exponential time
-or memory on some inputs.
+bounded before the parser and the code generator of rosbags see them: both take exponential time or
+memory on some inputs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MAX_UNROLLED: Final = 5_000
 """Elements of fixed arrays of strings or messages: rosbags writes a line of code for each."""
 MAX_CACHED_TYPES: Final = 4_096
 MAX_CACHED_BYTES: Final = 8 << 20
-"""Of their texts: what is made of a text takes some ten times as much."""
+"""Of definitions whose deserializers are cached; a deserializer takes some ten times as much."""
 _REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
@@ -55,10 +55,10 @@ _IDL_NESTED_SEQUENCE: Final = re.compile(r"sequence\s*<\s*sequence")
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """How one schema is deserialized, or the reason why it cannot be (one of both is None).
+    """The deserializer of one schema, or the reason why there is none (one of both is None).
 
     `fieldless`: the definition has no field, so any payload of more than a byte contradicts it.
-    `definitions` are those of the type and of all that it is made of; None with a reason.
+    `definitions` are those of the type and of its nested types; None with a reason.
     """
 
     name: str
@@ -78,14 +78,14 @@ class _Section(NamedTuple):
 
 
 class Typestores:
-    """Deserializers by schema content. Safe to use from several threads at once.
+    """Deserializers by schema content. Thread-safe.
 
     Args:
-        custom_msg_paths: folders in which `<package>/msg/*.msg` lie, at any depth, or a package.
-            A type that stands in several is taken from the first.
+        custom_msg_paths: folders that contain `<package>/msg/*.msg` at any depth, or a package.
+            A type that is in several is taken from the first.
 
     Raises:
-        ConfigError: a path is not a folder, holds no `.msg` file, or cannot be read.
+        ConfigError: a path is not a folder, has no `.msg` file in it, or cannot be read.
     """
 
     def __init__(self, custom_msg_paths: Sequence[Path | str] = ()) -> None:
@@ -99,25 +99,26 @@ class Typestores:
         self._lock = threading.Lock()
 
     def lookup(self, name: str, encoding: str, text: bytes) -> MessageType:
-        """The type that a schema of a bag stands for.
+        """Returns the type that a schema of a bag defines.
 
         Args:
             name: the type, `package/msg/Name`.
-            encoding: `ros2msg`, `ros2idl`, or empty where the bag holds no definition.
-            text: the definition with the nested ones behind it, as rosbag2 concatenates them.
+            encoding: `ros2msg`, `ros2idl`, or empty where the bag has no definition.
+            text: the definition followed by the nested ones, as rosbag2 concatenates them.
         """
         key = (name, encoding, text)
         known = self._types.get(key)
         if known is not None:
             return known
+        # One thread at a time compiles: another that waits here then finds the type.
         with self._lock:
             known = self._types.get(key)
             if known is None:
                 known = self._build(name, encoding, text)
-                self._keep(key, known)
+                self._cache(key, known)
             return known
 
-    def _keep(self, key: tuple[str, str, bytes], made: MessageType) -> None:
+    def _cache(self, key: tuple[str, str, bytes], made: MessageType) -> None:
         size = len(key[0]) + len(key[2])
         if size > MAX_CACHED_BYTES:
             return
@@ -141,7 +142,7 @@ class Typestores:
         return MessageType(name, deserialize, None, not definitions[root][1], definitions)
 
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
-        """The definitions of `root` and of all that it is made of, checked to be bounded."""
+        """Returns the definitions of `root` and of all nested types, checked to be bounded."""
         found: Typesdict = {}
         finished: set[str] = set()
         members = unrolled = 0
@@ -194,7 +195,7 @@ class Typestores:
 
 
 def _sections(name: str, encoding: str, text: bytes) -> dict[str, _Section]:
-    """The definitions in one schema text, by type name."""
+    """Returns the definitions in one schema text, by type name."""
     if encoding not in {"", "ros2msg", "ros2idl", "omgidl"}:
         raise _UnusableError(f"its schema encoding {encoding!r} is not read")
     if len(text) > MAX_TEXT_BYTES:
@@ -218,7 +219,7 @@ def _sections(name: str, encoding: str, text: bytes) -> dict[str, _Section]:
 
 
 def full_name(name: str) -> str:
-    """`package/Name` as `package/msg/Name`."""
+    """Returns `package/Name` as `package/msg/Name`."""
     parts = name.split("/")
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
@@ -230,9 +231,10 @@ def _parse(name: str, section: _Section) -> Typesdict:
     statements = text.count(";" if section.encoding == "ros2idl" else "\n")
     if statements > MAX_STATEMENTS:
         raise _UnusableError(f"its definition of {name} has {statements} statements, too many")
-    parse = get_types_from_idl if section.encoding == "ros2idl" else _types_from_msg(name)
     try:
-        return parse(text)
+        if section.encoding == "ros2idl":
+            return get_types_from_idl(text)
+        return get_types_from_msg(text, name)
     # The parser raises its own error, or whatever Python does with what it took for a number.
     except Exception as error:
         reason = f"its definition of {name} cannot be parsed: {_brief(error)}"
@@ -250,15 +252,11 @@ def _compiled(definitions: Typesdict, root: str) -> Typestore:
     return store
 
 
-def _types_from_msg(name: str) -> Callable[[str], Typesdict]:
-    return lambda text: get_types_from_msg(text, name)
-
-
 def _plain_idl(text: str) -> str:
-    """IDL without comments and annotations, refused where the parser would not come to an end.
+    """Returns IDL without comments and annotations; refuses what the parser would not finish.
 
-    rosbags parses an expression 128 times for each parenthesis around it, and a sequence twice
-    for each sequence around it; message definitions need neither.
+    rosbags parses an expression 128 times for each parenthesis around it, and a sequence twice for
+    each sequence around it; message definitions need neither.
     """
     kept: list[str] = []
     depth = 0
@@ -280,7 +278,7 @@ def _plain_idl(text: str) -> str:
 
 
 def _nested_type(field: FieldDesc) -> str | None:
-    """The message type that a field holds, alone or in an array; None for a primitive."""
+    """Returns the message type of a field, alone or in an array; None for a primitive."""
     if field[0] == Nodetype.NAME:
         return str(field[1])
     if field[0] == Nodetype.ARRAY or field[0] == Nodetype.SEQUENCE:
@@ -290,7 +288,7 @@ def _nested_type(field: FieldDesc) -> str | None:
 
 
 def _unrolled(field: FieldDesc) -> int:
-    """Elements that generated code spells out one by one."""
+    """Returns how many elements generated code spells out one by one."""
     if field[0] != Nodetype.ARRAY:
         return 0
     element, count = field[1]
@@ -299,7 +297,7 @@ def _unrolled(field: FieldDesc) -> int:
 
 
 def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
-    """(type name, text) of every `<package>/msg/<Name>.msg` below or of the folder."""
+    """Yields (type name, text) of every `<package>/msg/<Name>.msg` below the folder."""
     if not folder.is_dir():
         raise ConfigError(
             f"reader.custom_msg_paths: {folder} is not a folder; give a folder of packages, or one"
@@ -321,7 +319,7 @@ def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def _package_name(package: Path) -> str:
-    """The name in package.xml, else the folder's."""
+    """Returns the name in package.xml, else the folder's."""
     manifest = package / "package.xml"
     if manifest.is_file():
         text = manifest.read_text(encoding="utf-8", errors="replace")
@@ -332,6 +330,6 @@ def _package_name(package: Path) -> str:
 
 
 def _brief(error: Exception) -> str:
-    """One line of an error whose text may hold the whole definition."""
+    """Returns one line of an error whose text may contain the whole definition."""
     words = " ".join(f"{error}".split()) or "no reason given"
     return f"{type(error).__name__}: {words[:160]}"

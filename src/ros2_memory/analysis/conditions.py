@@ -1,7 +1,8 @@
 """Conditions on one extracted value: `contains`, `equals`, `above`, `below`, `near_position`.
 
 They are tested on the whole value, before anything in it is downsampled or rounded. NaN and null
-match nothing.
+match nothing. `refusal_for` says where no value of a shape can match: a search for a field that
+the values do not have would find nothing, and the answer "never" would be false.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ros2_memory.core.geometry import distance
 from ros2_memory.core.text import abbreviate
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.zone_map import ZoneMap
     from ros2_memory.core.model import JsonValue, Vector3
@@ -31,6 +32,7 @@ POSITION_KEYS: Final = ("position", "point", "translation")
 # Bounded, since int() refuses texts of thousands of digits.
 _WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
 _DECIMAL: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+_LISTED_PATHS: Final = 16
 _INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 _EXAMPLES: Final = {
     "contains": 'condition_type "contains", value "scissors"',
@@ -45,12 +47,12 @@ _SIDES: Final = {"above": True, "below": False}
 
 @dataclass(frozen=True, slots=True)
 class Contains:
-    """Part of a text, or an element of a list.
+    """Part of a string, or an element of a list.
 
-    A text is found inside any string at any depth (not in the keys), without regard to case; a
-    boolean wherever one is equal. A number is a whole value, never a part of one, and is looked
-    for only where a field leads (`has_element`): in a whole message every size, level and
-    coordinate would match. Elsewhere its digits are a text like any other.
+    A string is found inside any string at any depth (not in the keys), without regard to case; a
+    boolean wherever one is equal. A number is a whole value, never a part of one, and is searched
+    only where a field leads (`has_element`): in a whole message every size, level and coordinate
+    would match. Elsewhere its digits are searched as a string.
     """
 
     needle: Scalar
@@ -59,7 +61,7 @@ class Contains:
     _boolean: bool | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        meant = _spelled(self.needle) if isinstance(self.needle, str) else self.needle
+        meant = _meaning(self.needle)
         text = _text_of(self.needle)
         object.__setattr__(self, "equal", Equals(self.needle))
         object.__setattr__(self, "_folded", None if text is None else text.casefold())
@@ -68,11 +70,11 @@ class Contains:
     @property
     def is_number(self) -> bool:
         """Whether the needle is a number or spells one."""
-        meant = _spelled(self.needle) if isinstance(self.needle, str) else self.needle
+        meant = _meaning(self.needle)
         return isinstance(meant, int | float) and not isinstance(meant, bool)
 
     def matches(self, value: JsonValue) -> bool:
-        """Whether some text of the value contains the needle, or some boolean is equal to it."""
+        """Returns whether a string of the value contains the needle, or a boolean equals it."""
         for leaf in leaves(value):
             if isinstance(leaf, str):
                 if self._folded is not None and self._folded in leaf.casefold():
@@ -82,26 +84,26 @@ class Contains:
         return False
 
     def has_element(self, target: JsonValue) -> bool:
-        """Whether the target of a field is equal to the needle, or is a list with such an element.
+        """Returns whether the target of a field is equal, or is a list with such an element.
 
-        Elements of lists in it count too, what stands in an object does not.
+        Elements of nested lists count too, fields of objects in them do not.
         """
         return any(self.equal.is_leaf(each) for each in elements(target))
 
-    def can_match(self, evidence: ZoneMap) -> bool:
-        """Whether some value of which this is the evidence may contain the needle."""
-        if self._folded is not None and evidence.can_contain_text(self._folded):
+    def can_match(self, zone_map: ZoneMap) -> bool:
+        """Returns whether some value of this zone map may contain the needle."""
+        if self._folded is not None and zone_map.can_contain_text(self._folded):
             return True
-        return self._boolean is not None and evidence.can_contain_boolean(self._boolean)
+        return self._boolean is not None and zone_map.can_contain_boolean(self._boolean)
 
 
 @dataclass(frozen=True, slots=True)
 class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
-    1 and 0 are equal to true and false. A number is equal to itself and to its float32 rounding,
-    which is what a float32 field holds of it. A string is compared to the letter; one that spells
-    a boolean or a number is equal to that, too, since planners put values in quotes.
+    1 and 0 equal true and false. A number equals itself and its float32 rounding, which is what a
+    float32 field stores of it. Strings are compared exactly; one that spells a boolean or a number
+    equals that too, since planners put values in quotes.
     """
 
     value: Scalar
@@ -109,26 +111,26 @@ class Equals:
     _numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        meant = _spelled(self.value) if isinstance(self.value, str) else self.value
+        meant = _meaning(self.value)
         boolean = bool(meant) if meant is not None and meant in (0, 1) else None
         numbers = () if meant is None else (meant, _float32(meant))
         object.__setattr__(self, "_boolean", boolean)
         object.__setattr__(self, "_numbers", numbers)
 
     def matches(self, value: JsonValue) -> bool:
-        """Whether any leaf at any depth is equal."""
+        """Returns whether any leaf at any depth is equal."""
         return any(self.is_leaf(leaf) for leaf in leaves(value))
 
-    def can_match(self, evidence: ZoneMap) -> bool:
-        """Whether some value of which this is the evidence may have such a leaf."""
-        if isinstance(self.value, str) and evidence.can_contain_text(self.value.casefold()):
+    def can_match(self, zone_map: ZoneMap) -> bool:
+        """Returns whether some value of this zone map may have such a leaf."""
+        if isinstance(self.value, str) and zone_map.can_contain_text(self.value.casefold()):
             return True
-        if self._boolean is not None and evidence.can_contain_boolean(self._boolean):
+        if self._boolean is not None and zone_map.can_contain_boolean(self._boolean):
             return True
-        return any(evidence.can_contain_number(number) for number in self._numbers)
+        return any(zone_map.can_contain_number(number) for number in self._numbers)
 
     def is_leaf(self, leaf: JsonValue) -> bool:
-        """Whether this leaf is equal."""
+        """Returns whether this leaf is equal."""
         if isinstance(leaf, bool):
             return leaf is self._boolean
         if isinstance(leaf, int | float):
@@ -138,22 +140,22 @@ class Equals:
 
 @dataclass(frozen=True, slots=True)
 class Beyond:
-    """A number on one side of a limit, which is not part of it; a boolean is no number."""
+    """A number above or below a limit, the limit excluded; a boolean is no number."""
 
     limit: int | float
     above: bool
 
     def matches(self, value: JsonValue) -> bool:
-        """Whether any number at any depth is on that side."""
+        """Returns whether any number at any depth is on that side."""
         return any(
             self._is_beyond(leaf)
             for leaf in leaves(value)
             if isinstance(leaf, int | float) and not isinstance(leaf, bool)
         )
 
-    def can_match(self, evidence: ZoneMap) -> bool:
-        """Whether some value of which this is the evidence may hold such a number."""
-        return evidence.open or self._is_beyond(evidence.high if self.above else evidence.low)
+    def can_match(self, zone_map: ZoneMap) -> bool:
+        """Returns whether some value of this zone map may have such a number."""
+        return zone_map.open or self._is_beyond(zone_map.high if self.above else zone_map.low)
 
     def _is_beyond(self, number: float) -> bool:
         return number > self.limit if self.above else number < self.limit
@@ -161,10 +163,10 @@ class Beyond:
 
 @dataclass(frozen=True, slots=True)
 class NearPosition:
-    """A place (m) within `tolerance_m`, inclusive; in the plane where `z` is None.
+    """A position (m) within `tolerance_m`, inclusive; in the plane where `z` is None.
 
     The frame is the value's own. A position without a finite x and y (and z, where one is asked)
-    is near nothing.
+    never matches.
     """
 
     x: float
@@ -173,20 +175,20 @@ class NearPosition:
     tolerance_m: float
 
     def matches(self, value: JsonValue) -> bool:
-        """Whether any position in the value is near."""
+        """Returns whether any position in the value is near."""
         return any(self.is_near(x, y, z) for x, y, z in positions(value))
 
-    def can_match(self, evidence: ZoneMap) -> bool:
-        """Whether some value of which this is the evidence may hold a position that is near."""
-        return evidence.can_contain_place(self.x, self.y, self.z, self.tolerance_m)
+    def can_match(self, zone_map: ZoneMap) -> bool:
+        """Returns whether some value of this zone map may have a position that is near."""
+        return zone_map.can_contain_place(self.x, self.y, self.z, self.tolerance_m)
 
-    def can_match_elsewhere(self, evidence: ZoneMap) -> bool:
-        """As `can_match`, for positions that stand where only a field leads to."""
+    def can_match_elsewhere(self, zone_map: ZoneMap) -> bool:
+        """Returns the same for a position that only a field leads to, whose numbers are known."""
         axes = (self.x, self.y) if self.z is None else (self.x, self.y, self.z)
-        return all(evidence.can_contain_number_near(axis, self.tolerance_m) for axis in axes)
+        return all(zone_map.can_contain_number_near(axis, self.tolerance_m) for axis in axes)
 
     def is_near(self, x: float, y: float, z: float) -> bool:
-        """Whether this position (m) is near; its z may be NaN where none is asked."""
+        """Returns whether a position (m) is near; its z may be NaN where none is asked."""
         here: Vector3 = (x, y, 0.0 if self.z is None else z)
         return distance(here, (self.x, self.y, self.z or 0.0)) <= self.tolerance_m
 
@@ -196,13 +198,13 @@ Test: TypeAlias = Contains | Equals | Beyond | NearPosition
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A test, and the dot-path of the part of the value that it is put to (None: all of it)."""
+    """A test, and the dot-path of the part of the value that it is applied to (None: all of it)."""
 
     test: Test
     field: str | None = None
 
     def matches(self, value: JsonValue) -> bool:
-        """Whether the value, or any target of the field in it, meets the test."""
+        """Returns whether the value, or any target of the field in it, passes the test."""
         if self.field is None:
             return self.test.matches(value)
         return any(self._meets(target) for target in at_field(value, self.field))
@@ -212,35 +214,45 @@ class Condition:
             return True
         return self.test.matches(target)
 
-    def can_match(self, evidence: ZoneMap) -> bool:
-        """Whether some value of which this is the evidence may match; False rules all of them out.
+    def can_match(self, zone_map: ZoneMap) -> bool:
+        """Returns whether some value of this zone map may match; False rules all of them out.
 
-        What a field leads to is part of the value, so what the whole value rules out is out.
+        The target of a field is part of the value, so whatever the whole value rules out is out.
         """
         if self.field is not None and isinstance(self.test, NearPosition):
-            return self.test.can_match_elsewhere(evidence)
+            return self.test.can_match_elsewhere(zone_map)
         if self.field is not None and isinstance(self.test, Contains):
-            return self.test.can_match(evidence) or self.test.equal.can_match(evidence)
-        return self.test.can_match(evidence)
+            return self.test.can_match(zone_map) or self.test.equal.can_match(zone_map)
+        return self.test.can_match(zone_map)
+
+    @property
+    def can_be_refused(self) -> bool:
+        """Whether some values have a shape that cannot match; see `refusal_for`."""
+        test = self.test
+        return (
+            self.field is not None
+            or isinstance(test, NearPosition)
+            or (isinstance(test, Contains) and test.is_number)
+        )
 
     @property
     def place(self) -> NearPosition | None:
-        """The place that alone decides what may match; None where something else does."""
+        """The test, if it is `near_position` without a field, where boxes alone decide."""
         return self.test if self.field is None and isinstance(self.test, NearPosition) else None
 
 
 def parse_condition(
     condition_type: str, value: JsonValue, tolerance_m: float, field: str | None = None
 ) -> Condition:
-    """The condition that a planner's arguments mean.
+    """Returns the condition that a planner's arguments describe.
 
     Args:
         condition_type: `contains`, `equals`, `above`, `below` or `near_position`.
-        value: a text, number or boolean; for `above` and `below` a number; for `near_position` an
-            object with x, y and perhaps z.
+        value: a string, number or boolean; for `above` and `below` a number; for `near_position`
+            an object with x, y and perhaps z.
         tolerance_m: how near `near_position` is.
         field: dot-path in the value that narrows the test; None or blank for all of it. `above`
-            and `below` need one: most messages hold numbers of many kinds.
+            and `below` need one: most messages have numbers of many kinds.
 
     Raises:
         InvalidArgumentsError: the sentence says what is wrong and gives an example.
@@ -256,10 +268,10 @@ def parse_condition(
 
 
 def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
-    """What stands at a dot-path in an extracted value; empty where there is nothing.
+    """Returns what is at a dot-path in an extracted value; empty where there is nothing.
 
-    Over a list the path goes on in every element, unless the segment is a whole number: that one
-    element (negative: from the end). `detections.label` gives every label, `detections.0.label`
+    Over a list the path goes on in every element, unless the segment is a whole number, which
+    selects one (negative: from the end). `detections.label` gives every label, `detections.0.label`
     the first.
     """
     found: list[JsonValue] = [value]
@@ -269,10 +281,10 @@ def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
 
 
 def positions(value: JsonValue) -> Iterator[Vector3]:
-    """The positions (m) in a value, with NaN for a coordinate that is missing or null.
+    """Yields the positions (m) in a value, with NaN for a coordinate that is missing or null.
 
-    The value itself where it is an object with x and y, or the elements of a list of those;
-    else the objects found at any depth under `position`, `point` or `translation`.
+    The value itself where it is an object with x and y, or the elements of a list of those; else
+    the objects found at any depth under `position`, `point` or `translation`.
     """
     own = list(_own_positions(value))
     if own:
@@ -301,8 +313,9 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
         )
     example = f"for example {_EXAMPLES[condition_type]}"
     if condition_type in _SIDES:
-        limit = _spelled(value) if isinstance(value, str) else value
-        if isinstance(limit, int | float) and not isinstance(limit, bool) and _is_limit(limit):
+        limit = _meaning(value) if isinstance(value, Scalar) else None
+        is_nan = isinstance(limit, float) and math.isnan(limit)
+        if limit is not None and not isinstance(limit, bool) and not is_nan:
             return Beyond(limit, _SIDES[condition_type])
         raise InvalidArgumentsError(
             f"'{condition_type}' takes a number as value, not {_kind(value)}; {example}"
@@ -321,10 +334,6 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
     return Contains(value)
 
 
-def _is_limit(number: float) -> bool:
-    return isinstance(number, int) or not math.isnan(number)
-
-
 def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
     example = f"for example {_EXAMPLES['near_position']}"
     if not isinstance(value, dict):
@@ -336,8 +345,10 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
         raise InvalidArgumentsError(
             f"'near_position' knows x, y and z only, not {abbreviate(unknown)}; {example}"
         )
-    for axis in ("x", "y", "z") if value.get("z") is not None else ("x", "y"):
-        if not math.isfinite(_coordinate(value.get(axis))):
+    x, y = _coordinate(value.get("x")), _coordinate(value.get("y"))
+    z = None if value.get("z") is None else _coordinate(value["z"])
+    for axis, coordinate in (("x", x), ("y", y), ("z", z)):
+        if coordinate is not None and not math.isfinite(coordinate):
             raise InvalidArgumentsError(
                 f"'{axis}' of 'near_position' must be a finite number of metres,"
                 f" not {_kind(value.get(axis))}; {example}"
@@ -346,17 +357,11 @@ def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:
         raise InvalidArgumentsError(
             f"the tolerance must be a finite number of metres, 0 or more, not {tolerance_m}"
         )
-    z = value.get("z")
-    return NearPosition(
-        _coordinate(value["x"]),
-        _coordinate(value["y"]),
-        None if z is None else _coordinate(z),
-        float(tolerance_m),
-    )
+    return NearPosition(x, y, z, float(tolerance_m))
 
 
 def _kind(value: JsonValue) -> str:
-    """A value as it is named in a sentence."""
+    """Returns a value as a sentence names it."""
     if isinstance(value, list):
         return "a list"
     return "an object" if isinstance(value, dict) else abbreviate(value)
@@ -377,7 +382,7 @@ def _step(held: JsonValue, segment: str) -> Iterator[JsonValue]:
 
 
 def leaves(value: JsonValue) -> Iterator[JsonValue]:
-    """Everything at any depth that is neither a list nor an object."""
+    """Yields everything at any depth that is neither a list nor an object."""
     waiting = [value]
     while waiting:
         held = waiting.pop()
@@ -390,7 +395,7 @@ def leaves(value: JsonValue) -> Iterator[JsonValue]:
 
 
 def elements(value: JsonValue) -> Iterator[JsonValue]:
-    """The value itself or, where it is a list, its elements and those of the lists in it."""
+    """Yields the value itself or, where it is a list, its elements and those of the lists in it."""
     waiting = [value]
     while waiting:
         held = waiting.pop()
@@ -411,7 +416,7 @@ def _own_positions(value: JsonValue) -> Iterator[Vector3]:
 
 
 def _coordinate(value: JsonValue) -> float:
-    """The number as metres; NaN for anything else, so that it is near nothing."""
+    """Returns a number as metres; NaN for anything else, so that it is near nothing."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
     try:
@@ -420,9 +425,11 @@ def _coordinate(value: JsonValue) -> float:
         return math.inf
 
 
-def _spelled(text: str) -> bool | int | float | None:
-    """The boolean or number that a text spells."""
-    word = text.strip().casefold()
+def _meaning(value: Scalar) -> bool | int | float | None:
+    """Returns a boolean or number as it is, or the one that a string spells, if any."""
+    if not isinstance(value, str):
+        return value
+    word = value.strip().casefold()
     if word in {"true", "false"}:
         return word == "true"
     if _WHOLE.fullmatch(word):
@@ -431,7 +438,7 @@ def _spelled(text: str) -> bool | int | float | None:
 
 
 def _text_of(needle: Scalar) -> str | None:
-    """The needle as a text: JSON's where it is none; None for a number too long to be one."""
+    """Returns the needle as a string, in JSON's spelling; None for a number too long to spell."""
     if isinstance(needle, str):
         return needle
     try:
@@ -441,9 +448,94 @@ def _text_of(needle: Scalar) -> str | None:
 
 
 def _float32(number: float) -> float:
-    """The number rounded to a float32; itself where a float32 cannot hold it."""
+    """Returns the number rounded to a float32; itself where a float32 cannot represent it."""
     try:
         rounded: float = struct.unpack("<f", struct.pack("<f", number))[0]
     except (OverflowError, struct.error):
         return number
     return rounded
+
+
+def refusal_for(condition: Condition, value: JsonValue) -> str | None:
+    """Returns why no value of this shape can match; None where one may.
+
+    An empty list or a null in the value may be anything in another message, so nothing is refused
+    for what would be below it.
+    """
+    if condition.field is not None:
+        if _is_unknown_below(value, condition.field):
+            return None
+        targets = at_field(value, condition.field)
+        if targets:
+            return _refusal_for_number(condition, targets)
+        known = ", ".join(_paths(value)) or "none"
+        return f"the values have no field {condition.field!r}; their fields are: {known}"
+    if isinstance(condition.test, NearPosition):
+        if any(True for _ in positions(value)) or _has_unknown_part(value):
+            return None
+        return _refusal_for_position(value)
+    return _refusal_for_number(condition, [value])
+
+
+def _refusal_for_position(value: JsonValue) -> str:
+    if isinstance(value, dict) and value.keys() >= {"latitude", "longitude"}:
+        return (
+            "the values give latitude and longitude in degrees, and near_position compares metres: "
+            "ask with above or below on field latitude or longitude"
+        )
+    return (
+        "the values carry no position: near_position needs a topic that does, "
+        "or a field that leads to an object with x and y"
+    )
+
+
+def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
+    """Returns why `contains` finds a number in none of these; None where it may."""
+    test = condition.test
+    if not isinstance(test, Contains) or not test.is_number:
+        return None
+    if condition.field is not None and any(True for each in targets for _ in elements(each)):
+        return None
+    kinds = {type(leaf) for each in targets for leaf in leaves(each)}
+    if str in kinds or not kinds & {int, float}:
+        return None
+    return (
+        "the values hold numbers and no text, and contains finds a number only as the value of a "
+        "field or as an element of its list: name that in field, or ask with equals"
+    )
+
+
+def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:
+    """Returns whether some beginning of the path leads to an empty list or a null."""
+    segments = dot_path.split(".")
+    return any(
+        target is None or target == []
+        for length in range(len(segments))
+        for target in (at_field(value, ".".join(segments[:length])) if length else [value])
+    )
+
+
+def _has_unknown_part(value: JsonValue) -> bool:
+    if isinstance(value, dict):
+        return any(_has_unknown_part(each) for each in value.values())
+    if isinstance(value, list):
+        return not value or any(_has_unknown_part(each) for each in value)
+    return value is None
+
+
+def _paths(value: JsonValue) -> list[str]:
+    """Returns the dot-paths of a value, outermost first, as many as fit into a sentence."""
+    paths = list(dict.fromkeys(_dot_paths(value, "")))
+    paths.sort(key=lambda path: path.count("."))
+    more = len(paths) - _LISTED_PATHS
+    return [*paths[:_LISTED_PATHS], *([f"{more} more"] if more > 0 else [])]
+
+
+def _dot_paths(value: JsonValue, prefix: str) -> Iterator[str]:
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield f"{prefix}{name}"
+            yield from _dot_paths(inner, f"{prefix}{name}.")
+    elif isinstance(value, list):
+        for element in value[:1]:
+            yield from _dot_paths(element, prefix)

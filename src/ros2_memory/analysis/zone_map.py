@@ -1,7 +1,8 @@
-"""What the messages of one topic can have said: enough to rule out that a condition held.
+"""Zone maps: a bound on what can be in the messages of one topic, to rule conditions out.
 
-Evidence never rules out what was there. Where it would have grown too large, or a message could
-not be decoded, it is open, and rules out nothing.
+Databases call this data skipping: minima, maxima and distinct values of a block decide whether it
+has to be read. A zone map never rules out what is there. Where it would grow too large, or a
+message could not be decoded, it is open, and rules out nothing.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -18,11 +20,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-MOST_WORDS: Final = 400
-"""Distinct words that are kept of one topic in one bag; a topic of logs or UUIDs passes it."""
-MOST_WORD_CHARS: Final = 4_000
-MOST_NUMBERS: Final = 16
-"""Distinct numbers that are kept besides their span."""
+MAX_WORDS: Final = 400
+"""Distinct words that are stored of one topic in one bag; logs and UUIDs exceed it."""
+MAX_WORD_CHARS: Final = 4_000
+MAX_NUMBERS: Final = 16
+"""Distinct numbers that are stored besides their range."""
 
 WORD_END: Final = "\n"
 
@@ -30,7 +32,7 @@ _WORD: Final = re.compile(r"\w+")
 
 
 class Box(NamedTuple):
-    """The smallest box (m) around places; its `z` bounds are those of the places that have one.
+    """The smallest box (m) around points; its `z` bounds are those of the points that have one.
 
     Where none has a `z`, `min_z` is above `max_z`.
     """
@@ -43,39 +45,34 @@ class Box(NamedTuple):
     max_z: float
 
     def meets(self, x: float, y: float, z: float | None, reach: float) -> bool:
-        """Whether some point of the box may lie within `reach` (m) of a place, in the plane or not.
+        """Returns whether some point of the box may be within `reach` (m) of a position.
 
-        Says yes a little too often: the slack is more than any rounding of a distance.
+        Errs on the side of yes: the slack is more than any rounding of a distance.
         """
         within = _near(self.min_x, self.max_x, x, reach) and _near(self.min_y, self.max_y, y, reach)
         return within and (z is None or _near(self.min_z, self.max_z, z, reach))
 
     def united(self, other: Box) -> Box:
-        """The box around both."""
-        return Box(
-            min(self.min_x, other.min_x),
-            max(self.max_x, other.max_x),
-            min(self.min_y, other.min_y),
-            max(self.max_y, other.max_y),
-            min(self.min_z, other.min_z),
-            max(self.max_z, other.max_z),
-        )
+        """Returns the box around both."""
+        # Bounds alternate: the least and the greatest of each axis.
+        low, high = map(min, self[::2], other[::2]), map(max, self[1::2], other[1::2])
+        return Box(*chain.from_iterable(zip(low, high, strict=True)))
 
 
 @dataclass(frozen=True, slots=True)
 class ZoneMap:
-    """What can have stood in the extracted values of some messages.
+    """What can be in the extracted values of some messages.
 
     Attributes:
-        words: the distinct words of all texts, casefolded, each ended by `WORD_END`; None where
+        words: the distinct words of all strings, casefolded, each ended by `WORD_END`; None where
             they are too many. A word is a longest run of letters, digits and underscores.
-        texts: whether there was any text at all, be it without a word.
+        texts: whether there was any string at all, even without a word.
         booleans: the distinct booleans, in no order.
         low: the least number, rounded down to a float; above `high` where there is none.
         high: the greatest number, rounded up; NaN is no number.
         numbers: the distinct numbers; None where they are too many.
-        box: around the places that `near_position` looks at; None without any.
-        open: nothing can be ruled out.
+        box: around the positions that `near_position` tests; None without any.
+        open: whether nothing can be ruled out.
     """
 
     words: str | None = ""
@@ -88,7 +85,7 @@ class ZoneMap:
     open: bool = False
 
     def can_contain_text(self, folded: str) -> bool:
-        """Whether some text may contain this casefolded one."""
+        """Returns whether some string may contain this casefolded one."""
         if self.open:
             return True
         if not self.texts or self.words is None:
@@ -97,11 +94,11 @@ class ZoneMap:
         return all(word in self.words for word in words_of(folded))
 
     def can_contain_boolean(self, value: bool) -> bool:
-        """Whether this boolean may stand somewhere."""
+        """Returns whether this boolean may be somewhere."""
         return self.open or value in self.booleans
 
     def can_contain_number(self, value: float) -> bool:
-        """Whether a number equal to this one may stand somewhere."""
+        """Returns whether a number equal to this one may be somewhere."""
         if self.open:
             return True
         if not (rounded(value, up=True) >= self.low and rounded(value, up=False) <= self.high):
@@ -109,24 +106,24 @@ class ZoneMap:
         return self.numbers is None or value in self.numbers
 
     def can_contain_number_near(self, value: float, reach: float) -> bool:
-        """Whether a number within `reach` of this one may stand somewhere."""
+        """Returns whether a number within `reach` of this one may be somewhere."""
         return self.open or _near(self.low, self.high, value, reach)
 
     def can_contain_place(self, x: float, y: float, z: float | None, reach: float) -> bool:
-        """Whether a place within `reach` (m) of this one may stand where it is looked for."""
+        """Returns whether a position within `reach` (m) of this one may be there."""
         return self.open or (self.box is not None and self.box.meets(x, y, z, reach))
 
 
 class Boxes:
-    """The boxes of many pieces of evidence, to be asked of one place all at once."""
+    """The boxes of many zone maps as one array, to compare a position with all of them at once."""
 
-    def __init__(self, evidence: Mapping[int, ZoneMap]) -> None:
-        self._numbers = list(evidence)
-        boxes = [_EVERYWHERE if each.open else each.box or _NOWHERE for each in evidence.values()]
+    def __init__(self, zone_maps: Mapping[int, ZoneMap]) -> None:
+        self._numbers = list(zone_maps)
+        boxes = [_EVERYWHERE if each.open else each.box or _NOWHERE for each in zone_maps.values()]
         self._bounds: NDArray[np.float64] = np.array(boxes, dtype=np.float64).reshape(-1, 6).T
 
     def meeting(self, x: float, y: float, z: float | None, reach: float) -> set[int]:
-        """The numbers of the evidence that may hold a place within `reach` (m) of this one."""
+        """Returns the numbers of the zone maps that may have a point within `reach` (m) of this."""
         within = np.ones(len(self._numbers), dtype=np.bool_)
         for axis, value in enumerate((x, y) if z is None else (x, y, z)):
             slack = _slack(value, reach)
@@ -139,20 +136,20 @@ _EVERYWHERE: Final = Box(-math.inf, math.inf, -math.inf, math.inf, -math.inf, ma
 _NOWHERE: Final = Box(math.inf, -math.inf, math.inf, -math.inf, math.inf, -math.inf)
 
 UNBOUNDED: Final = ZoneMap(words=None, texts=True, numbers=None, open=True)
-"""Of messages of which nothing is known."""
+"""The zone map of messages of which nothing is known."""
 
 
 def words_of(folded: str) -> list[str]:
-    """The words of a casefolded text."""
+    """Returns the words of a casefolded string."""
     return _WORD.findall(folded)
 
 
-def united(evidence: Iterable[ZoneMap]) -> ZoneMap:
-    """What can have stood in any of several, without the distinct numbers."""
+def united(zone_maps: Iterable[ZoneMap]) -> ZoneMap:
+    """Returns the zone map of several together, without the distinct numbers."""
     words: set[str] | None = set()
     texts, booleans, low, high = False, set[bool](), math.inf, -math.inf
     box: Box | None = None
-    for each in evidence:
+    for each in zone_maps:
         if each.open:
             return UNBOUNDED
         if words is not None and each.words is not None:
@@ -169,12 +166,12 @@ def united(evidence: Iterable[ZoneMap]) -> ZoneMap:
 
 
 def joined_words(words: Iterable[str]) -> str:
-    """Words as `ZoneMap` keeps them."""
+    """Returns words in the form in which `ZoneMap` stores them."""
     return "".join(f"{word}{WORD_END}" for word in sorted(words) if word)
 
 
 def rounded(number: float, *, up: bool) -> float:
-    """The number (an int of any size, too) as a float that is not below it, or not above it."""
+    """Returns a float that is not below the number, or not above it; an int may be of any size."""
     try:
         near = float(number)
     except OverflowError:
@@ -192,5 +189,5 @@ def _near(low: float, high: float, value: float, reach: float) -> bool:
 
 
 def _slack(value: float, reach: float) -> float:
-    """More than any rounding of a distance."""
+    """Returns more than any rounding of a distance."""
     return 1e-9 * (1 + abs(value) + reach)

@@ -1,7 +1,4 @@
-"""Collects, message by message, the evidence of what one topic can have said.
-
-Pure: it is given values, or rows of the payloads of a mould, and reads nothing itself.
-"""
+"""Builds the zone map of one topic, message by message or by rows of payloads of a template."""
 
 from __future__ import annotations
 
@@ -12,9 +9,9 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import leaves, positions
 from ros2_memory.analysis.zone_map import (
-    MOST_NUMBERS,
-    MOST_WORD_CHARS,
-    MOST_WORDS,
+    MAX_NUMBERS,
+    MAX_WORD_CHARS,
+    MAX_WORDS,
     UNBOUNDED,
     Box,
     ZoneMap,
@@ -27,15 +24,15 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.bulk_decode import Bytes, PayloadTemplate
     from ros2_memory.core.model import JsonValue
 
-MOST_TEXTS: Final = 2_000
-"""Distinct texts of one topic that are looked at before its words count as too many."""
-_MOST_TEXT_CHARS: Final = 1 << 20
+MAX_TEXTS: Final = 2_000
+"""Distinct strings of one topic that are examined before its words count as too many."""
+_MAX_TEXT_CHARS: Final = 1 << 20
 """The words of a longer text alone would take more memory than it."""
 _LARGEST: Final = 1e300
 
 
 class ZoneMapBuilder:
-    """Takes extracted values, and says what can have stood in them."""
+    """Takes extracted values, and bounds what can be in them."""
 
     def __init__(self) -> None:
         self._open = False
@@ -49,7 +46,7 @@ class ZoneMapBuilder:
         self._box: Box | None = None
 
     def give_up(self) -> None:
-        """A message whose value is not known: nothing can be ruled out any more."""
+        """Takes a message whose value is not known: nothing can be ruled out any more."""
         self._open = True
 
     def add(self, value: JsonValue) -> None:
@@ -67,30 +64,29 @@ class ZoneMapBuilder:
         if numbers:
             self._add_numbers(numbers)
             for x, y, z in positions(value):
-                self._add_place(x, y, z)
+                if math.isfinite(x) and math.isfinite(y):
+                    low_z, high_z = (z, z) if math.isfinite(z) else (math.inf, -math.inf)
+                    self._add_box(Box(x, x, y, y, low_z, high_z))
 
-    def add_rows(self, mould: PayloadTemplate, rows: Bytes) -> None:
-        """Takes many messages of a mould of which one was added as a value."""
+    def add_rows(self, template: PayloadTemplate, rows: Bytes) -> None:
+        """Takes many messages of a template, the first of which was added as a value."""
         if self._open:
             return
-        for offset in mould.numbers:
-            column = mould.column(rows, offset)
+        for offset in template.numbers:
+            column = template.column(rows, offset)
             numbers = column[~np.isnan(column)]
             if numbers.size:
                 self._add_numbers(np.unique(numbers).tolist())
-        for offset in mould.times:
-            self._add_numbers(mould.seconds(rows, offset))
-        if mould.angles:
+        for offset in template.times:
+            self._add_numbers(template.seconds(rows, offset))
+        if template.angles:
             self._add_numbers([-180.0, 180.0])
             self._numbers = None
-        for place in mould.points:
-            points = np.array(mould.coordinates(rows, place), dtype=np.float64)
-            here = points[np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])]
-            if here.size:
-                self._add_places(here)
+        for point in template.points:
+            self._add_points(np.array(template.coordinates(rows, point), dtype=np.float64))
 
     def zone_map(self) -> ZoneMap:
-        """What the values so far can have held."""
+        """Returns the zone map of the values so far."""
         if self._open:
             return UNBOUNDED
         return ZoneMap(
@@ -107,13 +103,13 @@ class ZoneMapBuilder:
         if text in self._strings or (self._words is None and self._strings):
             return
         self._strings.add(text)
-        if self._words is None or len(text) > _MOST_TEXT_CHARS:
+        if self._words is None or len(text) > _MAX_TEXT_CHARS:
             self._words = None
             return
         fresh = set(words_of(text.casefold())) - self._words
         self._chars += sum(len(word) + 1 for word in fresh)
-        many = len(self._strings) > MOST_TEXTS or len(self._words) + len(fresh) > MOST_WORDS
-        if many or self._chars > MOST_WORD_CHARS:
+        many = len(self._strings) > MAX_TEXTS or len(self._words) + len(fresh) > MAX_WORDS
+        if many or self._chars > MAX_WORD_CHARS:
             self._words = None
         else:
             self._words |= fresh
@@ -125,23 +121,21 @@ class ZoneMapBuilder:
         if high > self._high:
             self._high = rounded(high, up=True)
         if self._numbers is not None:
-            self._numbers.update(numbers[: MOST_NUMBERS + 1])
+            self._numbers.update(numbers[: MAX_NUMBERS + 1])
             # JSON may hold whole numbers of any length.
             huge = max(abs(low), abs(high)) > _LARGEST
-            if huge or len(numbers) > MOST_NUMBERS or len(self._numbers) > MOST_NUMBERS:
+            if huge or len(numbers) > MAX_NUMBERS or len(self._numbers) > MAX_NUMBERS:
                 self._numbers = None
 
-    def _add_places(self, points: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:
+    def _add_points(self, points: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:
+        points = points[np.isfinite(points[:, :2]).all(axis=1)]
+        if not points.size:
+            return
         heights = points[np.isfinite(points[:, 2]), 2]
         low_z, high_z = (heights.min(), heights.max()) if heights.size else (math.inf, -math.inf)
         (min_x, min_y, _), (max_x, max_y, _) = points.min(axis=0), points.max(axis=0)
         bounds = (min_x, max_x, min_y, max_y, low_z, high_z)
-        box = Box(*(float(bound) for bound in bounds))
-        self._box = box if self._box is None else self._box.united(box)
+        self._add_box(Box(*(float(bound) for bound in bounds)))
 
-    def _add_place(self, x: float, y: float, z: float) -> None:
-        if not (math.isfinite(x) and math.isfinite(y)):
-            return
-        low_z, high_z = (z, z) if math.isfinite(z) else (math.inf, -math.inf)
-        here = Box(x, x, y, y, low_z, high_z)
-        self._box = here if self._box is None else self._box.united(here)
+    def _add_box(self, box: Box) -> None:
+        self._box = box if self._box is None else self._box.united(box)

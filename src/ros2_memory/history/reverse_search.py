@@ -11,7 +11,7 @@ import heapq
 import time
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.analysis.testable import can_be_untestable, untestable
+from ros2_memory.analysis.conditions import refusal_for
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason
@@ -113,7 +113,7 @@ class ReverseSearch:
         Raises:
             InvalidArgumentsError: the newest value of none of the topics has what is tested.
         """
-        if not can_be_untestable(self._condition):
+        if not self._condition.can_be_refused:
             return
         refusals = []
         for topic in self.topics:
@@ -129,7 +129,7 @@ class ReverseSearch:
         if found is None or message is None:
             return None
         value = self._view.memory.extractor.exact(message, found.record.channel.type)
-        return untestable(self._condition, value)
+        return refusal_for(self._condition, value)
 
     def _messages(self, part: SearchWindow) -> Iterator[StoredMessage]:
         """Returns the messages of a part, newest first.

@@ -18,7 +18,7 @@ from ros2_memory.analysis.conditions import (
     parse_condition,
 )
 from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
-from ros2_memory.analysis.zone_map import MOST_WORDS
+from ros2_memory.analysis.zone_map import MAX_WORDS
 from ros2_memory.catalogue.codec import (
     decode_poses,
     decode_schema,
@@ -91,7 +91,7 @@ def test_evidence_lets_through_what_was_there(condition_type: str, value: JsonVa
 
 
 def test_a_topic_of_too_many_words_is_not_ruled_out_by_words_but_still_by_numbers() -> None:
-    seen = topic_of([text(T0 + n, f"word{n}") for n in range(MOST_WORDS + 1)])
+    seen = topic_of([text(T0 + n, f"word{n}") for n in range(MAX_WORDS + 1)])
     assert Contains("scissors").can_match(seen.zone_map)
     assert not Equals(3).can_match(seen.zone_map)
 

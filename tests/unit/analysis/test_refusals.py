@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.conditions import parse_condition
-from ros2_memory.analysis.testable import untestable
+from ros2_memory.analysis.conditions import parse_condition, refusal_for
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
@@ -20,7 +19,7 @@ NOTHING_SEEN: JsonValue = {"skill": "scene", "detections": []}
 
 
 def refusal(value: JsonValue, kind: str, wanted: JsonValue, field: str | None = None) -> str | None:
-    return untestable(parse_condition(kind, wanted, 0.5, field), value)
+    return refusal_for(parse_condition(kind, wanted, 0.5, field), value)
 
 
 @pytest.mark.parametrize(
@@ -94,4 +93,4 @@ def test_what_matches_is_never_refused(value: JsonValue, field: str) -> None:
             parse_condition(kind, wanted, 2.0),
         ):
             if condition.matches(value):
-                assert untestable(condition, value) is None
+                assert refusal_for(condition, value) is None
