@@ -1,8 +1,6 @@
-"""The tools beyond the specification's: what happened, where and when, in one call each."""
+"""The tools beyond the specification: what happened, where and when, in one call each."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.saved_moments import list_moments, remember_moment
@@ -21,28 +19,6 @@ from ros2_memory.tools.arguments import (
     WindowArguments,
 )
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from ros2_memory.tools.declaration import Tool
-
-
-def tools(defaults: Mapping[str, object], *, writing: bool) -> Iterator[Tool]:
-    """The tools, in order; `defaults` fill the placeholders of descriptions."""
-    yield from _SIGHTINGS.tools(defaults)
-    yield from _RECAP.tools(defaults)
-    yield from _VISITS.tools(defaults)
-    yield from _STATUS.tools(defaults)
-    yield from _MOMENTS.tools(defaults)
-    if writing:
-        yield from _REMEMBER.tools(defaults)
-
-
-def readable(defaults: Mapping[str, object]) -> Iterator[Tool]:
-    """What is asked by reading a resource, and no tool."""
-    yield from _TYPE.tools(defaults)
-
 
 _SIGHTINGS = ToolDeclaration(
     (ToolName("find_matches", "Sightings"),),
@@ -100,7 +76,7 @@ _VISITS = ToolDeclaration(
     ),
     blocking=True,
 )
-_TYPE = ToolDeclaration(
+TYPE = ToolDeclaration(
     (ToolName("describe_type", "Fields of a message type"),),
     "The fields that replies show of a message type.",
     TypeArguments,
@@ -112,7 +88,7 @@ _MOMENTS = ToolDeclaration(
     NoArguments,
     lambda memory, call, _: list_moments(memory, call),
 )
-_REMEMBER = ToolDeclaration(
+_SAVE_MOMENT = ToolDeclaration(
     (ToolName("remember_moment", "Keep a moment"),),
     "Keeps what is recorded around now from deletion. Reply: {{moment, bags, pending: the rest is "
     "being written}}.",
@@ -127,3 +103,4 @@ _REMEMBER = ToolDeclaration(
     blocking=True,
     writes=True,
 )
+DECLARATIONS = (_SIGHTINGS, _RECAP, _VISITS, _STATUS, _MOMENTS, _SAVE_MOMENT)

@@ -40,7 +40,7 @@ values with fields, or ask for a shorter window.
 """
 
 
-def instructions(limits: QuerySettings, *, additions: bool = True) -> str:
+def instructions(settings: QuerySettings, *, additions: bool = True) -> str:
     """The rules whose neglect makes most wrong calls, with this deployment's defaults.
 
     Clients cut instructions at about 2,000 characters; these stay below. `additions`: whether the
@@ -48,10 +48,10 @@ def instructions(limits: QuerySettings, *, additions: bool = True) -> str:
     """
     return (_RULES + (_HAPPENED if additions else _SEEN) + _REST).format(
         newest="the newest 3 s or so are not on disk yet and"
-        if limits.include_active
-        else f"the newest {limits.split_duration_s:g} s or so are still being written and",
-        pose_topic=limits.pose_topic,
-        tolerance=f"{limits.time_tolerance_s:g}",
+        if settings.include_active
+        else f"the newest {settings.split_duration_s:g} s or so are still being written and",
+        pose_topic=settings.pose_topic,
+        tolerance=f"{settings.time_tolerance_s:g}",
     )
 
 

@@ -1,7 +1,8 @@
-"""Keeps a reply under its size: rows first, then arrays, then texts, and a note for what went.
+"""Keeps a reply under its size: thins rows first, then arrays, then cuts texts, and notes it.
 
-A planner's context is small, and a client cuts what is too long in the middle of a number. So what
-is too long is made shorter here, evenly, and says so.
+A planner's context is small, and a client cuts a text that is too long in the middle of a number.
+So a reply is shortened here, evenly where its rows are along time, and its notes name what was left
+out and how to see it.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
 
+from ros2_memory.core.text import shortened
 from ros2_memory.messages.downsample import evenly
 
 if TYPE_CHECKING:
@@ -19,9 +21,10 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
 
 JsonObject: TypeAlias = "dict[str, JsonValue]"
+_Path: TypeAlias = tuple[str, ...]
 
 EVENLY_THINNED: Final = frozenset({"samples", "waypoints", "value"})
-"""Rows along time: some of all of it say more than all of some of it. Others lose their end."""
+"""Rows along time: some of every part say more than all of one part. Others lose their end."""
 
 _FEWEST_ROWS: Final = 2
 _SHORTEST_TEXT: Final = 200
@@ -29,21 +32,23 @@ _ARRAY_STEPS: Final = (50, 25, 12, 6, 3, 2)
 _KEY_STEPS: Final = (200, 50, 12, 4)
 _MOST_NOTES: Final = 12
 _LONGEST_NOTE: Final = 600
+_LONGEST_OUTLINED: Final = 80
 _MOST_NAMES: Final = 8
-_CUT: Final = "…"
 
 
 def to_json_text(value: JsonValue) -> str:
-    """The shortest JSON text of a value.
+    """Returns the shortest JSON text of a value.
 
-    What JSON or UTF-8 cannot carry does not leave: NaN and infinities become null, a lone
-    surrogate a question mark; -0.0 becomes 0.0.
+    What JSON or UTF-8 cannot represent is replaced: NaN and infinities by null, a lone surrogate by
+    a question mark, -0.0 by 0.0.
     """
-    return json.dumps(_sound(value), separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return json.dumps(
+        _representable(value), separators=(",", ":"), ensure_ascii=False, allow_nan=False
+    )
 
 
 def fit_reply(reply: JsonObject, max_chars: int) -> str:
-    """The reply as JSON text of at most `max_chars` characters, always valid.
+    """Returns the reply as valid JSON text of at most `max_chars` characters.
 
     Where it would be longer, its lists of rows are thinned (along time evenly, first and last
     kept), then the arrays inside, then texts are cut and objects lose keys; `notes` says what was
@@ -53,7 +58,7 @@ def fit_reply(reply: JsonObject, max_chars: int) -> str:
     if len(text) <= max_chars:
         return text
     bounded = _with_few_notes(reply)
-    for attempt in (_fewer_rows, _less_inside):
+    for attempt in (_fewer_rows, _shorter_values):
         bounded = attempt(bounded, max_chars)
         text = to_json_text(bounded)
         if len(text) <= max_chars:
@@ -62,74 +67,62 @@ def fit_reply(reply: JsonObject, max_chars: int) -> str:
 
 
 def without_constant_zeros(samples: Sequence[JsonValue]) -> tuple[list[JsonValue], list[str]]:
-    """The samples' values without the numbers that are 0 in every one of them, and their paths.
+    """Returns the samples without the numbers that are 0 in every one of them, and their paths.
 
-    Only leaves of objects go, and never all of one object: a structure that is 0 throughout says
-    something and stays whole. Fewer than two values are left as they are.
+    Only leaves of objects are removed, and never all of one object: a structure that is 0
+    throughout means something and stays whole. Fewer than two samples are returned as they are.
     """
     if len(samples) < 2:
         return list(samples), []
-    shared: dict[tuple[str, ...], None] | None = None
+    shared = [path for path, item in _items(samples[0]) if _is_zero(item)]
+    removed = set(shared)
+    for sample in samples[1:]:
+        removed &= {path for path, item in _items(sample) if _is_zero(item)}
     for sample in samples:
-        zeros = dict.fromkeys(_zeros(sample, ()))
-        shared = zeros if shared is None else {path: None for path in shared if path in zeros}
-    gone = set(shared or ())
-    for sample in samples:
-        for path, names in _objects(sample, ()):
-            leaves = {(*path, name) for name in names}
-            if leaves <= gone:
-                gone -= leaves
-    named = [".".join(path) for path in shared or () if path in gone]
-    return [_without(sample, (), gone) for sample in samples] if gone else list(samples), named
+        for path, item in [((), sample), *_items(sample)]:
+            leaves = {(*path, key) for key in item} if isinstance(item, dict) else set()
+            if leaves <= removed:
+                removed -= leaves
+    named = [".".join(path) for path in shared if path in removed]
+    return [_without(sample, removed) for sample in samples] if removed else list(samples), named
 
 
-def _sound(value: JsonValue) -> JsonValue:
+def _representable(value: JsonValue) -> JsonValue:
     if isinstance(value, str):
-        return value if value.isascii() else value.encode("utf-8", "replace").decode("utf-8")
+        return _encodable(value)
     if isinstance(value, float):
         return value + 0.0 if math.isfinite(value) else None
     if isinstance(value, list):
-        return [_sound(item) for item in value]
+        return [_representable(item) for item in value]
     if isinstance(value, dict):
-        return {_key(key): _sound(item) for key, item in value.items()}
+        return {_encodable(key): _representable(item) for key, item in value.items()}
     return value
 
 
-def _key(key: str) -> str:
-    return key if key.isascii() else key.encode("utf-8", "replace").decode("utf-8")
+def _encodable(text: str) -> str:
+    return text if text.isascii() else text.encode("utf-8", "replace").decode("utf-8")
 
 
-def _zeros(value: JsonValue, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+def _is_zero(value: JsonValue) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and value == 0
+
+
+def _items(value: JsonValue, path: _Path = ()) -> Iterator[tuple[_Path, JsonValue]]:
+    """Yields everything in an object, at any depth, with its path."""
     if isinstance(value, dict):
         for key, item in value.items():
-            yield from _zeros(item, (*path, key))
-    elif path and isinstance(value, int | float) and not isinstance(value, bool) and value == 0:
-        yield path
+            yield (*path, key), item
+            yield from _items(item, (*path, key))
 
 
-def _objects(
-    value: JsonValue, path: tuple[str, ...]
-) -> Iterator[tuple[tuple[str, ...], list[str]]]:
-    if isinstance(value, dict):
-        yield path, list(value)
-        for key, item in value.items():
-            yield from _objects(item, (*path, key))
-
-
-def _without(value: JsonValue, path: tuple[str, ...], gone: set[tuple[str, ...]]) -> JsonValue:
+def _without(value: JsonValue, removed: set[_Path], path: _Path = ()) -> JsonValue:
     if not isinstance(value, dict):
         return value
     return {
-        key: _without(item, (*path, key), gone)
+        key: _without(item, removed, (*path, key))
         for key, item in value.items()
-        if (*path, key) not in gone
+        if (*path, key) not in removed
     }
-
-
-def _noted(reply: JsonObject, sentence: str) -> JsonObject:
-    """The reply with one more note; `notes` stays its last key."""
-    rest = {key: item for key, item in reply.items() if key != "notes"}
-    return {**rest, "notes": [*_notes(reply), sentence]}
 
 
 def _notes(reply: JsonObject) -> list[JsonValue]:
@@ -137,30 +130,38 @@ def _notes(reply: JsonObject) -> list[JsonValue]:
     return notes if isinstance(notes, list) else []
 
 
+def _with_note(reply: JsonObject, sentence: str) -> JsonObject:
+    """Returns the reply with one more note; `notes` stays its last key."""
+    rest = {key: item for key, item in reply.items() if key != "notes"}
+    return {**rest, "notes": [*_notes(reply), sentence]}
+
+
 def _with_few_notes(reply: JsonObject) -> JsonObject:
     notes = _notes(reply)
     if not notes:
         return reply
-    kept = [_cut(note, _LONGEST_NOTE) for note in notes[:_MOST_NOTES]]
+    kept = [
+        shortened(note, _LONGEST_NOTE) if isinstance(note, str) else note
+        for note in notes[:_MOST_NOTES]
+    ]
     if len(notes) > _MOST_NOTES:
         kept.append(f"and {len(notes) - _MOST_NOTES} more notes")
     return {**reply, "notes": kept}
 
 
 def _outline(reply: JsonObject, max_chars: int) -> JsonObject:
-    """The few words and numbers of the reply's first level, for what defies being shortened."""
-    sentence = (
-        f"the answer does not fit into {max_chars} characters; name parts of it in fields, or ask "
-        "more narrowly"
-    )
-    kept: JsonObject = {}
+    """Returns the short values of the reply's first level, where shortening was not enough."""
+    outline: JsonObject = {}
     for key, item in reply.items():
-        is_short = (
-            key != "notes" and not isinstance(item, list | dict) and len(to_json_text(item)) < 80
-        )
-        if is_short and len(to_json_text({**kept, key: item})) < max_chars // 2:
-            kept[key] = item
-    return {**kept, "notes": [sentence]}
+        is_short = not isinstance(item, list | dict) and len(to_json_text(item)) < _LONGEST_OUTLINED
+        extended = {**outline, key: item}
+        if key != "notes" and is_short and len(to_json_text(extended)) < max_chars // 2:
+            outline = extended
+    return _with_note(
+        outline,
+        f"the answer does not fit into {max_chars} characters; name parts of it in fields, or ask "
+        "more narrowly",
+    )
 
 
 def _fewer_rows(reply: JsonObject, max_chars: int) -> JsonObject:
@@ -171,10 +172,9 @@ def _fewer_rows(reply: JsonObject, max_chars: int) -> JsonObject:
         if len(to_json_text(reply)) <= max_chars or len(rows) <= _FEWEST_ROWS:
             continue
         sizes = [len(to_json_text(row)) + 1 for row in rows]
-        empty = _noted({**reply, key: []}, _rows_note(key, len(rows), len(rows), max_chars))
-        spare = max_chars - len(to_json_text(empty))
-        kept = _rows_that_fit(key, sizes, spare)
-        reply = _noted(
+        empty = _with_note({**reply, key: []}, _rows_note(key, len(rows), len(rows), max_chars))
+        kept = _rows_that_fit(key, sizes, max_chars - len(to_json_text(empty)))
+        reply = _with_note(
             {**reply, key: [rows[index] for index in kept]},
             _rows_note(key, len(kept), len(rows), max_chars),
         )
@@ -182,13 +182,13 @@ def _fewer_rows(reply: JsonObject, max_chars: int) -> JsonObject:
 
 
 def _rows_that_fit(key: str, sizes: Sequence[int], spare: int) -> list[int]:
-    def places(count: int) -> list[int]:
+    def chosen(count: int) -> list[int]:
         return evenly(len(sizes), count) if key in EVENLY_THINNED else list(range(count))
 
     def fits(count: int) -> bool:
-        return sum(sizes[index] for index in places(count)) <= spare
+        return sum(sizes[index] for index in chosen(count)) <= spare
 
-    return places(_largest(_FEWEST_ROWS, len(sizes), fits) or _FEWEST_ROWS)
+    return chosen(_largest(_FEWEST_ROWS, len(sizes), fits) or _FEWEST_ROWS)
 
 
 def _rows_note(key: str, kept: int, total: int, max_chars: int) -> str:
@@ -202,112 +202,101 @@ def _rows_note(key: str, kept: int, total: int, max_chars: int) -> str:
     )
 
 
-def _less_inside(reply: JsonObject, max_chars: int) -> JsonObject:
-    """Thins what stands inside the rows: arrays, then texts, then keys of wide objects."""
-    note_room = max_chars - _LONGEST_NOTE if max_chars > 3 * _LONGEST_NOTE else max_chars * 2 // 3
-
-    def fits(keys: int, arrays: int, text: int) -> bool:
-        return len(to_json_text(_Shorter(keys, arrays, text).reply(reply))) <= note_room
-
-    whole = len(to_json_text(reply))
-    longest = _largest(_ARRAY_STEPS[0], max_chars, lambda size: fits(whole, size, whole))
-    if longest is not None:
-        return _shortened(reply, _Shorter(whole, longest, whole), max_chars)
-    for arrays in _ARRAY_STEPS:
-        text = _largest(_SHORTEST_TEXT, max_chars, partial(fits, whole, arrays))
-        if text is not None:
-            return _shortened(reply, _Shorter(whole, arrays, text), max_chars)
-    fewest, shortest = _ARRAY_STEPS[-1], _SHORTEST_TEXT // 4
-    keys = next((step for step in _KEY_STEPS if fits(step, fewest, shortest)), _KEY_STEPS[-1])
-    return _shortened(reply, _Shorter(keys, fewest, shortest), max_chars)
-
-
-def _shortened(reply: JsonObject, shorter: _Shorter, max_chars: int) -> JsonObject:
-    short = shorter.reply(reply)
-    touched = list(shorter.touched.items())
-    named = [f"{_in_fields(path)} ({how}{kept})" for (path, how), kept in touched[:_MOST_NAMES]]
-    if len(touched) > _MOST_NAMES:
-        named.append(f"and {len(touched) - _MOST_NAMES} more")
+def _shorter_values(reply: JsonObject, max_chars: int) -> JsonObject:
+    """Thins the arrays inside the rows, then cuts texts, then drops keys of wide objects."""
+    shortener = _weakest_shortener(reply, max_chars)
+    shorter = shortener.shorten(reply)
+    named = [
+        f"{_as_field(path)} ({how}{f': {kept} of {total} kept' if total else ''})"
+        for (path, how), (kept, total) in shortener.shortened.items()
+    ]
+    if len(named) > _MOST_NAMES:
+        named[_MOST_NAMES:] = [f"and {len(named) - _MOST_NAMES} more"]
     sentence = (
         f"shortened to keep the reply under {max_chars} characters: {', '.join(named)}; "
         "name one of them in fields to see more of it"
     )
-    return _noted(short, _cut_text(sentence, _LONGEST_NOTE - 50))
+    return _with_note(shorter, shortened(sentence, _LONGEST_NOTE - 50))
 
 
-def _in_fields(path: str) -> str:
-    """The dot-path as the `fields` argument takes it: counted from the value of a sample."""
+def _weakest_shortener(reply: JsonObject, max_chars: int) -> _Shortener:
+    """Returns the limits that leave most of the reply, and room for the note on them."""
+    room = max_chars - _LONGEST_NOTE if max_chars > 3 * _LONGEST_NOTE else max_chars * 2 // 3
+
+    def fits(keys: int, arrays: int, text: int) -> bool:
+        return len(to_json_text(_Shortener(keys, arrays, text).shorten(reply))) <= room
+
+    unlimited = len(to_json_text(reply))
+    longest = _largest(
+        _ARRAY_STEPS[0], max_chars, lambda arrays: fits(unlimited, arrays, unlimited)
+    )
+    if longest is not None:
+        return _Shortener(unlimited, longest, unlimited)
+    for arrays in _ARRAY_STEPS:
+        text = _largest(_SHORTEST_TEXT, max_chars, partial(fits, unlimited, arrays))
+        if text is not None:
+            return _Shortener(unlimited, arrays, text)
+    fewest, shortest = _ARRAY_STEPS[-1], _SHORTEST_TEXT // 4
+    keys = next((step for step in _KEY_STEPS if fits(step, fewest, shortest)), _KEY_STEPS[-1])
+    return _Shortener(keys, fewest, shortest)
+
+
+def _as_field(path: str) -> str:
+    """Returns the dot-path as the `fields` argument takes it: relative to a sample's value."""
     return path.removeprefix("samples.").removeprefix("value.")
 
 
-class _Shorter:
-    """One set of limits, and what they touched: (dot-path without indices, how), and how much.
+class _Shortener:
+    """Limits on the keys of an object, the elements of an array, and the characters of a text.
 
-    How much is that of the longest list or widest object at the path; empty for texts.
+    Attributes:
+        shortened: what exceeded them: (dot-path without indices, how it was shortened) to how much
+            was kept of how much, of the longest list or widest object there; (0, 0) for texts.
     """
 
     def __init__(self, keys: int, arrays: int, text: int) -> None:
         self._keys = keys
         self._arrays = arrays
         self._text = text
-        self.touched: dict[tuple[str, str], str] = {}
-        self._most: dict[tuple[str, str], int] = {}
+        self.shortened: dict[tuple[str, str], tuple[int, int]] = {}
 
-    def reply(self, reply: JsonObject) -> JsonObject:
-        """The reply with everything below its first level within the limits."""
-        self.touched.clear()
-        self._most.clear()
+    def shorten(self, reply: JsonObject) -> JsonObject:
+        """Returns the reply with everything within the limits, except notes and its rows."""
         return {
-            key: item if key == "notes" else self._top(key, item) for key, item in reply.items()
+            key: item
+            if key == "notes"
+            else [self._value(row, key) for row in item]
+            if isinstance(item, list)
+            else self._value(item, key)
+            for key, item in reply.items()
         }
-
-    def _touch(self, path: str, how: str, kept: int, total: int) -> None:
-        if total > self._most.get((path, how), 0):
-            self._most[path, how] = total
-            self.touched[path, how] = f": {kept} of {total} kept"
-
-    def _top(self, key: str, item: JsonValue) -> JsonValue:
-        if isinstance(item, list):
-            return [self._value(row, key) for row in item]
-        return self._value(item, key)
 
     def _value(self, value: JsonValue, path: str) -> JsonValue:
-        if isinstance(value, str):
-            if len(value) <= self._text:
-                return value
-            self.touched[path, "texts cut"] = ""
-            return _cut_text(value, self._text)
+        if isinstance(value, str) and len(value) > self._text:
+            self.shortened[path, "texts cut"] = (0, 0)
+            return shortened(value, self._text)
         if isinstance(value, list):
-            return self._array(value, path)
+            indices = evenly(len(value), self._arrays)
+            self._count(path, "evenly thinned", len(indices), len(value))
+            return [self._value(value[index], path) for index in indices]
         if isinstance(value, dict):
-            return self._object(value, path)
+            kept = list(value.items())[: self._keys]
+            self._count(path, "keys left out", len(kept), len(value))
+            return {
+                shortened(key, self._text): self._value(item, f"{path}.{key}") for key, item in kept
+            }
         return value
 
-    def _array(self, value: list[JsonValue], path: str) -> JsonValue:
-        kept = evenly(len(value), self._arrays)
-        if len(kept) < len(value):
-            self._touch(path, "evenly thinned", len(kept), len(value))
-        return [self._value(value[index], path) for index in kept]
-
-    def _object(self, value: JsonObject, path: str) -> JsonValue:
-        kept = list(value.items())[: self._keys]
-        if len(kept) < len(value):
-            self._touch(path, "keys left out", len(kept), len(value))
-        return {
-            _cut_text(key, self._text): self._value(item, f"{path}.{key}") for key, item in kept
-        }
-
-
-def _cut(value: JsonValue, length: int) -> JsonValue:
-    return _cut_text(value, length) if isinstance(value, str) else value
-
-
-def _cut_text(text: str, length: int) -> str:
-    return text if len(text) <= length else text[: length - 1] + _CUT
+    def _count(self, path: str, how: str, kept: int, total: int) -> None:
+        if kept < total and total > self.shortened.get((path, how), (0, 0))[1]:
+            self.shortened[path, how] = (kept, total)
 
 
 def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int | None:
-    """The largest number from `low` to `high` that fits, by halving; None where `low` does not."""
+    """Returns the largest number from `low` to `high` that fits, by bisection; None if none does.
+
+    A number fits if a larger one does.
+    """
     if not fits(low):
         return None
     while low < high:

@@ -1,7 +1,7 @@
-"""The specification's 17 tools: names, what the planner reads, and the query behind each.
+"""The specification's 17 tools: their names, what planners read, and the query of each.
 
 A pair of tools (`_at` and `_seconds_ago`, `_in_range` and `_in_last`) is declared once; only the
-`ToolName`s differ. The order here is the order in which clients see them.
+`ToolName`s differ. The order of the declarations is the order in which clients see the tools.
 """
 
 from __future__ import annotations
@@ -34,38 +34,31 @@ if TYPE_CHECKING:
     from ros2_memory.tools.declaration import Tool
 
 
-def readable_tools(limits: QuerySettings) -> tuple[Tool, ...]:
-    """What is asked by reading a resource, and no tool."""
-    return tuple(extra_tools.readable({"pose_topic": limits.pose_topic}))
+def readable_tools(settings: QuerySettings) -> tuple[Tool, ...]:
+    """Returns what is read as a resource, and is not a tool."""
+    return tuple(extra_tools.TYPE.tools({"pose_topic": settings.pose_topic}))
 
 
 def build_tools(
-    limits: QuerySettings, call_timeout_s: float, *, additions: bool = True, writing: bool = False
+    settings: QuerySettings, call_timeout_s: float, *, additions: bool = True, writing: bool = False
 ) -> tuple[Tool, ...]:
-    """The tools, in order. The descriptions tell this deployment's defaults.
+    """Returns the tools, in order. Their descriptions name this deployment's defaults.
 
-    `additions`: those beyond the specification's, too; `writing`: those among them that write.
+    `additions`: also those beyond the specification; `writing`: also those of them that write.
     """
     defaults = {
         "timeout": f"{call_timeout_s:g}",
-        "pose_topic": limits.pose_topic,
-        "tolerance": f"{limits.time_tolerance_s:g}",
-        "near": f"{limits.position_tolerance_m:g}",
-        "map_frame": limits.map_frame or "no map",
+        "pose_topic": settings.pose_topic,
+        "tolerance": f"{settings.time_tolerance_s:g}",
+        "near": f"{settings.position_tolerance_m:g}",
+        "map_frame": settings.map_frame or "no map",
     }
-    return (
-        *_LIST.tools(defaults),
-        *_RANGE.tools(defaults),
-        *_TOPIC_AT.tools(defaults),
-        *_TOPIC_OVER.tools(defaults),
-        *_POSITION.tools(defaults),
-        *_VELOCITY.tools(defaults),
-        *_TRANSFORM.tools(defaults),
-        *_FRAMES.tools(defaults),
-        *_LAST_MATCH.tools(defaults),
-        *_VALUE_WHEN.tools(defaults),
-        *_TRAJECTORY.tools(defaults),
-        *(extra_tools.tools(defaults, writing=writing) if additions else ()),
+    declarations = (*_DECLARATIONS, *(extra_tools.DECLARATIONS if additions else ()))
+    return tuple(
+        tool
+        for declaration in declarations
+        if writing or not declaration.writes
+        for tool in declaration.tools(defaults)
     )
 
 
@@ -130,7 +123,7 @@ _TOPIC_AT = ToolDeclaration(
         fields=given.fields,
     ),
 )
-_TOPIC_OVER = ToolDeclaration(
+_TOPIC_RANGE = ToolDeclaration(
     (
         ToolName("get_topic_in_range", "A topic over a window", Between, "between two Unix times"),
         ToolName("get_topic_in_last", "A topic over the last seconds", Last, "in the last seconds"),
@@ -246,4 +239,17 @@ _TRAJECTORY = ToolDeclaration(
         memory, call, given.span, topic=given.topic
     ),
     blocking=True,
+)
+_DECLARATIONS = (
+    _LIST,
+    _RANGE,
+    _TOPIC_AT,
+    _TOPIC_RANGE,
+    _POSITION,
+    _VELOCITY,
+    _TRANSFORM,
+    _FRAMES,
+    _LAST_MATCH,
+    _VALUE_WHEN,
+    _TRAJECTORY,
 )
