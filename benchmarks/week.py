@@ -69,7 +69,7 @@ class Week:
         progress = filler.progress()
         if progress.waiting or progress.closed != self.whole.bags:
             raise RuntimeError(f"not every bag of the week is in the catalogue: {progress}")
-        filler.warm()
+        filler.precompute()
         return self.settings
 
     @cached_property

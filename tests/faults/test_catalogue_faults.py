@@ -21,8 +21,8 @@ from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.core.errors import BagError
 from ros2_memory.serving.backfill import (
-    AGAIN_NS,
     BACKLOG,
+    RETRY_NS,
     Backfill,
     Progress,
     keep_backfilled,
@@ -316,7 +316,7 @@ def test_a_bag_that_could_not_be_digested_is_tried_again_later(tmp_path: Path) -
     refusing = Backfill(memory, Refusing(memory.reader, memory.extractor, 10.0), tmp_path)
     fill_up(refusing)
     assert refusing.progress() == Progress(2, 0, 2)
-    clock.at += AGAIN_NS
+    clock.at += RETRY_NS
     assert refusing.progress() == Progress(2, 2, 0)
 
 
@@ -327,7 +327,7 @@ def test_an_empty_bag_directory_purges_nothing(tmp_path: Path) -> None:
     memory, filler = served(bag_dir)
     fill_up(filler)
     (bag_dir / "rec").rename(away)
-    filler.tidy()
+    filler.prune()
     assert memory.recall is not None
     assert len(memory.recall.catalogue.paths()) == 3
     away.rename(bag_dir / "rec")

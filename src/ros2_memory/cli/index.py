@@ -111,8 +111,8 @@ def fill_catalogue(
             show(progress.after(number))
             done += backfill.digest(bag)
     if not is_cancelled():
-        backfill.tidy()
-        backfill.warm()
+        backfill.prune()
+        backfill.precompute()
     return backfill.progress()
 
 

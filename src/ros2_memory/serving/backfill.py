@@ -1,6 +1,7 @@
-"""Fills the catalogue: every closed bag that has no entry is digested, the newest first.
+"""Fills the catalogue: digests every closed bag that has no entry, the newest first.
 
-A kill at any moment loses at most the bag under way: entries are written whole or not at all.
+A kill at any moment loses at most the bag that is being digested: entries are written whole or not
+at all.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import anyio
 import anyio.to_thread
@@ -30,24 +31,26 @@ from ros2_memory.index.scan import settled
 from ros2_memory.queries import list_recorded_topics, trajectory_summary
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from ros2_memory.catalogue.digest import Digester
     from ros2_memory.core.model import BagFile
     from ros2_memory.history.context import Memory
 
+T = TypeVar("T")
+
 log = get_logger(__name__)
 
 BACKLOG: Final = 8
-"""More bags than these are digested by a program of its own, so that answers stay fast."""
-TIDY_S: Final = 600.0
-"""How often entries are looked through for files that are gone."""
+"""A child process digests more bags than these, so that answers stay fast."""
+PRUNE_INTERVAL_S: Final = 600.0
+"""How often the entries of deleted files are removed."""
 
-LAST_S: Final = 9.2e9
-"""Unix seconds after everything that was ever recorded."""
+LATEST_UNIX_S: Final = 9.2e9
+"""A time after everything that was ever recorded."""
 
-AGAIN_NS: Final[Ns] = 600 * NS_PER_S
+RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long a bag that could not be digested is tried again: the disk may have failed."""
 
 _MOST_REFUSED: Final = 10_000
@@ -57,7 +60,7 @@ _MOST_REFUSED: Final = 10_000
 class Progress:
     """How many closed bags there are, and how many of them are still to be digested.
 
-    `refused` cannot be digested: they are read whenever a question is about them.
+    `refused` cannot be digested; they are read by every query that concerns them.
     """
 
     closed: int
@@ -65,40 +68,44 @@ class Progress:
     refused: int
 
     def after(self, more: int) -> Progress:
-        """When some more have been digested."""
+        """Returns the progress when some more have been digested."""
         return Progress(self.closed, self.waiting - more, self.refused)
 
 
 class Backfill:
-    """Digests the bags of one memory. Not for several threads at once, but for `progress`."""
+    """Digests the bags of one memory. Only `progress` may be called from several threads.
+
+    Raises:
+        ValueError: the memory has no catalogue.
+    """
 
     def __init__(self, memory: Memory, digester: Digester, bag_dir: Path) -> None:
+        if memory.recall is None:
+            raise ValueError("a memory without a catalogue has nothing to fill")
         self._memory = memory
+        self._digests = memory.recall
+        self._catalogue = memory.recall.catalogue
         self._digester = digester
         self._bag_dir = bag_dir
         self._refused: dict[BagKey, Ns] = {}
         self.undecodable: dict[str, str] = {}
-        """By topic, why its messages cannot be decoded, as it was when that was last looked at."""
+        """By topic, why its messages cannot be decoded, as `precompute` last found."""
 
     def waiting(self) -> list[BagFile]:
-        """The bags to be digested, the newest first."""
-        recall = self._memory.recall
-        if recall is None:
-            return []
-        missing = bags_without_entry(self._memory.index.snapshot().segments, recall)
+        """Returns the bags to be digested, the newest first."""
+        missing = bags_without_entry(self._memory.index.snapshot().segments, self._digests)
         return [bag for bag in reversed(missing) if not self._is_refused(self._key(bag))]
 
     def progress(self) -> Progress:
-        """How far the catalogue is."""
+        """Returns how much of the catalogue is filled."""
         bags = self._memory.index.snapshot().bags
         closed = sum(bag.state is BagState.CLOSED for bag in bags)
         refused = sum(self._is_refused(key) for key in list(self._refused))
         return Progress(closed, len(self.waiting()), refused)
 
     def digest(self, bag: BagFile) -> bool:
-        """Digests one bag; False where it must wait, was changed meanwhile, or is refused."""
-        recall = self._memory.recall
-        if recall is None or not self._looks_like_itself(bag):
+        """Digests one bag; returns False if it must wait, has changed meanwhile, or is refused."""
+        if not self._is_unchanged(bag):
             return False
         begun = time.perf_counter_ns()
         try:
@@ -110,9 +117,9 @@ class Backfill:
             log.exception("digest_failed", path=str(bag.path))
             self._refuse(bag, type(error).__name__)
             return False
-        if digest.summary != bag.summary or not self._looks_like_itself(bag):
+        if digest.summary != bag.summary or not self._is_unchanged(bag):
             return False
-        if not recall.catalogue.put(self._key(bag), digest):
+        if not self._catalogue.put(self._key(bag), digest):
             return False
         log.debug(
             "bag_digested",
@@ -123,67 +130,63 @@ class Backfill:
 
     @property
     def cannot_write(self) -> bool:
-        """Whether what was digested last could not be kept."""
-        recall = self._memory.recall
-        return recall is not None and recall.catalogue.is_failing
+        """Returns whether the last digest could not be stored."""
+        return self._catalogue.is_failing
 
     @property
     def trouble(self) -> str | None:
-        """Why the catalogue is not what it should be; None where nothing is amiss."""
-        recall = self._memory.recall
-        return None if recall is None else recall.catalogue.trouble
+        """Returns what is wrong with the catalogue; None if nothing is."""
+        return self._catalogue.trouble
 
     def look_after(self, *, thorough: bool = False) -> None:
-        """Has the catalogue go back to its file, unless the bag directory itself is away.
+        """Returns the catalogue to its file, unless the bag directory itself is missing.
 
         Args:
-            thorough: whether all of the file is read to see that it is whole.
+            thorough: whether the whole file is read to check its integrity.
         """
-        recall = self._memory.recall
-        if recall is not None and self._memory.index.snapshot().problem is None:
-            recall.catalogue.look_after(thorough=thorough)
+        if self._memory.index.snapshot().problem is None:
+            self._catalogue.look_after(thorough=thorough)
 
     @property
     def in_memory(self) -> bool:
-        """Whether no other process could see what is written."""
-        recall = self._memory.recall
-        return recall is None or recall.catalogue.path is None
+        """Returns whether the catalogue has no file, so that no other process can fill it."""
+        return self._catalogue.path is None
 
-    def warm(self) -> None:
-        """Works out what recordings that overlap hold together, before somebody asks."""
+    def precompute(self) -> None:
+        """Computes what overlapping recordings hold together, before a client asks."""
         with suppress(EpisodicError):
             rows = list_recorded_topics(self._memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
         with suppress(EpisodicError):
-            trajectory_summary(self._memory, Call(), TimeRange(start_s=0.0, end_s=LAST_S))
+            everything = TimeRange(start_s=0.0, end_s=LATEST_UNIX_S)
+            trajectory_summary(self._memory, Call(), everything)
 
-    def tidy(self) -> None:
-        """Drops the entries of files that are gone, and those of older configurations.
+    def prune(self) -> None:
+        """Removes the entries of deleted files, and those of older configurations.
 
-        Not while there are no bags at all.
+        Does nothing where there are no bags: the disk of the bags is more likely missing than
+        empty.
         """
-        recall = self._memory.recall
         snapshot = self._memory.index.snapshot()
-        # Where no bag is left the disk of the bags is rather missing than empty.
-        if recall is None or snapshot.problem is not None or not snapshot.bags:
+        if snapshot.problem is not None or not snapshot.bags:
             return
-        there = {self._key(bag).path for run in snapshot.segments for bag in run.bags}
-        recall.catalogue.forget([path for path in recall.catalogue.paths() if path not in there])
-        recall.catalogue.forget_older_configurations()
+        present = {self._key(bag).path for segment in snapshot.segments for bag in segment.bags}
+        self._catalogue.forget([path for path in self._catalogue.paths() if path not in present])
+        self._catalogue.forget_older_configurations()
 
-    def _looks_like_itself(self, bag: BagFile) -> bool:
-        """Whether the file and its sidecar look as the index saw them, and long enough so."""
+    def _is_unchanged(self, bag: BagFile) -> bool:
+        """Returns whether the file and its sidecar are as the index found them, for a while now."""
         try:
             stat = os.lstat(bag.path)
         except OSError:
             return False
         sidecar_ns = _mtime_ns(bag.path.with_name(HANDOVER_FILE))
         now = self._memory.clock.now()
-        return (stat.st_size, stat.st_mtime_ns, sidecar_ns) == (
-            bag.size,
-            bag.mtime_ns,
-            bag.sidecar_ns,
-        ) and (settled(stat.st_mtime_ns, now) and settled(sidecar_ns, now))
+        return (
+            (stat.st_size, stat.st_mtime_ns, sidecar_ns) == (bag.size, bag.mtime_ns, bag.sidecar_ns)
+            and settled(stat.st_mtime_ns, now)
+            and settled(sidecar_ns, now)
+        )
 
     def _refuse(self, bag: BagFile, reason: str) -> None:
         log.warning("bag_not_digested", path=str(bag.path), reason=reason)
@@ -193,52 +196,55 @@ class Backfill:
 
     def _is_refused(self, key: BagKey) -> bool:
         since = self._refused.get(key)
-        return since is not None and abs(self._memory.clock.now() - since) < AGAIN_NS
+        return since is not None and abs(self._memory.clock.now() - since) < RETRY_NS
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
 
 
-async def keep_backfilled(filler: Backfill, helper: Sequence[str], every_s: float) -> None:
-    """Digests what has closed, every `every_s` seconds, until it is cancelled.
+async def keep_backfilled(backfill: Backfill, helper: Sequence[str], every_s: float) -> None:
+    """Digests closed bags every `every_s` seconds, until it is cancelled.
 
     `helper` is the command line of the program that digests a backlog (`ros2-memory index`).
     """
-    tidied, warmed = -math.inf, False
+    pruned_s, is_precomputed = -math.inf, False
     while True:
         try:
-            due = time.monotonic() - tidied > TIDY_S
-            look_after = partial(filler.look_after, thorough=due)
-            await anyio.to_thread.run_sync(look_after, abandon_on_cancel=True)
-            waiting = await anyio.to_thread.run_sync(filler.waiting, abandon_on_cancel=True)
-            if len(waiting) > BACKLOG and not filler.in_memory and await _helped(helper):
-                # What it could not digest is tried here, and refused if need be.
-                waiting = await anyio.to_thread.run_sync(filler.waiting, abandon_on_cancel=True)
-            done = await _digest(filler, waiting[:BACKLOG])
-            # What is still to be digested would be read for it.
-            if (done or not warmed) and len(waiting) <= BACKLOG:
-                await anyio.to_thread.run_sync(filler.warm, abandon_on_cancel=True)
-                warmed = True
+            due = time.monotonic() - pruned_s > PRUNE_INTERVAL_S
+            await _in_thread(partial(backfill.look_after, thorough=due))
+            waiting = await _in_thread(backfill.waiting)
+            if len(waiting) > BACKLOG and not backfill.in_memory and await _run_helper(helper):
+                # Bags that the helper could not digest are tried here, and refused if they fail.
+                waiting = await _in_thread(backfill.waiting)
+            done = await _digest(backfill, waiting[:BACKLOG])
+            # Earlier, bags without a digest would be read for it.
+            if (done or not is_precomputed) and len(waiting) <= BACKLOG:
+                await _in_thread(backfill.precompute)
+                is_precomputed = True
             if due:
-                await anyio.to_thread.run_sync(filler.tidy, abandon_on_cancel=True)
-                tidied = time.monotonic()
+                await _in_thread(backfill.prune)
+                pruned_s = time.monotonic()
         except Exception:
             log.exception("filling_failed")
         await anyio.sleep(every_s)
 
 
-async def _digest(filler: Backfill, bags: Sequence[BagFile]) -> int:
-    """How many of these bags could be digested and kept."""
+async def _in_thread(work: Callable[[], T]) -> T:
+    return await anyio.to_thread.run_sync(work, abandon_on_cancel=True)
+
+
+async def _digest(backfill: Backfill, bags: Sequence[BagFile]) -> int:
+    """Returns how many of these bags could be digested and stored."""
     done = 0
     for bag in bags:
-        done += await anyio.to_thread.run_sync(filler.digest, bag, abandon_on_cancel=True)
-        if filler.cannot_write:
+        done += await _in_thread(partial(backfill.digest, bag))
+        if backfill.cannot_write:
             break
     return done
 
 
-async def _helped(helper: Sequence[str]) -> bool:
-    """Runs the helper to its end; whether it did its work. Cancelling ends it."""
+async def _run_helper(helper: Sequence[str]) -> bool:
+    """Runs the helper to its end; returns whether it succeeded. Cancelling ends it."""
     try:
         async with await anyio.open_process(
             helper, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=None

@@ -136,7 +136,7 @@ def test_entries_of_bags_that_are_gone_are_dropped(tmp_path: Path) -> None:
     memory = recalling(tmp_path)
     fill_catalogue(filler_of(memory, tmp_path))
     paths[0].unlink()
-    filler_of(memory, tmp_path).tidy()
+    filler_of(memory, tmp_path).prune()
     assert memory.recall is not None
     assert sorted(memory.recall.catalogue.paths()) == ["rec/rec_1.mcap", "rec/rec_2.mcap"]
 
@@ -148,7 +148,7 @@ def test_a_bag_directory_that_is_gone_for_a_while_keeps_its_entries(tmp_path: Pa
     memory = replace(memory_of(bag_dir), recall=recall)
     fill_catalogue(filler_of(memory, bag_dir))
     bag_dir.rename(elsewhere)
-    filler_of(memory, bag_dir).tidy()
+    filler_of(memory, bag_dir).prune()
     assert recall.catalogue.paths() == ["rec/rec_0.mcap"]
 
 
