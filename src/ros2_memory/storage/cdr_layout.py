@@ -1,26 +1,28 @@
-"""Where the numbers lie in a serialized message, so that thousands alike need not be decoded.
+"""Finds the numbers in a serialized message, so that thousands alike need not be decoded.
 
 The layout follows from a type's definition and one payload by the rules of CDR (OMG CDR 1.x, as
 ROS 2 writes it: a header of 4 bytes, then each primitive aligned to its own size). It holds for
 every payload of the same length that has the same bytes outside of the numbers: lengths of texts
-and sequences, the texts themselves, whole numbers and booleans are all outside.
+and sequences, the texts themselves, integers and booleans are all outside.
 """
 
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from rosbags.interfaces import Nodetype
 
 from ros2_memory.storage.base import CdrLayout
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
 _LITTLE_ENDIAN: Final = b"\x00\x01"
-_HEADER: Final = 4
-_MOST_NUMBERS: Final = 200
+_HEADER_BYTES: Final = 4
+_MAX_NUMBERS: Final = 200
 _SIZES: Final = {
     "bool": 1,
     "byte": 1,
@@ -34,25 +36,30 @@ _SIZES: Final = {
     "uint32": 4,
     "int64": 8,
     "uint64": 8,
+    "float32": 4,
+    "float64": 8,
 }
-_FLOATS: Final = {"float32": 4, "float64": 8}
-_TIME: Final = ((("int32", 0), ("uint32", 0)), ("sec", "nanosec"))
+_FLOATS: Final = ("float32", "float64")
+_TIME: Final = [("sec", "int32"), ("nanosec", "uint32")]
 
-
-MOST_ELEMENTS: Final = 200_000
+MAX_OBJECTS: Final = 200_000
 """Texts and messages in one message; each is an object when it is decoded."""
 _COUNTED_FROM_BYTES: Final = 256 << 10
 
 
 class _NoLayoutError(Exception):
-    """The numbers are too many, or something of the payload is not understood here."""
+    """The numbers are too many, or the payload does not fit its definition."""
+
+
+class _TooManyError(Exception):
+    """The payload holds more texts and messages than are decoded."""
 
 
 def layout_of(definitions: Typesdict, root: str, payload: bytes) -> CdrLayout | None:
-    """The layout of payloads like this one; None where decoding them is the only way."""
+    """Returns the layout of payloads like this one; None if they must be decoded."""
     if payload[:2] != _LITTLE_ENDIAN:
         return None
-    walk = _Walk(definitions, payload)
+    walk = _NumberWalk(definitions, payload)
     try:
         walk.message(root)
     except (_NoLayoutError, struct.error):
@@ -64,16 +71,15 @@ def layout_of(definitions: Typesdict, root: str, payload: bytes) -> CdrLayout | 
 
 
 def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
-    """Whether decoding a payload would make more objects than memory and patience have room for.
+    """Returns whether decoding a payload would make more than `MAX_OBJECTS` objects.
 
-    A byte of it can stand for an object of a hundred. One that does not fit its definition is left
-    to decoding, which says so.
+    One byte of it can stand for an object of a hundred. A payload that does not fit its definition
+    is left to decoding, which names the fault.
     """
     if len(payload) < _COUNTED_FROM_BYTES:
         return False
-    walk = _Count(definitions, payload)
     try:
-        walk.message(root)
+        _ObjectWalk(definitions, payload).message(root)
     except _TooManyError:
         return True
     except (_NoLayoutError, struct.error, IndexError):
@@ -82,22 +88,18 @@ def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
 
 
 class _Walk:
+    """Goes through the fields of a payload, in either byte order."""
+
+    _skipped: ClassVar[Mapping[str, int]] = _SIZES  # primitives whose arrays are passed in one step
+
     def __init__(self, definitions: Typesdict, payload: bytes) -> None:
         self._definitions = definitions
         self._payload = payload
-        self.position = _HEADER
-        self.doubles: list[int] = []
-        self.singles: list[int] = []
-        self.times: list[int] = []
+        self._length_of = struct.Struct("<I" if payload[1] & 1 else ">I")
+        self.position = _HEADER_BYTES
 
     def message(self, name: str) -> None:
-        fields = self._definitions[name][1]
-        if _is_time(name, fields):
-            self._aligned(4)
-            self.times.append(self.position)
-            self._advance(8)
-            return
-        for _, field in fields:
+        for _, field in self._definitions[name][1]:
             self._field(field)
 
     def _field(self, field: FieldDesc) -> None:
@@ -112,99 +114,94 @@ class _Walk:
             self._elements(field[1][0], self._length())
 
     def _elements(self, element: FieldDesc, count: int) -> None:
-        if element[0] == Nodetype.BASE and element[1][0] in _SIZES and count:
-            size = _SIZES[element[1][0]]
-            self._aligned(size)
-            self._advance(size * count)
-            return
-        if count > _MOST_NUMBERS:
-            raise _NoLayoutError
+        size = self._skipped.get(element[1][0]) if element[0] == Nodetype.BASE else None
+        if size is None:
+            self._each(element, count)
+        elif count:
+            self._advance(size, size * count)
+
+    def _each(self, element: FieldDesc, count: int) -> None:
         for _ in range(count):
             self._field(element)
 
     def _primitive(self, name: str) -> None:
         if name == "string":
-            self._advance(self._length())
-        elif name in _FLOATS:
-            self._aligned(_FLOATS[name])
-            (self.doubles if name == "float64" else self.singles).append(self.position)
-            self._advance(_FLOATS[name])
-            if len(self.doubles) + len(self.singles) > _MOST_NUMBERS:
-                raise _NoLayoutError
+            self._advance(1, self._length())
         elif name in _SIZES:
-            self._aligned(_SIZES[name])
-            self._advance(_SIZES[name])
+            self._advance(_SIZES[name], _SIZES[name])
         else:
             raise _NoLayoutError
 
     def _length(self) -> int:
-        self._aligned(4)
-        length: int = struct.unpack_from("<I", self._payload, self.position)[0]
-        self._advance(4)
+        at = self._advance(4, 4)
+        length: int = self._length_of.unpack_from(self._payload, at)[0]
         return length
 
-    def _aligned(self, size: int) -> None:
-        self.position += -(self.position - _HEADER) % size
-
-    def _advance(self, size: int) -> None:
-        self.position += size
+    def _advance(self, alignment: int, size: int) -> int:
+        """Goes past an aligned value, and returns where it begins."""
+        at = self.position + -(self.position - _HEADER_BYTES) % alignment
+        self.position = at + size
         if self.position > len(self._payload):
             raise _NoLayoutError
+        return at
 
 
-class _TooManyError(Exception):
-    """More elements than are decoded."""
+class _NumberWalk(_Walk):
+    """Collects the offsets of floats, times and durations."""
 
-
-class _Count(_Walk):
-    """Counts texts and messages, whatever the byte order."""
+    _skipped: ClassVar[Mapping[str, int]] = {
+        name: size for name, size in _SIZES.items() if name not in _FLOATS
+    }
 
     def __init__(self, definitions: Typesdict, payload: bytes) -> None:
         super().__init__(definitions, payload)
-        self._elements_seen = 0
-        self._length_of = struct.Struct("<I" if payload[1] & 1 else ">I")
+        self.doubles: list[int] = []
+        self.singles: list[int] = []
+        self.times: list[int] = []
 
     def message(self, name: str) -> None:
-        self._seen()
-        fields = self._definitions[name][1]
-        if not fields:
-            self._advance(1)
-        for _, field in fields:
-            self._field(field)
+        if _is_time(name, self._definitions[name][1]):
+            self.times.append(self._advance(4, 8))
+        else:
+            super().message(name)
 
-    def _elements(self, element: FieldDesc, count: int) -> None:
-        if element[0] == Nodetype.BASE and element[1][0] != "string":
-            if count:
-                size = _SIZES.get(element[1][0]) or _FLOATS.get(element[1][0], 1)
-                self._aligned(size)
-                self._advance(size * count)
-            return
-        for _ in range(count):
-            self._field(element)
+    def _each(self, element: FieldDesc, count: int) -> None:
+        if count > _MAX_NUMBERS:
+            raise _NoLayoutError
+        super()._each(element, count)
+
+    def _primitive(self, name: str) -> None:
+        super()._primitive(name)
+        if name in _FLOATS:
+            offsets = self.doubles if name == "float64" else self.singles
+            offsets.append(self.position - _SIZES[name])
+            if len(self.doubles) + len(self.singles) > _MAX_NUMBERS:
+                raise _NoLayoutError
+
+
+class _ObjectWalk(_Walk):
+    """Counts texts and messages."""
+
+    _objects = 0
+
+    def message(self, name: str) -> None:
+        self._count()
+        if not self._definitions[name][1]:
+            self._advance(1, 1)
+        super().message(name)
 
     def _primitive(self, name: str) -> None:
         if name == "string":
-            self._seen()
-            self._advance(self._length())
-        else:
-            size = _SIZES.get(name) or _FLOATS.get(name, 1)
-            self._aligned(size)
-            self._advance(size)
+            self._count()
+        super()._primitive(name)
 
-    def _length(self) -> int:
-        self._aligned(4)
-        length: int = self._length_of.unpack_from(self._payload, self.position)[0]
-        self._advance(4)
-        return length
-
-    def _seen(self) -> None:
-        self._elements_seen += 1
-        if self._elements_seen > MOST_ELEMENTS:
+    def _count(self) -> None:
+        self._objects += 1
+        if self._objects > MAX_OBJECTS:
             raise _TooManyError
 
 
 def _is_time(name: str, fields: list[tuple[str, FieldDesc]]) -> bool:
     if name not in {"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"}:
         return False
-    kinds = tuple((field[1][0], 0) for _, field in fields if field[0] == Nodetype.BASE)
-    return (kinds, tuple(each for each, _ in fields)) == _TIME
+    return [(each, field[1][0]) for each, field in fields if field[0] == Nodetype.BASE] == _TIME

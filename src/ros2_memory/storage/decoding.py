@@ -6,7 +6,7 @@ import json
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.storage.cdr_layout import MOST_ELEMENTS, holds_too_many, layout_of
+from ros2_memory.storage.cdr_layout import MAX_OBJECTS, holds_too_many, layout_of
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC
 from ros2_memory.typestore import Typestores, full_name
@@ -115,7 +115,7 @@ def _bounded(
 
     def decode(payload: bytes) -> object:
         if holds_too_many(definitions, root, payload):
-            raise UnreadableError(f"it holds more than {MOST_ELEMENTS} texts or messages")
+            raise UnreadableError(f"it holds more than {MAX_OBJECTS} texts or messages")
         return deserialize(payload)
 
     return decode
