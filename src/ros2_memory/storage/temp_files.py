@@ -1,4 +1,4 @@
-"""Temporary files that a reader needs: unpacked bags, and bags with their journal played back."""
+"""Temporary files that a reader needs: decompressed bags, and bags with their journal applied."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from ros2_memory.storage.errors import UnreachableError, UnreadableError
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator
 
-_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, weakref_slot=True, eq=False)
 class _Entry:
-    folder: Path
     lock: threading.Lock = field(default_factory=threading.Lock)
+    folder: Path | None = None
     size: int = 0
     users: int = 0
     filled: tuple[Path, str] | None = None
 
 
 class Scratch:
-    """A folder of its own for temporary files, bounded in bytes. Safe to use from several threads.
+    """Folders for temporary files, bounded in bytes. Safe to use from several threads.
 
-    The least recently used are deleted first, never one in use. All go when the reader goes, or
-    the program ends.
+    The least recently used are deleted first, never one in use. All are deleted with the reader, or
+    when the program ends.
 
     Args:
         max_bytes: what all files together may take.
@@ -44,26 +44,27 @@ class Scratch:
         self._max_bytes = max_bytes
         self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
         self._bytes = 0
-        self._made = 0
-        self._root: Path | None = None
         self._lock = threading.Lock()
 
     @contextmanager
     def holding(
         self, key: Hashable, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]
     ) -> Iterator[tuple[Path, str]]:
-        """The file made of the content `key`; it is not deleted inside the block.
+        """Yields the file that is made of the content `key`; it is not deleted inside the block.
 
         Args:
             key: the content that it is made of.
-            fill: makes it, where it is not there: gets an empty folder, and a function to call
-                with a number of bytes before writing as many; gives the file and a note on it.
+            fill: makes the file if it is not there: takes an empty folder, and a function to call
+                with a number of bytes before it writes as many; returns the file and a note on it.
 
         Raises:
-            UnreadableError: it does not fit into `max_bytes`.
+            UnreadableError: the file does not fit into `max_bytes`.
             UnreachableError: the disk of the temporary files is full.
         """
-        entry = self._enter(key)
+        with self._lock:
+            entry = self._entries.setdefault(key, _Entry())
+            entry.users += 1
+            self._entries.move_to_end(key)
         try:
             with entry.lock:
                 if entry.filled is None or not entry.filled[0].exists():
@@ -71,54 +72,29 @@ class Scratch:
                 filled = entry.filled
             yield filled
         finally:
-            self._leave(key, entry)
-
-    def _enter(self, key: Hashable) -> _Entry:
-        with self._lock:
-            entry = self._entries.get(key)
-            if entry is None:
-                self._made += 1
-                entry = self._entries[key] = _Entry(self._folder() / str(self._made))
-            entry.users += 1
-            self._entries.move_to_end(key)
-            return entry
-
-    def _folder(self) -> Path:
-        if self._root is None or not self._root.is_dir():
-            try:
-                self._root = Path(tempfile.mkdtemp(prefix="ros2-memory-"))
-            except OSError as error:
-                raise _no_room(error) from error
-            weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
-        return self._root
-
-    def _leave(self, key: Hashable, entry: _Entry) -> None:
-        with self._lock:
-            entry.users -= 1
-            if entry.filled is None and not entry.users:
-                self._entries.pop(key, None)
+            with self._lock:
+                entry.users -= 1
+                if entry.filled is None and not entry.users:
+                    self._entries.pop(key, None)
 
     def _fill(
         self, entry: _Entry, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]
     ) -> tuple[Path, str]:
-        def reserve(size: int) -> None:
-            self._reserve(entry, size)
-
-        self._forget(entry)
+        self._empty(entry)
         try:
-            entry.folder.mkdir(parents=True)
-            return fill(entry.folder, reserve)
+            return fill(_new_folder(entry), lambda size: self._reserve(entry, size))
         except OSError as error:
-            self._forget(entry)
-            if error.errno in _NO_ROOM:
-                raise _no_room(error) from error
+            self._empty(entry)
+            if error.errno in _DISK_FULL:
+                raise _disk_full(error) from error
             raise
         except BaseException:
-            self._forget(entry)
+            self._empty(entry)
             raise
 
-    def _forget(self, entry: _Entry) -> None:
-        shutil.rmtree(entry.folder, ignore_errors=True)
+    def _empty(self, entry: _Entry) -> None:
+        if entry.folder is not None:
+            shutil.rmtree(entry.folder, ignore_errors=True)
         with self._lock:
             self._bytes -= entry.size
             entry.size = 0
@@ -129,7 +105,7 @@ class Scratch:
             for key, other in list(self._entries.items()):
                 if self._bytes + size <= self._max_bytes:
                     break
-                if not other.users:
+                if not other.users and other.folder is not None:
                     del self._entries[key]
                     self._bytes -= other.size
                     shutil.rmtree(other.folder, ignore_errors=True)
@@ -142,7 +118,17 @@ class Scratch:
             entry.size += size
 
 
-def _no_room(error: OSError) -> UnreachableError:
+def _new_folder(entry: _Entry) -> Path:
+    """Makes a folder that is deleted with the entry, or when the program ends."""
+    try:
+        entry.folder = Path(tempfile.mkdtemp(prefix="ros2-memory-"))
+    except OSError as error:
+        raise _disk_full(error) from error
+    weakref.finalize(entry, shutil.rmtree, entry.folder, ignore_errors=True)
+    return entry.folder
+
+
+def _disk_full(error: OSError) -> UnreachableError:
     return UnreachableError(
         "it must be unpacked, and nothing can be written into the folder for temporary files"
         f" ({error.strerror or error}); free disk space there, or name another folder in TMPDIR"
