@@ -53,12 +53,6 @@ class ByteLru(Generic[T]):
                 _, (_, dropped) = self._held.popitem(last=False)
                 self._bytes -= dropped
 
-    @property
-    def bytes_held(self) -> int:
-        """The sum of the sizes of what is kept."""
-        with self._lock:
-            return self._bytes
-
 
 def shared(channel: Channel) -> Channel:
     """Returns the first channel met that equals this one: bags of one robot declare the same.

@@ -42,6 +42,7 @@ from ros2_memory.storage.errors import (
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.mcap.records import offered_as_latched
 from ros2_memory.storage.zstd_bag import plain_payload
+from ros2_memory.typestore import full_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -216,7 +217,11 @@ class SqliteBags:
         if found[1:] != (time, number):
             raise UnreadableError("damaged: a message is not the one that an index names")
         channel = wanted[number]
-        payload = self._plain(found[0]) if channel.encoding == "cdr" else found[0]
+        payload = (
+            plain_payload(found[0], self._max_message_bytes)
+            if channel.encoding == "cdr"
+            else found[0]
+        )
         return Record(channel, time, time, payload)
 
     def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:
@@ -232,9 +237,6 @@ class SqliteBags:
                 right = False
             self._proven.put(known.key, right, _PROOF_BYTES)
         return right
-
-    def _plain(self, payload: bytes) -> bytes:
-        return plain_payload(payload, self._max_message_bytes)
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
@@ -271,7 +273,7 @@ class SqliteBags:
         for row in rows:
             value = dict(zip(names, row, strict=True))
             raw_type = str(value["type"])
-            schema = definitions.get(raw_type, Schema(_full_type(raw_type)))
+            schema = definitions.get(raw_type, Schema(full_name(raw_type)))
             channels[int(value["id"])] = shared(
                 Channel(
                     str(value["name"]),
@@ -348,17 +350,11 @@ def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
     )
     return {
         str(name): Schema(
-            _full_type(str(name)), str(encoding), str(text).encode()[: MAX_DEFINITION_BYTES + 1]
+            full_name(str(name)), str(encoding), str(text).encode()[: MAX_DEFINITION_BYTES + 1]
         )
         for name, encoding, text in rows
         if encoding in {"ros2msg", "ros2idl"}
     }
-
-
-def _full_type(name: str) -> str:
-    """The type as it is written since 2019: `package/Name` is `package/msg/Name`."""
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
 def journals_beside(path: Path) -> list[Path]:

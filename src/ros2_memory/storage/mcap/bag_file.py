@@ -236,18 +236,18 @@ class McapBags:
         large: dict[int, bytes] = {}
 
         def chunk_run(chunk: Chunk) -> SortedRun[Record | LostError]:
-            def rows() -> Rows[Record | LostError]:
+            def rows() -> Rows[Record | LostError] | None:
                 # Of a chunk that cannot be read, only what its index says was wanted is lost.
                 try:
                     with as_unreadable():
                         data = self._chunk_data(file, chunk)
                 except UnreadableError as error:
                     lost = self._lost(file, chunk, wanted, window, str(error))
-                    return _lost(lost, newest_first=newest_first) if lost else _NO_ROWS
+                    return _lost(lost, newest_first=newest_first) if lost else None
                 columns = self._chunk_columns(file, chunk, wanted, data)
                 column = joined([each.between(window.start, window.stop) for each in columns])
                 if not column.times.size:
-                    return _NO_ROWS
+                    return None
                 fetch = self._fetching(file, chunk, data, wanted, large)
                 return _rows(column, fetch, newest_first=newest_first)
 
@@ -520,13 +520,6 @@ def _rows(
     if newest_first:
         times, places = times[::-1], places[::-1]
     return Rows(times.tolist(), places.tolist(), fetch)
-
-
-def _nothing(_place: int, _time: Ns) -> Record:
-    raise UnreadableError(NOT_THERE)
-
-
-_NO_ROWS: Final[Rows[Record | LostError]] = Rows([], [], _nothing)
 
 
 def _from_bytes(

@@ -292,9 +292,6 @@ def _index_at(region: bytes, channel: int, at: int) -> tuple[int, int]:
     return pairs_at, count
 
 
-_COUNTED_EVERY: Final = 1 << 20
-
-
 @dataclass(slots=True)
 class ChunkContent:
     """What walking the records of a chunk found.
@@ -318,11 +315,8 @@ def walk_chunk(data: bytes) -> ChunkContent:
     declarations: list[tuple[int, bytes]] = []
     position, end = 0, len(data)
     record, message = RECORD.unpack_from, MESSAGE.unpack_from
-    counted = MAX_CHUNK_MESSAGES * MESSAGE.size  # where there can first be too many
+    messages = 0
     while position + RECORD.size <= end:
-        if position > counted:
-            _require_few(found)
-            counted += _COUNTED_EVERY
         opcode, length = record(data, position)
         following = position + RECORD.size + length
         if following > end or opcode == 0:
@@ -336,19 +330,16 @@ def walk_chunk(data: bytes) -> ChunkContent:
                 entry = found[channel] = ([], [])
             entry[0].append(log_time)
             entry[1].append(position)
+            messages += 1
+            if messages > MAX_CHUNK_MESSAGES:
+                raise UnreadableError(f"a chunk holds more than {MAX_CHUNK_MESSAGES} messages")
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             declarations.append((opcode, data[position + RECORD.size : following]))
             if len(declarations) > MAX_CHUNK_DECLARATIONS:
                 raise UnreadableError(_MANY_DECLARED)
         position = following
     columns = {channel: column_of(*lists) for channel, lists in found.items()}
-    messages = sum(len(times) for times, _ in found.values())
     return ChunkContent(columns, position, messages, declarations)
-
-
-def _require_few(found: Mapping[int, tuple[list[int], list[int]]]) -> None:
-    if sum(len(times) for times, _ in found.values()) > MAX_CHUNK_MESSAGES:
-        raise UnreadableError(f"a chunk holds more than {MAX_CHUNK_MESSAGES} messages")
 
 
 def column_of(times: Sequence[int], places: Sequence[int]) -> Column:

@@ -34,7 +34,7 @@ class SortedRun(NamedTuple, Generic[T]):
     first: Ns
     last: Ns
     rank: int
-    rows: Callable[[], Rows[T]]
+    rows: Callable[[], Rows[T] | None]
 
 
 def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
@@ -55,7 +55,7 @@ def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
         while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
             _, rank, run = waiting.pop()
             rows = run.rows()
-            if rows.times:
+            if rows is not None:
                 keys = [-time for time in rows.times] if newest_first else rows.times
                 heappush(heap, (keys[0], rank, 0, rows, keys))
             del rows, run

@@ -66,8 +66,7 @@ _STATISTICS: Final = struct.Struct("<QHIIIIQQI")
 """Messages, schemas, channels, attachments, metadata, chunks, first and last log time, and the
 bytes of the counts by channel."""
 _COUNT: Final = struct.Struct("<HQ")
-_MOST_REMEMBERED: Final = 256
-_LONGEST_REMEMBERED: Final = 16 * 1024
+_LONGEST_CACHED: Final = 16 * 1024
 
 # QoS stands in a channel's metadata as YAML; parsing it costs fifty times this search. Newer
 # distros write the durability's name, older ones rmw's number for it.
@@ -79,22 +78,22 @@ def offered_as_latched(qos_profiles: str) -> bool:
     return _TRANSIENT_LOCAL.search(qos_profiles) is not None
 
 
-def framed(section: bytes) -> Iterator[tuple[int, bytes]]:
-    """The records of a section as (opcode, body).
+def framed(section: bytes, position: int = 0) -> Iterator[tuple[int, int, int]]:
+    """Yields the opcode of each record from `position` on, and where its body begins and ends.
 
     Raises:
         UnreadableError: the section does not end where a record does.
     """
-    position, end = 0, len(section)
+    end = len(section)
     while position < end:
         if position + RECORD.size > end:
             raise UnreadableError("damaged: a section ends inside a record")
         opcode, length = RECORD.unpack_from(section, position)
-        position += RECORD.size
-        if position + length > end:
+        begin = position + RECORD.size
+        position = begin + length
+        if position > end:
             raise UnreadableError("damaged: a record is longer than its section")
-        yield opcode, section[position : position + length]
-        position += length
+        yield opcode, begin, position
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,12 +128,13 @@ class Declarations:
 
     def add(self, opcode: int, body: bytes) -> None:
         """Takes note of a schema or channel record; others are ignored."""
-        if opcode == Opcode.SCHEMA:
-            number, schema = _schema(body) if _is_short(body) else _schema.__wrapped__(body)
-            self._schemas[number] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = _channel(body) if _is_short(body) else _channel.__wrapped__(body)
-            self._channels[channel.id] = channel
+        # Short ones only, so that what the cache holds stays below 8 MiB.
+        decode = _declaration if len(body) <= _LONGEST_CACHED else _declaration.__wrapped__
+        number, declared = decode(opcode, body)
+        if isinstance(declared, Schema):
+            self._schemas[number] = declared
+        elif declared is not None:
+            self._channels[number] = declared
 
     def agrees(self, opcode: int, body: bytes) -> bool:
         """Whether a schema or channel record declares what is known of its number, if anything."""
@@ -193,25 +193,17 @@ class Declarations:
 
 
 # The bags of one robot declare the same, byte for byte.
-@lru_cache(_MOST_REMEMBERED)
-def _schema(body: bytes) -> tuple[int, Schema]:
-    schema: mcap_records.Schema = mcap_records.Schema.read(_stream(body))
-    return schema.id, Schema(schema.name, schema.encoding, schema.data[: MAX_DEFINITION_BYTES + 1])
-
-
-@lru_cache(_MOST_REMEMBERED)
-def _channel(body: bytes) -> mcap_records.Channel:
-    channel: mcap_records.Channel = mcap_records.Channel.read(_stream(body))
-    return channel
-
-
-def _is_short(body: bytes) -> bool:
-    """Whether it may be remembered: what is, together, stays below some MB."""
-    return len(body) <= _LONGEST_REMEMBERED
-
-
-def _stream(body: bytes) -> ReadDataStream:
-    return ReadDataStream(BytesIO(body))
+@lru_cache(512)
+def _declaration(opcode: int, body: bytes) -> tuple[int, Schema | mcap_records.Channel | None]:
+    stream = ReadDataStream(BytesIO(body))
+    if opcode == Opcode.SCHEMA:
+        schema: mcap_records.Schema = mcap_records.Schema.read(stream)
+        text = schema.data[: MAX_DEFINITION_BYTES + 1]
+        return schema.id, Schema(schema.name, schema.encoding, text)
+    if opcode == Opcode.CHANNEL:
+        channel: mcap_records.Channel = mcap_records.Channel.read(stream)
+        return channel.id, channel
+    return 0, None
 
 
 _MOST_PROFILE_BYTES: Final = 256

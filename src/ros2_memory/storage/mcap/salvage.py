@@ -17,7 +17,7 @@ from mcap.data_stream import ReadDataStream
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import MAX_SECTION_BYTES, UnreadableError, as_unreadable
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, RECORD, Opcode
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, Opcode, framed
 from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
@@ -100,12 +100,9 @@ class Salvage:
 
 
 def _content_of(data: bytes, usable: int) -> Iterator[tuple[int, bytes]]:
-    position = 0
-    while position < usable:
-        opcode, length = RECORD.unpack_from(data, position)
-        position += RECORD.size + length
+    for opcode, begin, end in framed(data[:usable]):
         if opcode in _CONTENT:
-            yield opcode, data[position - length : position]
+            yield opcode, data[begin:end]
 
 
 def parsed(records: Iterable[tuple[int, bytes]]) -> Iterator[mcap_records.McapRecord]:

@@ -45,6 +45,7 @@ _index_size: Final = struct.Struct("<Q").unpack_from
 _tuple: Final = tuple.__new__
 _DECLARING: Final = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))
 _STATISTICS: Final = int(Opcode.STATISTICS)
+_CHUNK_INDEX_OPCODE: Final = int(Opcode.CHUNK_INDEX)
 _MOST_REMEMBERED: Final = 32
 _LONGEST_REMEMBERED: Final = 128 * 1024
 
@@ -112,22 +113,13 @@ def read_summary(file: OpenFile) -> Summary:
     declaring: list[bytes] = [] if beginning is None else [beginning.records]
     chunks: list[Chunk] = []
     stated: Statistics | None = None
-    position, end = sum(map(len, declaring)), len(section)
-    record, size, chunk_index = RECORD.unpack_from, RECORD.size, int(Opcode.CHUNK_INDEX)
-    while position < end:
-        if position + size > end:
-            raise UnreadableError("damaged: a section ends inside a record")
-        opcode, length = record(section, position)
-        following = position + size + length
-        if following > end:
-            raise UnreadableError("damaged: a record is longer than its section")
-        if opcode == chunk_index:
-            chunks.append(_chunk(section, position + size, following))
+    for opcode, begin, end in framed(section, sum(map(len, declaring))):
+        if opcode == _CHUNK_INDEX_OPCODE:
+            chunks.append(_chunk(section, begin, end))
         elif opcode in _DECLARING:
-            declaring.append(section[position:following])
+            declaring.append(section[begin - RECORD.size : end])
         elif opcode == _STATISTICS:
-            stated = statistics(section[position + size : following])
-        position = following
+            stated = statistics(section[begin:end])
     if beginning is None or len(declaring) > 1:
         beginning = _declared(b"".join(declaring))
         _remember(beginning, section)
@@ -173,8 +165,8 @@ def _numbers(low: bytes, high: bytes) -> frozenset[int]:
 def _declared(records: bytes) -> _Declared:
     """What schema and channel records declare."""
     declarations = Declarations()
-    for opcode, body in framed(records):
-        declarations.add(opcode, body)
+    for opcode, begin, end in framed(records):
+        declarations.add(opcode, records[begin:end])
     channels = declarations.channels()
     return _Declared(records, channels, unshared_bytes(channels), declarations)
 
