@@ -1,8 +1,4 @@
-"""The way driven in a window: whole bags by the digests of their poses, the others pose by pose.
-
-A digest is the same whether it comes from the catalogue or is made here from the bag, so an answer
-does not depend on what the catalogue knows.
-"""
+"""The driven path in a window: whole bags by digests of their poses, the others pose by pose."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.analysis.bulk_decode import MotionDecoder
-from ros2_memory.analysis.odometry import TimedPosition, is_place
+from ros2_memory.analysis.odometry import is_place
 from ros2_memory.analysis.trajectory import PoseCollector, TrajectoryBuilder
 from ros2_memory.catalogue.codec import decode_poses, encode_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
@@ -23,14 +19,14 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.analysis.trajectory import Trajectory
-    from ros2_memory.core.model import Pose, TimeWindow
+    from ros2_memory.core.model import Pose, TimeWindow, Vector3
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Span
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
 _MOST_AT_ONCE: Final = 1024
-"""Messages that are looked at together."""
+"""Messages that are decoded together: 0.74 in place of 7.6 µs for the position of each."""
 _MOST_BYTES_AT_ONCE: Final = 1 << 20
 
 
@@ -40,7 +36,7 @@ AddPose: TypeAlias = "Callable[[Ns, Pose, float | None], None]"
 
 @dataclass(frozen=True, slots=True)
 class DrivenPath:
-    """The way, its frames in order of appearance, and the times of its first and last message."""
+    """A path, its frames in order of appearance, and the times of its first and last message."""
 
     trajectory: Trajectory
     frames: tuple[str, ...]
@@ -92,35 +88,35 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None
     return None if span is None else DrivenPath(builder.result(), builder.frames, *span)
 
 
-def length_notes(way: Trajectory) -> Iterator[str]:
-    """What is not in the length of a way, and why it is not the sum of all steps."""
-    if way.invalid:
-        poses = counted(way.invalid, "pose")
+def length_notes(path: Trajectory) -> Iterator[str]:
+    """Yields what is left out of the length of a path, and why it is not the sum of all steps."""
+    if path.invalid:
+        poses = counted(path.invalid, "pose")
         yield f"{poses} left out: the coordinates are no place (NaN or beyond)"
-    if way.is_noisy:
+    if path.is_noisy:
         yield (
-            f"the positions are noisy: step by step they sum up to {way.path_sum_m:.2f} m; "
+            f"the positions are noisy: step by step they sum up to {path.path_sum_m:.2f} m; "
             "distance_m is without what the noise adds"
         )
-    if way.in_doubt:
+    if path.in_doubt:
         yield (
             "the positions come more than 0.25 s apart, and noise or sharp turns are much of the "
             "steps between them: distance_m may be too long, since noise cannot be taken off"
         )
-    if way.gaps:
-        without = "without a valid pose" if way.invalid else "in which nothing was recorded"
+    if path.gaps:
+        without = "without a valid pose" if path.invalid else "in which nothing was recorded"
         yield (
-            f"{counted(way.gaps, 'gap')} {without}, {way.gap_m:.2f} m across in straight lines "
+            f"{counted(path.gaps, 'gap')} {without}, {path.gap_m:.2f} m across in straight lines "
             "(gap_m): left out of distance_m"
         )
-    if way.jumps:
+    if path.jumps:
         yield (
-            f"{counted(way.jumps, 'jump')} of {way.jumped_m:.2f} m in all, faster than is "
+            f"{counted(path.jumps, 'jump')} of {path.jumped_m:.2f} m in all, faster than is "
             "plausible, left out of distance and speed"
         )
-    if way.resets:
+    if path.resets:
         yield (
-            f"odometry began anew {counted(len(way.resets), 'time')}: "
+            f"odometry began anew {counted(len(path.resets), 'time')}: "
             "what led back to its origin is left out of distance and speed"
         )
 
@@ -132,7 +128,7 @@ def add_poses(
     messages: Iterable[StoredMessage],
     failures: list[UndecodableError],
 ) -> tuple[Ns, Ns] | None:
-    """Adds the poses of messages, and gives the times of the first and last; None without any.
+    """Adds the poses of messages, and returns the times of the first and last; None without any.
 
     Those that cannot be decoded are added to `failures`.
 
@@ -142,13 +138,13 @@ def add_poses(
     first: Ns | None = None
     last: Ns | None = None
     for some in _batches(messages):
-        for found, sight in zip(some, decoder.decode([each.record for each in some]), strict=True):
-            if isinstance(sight, UndecodableError):
-                failures.append(sight)
+        for found, sample in zip(some, decoder.decode([each.record for each in some]), strict=True):
+            if isinstance(sample, UndecodableError):
+                failures.append(sample)
                 continue
-            if sight.pose is None:
+            if sample.pose is None:
                 raise InvalidArgumentsError(describe_lack(view, "position", found))
-            add(found.time, sight.pose, sight.speed_mps)
+            add(found.time, sample.pose, sample.speed_mps)
             first = found.time if first is None else first
             last = found.time
         view.bags.check_deadline()
@@ -156,7 +152,7 @@ def add_poses(
 
 
 def _batches(messages: Iterable[StoredMessage]) -> Iterator[list[StoredMessage]]:
-    """The messages, as many at a time as may be held."""
+    """Yields the messages in lists, bounded in number and in bytes."""
     some: list[StoredMessage] = []
     size = 0
     for found in messages:
@@ -169,23 +165,25 @@ def _batches(messages: Iterable[StoredMessage]) -> Iterator[list[StoredMessage]]
         yield some
 
 
-def stops(view: View, messages: Iterable[StoredMessage]) -> Iterator[TimedPosition]:
-    """Where the poses of messages are; what is no place is left out.
+def positions_of(
+    view: View, messages: Iterable[StoredMessage]
+) -> Iterator[tuple[StoredMessage, Vector3]]:
+    """Yields messages with the positions (m) of their poses; without those that are NaN or beyond.
 
-    So is, with a note, what cannot be decoded.
+    A note says which messages cannot be decoded.
     """
     for found in messages:
         try:
             message = view.memory.reader.decode(found.record)
         except UndecodableError as error:
-            leave_out(view, error)
+            note_left_out(view, error)
             continue
         pose = view.memory.extractor.pose(message, found.record.channel.type)
         if pose is not None and is_place(pose.position):
-            yield TimedPosition(found.time, pose.position)
+            yield found, pose.position
 
 
-def leave_out(view: View, error: UndecodableError) -> None:
-    """Says that there are poses which cannot be decoded, and why."""
+def note_left_out(view: View, error: UndecodableError) -> None:
+    """Notes that there are poses which cannot be decoded, and why."""
     view.notes.complete = False
     view.notes.add(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")

@@ -114,7 +114,7 @@ class MapPlacement:
         px, py, _ = rotate(back.rotation, (x, y, 0.0))
         return px + back.translation[0], py + back.translation[1]
 
-    def is_one(self, topic: str) -> bool:
+    def is_fixed(self, topic: str) -> bool:
         """Whether what is fixed is the same in every recording of a topic."""
         if self.frame_id == self.pose_frame:
             return True

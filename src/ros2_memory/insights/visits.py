@@ -1,14 +1,13 @@
-"""When the robot was near a place: arrival, departure, closest approach, newest first.
+"""Visits to a place: arrival, departure and closest approach, newest first.
 
 A visit is pose after pose within the radius. It is over when the robot is farther away for some
-seconds, and where for longer no pose tells where it is. Odometry that
-begins anew gives places another meaning: visits of before are marked.
+seconds, and where for longer there is no pose to know it by. When odometry is reset, the same
+coordinates are another place: visits from before that are marked.
 """
 
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from itertools import chain, islice, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
@@ -33,8 +32,8 @@ from ros2_memory.history.driven_path import (
     POSES,
     add_poses,
     driven_path,
-    leave_out,
-    stops,
+    note_left_out,
+    positions_of,
 )
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import describe_lack, require_bags, resolve_pose_topic
@@ -45,10 +44,9 @@ from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from ros2_memory.analysis.dwell import Dwell
-    from ros2_memory.analysis.odometry import PoseDigest, TimedPosition
+    from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.core.model import Pose, Vector3
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
@@ -56,13 +54,13 @@ if TYPE_CHECKING:
     from ros2_memory.insights.map_placement import MapPlacement
 
 _COUNTING_S: Final = 5.0
-"""For so long visits are counted that are not shown."""
+"""How long visits are counted that are not shown."""
 _ROUNDING_M: Final = 1e-6
-"""What may be lost of a distance between doubles."""
+"""What rounding of doubles may take off a distance."""
 _SPLITS: Final = 3
-"""A pose so many splits old is the newest of a robot that goes on: a split answers when closed."""
+"""A pose no older than so many splits is current: a split answers only when it is closed."""
 _MOST_TRIED: Final = 1000
-"""The newest poses, of which one must be readable."""
+"""How many of the newest poses are tried until one can be decoded."""
 
 
 def visits(
@@ -75,9 +73,9 @@ def visits(
     radius_m: float | None = None,
     limit: int = 10,
 ) -> Visits:
-    """When the robot was within a radius (m) of a place of the plane, the newest visits first.
+    """Returns when the robot was within a radius (m) of a place in the plane, newest visits first.
 
-    The place is meant in `frame_id`: the map, as where none is given, or the frame of the poses.
+    `x` and `y` (m) are in `frame_id`: the map, which is the default, or the frame of the poses.
 
     Raises:
         InvalidArgumentsError: the pose topic carries no position, the radius is not positive, or
@@ -93,31 +91,31 @@ def visits(
     require_bags(view)
     topic = resolve_pose_topic(view)
     place = map_placement(view, _pose_frame(view, topic), topic, frame_id)
-    looking = _Looking(view, topic, place, (x, y, radius))
-    latest, newest = view.snapshot.latest, looking.newest_time
+    search = _VisitSearch(view, topic, place, (x, y, radius))
+    latest, newest = view.snapshot.latest, search.newest_time
     now = memory.now(wall, latest)
     stale = _SPLITS * ns_from_unix(memory.limits.split_duration_s)
     known = newest is not None and newest >= now - stale
-    found, total = looking.newest(limit)
-    epochs = () if place.is_map or not found else _restarts(view, topic, found[-1][0].arrived)
+    found, total = search.newest(limit)
+    resets = () if place.is_map or not found else _resets(view, topic, found[-1][0].arrived)
     note_unread(view, TimeWindow.everything(), nothing=not found)
-    told = tuple(
+    shown = tuple(
         Visit(
-            arrived=stay.arrived if stay.begun else None,
-            departed=None if known and stay.departed == newest else stay.departed,
-            duration=stay.departed - stay.arrived,
+            arrived=dwell.arrived if dwell.begun else None,
+            departed=None if known and dwell.departed == newest else dwell.departed,
+            duration=dwell.departed - dwell.arrived,
             closest_m=closest.distance_m,
             closest_at=closest.time,
-            restarts=sum(epoch > stay.departed for epoch in epochs),
+            restarts=sum(reset > dwell.departed for reset in resets),
         )
-        for stay, closest in found
+        for dwell, closest in found
     )
-    if newest is not None and any(visit.departed == newest for visit in told):
+    if newest is not None and any(visit.departed == newest for visit in shown):
         view.notes.add(
             f"the newest pose, of {unix_text(newest)}, is too old to know whether the robot is "
             "there now: departed is that pose"
         )
-    if any(visit.restarts for visit in told):
+    if any(visit.restarts for visit in shown):
         view.notes.add(
             "visits with restarts_since are of before odometry began anew: "
             "the same coordinates may have been another place"
@@ -127,91 +125,94 @@ def visits(
         x=x,
         y=y,
         radius_m=radius,
-        visits=told,
-        more=total > len(told),
+        visits=shown,
+        more=total > len(shown),
         total=total,
         now=now,
         notes=view.notes.sentences(),
     )
 
 
-def _restarts(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
-    """When odometry began anew after a moment; not known where the time is over before."""
+def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
+    """Returns the times of the first poses after each reset of odometry since a moment.
+
+    None, with a note, where the time for the answer is over before they are known.
+    """
     try:
-        return odometry_resets(view, topic, since)
+        path = driven_path(view, topic, TimeWindow(since, MAX_NS))
+    except (InvalidArgumentsError, NoDataError):
+        return ()  # poses that cannot be read say nothing about resets
     except QueryTimeoutError:
         view.notes.complete = False
         view.notes.add("the time was over before it was known whether odometry began anew since")
         return ()
+    return () if path is None else path.trajectory.resets
 
 
 def _pose_frame(view: View, topic: str) -> str:
-    """The frame of the newest pose that can be decoded.
+    """Returns the frame of the newest pose that can be decoded; empty without a pose.
 
     Raises:
         InvalidArgumentsError: the topic's messages carry no position.
         UndecodableError: none of the newest ones can be decoded.
     """
-    found = view.stream.newest(topic, TimeWindow.everything())
-    if found is None:
-        return ""
-    try:
-        return _frame_of(view, found)
-    except UndecodableError as error:
-        leave_out(view, error)
-        older = view.stream.messages([topic], TimeWindow.until(found.time), newest_first=True)
-        for each in islice(older, _MOST_TRIED):
-            with suppress(UndecodableError):
-                return _frame_of(view, each)
-        raise
+    failure: UndecodableError | None = None
+    newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
+    for found in islice(newest, _MOST_TRIED):
+        try:
+            message = view.memory.reader.decode(found.record)
+        except UndecodableError as error:
+            failure = failure or error
+            continue
+        pose = view.memory.extractor.pose(message, found.record.channel.type)
+        if pose is None:
+            raise InvalidArgumentsError(describe_lack(view, "position", found))
+        if failure is not None:
+            note_left_out(view, failure)
+        return pose.frame_id
+    if failure is not None:
+        raise failure
+    return ""
 
 
-def _frame_of(view: View, found: StoredMessage) -> str:
-    message = view.memory.reader.decode(found.record)
-    pose = view.memory.extractor.pose(message, found.record.channel.type)
-    if pose is None:
-        raise InvalidArgumentsError(describe_lack(view, "position", found))
-    return pose.frame_id
-
-
-class _Looking:
-    """Goes through the poses of a topic from the newest on, but for bags that are ruled out."""
+class _VisitSearch:
+    """Goes through the poses of a topic from the newest on, without bags that are ruled out."""
 
     def __init__(
-        self, view: View, topic: str, place: MapPlacement, wanted: tuple[float, float, float]
+        self, view: View, topic: str, place: MapPlacement, target: tuple[float, float, float]
     ) -> None:
         self._view = view
         self._topic = topic
         self._place = place
-        self._x, self._y, self._radius = wanted
-        self._one = place.is_one(topic)
+        self._x, self._y, self._radius = target
+        self._is_fixed = place.is_fixed(topic)
         self._digests = StoredDigests(view, topic, POSES, TimeWindow.everything())
         self._decoder = MotionDecoder(view.memory.reader, view.memory.extractor)
         self._counting: Deadline | None = None
 
     @property
     def newest_time(self) -> Ns | None:
-        """When the newest pose was recorded."""
-        return next((stop.time for stop in self._positions(TimeWindow.everything())), None)
+        """The log time of the newest pose; None without one."""
+        return next((found.time for found, _ in self._positions(TimeWindow.everything())), None)
 
     def newest(self, limit: int) -> tuple[list[tuple[Dwell, Approach]], int]:
-        """The newest visits, each with its closest approach, and how many there are in all.
+        """Returns the newest visits, each with its closest approach, and how many there are.
 
-        Where the time is over before all is gone through, there are as many as were found.
+        Where the time is over before the end, a note says how far back they were counted.
         """
-        stays = DwellBuilder(limit)
+        visits = DwellBuilder(limit)
         before = MAX_NS
         try:
             for part in self._parts():
-                self._pass_over(stays, TimeWindow(part.stop, max(before, part.stop)))
-                self._look(stays, part)
+                self._pass_over(visits, TimeWindow(part.stop, max(before, part.stop)))
+                self._add_part(visits, part)
                 before = part.start
-                if stays.enough and self._counting is None:
+                if visits.enough and self._counting is None:
                     self._counting = Deadline.after(_COUNTING_S)
                 self._check_counting()
-            stays.end()
+            visits.end()
         except QueryTimeoutError:
-            if not stays.all:
+            if not visits.all:
                 raise
             self._view.notes.complete = False
             if self._counting is None:
@@ -219,24 +220,24 @@ class _Looking:
             self._view.notes.add(
                 f"total counts the visits back to {unix_text(before)}: there may be more"
             )
-        return [(stay, self._closest(stay)) for stay in stays.all[:limit]], len(stays.all)
+        return [(visit, self._closest(visit)) for visit in visits.all[:limit]], len(visits.all)
 
     def _check_counting(self) -> None:
-        """Gives up when the time for counting visits that are not shown is over.
+        """Checks that there is time left to count visits that are not shown.
 
         Raises:
-            QueryTimeoutError: it is.
+            QueryTimeoutError: there is none.
         """
         if self._counting is not None and self._counting.expired():
             raise QueryTimeoutError("counting takes too long")
 
-    def _closest(self, stay: Dwell) -> Approach:
-        """The closest of all poses of a visit, the earliest of equals.
+    def _closest(self, visit: Dwell) -> Approach:
+        """Returns the closest pose of a visit, the earliest of equals.
 
         Whole bags within the radius are read only where one of their poses may be closer.
         """
-        closest = stay.closest
-        for bound, window, here in sorted(stay.unread, key=attrgetter("bound")):
+        closest = visit.closest
+        for bound, window, here in sorted(visit.unread, key=attrgetter("bound")):
             if closest is not None and closest <= bound:
                 break
             approaches = [] if closest is None else [closest]
@@ -245,13 +246,13 @@ class _Looking:
             except QueryTimeoutError:
                 self._view.notes.complete = False
                 self._view.notes.add(
-                    f"closest_m of the visit until {unix_text(stay.departed)} is not the least: "
+                    f"closest_m of the visit until {unix_text(visit.departed)} is not the least: "
                     "the time was over before all of its poses were read"
                 )
                 return min(approaches, default=bound)
             closest = min(approaches, default=None)
-        # Where the bags of the visit are gone meanwhile, what is known of them serves.
-        return closest or min(each.bound for each in stay.unread)
+        # Bags that were deleted meanwhile leave their bounds.
+        return closest or min(each.bound for each in visit.unread)
 
     def _add_approaches(
         self, approaches: list[Approach], window: TimeWindow, here: tuple[float, float]
@@ -264,75 +265,76 @@ class _Looking:
         add_poses(self._view, add, self._decoder, messages, [])
 
     def _parts(self) -> Iterator[TimeWindow]:
-        """The times in which the robot may have been near, newest first."""
+        """Yields the times in which the robot may have been near, newest first."""
         if self._view.stream.may_be_relatched([self._topic]):
-            # What ends a visit may be a copy of a pose in a bag that is ruled out.
+            # A visit may be ended by the duplicate of a pose in a bag that is ruled out.
             yield TimeWindow.everything()
             return
-        holdings = self._view.stream.overlapping_bags([self._topic], TimeWindow.everything())
-        here = self._here_in(holdings[0]) if self._one and holdings else None
-        if here is None:  # the place is another one in some bags: none is ruled out
+        bags = self._view.stream.overlapping_bags([self._topic], TimeWindow.everything())
+        here = self._here_in(bags[0]) if self._is_fixed and bags else None
+        if here is None:  # its coordinates are not the same in all bags, so none is ruled out
             near = Condition(NearPosition(0.0, 0.0, None, math.inf))
         else:
             near = Condition(NearPosition(*here, None, self._radius))
-        for stretch in CandidateBags(self._view, (self._topic,), near, MAX_NS).windows():
-            yield stretch.window
+        for part in CandidateBags(self._view, (self._topic,), near, MAX_NS).windows():
+            yield part.window
 
-    def _pass_over(self, stays: DwellBuilder, gap: TimeWindow) -> None:
-        """Takes the time between two parts: any pose in it is elsewhere."""
-        if gap.empty or not stays.under_way:
+    def _pass_over(self, visits: DwellBuilder, gap: TimeWindow) -> None:
+        """Adds the poses between two parts, which are all elsewhere, until the visit is over."""
+        if gap.empty or not visits.under_way:
             return
-        for stop in self._positions(gap):
-            if not stays.away(stop.time):
+        for found, _ in self._positions(gap):
+            if not visits.away(found.time):
                 return
 
-    def _look(self, stays: DwellBuilder, part: TimeWindow) -> None:
+    def _add_part(self, visits: DwellBuilder, part: TimeWindow) -> None:
+        """Adds the poses of a part: by their digest where that is enough, else one by one."""
         groups = groups_of(self._view.stream, self._topic, part)
-        alone = len(groups) == 1 and groups[0].is_whole and not self._contested(part)
+        alone = len(groups) == 1 and groups[0].is_whole and not self._may_have_duplicates(part)
         here = self._here_in(groups[0].bags[0]) if alone else None
         if here is not None:
             known = self._digests.of(groups[0])
-            if known is not None and self._sum_up(stays, groups[0], *known, here):
+            if known is not None and self._add_digest(visits, groups[0], *known, here):
                 return
         self._place.look_at(part)
-        for recording, time, position in self._positions_in(part):
+        for found, position in self._positions(part):
             self._check_counting()
-            off = self._off(recording, time, position)
-            if off is not None and off <= self._radius:
-                stays.near(Approach(off, time))
+            distance = self._distance(found, position)
+            if distance is not None and distance <= self._radius:
+                visits.near(Approach(distance, found.time))
             else:
-                stays.away(time)
+                visits.away(found.time)
 
-    def _sum_up(
+    def _add_digest(
         self,
-        stays: DwellBuilder,
+        visits: DwellBuilder,
         group: Group,
         digest: PoseDigest,
         span: tuple[Ns, Ns],
         here: tuple[float, float],
     ) -> bool:
-        """Takes a whole group by the digest of its poses, where that is enough to know."""
+        """Adds a whole group by the digest of its poses; False where that is not enough to know."""
         if digest.invalid or digest.first is None or digest.last is None:
             return False
         path = [vertex[1] for vertex in digest.vertices]
         error_m = digest.error_m + _ROUNDING_M
         bound_m = _off_path(path, here) - error_m
         if bound_m > self._radius:
-            stays.away(digest.first.time)
+            visits.away(digest.first.time)
             return True
         near = all(_away(position, here) + error_m <= self._radius for position in path)
         if not near or not self._unbroken(group, digest, span):
             return False
         if digest.error_m == 0 and len({*path}) == 1:
-            # It stood, and all poses are one.
-            stays.near(Approach(_away(path[0], here), digest.first.time), digest.last.time)
+            # The robot stood still: the digest has the exact position of all poses.
+            visits.near(Approach(_away(path[0], here), digest.first.time), digest.last.time)
             return True
         bound = Approach(max(bound_m, 0.0), span[0])
-        stays.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1), here))
+        visits.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1), here))
         return True
 
     def _unbroken(self, group: Group, digest: PoseDigest, span: tuple[Ns, Ns]) -> bool:
-        """Whether no two poses of a group that follow each other are so far apart as to part it."""
+        """Whether no silence between two poses of a group is long enough to end a visit."""
         first, last = span
         if last - first <= SILENCE_NS:
             return True
@@ -344,66 +346,39 @@ class _Looking:
             after - before <= SILENCE_NS for before, after in pairwise(times)
         )
 
-    def _contested(self, part: TimeWindow) -> bool:
+    def _may_have_duplicates(self, part: TimeWindow) -> bool:
         """Whether another recording may hold the original of a pose in a part."""
         wider = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
-        return (
-            len(
-                {
-                    each.bag.recording
-                    for each in self._view.stream.overlapping_bags([self._topic], wider)
-                }
-            )
-            > 1
-        )
+        bags = self._view.stream.overlapping_bags([self._topic], wider)
+        return len({each.bag.recording for each in bags}) > 1
 
     def _here_in(self, held: BagSpan) -> tuple[float, float] | None:
-        """Where the place is in the poses' frame of a bag; None where that is not one place."""
+        """Returns the target in the frame of a bag's poses; None where that frame moves."""
         return self._place.in_poses(held.bag.recording, held.first, self._x, self._y)
 
-    def _off(self, recording: Path, time: Ns, position: Vector3) -> float | None:
-        here = self._place.in_poses(recording, time, self._x, self._y)
+    def _distance(self, found: StoredMessage, position: Vector3) -> float | None:
+        """Returns how far (m) a pose is from the target; None where no transform tells."""
+        recording = found.bag.recording
+        here = self._place.in_poses(recording, found.time, self._x, self._y)
         if here is not None:
             return _away(position, here)
-        there = self._place.of(recording, time, position)
+        there = self._place.of(recording, found.time, position)
         return None if there is None else _away(there, (self._x, self._y))
 
-    def _positions_in(self, part: TimeWindow) -> Iterator[tuple[Path, Ns, Vector3]]:
-        """As `_positions`, each with its recording."""
+    def _positions(self, part: TimeWindow) -> Iterator[tuple[StoredMessage, Vector3]]:
+        """Returns the positions of a part, newest first."""
         messages = self._view.stream.messages([self._topic], part, newest_first=True)
-        at: list[Path] = []
-
-        def noted() -> Iterator[StoredMessage]:
-            for found in messages:
-                at[:] = [found.bag.recording]
-                yield found
-
-        for stop in stops(self._view, noted()):
-            yield at[0], *stop
-
-    def _positions(self, part: TimeWindow) -> Iterator[TimedPosition]:
-        """The positions of a part that are places, newest first."""
-        return stops(self._view, self._view.stream.messages([self._topic], part, newest_first=True))
+        return positions_of(self._view, messages)
 
 
 def _away(position: Vector3, here: tuple[float, float]) -> float:
-    """How far (m, in the plane) a position is from a place of the same frame."""
+    """Returns how far (m, in the plane) a position is from a place of the same frame."""
     return math.dist(position[:2], here)
 
 
 def _off_path(path: Sequence[Vector3], here: tuple[float, float]) -> float:
-    """How far (m, in the plane) a place is from a drawn path of the same frame."""
-    # Each vertex by itself too: what is parted may be a single one.
+    """Returns how far (m, in the plane) a place is from a path of the same frame."""
+    # Each vertex by itself too: a part of the path may be a single vertex.
     pairs = chain(zip(path, path, strict=True), pairwise(path))
     gaps = [off_segment(here, before[:2], after[:2]) for before, after in pairs]
     return min(gap for gap in gaps if not math.isnan(gap))
-
-
-def odometry_resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
-    """The times of the first poses of odometry that began anew after a moment, in order."""
-    # Poses that cannot be read, or are none, do not say where odometry is.
-    with suppress(InvalidArgumentsError, NoDataError):
-        way = driven_path(view, topic, TimeWindow(since, MAX_NS))
-        if way is not None:
-            return way.trajectory.resets
-    return ()
