@@ -1,8 +1,8 @@
-"""Matches in a row as sightings: when each began and ended, and where the robot and the thing were.
+"""Sightings: consecutive matches of a condition, with where the robot and the thing were.
 
-A sighting is message after message of one topic that meets a condition. It is over with a message
-of that topic that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector
-may speak only of what it sees. A message that cannot be decoded is neither a match nor an end.
+A sighting is message after message of one topic that meets a condition. It ends with a message of
+that topic that does not, and where the topic is silent for longer than `SILENCE_NS`: a detector may
+publish only what it sees. A message that cannot be decoded is neither a match nor an end.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
     QueryTimeoutError,
-    UndecodableError,
 )
 from ros2_memory.core.geometry import rotate
 from ros2_memory.core.model import TimeWindow
@@ -33,7 +32,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.reverse_search import ReverseSearch
-from ros2_memory.history.time_arguments import TimeRange, clamped, ns_argument
+from ros2_memory.history.time_arguments import TimeRange, clamped, last_window, ns_argument
 from ros2_memory.history.transforms import own_holdings, transform_at
 from ros2_memory.history.view import View
 from ros2_memory.messages.detections import detections_of
@@ -50,18 +49,18 @@ if TYPE_CHECKING:
     from ros2_memory.messages.detections import Detection
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
-"""An older pose does not tell where the robot was."""
+"""The robot may have moved since an older pose."""
 
 
 @dataclass(slots=True)
-class _Run:
-    """Matches in a row, the newest first.
+class _Matches:
+    """Consecutive matches on one topic, collected from the newest on.
 
     Attributes:
         newest: the last match.
-        first: log time of the first match so far.
-        reach: log time of the first message so far, be it one that cannot be decoded.
-        begun: it is known what is before them.
+        first: log time of the earliest match so far.
+        reach: log time of the earliest message so far, also of one that cannot be decoded.
+        begun: whether what came before the earliest match is known.
     """
 
     newest: StoredMessage
@@ -85,10 +84,10 @@ def find_matches(
     limit: int = 5,
     oldest_first: bool = False,
 ) -> Sightings:
-    """The newest `limit` sightings on a topic, or on all topics of a glob, newest first.
+    """Returns the newest `limit` sightings on a topic, or on all topics of a glob, newest first.
 
     `start_s` and `end_s` (Unix seconds, inclusive), or `last_s` (before now), bound what is
-    searched. With `oldest_first` all of it is gone through, and the oldest sightings are told.
+    searched. With `oldest_first` all of it is searched, and the oldest sightings are returned.
 
     Raises:
         InvalidArgumentsError: nothing can meet the condition, or the bounds make no window.
@@ -103,12 +102,14 @@ def find_matches(
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     now = memory.now(wall, latest)
     window = clamped(view, _window(span, now))
-    runs = _Runs(limit, oldest_first=oldest_first)
-    _gather(view, topic, condition, window, runs)
-    searched = TimeWindow(runs.told[-1].first, window.stop) if runs.cut and runs.told else window
+    collected = _Sightings(limit, oldest_first=oldest_first)
+    _collect(view, topic, condition, window, collected)
+    searched = window
+    if collected.cut and collected.selected:
+        searched = TimeWindow(collected.selected[-1].first, window.stop)
     view.notes.retract_before(searched.start)
     pose_topic = memory.limits.pose_topic
-    found = tuple(_told(view, condition, run, pose_topic) for run in runs.told)
+    found = tuple(_sighting(view, condition, matches, pose_topic) for matches in collected.selected)
     note_unread(view, searched, nothing=not found, search=True)
     start = window.start if earliest is None else max(window.start, earliest)
     end = window.stop if latest is None else min(window.stop, latest)
@@ -116,8 +117,8 @@ def find_matches(
         start, end = window.asked()
     return Sightings(
         found,
-        more=runs.cut or runs.count > len(found),
-        total=None if runs.cut else runs.count,
+        more=collected.cut or collected.count > len(found),
+        total=None if collected.cut else collected.count,
         start=start,
         end=end,
         now=now,
@@ -126,7 +127,7 @@ def find_matches(
 
 
 def _window(span: TimeRange, now: Ns) -> TimeWindow:
-    """The window searched, with the slack of floats of seconds.
+    """Returns the window to search, with the slack of floats of seconds.
 
     Raises:
         InvalidArgumentsError: the end lies before the start, or a bound is not finite, or both
@@ -136,8 +137,7 @@ def _window(span: TimeRange, now: Ns) -> TimeWindow:
     if span.last_s is not None:
         if start_s is not None or end_s is not None:
             raise InvalidArgumentsError("seconds counts from now: give it, or start and end")
-        stop = min(now + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
-        return TimeWindow(max(now - ns_argument("seconds", span.last_s), MIN_NS), stop)
+        return last_window(now, ns_argument("seconds", span.last_s))
     start = MIN_NS if start_s is None else ns_argument("start", start_s) - START_SLACK_NS
     end = MAX_NS - 1 if end_s is None else ns_argument("end", end_s) + AT_OR_BEFORE_SLACK_NS
     if end < start:
@@ -145,10 +145,10 @@ def _window(span: TimeRange, now: Ns) -> TimeWindow:
     return TimeWindow(max(start, MIN_NS), min(end + 1, MAX_NS))
 
 
-def _gather(
-    view: View, pattern: str, condition: Condition, window: TimeWindow, runs: _Runs
+def _collect(
+    view: View, pattern: str, condition: Condition, window: TimeWindow, found: _Sightings
 ) -> None:
-    """Adds the matches in a window, newest first, until there are enough.
+    """Collects the matches in a window, newest first, until there are enough.
 
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
@@ -160,145 +160,145 @@ def _gather(
     before = window.stop
     try:
         for part, topics in _parts(view, search.topics, candidates.windows(), window):
-            runs.end_silent(part.stop)
-            _pass_over(view, runs, TimeWindow(part.stop, max(before, part.stop)))
-            # There may be thousands of topics: read are those that can begin a row or end one.
-            bearing = sorted({*topics, *runs.under_way()})
-            for found in view.stream.messages(bearing, part, newest_first=True):
-                before = found.time
-                runs.end_silent(found.time)
-                matches = search.matches(found)
+            found.end_silent(part.stop)
+            _end_in_gap(view, found, TimeWindow(part.stop, max(before, part.stop)))
+            # Only topics that can begin or end a sighting are read: there may be thousands.
+            relevant = sorted({*topics, *found.open_topics()})
+            for each in view.stream.messages(relevant, part, newest_first=True):
+                before = each.time
+                found.end_silent(each.time)
+                matches = search.matches(each)
                 if matches:
-                    runs.add(found)
+                    found.add(each)
                 elif matches is None:
-                    runs.pass_by(found)
+                    found.skip(each)
                 else:
-                    runs.end(found.record.channel.topic)
-                if runs.enough:
-                    _leave(search, runs)
+                    found.end(each.record.channel.topic)
+                if found.enough:
+                    _stop(search, found)
                     return
             before = part.start
     except QueryTimeoutError:
-        if not runs.count:
+        if not found.count:
             raise
-        runs.cut = True
+        found.cut = True
         view.notes.complete = False
         view.notes.add(
             f"the search ran out of time at {unix_text(before)}: to go on, ask with end there"
         )
         return
-    for topic in runs.under_way():
-        runs.end(topic)
-    if runs.enough:
-        # As where one message more is read, which the catalogue rules out.
-        _leave(search, runs)
+    for topic in found.open_topics():
+        found.end(topic)
+    if found.enough:
+        # Without the catalogue one message more would be read here: the reply is to be the same.
+        _stop(search, found)
     else:
-        search.close(candidates, window, found=bool(runs.count))
+        search.close(candidates, window, found=bool(found.count))
 
 
-def _pass_over(view: View, runs: _Runs, gap: TimeWindow) -> None:
-    """Ends the rows of the topics that have a message in a time without a match."""
-    for topic in runs.under_way():
-        if _any_between(view, topic, gap):
-            runs.end(topic)
+def _end_in_gap(view: View, found: _Sightings, gap: TimeWindow) -> None:
+    """Ends the sightings of topics that have a message in a time without a match."""
+    for topic in found.open_topics():
+        if _has_messages(view, topic, gap):
+            found.end(topic)
 
 
-def _leave(search: ReverseSearch, runs: _Runs) -> None:
-    """Ends a search that need not have looked further."""
-    runs.cut = True
-    search.note_undecodable(runs.told[-1].first)
+def _stop(search: ReverseSearch, found: _Sightings) -> None:
+    """Ends a search that has enough."""
+    found.cut = True
+    search.note_undecodable(found.selected[-1].first)
 
 
-class _Runs:
-    """Matches that come newest first, in rows by topic; told are the newest or the oldest ones.
+class _Sightings:
+    """Collects matches that come newest first; selects the newest or the oldest sightings.
 
     Attributes:
-        count: how many rows there are so far.
-        cut: the search was left before all was gone through, or might have been.
+        count: how many sightings there are so far.
+        cut: whether the search ended before all was searched, or might have.
     """
 
     def __init__(self, limit: int, *, oldest_first: bool) -> None:
         self._limit = limit
         self._oldest_first = oldest_first
-        self._kept: deque[_Run] = deque(maxlen=limit if oldest_first else None)
-        self._open: OrderedDict[str, _Run] = OrderedDict()  # the one longest without a match first
+        self._kept: deque[_Matches] = deque(maxlen=limit if oldest_first else None)
+        self._open: OrderedDict[str, _Matches] = OrderedDict()  # least recently matched first
         self.count = 0
         self.cut = False
 
     def add(self, found: StoredMessage) -> None:
-        """Takes the next older match; rows that ended in silence before it have been ended."""
+        """Adds the next older match; call `end_silent` with its time before."""
         topic = found.record.channel.topic
-        run = self._open.get(topic)
-        if run is None:
-            self._open[topic] = run = _Run(found, found.time, found.time)
-            self._kept.append(run)
+        matches = self._open.get(topic)
+        if matches is None:
+            self._open[topic] = matches = _Matches(found, found.time, found.time)
+            self._kept.append(matches)
             self.count += 1
         else:
-            run.first = run.reach = found.time
-            run.messages += 1
+            matches.first = matches.reach = found.time
+            matches.messages += 1
             self._open.move_to_end(topic)
 
-    def pass_by(self, found: StoredMessage) -> None:
-        """Takes a message that cannot be decoded: it is no match, and ends no row."""
+    def skip(self, found: StoredMessage) -> None:
+        """Adds a message that cannot be decoded: no match, but it ends no sighting either."""
         topic = found.record.channel.topic
-        run = self._open.get(topic)
-        if run is not None:
-            run.reach = found.time
+        matches = self._open.get(topic)
+        if matches is not None:
+            matches.reach = found.time
             self._open.move_to_end(topic)
 
     def end_silent(self, until: Ns) -> None:
-        """Ends the rows in which no message from before a moment can be."""
+        """Ends the sightings to which no message before a moment can belong."""
         while self._open:
-            run = next(iter(self._open.values()))
-            if run.reach - until <= SILENCE_NS:
+            matches = next(iter(self._open.values()))
+            if matches.reach - until <= SILENCE_NS:
                 return
-            self.end(run.newest.record.channel.topic)
+            self.end(matches.newest.record.channel.topic)
 
     def end(self, topic: str) -> None:
-        """What comes next of the topic belongs to another row."""
-        run = self._open.pop(topic, None)
-        if run is not None:
-            run.begun = True
+        """Ends the sighting of a topic: its next match begins another one."""
+        matches = self._open.pop(topic, None)
+        if matches is not None:
+            matches.begun = True
 
-    def under_way(self) -> tuple[str, ...]:
-        """The topics whose row may go on."""
+    def open_topics(self) -> tuple[str, ...]:
+        """Returns the topics whose sighting may have begun earlier."""
         return tuple(self._open)
 
     @property
-    def told(self) -> list[_Run]:
-        """As many as are asked for, in their order."""
+    def selected(self) -> list[_Matches]:
+        """As many sightings as were asked for, in the order that was asked for."""
         if self._oldest_first:
             return [*reversed(self._kept)]
         return [*islice(self._kept, self._limit)]
 
     @property
     def enough(self) -> bool:
-        """Whether nothing that comes can change the newest ones, and those are told."""
+        """Whether no older match can change the sightings that are selected."""
         return (
             not self._oldest_first
             and self.count > self._limit
-            and all(run.begun for run in self.told)
+            and all(matches.begun for matches in self.selected)
         )
 
 
 def _parts(
-    view: View, topics: Sequence[str], stretches: Iterator[SearchWindow], window: TimeWindow
+    view: View, topics: Sequence[str], windows: Iterator[SearchWindow], window: TimeWindow
 ) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
-    """The parts of a window in which topics may have matches, and these, newest first."""
+    """Yields the parts of a window in which topics can have matches, and these, newest first."""
     if view.stream.may_be_relatched(topics):
-        # What ends a row may be a copy of a message in a bag that is ruled out.
+        # A sighting may be ended by the duplicate of a message in a bag that is ruled out.
         yield window, topics
         return
-    for stretch in stretches:
-        if stretch.window.stop <= window.start:
+    for each in windows:
+        if each.window.stop <= window.start:
             return
-        part = stretch.window.intersect(window)
+        part = each.window.intersect(window)
         if not part.empty:
-            yield part, stretch.topics
+            yield part, each.topics
 
 
-def _any_between(view: View, topic: str, gap: TimeWindow) -> bool:
-    """Whether the topic has a message in a time that holds no match."""
+def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
+    """Whether a topic has a message in a time; by the index where that is enough."""
     if gap.empty:
         return False
     held = view.stream.overlapping_bags([topic], gap)
@@ -309,24 +309,24 @@ def _any_between(view: View, topic: str, gap: TimeWindow) -> bool:
     return bool(held) and view.stream.first([topic], gap) is not None
 
 
-def _told(view: View, condition: Condition, run: _Run, pose_topic: str) -> Sighting:
-    """A row with where the robot was at its newest message, and where the thing was."""
-    robot = _robot(view, pose_topic, run.newest)
+def _sighting(view: View, condition: Condition, matches: _Matches, pose_topic: str) -> Sighting:
+    """Returns the result, with where the robot and the thing were at the newest match."""
+    robot = _robot(view, pose_topic, matches.newest)
     return Sighting(
-        topic=run.newest.record.channel.topic,
-        first=run.first,
-        last=run.newest.time,
-        messages=run.messages,
-        begun=run.begun,
+        topic=matches.newest.record.channel.topic,
+        first=matches.first,
+        last=matches.newest.time,
+        messages=matches.messages,
+        begun=matches.begun,
         robot=robot,
-        thing=_spot(view, condition, run.newest, robot),
+        thing=_spot(view, condition, matches.newest, robot),
     )
 
 
 def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
-    """Where the robot was: its newest pose at or before then that can be read.
+    """Returns the robot's newest pose at or before a match; None where it is not known.
 
-    Where the sighting's own session has poses, it is one of these.
+    Where the session of the match has poses, it is one of these.
     """
     window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
     own = own_holdings(view, topic, window, seen.bag.recording)
@@ -335,9 +335,8 @@ def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
         found = view.stream.first([topic], window, newest_first=True, among=own)
     if found is None:
         return None
-    try:
-        message = view.memory.reader.decode(found.record)
-    except UndecodableError:
+    message = view.bags.decode(found)
+    if message is None:
         return None
     pose = view.memory.extractor.pose(message, found.record.channel.type)
     return pose if pose is not None and all(map(math.isfinite, pose.position)) else None
@@ -346,7 +345,7 @@ def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
 def _spot(
     view: View, condition: Condition, found: StoredMessage, robot: Pose | None
 ) -> Spot | None:
-    """Where the thing that matched was; in the map, the robot's frame, or its message's own."""
+    """Returns where the thing that matched was: in the map, the robot's frame, or its message's."""
     message = view.memory.reader.decode(found.record)
     value = view.memory.extractor.exact(message, found.record.channel.type)
     frame = view.memory.extractor.frame(message)
@@ -370,13 +369,15 @@ def _spot(
     return Spot(thing.label, thing.place, thing.frame_id)
 
 
-def _matching(things: Sequence[Detection], condition: Condition) -> Detection | None:
-    """The thing that a condition is about: by name or place, or the only one; placed ones first."""
+def _matching(detections: Sequence[Detection], condition: Condition) -> Detection | None:
+    """Returns the detection that a condition is about: by label or place, or the only one."""
     test = condition.test
     if isinstance(test, NearPosition):
-        about = [each for each in things if each.place is not None and test.is_near(*each.place)]
+        about = [
+            each for each in detections if each.place is not None and test.is_near(*each.place)
+        ]
     else:
-        about = [each for each in things if test.matches(each.label)]
-    if not about and len(things) == 1:
-        about = list(things)
+        about = [each for each in detections if test.matches(each.label)]
+    if not about and len(detections) == 1:
+        about = list(detections)
     return max(about, key=lambda thing: thing.place is not None, default=None)
