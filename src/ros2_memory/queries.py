@@ -370,7 +370,7 @@ def _newest_beside(
     if newest is None or newest.bag.recording == match.bag.recording:
         return newest
     recording = match.bag.recording
-    own = frame_history.own_holdings(view, topic, window, recording) or []
+    own = frame_history.session_bags(view, topic, window, recording) or []
     if newest.bag not in {each.bag for each in own}:
         newest = view.stream.first([topic], window, newest_first=True, among=own) or newest
     if not frame_history.sessions_of(view).are_joined(recording, newest.bag.recording):

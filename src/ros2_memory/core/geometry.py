@@ -106,11 +106,16 @@ def rotate(q: Quaternion, v: Vector3) -> Vector3:
     )
 
 
+def transform_point(t: Transform, point: Vector3) -> Vector3:
+    """Returns a point (m) of the child frame in the parent frame."""
+    x, y, z = rotate(t.rotation, point)
+    dx, dy, dz = t.translation
+    return (x + dx, y + dy, z + dz)
+
+
 def compose(a: Transform, b: Transform) -> Transform:
     """`a`, then `b` from there: the pose of b's child in a's parent."""
-    x, y, z = rotate(a.rotation, b.translation)
-    ax, ay, az = a.translation
-    return Transform((ax + x, ay + y, az + z), multiply(a.rotation, b.rotation))
+    return Transform(transform_point(a, b.translation), multiply(a.rotation, b.rotation))
 
 
 def invert(t: Transform) -> Transform:

@@ -1,9 +1,9 @@
-"""The same message in two recordings: how copies are recognised, and how one of them is kept.
+"""The same message in two recordings: how duplicates are recognised, and which one counts.
 
-Recordings overlap for some seconds while one takes over from the other. A message that stands in
-both carries the same publish time and payload in each, and log times that differ by little
+Recordings overlap for some seconds while one takes over from the other. A message that is in both
+has the same publish time and payload in each, and log times that differ by little
 (`COPY_HORIZON_NS` at most); it counts once, at its earliest log time. Inside one recording nothing
-is a copy, however alike two messages are.
+is a duplicate, however alike two messages are.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 COPY_HORIZON_NS: Final[Ns] = 2 * NS_PER_S
 _LONGEST_ROW_NS: Final[Ns] = 3 * COPY_HORIZON_NS
-"""Bounds what is held of a topic whose messages are all alike, their publish times too."""
+"""Bounds memory for a topic whose messages are all alike, their publish times too."""
 
 
 class StoredMessage(NamedTuple):
-    """One undecoded message and the bag it stands in."""
+    """An undecoded message and the bag that it is in."""
 
     bag: BagFile
     record: Record
@@ -39,7 +39,7 @@ class StoredMessage(NamedTuple):
 
 
 class BagSpan(NamedTuple):
-    """A bag that holds messages of the topics asked for; `first` and `last` are inclusive."""
+    """A bag and the log times of its first and last message of some topics, both inclusive."""
 
     first: Ns
     last: Ns
@@ -47,7 +47,7 @@ class BagSpan(NamedTuple):
 
 
 class Copy(NamedTuple):
-    """What two copies of one message share."""
+    """What the duplicates of one message share."""
 
     topic: str
     publish_time: Ns
@@ -56,21 +56,22 @@ class Copy(NamedTuple):
 
 
 def copy_key(record: Record) -> Copy:
-    """The identity of a message across recordings."""
+    """Returns the identity of a message across recordings."""
     payload = record.payload
     return Copy(record.channel.topic, record.publish_time, len(payload), hash(payload))
 
 
-def bag_overlaps(holdings: Iterable[BagSpan]) -> list[tuple[Ns, Ns]]:
-    """The half-open spans in which bags of different recordings can hold copies, merged.
+def bag_overlaps(bags: Iterable[BagSpan]) -> list[tuple[Ns, Ns]]:
+    """Returns the half-open spans in which bags of different recordings can hold duplicates.
 
-    Two bags contest the time that both hold, widened by the horizon at both ends.
+    That is the time that both hold, widened by the horizon at both ends; spans that touch are
+    merged.
     """
-    return overlap_spans((held.first, held.last, held.bag.recording) for held in holdings)
+    return overlap_spans((each.first, each.last, each.bag.recording) for each in bags)
 
 
 def overlap_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
-    """As `bag_overlaps`, of first and last log time (inclusive) and recording."""
+    """Returns the same for first and last log times (inclusive) and recordings."""
     spans: list[tuple[Ns, Ns]] = []
     open_ones: list[tuple[Ns, Path]] = []
     for first, last, recording in sorted(held, key=lambda each: each[0]):
@@ -85,7 +86,7 @@ def overlap_spans(held: Iterable[tuple[Ns, Ns, Path]]) -> list[tuple[Ns, Ns]]:
 
 
 def united(spans: Iterable[tuple[Ns, Ns]]) -> list[tuple[Ns, Ns]]:
-    """Half-open spans, sorted, those that touch made one."""
+    """Returns half-open spans, sorted; those that touch are merged."""
     united: list[tuple[Ns, Ns]] = []
     for start, stop in sorted(spans):
         if united and start <= united[-1][1]:
@@ -103,7 +104,7 @@ def _inside(spans: Sequence[tuple[Ns, Ns]], moment: Ns) -> bool:
 def deduplicate_forward(
     found: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
 ) -> Iterator[StoredMessage]:
-    """An ascending stream without the later copies.
+    """Yields an ascending stream without the later duplicates.
 
     Where one recording holds a message n times and another m times, max(n, m) remain.
     """
@@ -128,10 +129,11 @@ def deduplicate_forward(
 def deduplicate_backward(
     found: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
 ) -> Iterator[StoredMessage]:
-    """A descending stream without the copies that `deduplicate_forward` leaves out.
+    """Yields a descending stream without the duplicates that `deduplicate_forward` leaves out.
 
-    Held back until no earlier copy can come. Where copies follow each other for longer than
-    `_LONGEST_ROW_NS`, with never a pause of `COPY_HORIZON_NS`, other ones of them may be left out.
+    A message is held until no earlier duplicate can come. Where duplicates follow each other for
+    longer than `_LONGEST_ROW_NS`, with never a pause of `COPY_HORIZON_NS`, other ones may be left
+    out.
     """
     held: deque[tuple[StoredMessage, _Row | None]] = deque()
     rows: dict[Copy, _Row] = {}
@@ -152,7 +154,7 @@ def deduplicate_backward(
 
 
 class _Row:
-    """Copies that follow each other without a long pause, newest first."""
+    """Duplicates that follow each other without a long pause, newest first."""
 
     def __init__(self, key: Copy) -> None:
         self.key = key
@@ -160,14 +162,14 @@ class _Row:
         self._kept: set[int] | None = None
 
     def is_over(self, now: Ns) -> bool:
-        """Whether what comes at a moment, or before it, is no part of it."""
+        """Whether no message at a moment or before it can belong to the row."""
         if self._kept is not None:
             return True
         first, last = self.messages[-1].time, self.messages[0].time
         return now < max(first - COPY_HORIZON_NS, last - _LONGEST_ROW_NS)
 
     def keeps(self, found: StoredMessage) -> bool:
-        """Whether one of its messages counts; it is over then."""
+        """Whether one of its messages counts; call it when the row is over."""
         if len(self.messages) == 1:
             return True
         if self._kept is None:

@@ -1,8 +1,8 @@
-"""Many bags read as one stream: in log-time order, each message once.
+"""Many bags as one stream: in log-time order, each message once.
 
-Besides the overlap of recordings (see `copies`), a new recording receives the latched messages
-again: a new log time, the original publish time. Such a message counts once too, at its earliest
-log time, however long ago that is.
+Recordings overlap (see `duplicates`), and a new recording receives latched messages again: with a
+new log time and the original publish time. Such a relatched message counts once too, at its
+earliest log time, however long ago that is.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment
 
 RELATCHED_NS: Final[Ns] = NS_PER_S
-"""A latched message logged this long after it was published may have been received before."""
+"""A latched message logged so long after it was published may have been received before."""
 _MAX_SEARCHES: Final = 8
 
 
@@ -53,7 +53,7 @@ class MergedStream:
         self._searches: Counter[str] = Counter()
 
     def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[BagSpan]:
-        """The bags that hold messages of these topics in the window, in order.
+        """Returns the bags that hold messages of these topics in the window, in order.
 
         Each with the times of its first and last message of these topics, in the window or not.
         """
@@ -79,12 +79,12 @@ class MergedStream:
         newest_first: bool = False,
         among: Sequence[BagSpan] | None = None,
     ) -> Iterator[StoredMessage]:
-        """The messages of the topics in the window in log-time order, each one once.
+        """Returns the messages of the topics in the window in log-time order, each one once.
 
-        `among` narrows the search to some of the bags.
+        `among` restricts the search to some bags.
 
         Raises:
-            QueryTimeoutError: the deadline passed on the way.
+            QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         parts = self._parts(topics, window) if among is None else [window]
         return self.bags.track_sources(
@@ -106,11 +106,14 @@ class MergedStream:
         return next(self.messages(topics, window, newest_first=newest_first, among=among), None)
 
     def newest(self, topic: str, window: TimeWindow) -> StoredMessage | None:
-        """What `messages` gives first of the topic when it is newest first."""
+        """Returns the newest message of the topic in the window.
+
+        Where a single bag can hold it, that bag alone is opened, and no stream is set up.
+        """
         if len(self._parts([topic], window)) == 1 and not self.may_be_relatched([topic]):
-            holdings = self.overlapping_bags([topic], _with_horizon(window))
-            if not bag_overlaps(holdings):
-                inside = [held for held in holdings if window.overlaps(held.first, held.last)]
+            bags = self.overlapping_bags([topic], _with_horizon(window))
+            if not bag_overlaps(bags):
+                inside = [each for each in bags if window.overlaps(each.first, each.last)]
                 if not inside:
                     return None
                 if len(inside) == 1:
@@ -119,7 +122,7 @@ class MergedStream:
         return self.first([topic], window, newest_first=True)
 
     def duplicate_spans(self, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
-        """Where in the window the topic's messages may stand in two recordings, widened."""
+        """Returns where in a window two recordings may hold a topic's messages, widened."""
         recordings = self._snapshot.recordings(topic)
         if len(recordings) < 2:
             return []
@@ -133,12 +136,14 @@ class MergedStream:
         return united(span for bags in near for span in bag_overlaps(bags))
 
     def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
-        """The window cut where runs of bags begin: a stream then holds few of them at a time."""
-        runs = self._snapshot.segments
-        begin = bisect_right(runs, window.start, key=_begins)
-        end = bisect_left(runs, window.stop, begin, key=_begins)
+        """Returns the window cut where segments begin, to hold few bags at a time."""
+        segments = self._snapshot.segments
+        begin = bisect_right(segments, window.start, key=_begins)
+        end = bisect_left(segments, window.stop, begin, key=_begins)
         cuts = [
-            _begins(run) for run in runs[begin:end] if any(topic in run.spans for topic in topics)
+            _begins(each)
+            for each in segments[begin:end]
+            if any(topic in each.spans for topic in topics)
         ]
         edges = [window.start, *dict.fromkeys(cuts), window.stop]
         return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
@@ -152,23 +157,21 @@ class MergedStream:
         newest_first: bool,
     ) -> Iterator[StoredMessage]:
         wider = _with_horizon(window)
-        holdings = self.overlapping_bags(topics, wider) if among is None else among
-        spans = bag_overlaps(holdings)
+        bags = self.overlapping_bags(topics, wider) if among is None else among
+        spans = bag_overlaps(bags)
         found: Iterator[StoredMessage]
         if spans:
-            merged = self.merged(
-                holdings, topics, wider, newest_first=newest_first, since=window.start
-            )
+            merged = self.merged(bags, topics, wider, newest_first=newest_first, since=window.start)
             once = (deduplicate_backward if newest_first else deduplicate_forward)(merged, spans)
             found = (each for each in once if window.contains(each.time))
         else:
-            found = self.merged(holdings, topics, window, newest_first=newest_first)
+            found = self.merged(bags, topics, window, newest_first=newest_first)
         if self.may_be_relatched(topics):
             return (each for each in found if not self._is_relatched(each))
         return found
 
     def may_be_relatched(self, topics: Iterable[str]) -> bool:
-        """Whether a latched message of these topics may have been received by two recordings."""
+        """Whether two recordings may have received one latched message of these topics."""
         return any(
             self._snapshot.is_transient_local(topic) and len(self._snapshot.recordings(topic)) > 1
             for topic in topics
@@ -196,7 +199,7 @@ class MergedStream:
         return found.time > first[0] and found.bag.recording != first[1]
 
     def _find_first_copy(self, topic: str, key: Copy, window: TimeWindow) -> None:
-        """Remembers where a message was received first, from its publish time on."""
+        """Records where a message was received first, from its publish time on."""
         wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop + 1)
         bags = self.overlapping_bags([topic], wider)
         for each in self.merged(bags, [topic], wider, newest_first=False):
@@ -205,42 +208,40 @@ class MergedStream:
                 return
 
     def _find_all_first_copies(self, topic: str) -> None:
-        """The same for every message of a topic that has many: one pass in place of one for each.
+        """Does the same for every message of a topic: one pass in place of one for each of many.
 
-        So it is where publish times say nothing, such as those of a simulated clock.
+        There are many where publish times mean nothing, such as those of a simulated clock.
         """
         everything = TimeWindow.everything()
-        holdings = self.overlapping_bags([topic], everything)
-        for each in self.merged(holdings, [topic], everything, newest_first=False):
+        bags = self.overlapping_bags([topic], everything)
+        for each in self.merged(bags, [topic], everything, newest_first=False):
             first = (each.time, each.bag.recording)
             self._first_copies.setdefault(copy_key(each.record), first)
 
     def merged(
         self,
-        holdings: Sequence[BagSpan],
+        bags: Sequence[BagSpan],
         topics: Sequence[str],
         window: TimeWindow,
         *,
         newest_first: bool,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
-        """All messages in order, copies too, opening a bag only when the stream reaches it.
+        """Yields all messages in order, duplicates too; opens a bag when the stream reaches it.
 
-        What cannot be read is noted where it was asked for: not all of it lies before `since`.
+        What cannot be read is noted, unless all of it lies before `since`.
         """
         read = partial(
             self.bags.read, topics=topics, window=window, newest_first=newest_first, since=since
         )
-        if len(holdings) == 1:
-            yield from read(holdings[0].bag)
+        if len(bags) == 1:
+            yield from read(bags[0].bag)
             return
         sign = -1 if newest_first else 1
         waiting = deque(
             sorted(
-                enumerate(holdings),
-                key=lambda held: (
-                    (-held[1].last, -held[0]) if newest_first else (held[1].first, held[0])
-                ),
+                enumerate(bags),
+                key=lambda each: (_edge(each[1], newest_first=newest_first), sign * each[0]),
             )
         )
         heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
@@ -254,8 +255,8 @@ class MergedStream:
             while waiting and (
                 not heap or _edge(waiting[0][1], newest_first=newest_first) <= heap[0][0]
             ):
-                index, held = waiting.popleft()
-                push(sign * index, read(held.bag))
+                rank, span = waiting.popleft()
+                push(sign * rank, read(span.bag))
             if heap:
                 _, rank, found, source = heapq.heappop(heap)
                 yield found
@@ -268,24 +269,24 @@ def _is_late(found: StoredMessage) -> bool:
 
 
 def _with_horizon(window: TimeWindow) -> TimeWindow:
-    """The window and what before it can be the original of a copy in it."""
+    """Returns the window and what before it can be the original of a duplicate in it."""
     return TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
 
 
-def _begins(run: Segment) -> Ns:
-    """Log time of the first message of the first bag: runs lie in its order."""
-    return run.bags[0].start
+def _begins(segment: Segment) -> Ns:
+    """Returns the log time of a segment's first message; segments are in this order."""
+    return segment.bags[0].start
 
 
-def _in_order(held: BagSpan) -> tuple[Ns, Ns, str]:
-    return held.first, held.last, held.bag.file
+def _in_order(span: BagSpan) -> tuple[Ns, Ns, str]:
+    return span.first, span.last, span.bag.file
 
 
 def bag_span_of(bag: BagFile, topics: Collection[str]) -> BagSpan:
-    """A bag with the times of its first and last message of these topics; it must hold some."""
+    """Returns a bag with the times of its first and last message of these topics, if any."""
     return BagSpan(*bag.summary.span_of(topics), bag)
 
 
-def _edge(held: BagSpan, *, newest_first: bool) -> Ns:
-    """The first moment at which a bag can have something for the stream, in the heap's sign."""
-    return -held.last if newest_first else held.first
+def _edge(span: BagSpan, *, newest_first: bool) -> Ns:
+    """Returns the earliest sort key that a message of a bag can have in the heap."""
+    return -span.last if newest_first else span.first

@@ -1,6 +1,6 @@
-"""Whether recordings that hold a topic at the same time may be of two robots.
+"""Notes on recordings that hold a topic at the same time, as of several robots.
 
-They are of one where a handover joins them, or where what one holds stands in the other too.
+They are of one robot where a handover joins them, or where messages of one are in the other too.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 _NEAR_NS: Final[Ns] = 10 * NS_PER_S
-"""How far around one message others count as recorded at its time."""
+"""How far around one message others count as recorded at the same time."""
 _TRIED: Final = 3
-"""So many messages are looked for in the other recording: a subscriber may miss one."""
+"""How many messages are looked for in the other recording: a subscriber may miss one."""
 
 
 def note_robots(view: View, topic: str, window: TimeWindow) -> None:
-    """Names the recordings that hold a topic at the same time in a window, each its own messages.
+    """Notes the recordings that hold messages of their own on a topic at the same time.
 
-    Nothing is noted of latched topics, of which each recording receives the same anew, and where
-    the time for the answer is over before it is known.
+    Nothing is noted of latched topics, which each recording receives anew, and where the time for
+    the answer is over before it is known.
     """
     if view.snapshot.is_transient_local(topic):
         return
     apart: set[Path] = set()
-    said = view.notes.keys()
+    noted_before = view.notes.keys()
     try:
-        for pair, both in _at_once(view, topic, window):
-            if not apart.issuperset(pair) and _are_apart(view, topic, pair, both):
+        for pair, both in _overlapping_pairs(view, topic, window):
+            if not apart.issuperset(pair) and _differ(view, topic, pair, both):
                 apart.update(pair)
     except QueryTimeoutError:
         return
     finally:
         # The answer itself needed nothing of what was read here.
-        view.notes.retract_before(MAX_NS, said)
+        view.notes.retract_before(MAX_NS, noted_before)
     if apart:
         names = sorted(each.name for each in apart)
         view.notes.add(
@@ -56,38 +56,38 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
 
 
 def note_robots_near(view: View, found: StoredMessage) -> None:
-    """As `note_robots`, of the time of a message."""
+    """Does as `note_robots`, around the time of a message."""
     note_robots(view, found.record.channel.topic, TimeWindow.around(found.time, _NEAR_NS))
 
 
-def _at_once(
+def _overlapping_pairs(
     view: View, topic: str, window: TimeWindow
 ) -> Iterator[tuple[tuple[Path, Path], TimeWindow]]:
-    """Pairs of recordings that hold a topic at the same time, and when."""
-    under_way: list[tuple[Ns, Path]] = []
+    """Yields pairs of recordings that hold a topic at the same time, and when."""
+    open_spans: list[tuple[Ns, Path]] = []
     spans = [(*span, path) for path, span in view.snapshot.recordings(topic).items()]
     for first, last, path in sorted(each for each in spans if window.overlaps(each[0], each[1])):
-        under_way = [each for each in under_way if each[0] >= first]
-        for until, other in under_way:
+        open_spans = [each for each in open_spans if each[0] >= first]
+        for until, other in open_spans:
             start, stop = max(first, window.start), min(last + 1, until + 1, window.stop)
             if start < stop:
                 yield (path, other), TimeWindow(start, stop)
-        under_way.append((last, path))
+        open_spans.append((last, path))
 
 
-def _are_apart(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
-    """Whether two recordings hold messages in a window, and those of one are not in the other."""
+def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
+    """Whether two recordings hold messages in a window, and the other none of the one's."""
     if sessions_of(view).are_joined(*pair):
         return False
     one, other = pair
     if next(_messages(view, topic, other, both), None) is None:
         return False
     some = list(islice(_messages(view, topic, one, both), _TRIED))
-    return bool(some) and not any(_stands_in(view, topic, other, each) for each in some)
+    return bool(some) and not any(_has_duplicate(view, topic, other, each) for each in some)
 
 
-def _stands_in(view: View, topic: str, recording: Path, found: StoredMessage) -> bool:
-    """Whether a recording holds a copy of a message."""
+def _has_duplicate(view: View, topic: str, recording: Path, found: StoredMessage) -> bool:
+    """Whether a recording holds a duplicate of a message."""
     near = TimeWindow.around(found.time, COPY_HORIZON_NS)
     key = copy_key(found.record)
     return any(copy_key(each.record) == key for each in _messages(view, topic, recording, near))
@@ -97,5 +97,5 @@ def _messages(
     view: View, topic: str, recording: Path, window: TimeWindow
 ) -> Iterator[StoredMessage]:
     bags = view.stream.overlapping_bags([topic], window)
-    held = [each for each in bags if each.bag.recording == recording]
-    return view.stream.merged(held, [topic], window, newest_first=False)
+    own = [each for each in bags if each.bag.recording == recording]
+    return view.stream.merged(own, [topic], window, newest_first=False)

@@ -1,14 +1,14 @@
-"""Which recordings hold what one robot said of itself in one go.
+"""Sessions: which recordings are of one robot in one run, so that their transforms belong together.
 
-A transform holds in the session in which it was published: another robot, or the same one after it
-was started anew, has its own. A session is a recording and those that it is joined with by
-handovers, and what was carried of these when their bags were deleted.
+A transform holds in the session in which it was published: another robot, or the same one after a
+restart, has its own. A session is a recording and those that it is joined with by handovers, and
+what was carried of these when their bags were deleted.
 
-Recordings of one time may be of one robot, for which two recorders were started. So one that has
-moving transforms alone borrows the static ones of other frames of one that has these alone, and
-one that has none borrows from the one session beside it that has some. None is lent where two
-recordings hold poses then: these are two robots. Nothing but a handover proves that two recordings
-are of one robot, so a reply that uses a loan has to say so.
+Recordings of one time may be of one robot, for which two recorders were started. So a session with
+moving transforms alone borrows the static ones of other frames from one that has these alone, and
+one without any borrows from the one session beside it that has some. Nothing is lent where two
+recordings hold poses at that time: these are two robots. Only a handover proves that two recordings
+are of one robot, so a reply that uses borrowed transforms has to say so.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ if TYPE_CHECKING:
     from ros2_memory.index.timeline import Timeline
 
 Session: TypeAlias = frozenset[str]
-"""The folders of the recordings, as they are called where they were recorded."""
+"""The folders of its recordings, as they were named when they were recorded."""
 
 _AROUND_NS: Final[Ns] = 10 * NS_PER_S
-"""A recording goes on at a moment where it has a bag so near: tf2 remembers no longer."""
+"""A recording goes on at a moment with a bag so near: the length of tf2's cache."""
 _JOINED: Final[WeakKeyDictionary[Timeline, Mapping[str, Session]]] = WeakKeyDictionary()
-"""What the sidecars of a timeline's recordings join; a new bag makes a new timeline."""
+"""Caches the chains of a timeline, for which sidecars are read; a new bag makes a new one."""
 
 
 class Sessions:
     """The sessions of a view that hold transforms.
 
     Args:
-        view: one call's sight of the memory.
+        view: one call's view of the memory.
         moving: the topics of moving transforms.
         static: those of static ones.
         poses: the topic of the robot's own poses: two sessions that hold it at once are two robots.
-        children: the child frames that a session has on some topics.
+        children: returns the child frames that a session has on some topics.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Sessions:
         self._lending: dict[tuple[str, Ns], Session] = {}
 
     def folder(self, recording: Path) -> str:
-        """Where a recording lies, or lay when it was recorded, if a moment keeps it."""
+        """Returns where a recording was recorded; a saved moment keeps it elsewhere."""
         return self._names.recorded_as(str(recording))
 
     def has(self, session: Session, found: StoredMessage) -> bool:
@@ -92,11 +92,11 @@ class Sessions:
         return any(f"{self._root}/{each}" in session for each in origin.recordings)
 
     def is_carried(self, bag: BagFile) -> bool:
-        """Whether a bag is that of carried messages, which are of several sessions."""
+        """Whether a bag holds carried messages, which are of several sessions."""
         return self.folder(bag.recording) == self._carried
 
     def of(self, recording: Path) -> Session:
-        """The session of a recording."""
+        """Returns the session of a recording."""
         return self._of(self.folder(recording))
 
     def are_joined(self, one: Path, other: Path) -> bool:
@@ -106,9 +106,10 @@ class Sessions:
         return other.name in _neighbours(one) or one.name in _neighbours(other)
 
     def lending_to(self, recording: Path, at: Ns) -> Session:
-        """Whose transforms hold for a message of a recording; empty where no session's do.
+        """Returns the session whose transforms hold for a message of a recording.
 
-        That is more than the recording's own session where another one lends.
+        That is more than the recording's own session where another one lends; empty where none has
+        any.
         """
         key = (self.folder(recording), at // _AROUND_NS)
         if key not in self._lending:
@@ -116,31 +117,31 @@ class Sessions:
         return self._lending[key]
 
     def recorded_at(self, moment: Ns) -> list[Session] | None:
-        """The sessions whose transforms hold at a moment; None where nothing was recorded then."""
+        """Returns the sessions whose transforms hold at a moment; None if none was recorded."""
         around = self._around(moment)
         if not around:
             return None
-        holding = (each for each in around if self._kinds(each))
-        return [*dict.fromkeys(self._completed(each, moment) for each in holding)]
+        with_transforms = (each for each in around if self._kinds(each))
+        return [*dict.fromkeys(self._completed(each, moment) for each in with_transforms)]
 
     def names(self, session: Session, at: Ns) -> str:
-        """The recordings of a session that went on at a moment; all of it where none did."""
+        """Returns the names of a session's recordings at a moment; of all if none went on."""
         recordings = sorted(session - {self._carried})
         around = [each for each in recordings if each in self._folders_around(at)] or recordings
         return " and ".join(each.rpartition("/")[2] for each in around) or "deleted recordings"
 
     def parts_of(self, session: Session) -> tuple[Session, ...]:
-        """The two sessions that one is made of by a loan; none where it is one."""
+        """Returns the two sessions that were joined by lending into this one; none if it is one."""
         return self._parts.get(session, ())
 
     def nearest_to(self, moment: Ns) -> list[Session]:
-        """All sessions that hold transforms, the nearest in time first."""
+        """Returns all sessions that hold transforms, the nearest in time first."""
         spans = [span for by_folder in self._spans.values() for span in by_folder.items()]
-        near = sorted(spans, key=lambda each: (_off(each[1], moment), each[0]))
+        near = sorted(spans, key=lambda each: (_distance(each[1], moment), each[0]))
         return [*dict.fromkeys(self._of(folder) for folder, _ in near)]
 
     def _completed(self, own: Session, at: Ns) -> Session:
-        """A session with the one beside it that has what it lacks; empty where it has nothing."""
+        """Returns a session with the one that lends to it; empty where it has no transforms."""
         kinds = self._kinds(own)
         if len(kinds) == len(self._topics) or self._are_two_robots(at):
             return own if kinds else frozenset()
@@ -156,8 +157,8 @@ class Sessions:
         return own if kinds else frozenset()
 
     def _are_two_robots(self, at: Ns) -> bool:
-        """Whether two sessions around a moment hold poses of the same time."""
-        near = [each for each in self._poses if _off(each[1], at) <= _AROUND_NS]
+        """Whether two sessions near a moment hold poses of the same time."""
+        near = [each for each in self._poses if _distance(each[1], at) <= _AROUND_NS]
         return any(
             max(first, begin) <= min(last, end) and self._of(one) != self._of(other)
             for (one, (first, last)), (other, (begin, end)) in combinations(near, 2)
@@ -171,15 +172,15 @@ class Sessions:
         return not self._children(every, one) & self._children(every, other)
 
     def _kinds(self, session: Session) -> frozenset[str]:
-        """Which kinds of transforms a session holds; those that are carried count as its own."""
+        """Returns which kinds of transforms a session holds; carried ones count as its own."""
         return frozenset(kind for kind, spans in self._spans.items() if session & spans.keys())
 
     def _around(self, moment: Ns) -> list[Session]:
-        """The sessions that were being recorded at a moment."""
+        """Returns the sessions that were being recorded at a moment."""
         return [*dict.fromkeys(map(self._of, sorted(self._folders_around(moment))))]
 
     def _folders_around(self, moment: Ns) -> set[str]:
-        """Where the recordings lie that went on at a moment."""
+        """Returns the folders of the recordings that went on at a moment."""
         bags = self._view.snapshot.overlapping(TimeWindow.around(moment, _AROUND_NS))
         return {self.folder(bag.recording) for bag in bags} - {self._carried}
 
@@ -198,7 +199,7 @@ class Sessions:
         return spans
 
     def _chains(self, poses: str) -> Mapping[str, Session]:
-        """By folder, the recordings with transforms or poses that are joined by handovers."""
+        """Returns, by folder, the recordings with transforms or poses joined by handovers."""
         timeline = self._view.snapshot.timeline
         known = None if timeline is None else _JOINED.get(timeline)
         if known is None:
@@ -213,7 +214,7 @@ class Sessions:
 
 
 def _joined(paths: Mapping[str, Path]) -> dict[str, Session]:
-    """By folder, all that are joined with it, of recordings by their folders."""
+    """Returns, by folder, all folders that are joined with it by handovers, itself included."""
     beside: defaultdict[str, set[str]] = defaultdict(set)
     for folder, path in paths.items():
         for name in _neighbours(path):
@@ -233,12 +234,12 @@ def _joined(paths: Mapping[str, Path]) -> dict[str, Session]:
     return joined
 
 
-def _off(span: tuple[Ns, Ns], moment: Ns) -> Ns:
-    """How far a moment is from a span of time."""
+def _distance(span: tuple[Ns, Ns], moment: Ns) -> Ns:
+    """Returns how far a moment is from a span of time."""
     return max(span[0] - moment, moment - span[1], 0)
 
 
 def _neighbours(recording: Path) -> tuple[str, ...]:
-    """The names of the recordings before and after one that are joined with it by a handover."""
+    """Returns the names of the recordings before and after one, joined with it by a handover."""
     handover = read_handover(recording).handover
     return tuple(filter(None, (handover.previous, handover.next)))

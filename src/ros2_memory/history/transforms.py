@@ -1,7 +1,7 @@
-"""The transforms that a question about frames needs, gathered from the history.
+"""Transforms between two frames, gathered from the history.
 
-Windows are in log time. A dynamic transform is looked for close to the moment first, then further
-away, up to tf2's cache length; a static one however far back it was recorded.
+Windows are in log time. A moving transform is looked for close to the moment first, then further
+away, up to the length of tf2's cache (10 s); a static one however far back it was recorded.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)
-"""How far around the moment dynamic transforms are read; the last is as far as tf2 remembers."""
+"""How far around the moment moving transforms are read; the last is the length of tf2's cache."""
 
 
 _LONGER_NS: Final[Ns] = 3600 * NS_PER_S
-"""How far around the moment it is looked for frames that were not known then."""
+"""How far around the moment frames are looked for that are unknown then."""
 
 _BORROWED: Final = Reason(
     "is placed by transforms of another recording of the same time; no handover says that both are "
@@ -85,42 +85,41 @@ class FoundTransform(NamedTuple):
 def transform_at(
     view: View, parent: str, child: str, at: Ns, recording: Path | None = None
 ) -> FoundTransform:
-    """The pose of `child` in `parent` at a moment, by tf2's rules.
+    """Returns the pose of `child` in `parent` at a moment, by tf2's rules.
 
-    Of a message of a `recording` it is told by the transforms of that recording's session; else by
+    With the `recording` of a message the transforms of that recording's session are used; else
     those of the session that was recorded then. Where several were, and differ, a note says so.
 
     Raises:
         NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,
-            or nothing brackets the moment on one of the edges between them.
+            or no transform brackets the moment on one of the edges between them.
     """
     limits = view.memory.limits
     if not _recorded(view, (*limits.tf_topics, *limits.tf_static_topics)):
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
-    sessions = sessions_of(view)
+    frames, sessions = (parent, child), sessions_of(view)
     if recording is not None:
-        among = lending_to(view, recording, (parent, child), at)
-        return _transform_in(view, among, (parent, child), at)
-    holding = sessions.recorded_at(at)
+        return _transform_in(view, lending_to(view, recording, frames, at), frames, at)
+    recorded = sessions.recorded_at(at)
     answers: list[tuple[Session, FoundTransform]] = []
-    failure: NoDataError | None = None
-    for session in (sessions.nearest_to(at) if holding is None else holding) or [frozenset()]:
+    failures: list[NoDataError] = []
+    for session in (sessions.nearest_to(at) if recorded is None else recorded) or [frozenset()]:
         try:
-            answers.append((session, _transform_in(view, session, (parent, child), at)))
+            answers.append((session, _transform_in(view, session, frames, at)))
         except NoDataError as error:
-            failure = failure or error
-        if holding is None and answers:
+            failures.append(error)
+        if recorded is None and answers:
             break
-    if not answers and failure is not None:
-        raise failure
+    if not answers:
+        raise failures[0]
     session, found = answers[0]
-    if not all(_alike(found, other) for _, other in answers):
+    if not all(alike(found.transform, each.transform) for _, each in answers):
         view.notes.add(
             f"{len(answers)} sessions that were recorded then hold different transforms; "
             f"this is that of {sessions.names(session, at)}"
         )
     parts = sessions.parts_of(session)
-    if parts and not any(connected(view, (parent, child), among=each) for each in parts):
+    if parts and not any(connected(view, frames, among=each) for each in parts):
         view.notes.add(
             f"transforms of {sessions.names(session, at)} are joined, as of one robot: they were "
             "recorded at the same time, and no handover says whether they are of one"
@@ -129,10 +128,10 @@ def transform_at(
 
 
 def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> Session:
-    """Whose transforms place a message of a recording; a note says where these are borrowed.
+    """Returns the session whose transforms place a message of a recording; a note says if borrowed.
 
-    They are where the recording's own do not lead from one frame to the other, and those of the
-    one other session that lends do.
+    They are borrowed where those of the recording's own session do not lead from one frame to the
+    other, and those of the one other session that lends do.
     """
     sessions = sessions_of(view)
     session, own = sessions.lending_to(recording, at), sessions.of(recording)
@@ -148,33 +147,33 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
     return sessions.chosen[key]
 
 
-def _alike(one: FoundTransform, other: FoundTransform) -> bool:
-    return alike(one.transform, other.transform)
-
-
 def _transform_in(view: View, among: Session, frames: tuple[str, str], at: Ns) -> FoundTransform:
-    """As `transform_at`, by the transforms of one session."""
+    """Does as `transform_at`, by the transforms of one session."""
     limits = view.memory.limits
-    static = _static_at(view, at, among)
+    static = static_at(static_transforms(view, among), at)
+
+    def look_up(moving: Sequence[StampedTransform]) -> FoundTransform:
+        graph = graph_of(view, static, moving)
+        return FoundTransform(graph.lookup(*frames, at), _clock(view, moving))
+
     for half_width in _HALF_WIDTHS:
         window = TimeWindow.around(at, half_width)
-        dynamic = list(_transforms(view, limits.tf_topics, window, among, static=False))
+        moving = list(_transforms(view, limits.tf_topics, window, among, static=False))
         try:
-            found = _lookup(static, dynamic, limits.tf_clock, frames, at)
-            return found._replace(reach=half_width)
+            return look_up(moving)._replace(reach=half_width)
         except NoDataError as error:
             failure = error
     if limits.tf_clock == "stamp":
-        dynamic = list(_stamped_near(view, at, among))
+        moving = list(_stamped_near(view, at, among))
         try:
-            return _lookup(static, dynamic, "stamp", frames, at)
+            return look_up(moving)
         except NoDataError as error:
-            raise _of_stamps(error, at, nothing_near=not dynamic) from error
-    raise _explained(view, failure, frames, at, among, nothing_near=not dynamic) from failure
+            raise _stamp_failure(error, at, nothing_near=not moving) from error
+    raise _explained(view, failure, frames, at, among, nothing_near=not moving) from failure
 
 
 def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTransform]:
-    """The moving transforms of a session with which any moment of a window can be looked up."""
+    """Returns the moving transforms of a session that a lookup at any moment of a window needs."""
     wider = TimeWindow(
         max(window.start - TF_CACHE_NS, MIN_NS), min(window.stop + TF_CACHE_NS, MAX_NS)
     )
@@ -184,35 +183,37 @@ def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTra
 def graph_of(
     view: View, static: Sequence[StampedTransform], moving: Sequence[StampedTransform]
 ) -> FrameGraph:
-    """The transforms as a graph, in the clock that is configured."""
-    clock: TfClock = "log" if view.memory.limits.tf_clock == "log" else "stamp"
-    if view.memory.limits.tf_clock == "auto":
-        clock = agreeing_clock(moving)
-    return FrameGraph([*static, *moving], clock)
+    """Returns the transforms as a graph, in the clock of `data.tf_clock`."""
+    return FrameGraph([*static, *moving], _clock(view, moving))
 
 
-def statics(view: View, among: Session) -> list[StampedTransform]:
-    """Every static transform of a session, in order."""
+def _clock(view: View, moving: Sequence[StampedTransform]) -> TfClock:
+    configured = view.memory.limits.tf_clock
+    return agreeing_clock(moving) if configured == "auto" else configured
+
+
+def static_transforms(view: View, among: Session) -> list[StampedTransform]:
+    """Returns every static transform of a session, in log-time order."""
     topics = view.memory.limits.tf_static_topics
     return list(_transforms(view, topics, TimeWindow.everything(), among, static=True))
 
 
-def holding_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
-    """For each child frame its newest static transform at a moment, of these in order.
+def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
+    """Returns, of static transforms in log-time order, the newest of each child at a moment.
 
-    A static transform holds at all times of its session, so one that was only received later holds
-    too, the first of them.
+    A static transform holds at all times of its session. So where all of a child were received
+    later, the first of them holds.
     """
-    holding: dict[str, StampedTransform] = {}
+    newest: dict[str, StampedTransform] = {}
     for each in static:
         child = each.child.lstrip("/")
-        if child not in holding or each.log_time <= at + AT_OR_BEFORE_SLACK_NS:
-            holding[child] = each
-    return list(holding.values())
+        if child not in newest or each.log_time <= at + AT_OR_BEFORE_SLACK_NS:
+            newest[child] = each
+    return list(newest.values())
 
 
 def sessions_of(view: View) -> Sessions:
-    """The sessions of a view, worked out once."""
+    """Returns the sessions of a view, made once."""
     if view.sessions is None:
         limits = view.memory.limits
         view.sessions = Sessions(
@@ -227,28 +228,31 @@ def sessions_of(view: View) -> Sessions:
     return view.sessions
 
 
-def own_holdings(
+def session_bags(
     view: View, topic: str, window: TimeWindow, recording: Path
 ) -> list[BagSpan] | None:
-    """What the session of a recording holds of a topic in a window; None where it never has any."""
+    """Returns the bags with a topic, in a window, of a recording's session.
+
+    None where that session has no message of the topic at all.
+    """
     sessions = sessions_of(view)
     own = sessions.of(recording)
     if not any(sessions.folder(each) in own for each in view.snapshot.recordings(topic)):
         return None
-    return _holdings(view, (topic,), window, own)
+    return _bags_of(view, (topic,), window, own)
 
 
 def children_moving(view: View, among: Session) -> set[str]:
-    """The child frames of a session's moving transforms."""
+    """Returns the child frames of a session's moving transforms."""
     pairs = _pairs(view, view.memory.limits.tf_topics, static=False, among=among)
     return {child.lstrip("/") for _, child in pairs}
 
 
 def edges(view: View) -> tuple[FrameEdge, ...]:
-    """Every parent and child pair that was recorded, sorted; `static` where it was so published.
+    """Returns every parent and child pair that was recorded, sorted; `static` where published so.
 
-    A pair that was published both ways stands once, as dynamic. One in which a frame has no name
-    is none to tf2, and left out with a note.
+    A pair that was published both ways is in it once, as moving. A pair in which a frame has no
+    name is none to tf2, and left out with a note.
     """
     limits = view.memory.limits
     pairs: dict[tuple[str, str], bool] = {}
@@ -272,17 +276,19 @@ def _pairs(
     window: TimeWindow | None = None,
     among: Session | None = None,
 ) -> set[tuple[str, str]]:
-    """The pairs of these topics: of which the catalogue says none, their bags are read.
+    """Returns the pairs of these topics: from the catalogue, or from bags that it has none of.
 
-    With a window, those of the bags that have something of a topic in it; `among` a session, of its
-    bags.
+    With a window, those of the bags that have something of a topic in it; with `among`, those of a
+    session's bags.
     """
     pairs: set[tuple[str, str]] = set()
     recorded = _recorded(view, topics)
     unknown: list[tuple[Ns, Ns]] = []
     for topic in recorded:
-        for run in view.snapshot.segments:
-            known, spans = _known_pairs(view, run, topic, window or TimeWindow.everything(), among)
+        for segment in view.snapshot.segments:
+            known, spans = _stored_pairs(
+                view, segment, topic, window or TimeWindow.everything(), among
+            )
             pairs |= known
             unknown += spans
     for span in united(unknown):
@@ -297,12 +303,12 @@ def _is_edge(pair: tuple[str, str]) -> bool:
     return bool(parent and child) and parent != child
 
 
-def _known_pairs(
-    view: View, run: Segment, topic: str, window: TimeWindow, among: Session | None
+def _stored_pairs(
+    view: View, segment: Segment, topic: str, window: TimeWindow, among: Session | None
 ) -> tuple[set[tuple[str, str]], list[tuple[Ns, Ns]]]:
-    """The pairs that the catalogue has of a run of bags, and the time of bags it has none of."""
-    notes = view.bags.digests_of(run) if topic in run.spans else None
-    if notes is not None and among is None and window.covers(*run.spans[topic]):
+    """Returns the pairs that the catalogue has of a segment, and the times of bags it lacks."""
+    notes = view.bags.digests_of(segment) if topic in segment.spans else None
+    if notes is not None and among is None and window.covers(*segment.spans[topic]):
         every = notes.pairs(topic)
         if every is not None:
             return set(every), []
@@ -310,8 +316,8 @@ def _known_pairs(
     edges = {} if notes is None else notes.edges(topic)
     known: set[tuple[str, str]] = set()
     rest: list[tuple[Ns, Ns]] = []
-    for bag, first, last in run.extents(topic):
-        if window.overlaps(first, last) and _is_among(view, bag, among):
+    for bag, first, last in segment.extents(topic):
+        if window.overlaps(first, last) and _is_of(view, bag, among):
             edge = edges.get(numbers.get(bag.file, 0))
             mixed = among is not None and sessions_of(view).is_carried(bag)
             if edge is None or mixed:
@@ -319,20 +325,6 @@ def _known_pairs(
             else:
                 known.update(edge.pairs)
     return known, rest
-
-
-def _lookup(
-    static: Sequence[StampedTransform],
-    dynamic: Sequence[StampedTransform],
-    mode: str,
-    frames: tuple[str, str],
-    at: Ns,
-) -> FoundTransform:
-    clock: TfClock = "log" if mode == "log" else "stamp"
-    if mode == "auto":
-        clock = agreeing_clock(dynamic)
-    graph = FrameGraph([*static, *dynamic], clock)
-    return FoundTransform(graph.lookup(*frames, at), clock)
 
 
 def _explained(
@@ -344,31 +336,29 @@ def _explained(
     *,
     nothing_near: bool,
 ) -> NoDataError:
-    """The failure of a lookup in its neighbourhood, said of the whole memory.
+    """Returns the failure of a lookup near a moment in terms of the whole memory.
 
-    A frame that is not known there is a gap where it is within `_LONGER_NS`.
+    A frame that is unknown near the moment, and known within `_LONGER_NS` of it, is a gap.
     """
     topics = _recorded(view, view.memory.limits.tf_topics)
+    near = TimeWindow.around(at, TF_CACHE_NS)
     if topics and nothing_near:
         return no_data_at(view, topics, at, None, around=TF_CACHE_NS)
     if failure.reason in _OF_ALL_TIMES:
-        then = _of_then(failure, at)
+        then = _near_failure(failure, at)
         unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
-        if not (unknown and connected(view, frames, TimeWindow.around(at, _LONGER_NS), among)):
+        if not unknown or not connected(view, frames, TimeWindow.around(at, _LONGER_NS), among):
             return then
-        told = f"{then.detail}; within {seconds(_LONGER_NS)} the two were connected: ask about then"
-        return NoDataError(between(view, TimeWindow.around(at, TF_CACHE_NS)), told)
+        advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
+        return NoDataError(between(view, near), f"{then.detail}; {advice}")
     if failure.reason not in {NoDataReason.OUTSIDE_RANGE, NoDataReason.GAP}:
         return failure
-    inside = topics and all(
-        view.stream.first(topics, side, newest_first=newest_first)
-        for side, newest_first in (
-            (TimeWindow.until(at), True),
-            (TimeWindow(at + 1, MAX_NS), False),
-        )
+    inside = (
+        topics
+        and view.stream.first(topics, TimeWindow.until(at), newest_first=True)
+        and view.stream.first(topics, TimeWindow(at + 1, MAX_NS))
     )
-    reason = between(view, TimeWindow.around(at, TF_CACHE_NS)) if inside else beyond(view, at)
-    return NoDataError(reason, failure.detail)
+    return NoDataError(between(view, near) if inside else beyond(view, at), failure.detail)
 
 
 def connected(
@@ -379,7 +369,7 @@ def connected(
 ) -> bool:
     """Whether transforms recorded in a window, and static ones, lead from one frame to the other.
 
-    Not known where the time for the answer is over before.
+    False, too, where the time for the answer is over before that is known.
     """
     limits = view.memory.limits
     try:
@@ -398,19 +388,19 @@ def connected(
     return target in reached and len(reached) > 1
 
 
-def _of_stamps(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:
-    """The failure of a lookup by header stamps, wherever in log time they were recorded."""
+def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:
+    """Returns the failure of a lookup by header stamps, wherever in log time they were recorded."""
     if nothing_near:
         return NoDataError(
             NoDataReason.OUTSIDE_RANGE,
             f"no moving transform has a header stamp within {seconds(TF_CACHE_NS)} of "
             f"{unix_text(at)}; data.tf_clock has them looked up by header stamp, not by log time",
         )
-    return _of_then(failure, at) if failure.reason in _OF_ALL_TIMES else failure
+    return _near_failure(failure, at) if failure.reason in _OF_ALL_TIMES else failure
 
 
-def _of_then(failure: NoDataError, at: Ns) -> NoDataError:
-    """A failure that sounds as if it held for all times, said of the time that was looked at."""
+def _near_failure(failure: NoDataError, at: Ns) -> NoDataError:
+    """Returns a failure that sounds as if it were about all times with the time it is about."""
     return NoDataError(
         failure.reason,
         f"within {seconds(TF_CACHE_NS)} of {unix_text(at)}: {failure.detail}; "
@@ -418,27 +408,22 @@ def _of_then(failure: NoDataError, at: Ns) -> NoDataError:
     )
 
 
-def _static_at(view: View, at: Ns, among: Session) -> list[StampedTransform]:
-    """The static transforms of a session that hold at a moment."""
-    return holding_at(statics(view, among), at)
-
-
 def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransform]:
-    """The dynamic transforms stamped around a moment, wherever in log time they were recorded.
+    """Yields the moving transforms stamped around a moment, wherever in log time they are.
 
-    A bag is read where the stamps of its first and last message reach as far as the moment.
+    A bag is read only where the stamps of its first and last message reach as far as the moment.
     """
     topics = _recorded(view, view.memory.limits.tf_topics)
     everything = TimeWindow.everything()
-    for held in _holdings(view, topics, everything, among):
-        ends = _stamps_at_ends(view, held.bag, topics)
+    for span in _bags_of(view, topics, everything, among):
+        ends = _stamps_at_ends(view, span.bag, topics)
         if ends and min(ends) - TF_CACHE_NS <= at <= max(ends) + TF_CACHE_NS:
-            for found in view.bags.track_sources(view.bags.read(held.bag, topics, everything)):
+            for found in view.bags.track_sources(view.bags.read(span.bag, topics, everything)):
                 yield from _decoded(view, found, static=False)
 
 
 def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]:
-    """The stamps in the bag's first and last message; of several topics in any order."""
+    """Returns the stamps in a bag's first and last message, in any order."""
     entry = view.bags.entry(bag) if len(topics) == 1 else None
     edges = None if entry is None else entry[0].edges(topics[0]).get(entry[1])
     if edges is not None:
@@ -462,35 +447,35 @@ def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
 def _transforms(
     view: View, topics: Iterable[str], window: TimeWindow, among: Session | None, *, static: bool
 ) -> Iterator[StampedTransform]:
-    """The transforms in a window, in order; of a session the copies in its recordings too."""
+    """Yields the transforms in a window, in order; with duplicates, where it is of one session."""
     recorded = _recorded(view, topics)
     if not recorded:
         return
     if among is None:
         found = view.stream.messages(recorded, window)
     else:
-        # A latched message that was received again counts in the recording that received it, too.
-        holdings = _holdings(view, recorded, window, among)
+        # A message that was relatched belongs to the recording that received it, too.
+        bags = _bags_of(view, recorded, window, among)
         sessions = sessions_of(view)
-        merged = view.stream.merged(holdings, recorded, window, newest_first=False)
-        several = any(sessions.is_carried(held.bag) for held in holdings)
+        merged = view.stream.merged(bags, recorded, window, newest_first=False)
+        several = any(sessions.is_carried(span.bag) for span in bags)
         tracked = view.bags.track_sources(merged)
         found = (each for each in tracked if not several or sessions.has(among, each))
     for each in found:
         yield from _decoded(view, each, static=static)
 
 
-def _holdings(
+def _bags_of(
     view: View, topics: Sequence[str], window: TimeWindow, among: Session
 ) -> list[BagSpan]:
-    held = view.stream.overlapping_bags(topics, window)
+    bags = view.stream.overlapping_bags(topics, window)
     sessions = sessions_of(view)
-    recordings = {each.bag.recording for each in held}
+    recordings = {each.bag.recording for each in bags}
     chosen = {each for each in recordings if sessions.folder(each) in among}
-    return [each for each in held if each.bag.recording in chosen]
+    return [each for each in bags if each.bag.recording in chosen]
 
 
-def _is_among(view: View, bag: BagFile, among: Session | None) -> bool:
+def _is_of(view: View, bag: BagFile, among: Session | None) -> bool:
     return among is None or sessions_of(view).folder(bag.recording) in among
 
 

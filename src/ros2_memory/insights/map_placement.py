@@ -1,8 +1,8 @@
-"""In which frame places are told, and how the poses of a topic become places in it.
+"""Places of poses in the map, or in their own frame where there is no map.
 
-That is `data.map_frame` where recorded transforms lead from the poses' own frame to it, and else
-the poses' own: odometry, which begins anew whenever the robot is started. Which transform holds is
-a question of the pose's time and of its recording.
+The frame is `data.map_frame` where recorded transforms lead from the poses' own frame to it, and
+else the poses' own: odometry, which begins at its origin whenever the robot is started. Which
+transform applies depends on the time of the pose and on its recording.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
-from ros2_memory.core.geometry import alike, invert, rotate
+from ros2_memory.core.geometry import alike, invert, transform_point
 from ros2_memory.core.model import TimeWindow, Transform
 from ros2_memory.core.text import Reason, abbreviate
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
@@ -22,11 +22,11 @@ from ros2_memory.history.transforms import (
     children_moving,
     connected,
     graph_of,
-    holding_at,
     lending_to,
     moving_in,
     sessions_of,
-    statics,
+    static_at,
+    static_transforms,
 )
 
 if TYPE_CHECKING:
@@ -37,21 +37,21 @@ if TYPE_CHECKING:
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
-_LEVEL: Final = 1e-6
-_NOWHERE_IN: Final = Reason(
+_LEVEL_TOLERANCE: Final = 1e-6
+_NOT_PLACED: Final = Reason(
     "has no transforms that place its poses: they are left out",
     "recording",
     many="have no transforms that place their poses: they are left out",
 )
-_NOWHERE: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+_IDENTITY: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
-    """What a session's transforms say of the poses' frame.
+class _SessionTransforms:
+    """The transforms of one session, as far as they place its poses.
 
     Attributes:
-        static: its static transforms, in order.
+        static: its static transforms, in log-time order.
         changes: the log times at which one of them changed.
         fixed: the pose of the poses' frame in that of the places, where it never changes in the
             session; None where it moves, or is not known.
@@ -64,7 +64,7 @@ class _Known:
 
 @dataclass(slots=True)
 class MapPlacement:
-    """How positions of poses become places.
+    """Converts positions of poses to places.
 
     Attributes:
         frame_id: of the places.
@@ -75,47 +75,43 @@ class MapPlacement:
     frame_id: str
     pose_frame: str
     _window: TimeWindow = field(default_factory=TimeWindow.everything)
-    _known: dict[Session, _Known] = field(default_factory=dict)
+    _known: dict[Session, _SessionTransforms] = field(default_factory=dict)
     _moving: dict[Session, list[StampedTransform]] = field(default_factory=dict)
     _graphs: dict[tuple[Session, int], FrameGraph] = field(default_factory=dict)
 
     @property
     def is_map(self) -> bool:
-        """Whether places keep their meaning when odometry begins anew."""
+        """Whether the coordinates of places keep their meaning when odometry is reset."""
         return self.frame_id == self.view.memory.limits.map_frame
 
-    def look_at(self, window: TimeWindow) -> None:
-        """Names the window of which poses are placed next: what they need is gathered once."""
+    def use_window(self, window: TimeWindow) -> None:
+        """Sets the window of the next poses: the moving transforms in it are gathered once."""
         self._window = window
         self._moving.clear()
         self._graphs.clear()
 
     def of(self, recording: Path, time: Ns, position: Vector3) -> Vector3 | None:
-        """The place of a position of a recording then; None where no transform tells it."""
+        """Returns the place (m) of a recording's position at a time; None without a transform."""
         pose = self._pose(recording, time)
         if pose is None:
             return None
-        x, y, z = rotate(pose.rotation, position)
-        dx, dy, dz = pose.translation
-        return (x + dx, y + dy, z + dz)
+        return transform_point(pose, position)
 
     def in_poses(self, recording: Path, at: Ns, x: float, y: float) -> tuple[float, float] | None:
-        """A place of the plane in the own frame of a recording's poses.
+        """Returns a place of the plane (m) in the own frame of a recording's poses.
 
-        None where that changes in its session, or is tilted.
+        None where that frame moves in its session, or is tilted.
         """
         fixed = self._fixed(recording, at)
         if fixed is None:
             return None
         qx, qy, _, _ = fixed.rotation
-        if abs(qx) > _LEVEL or abs(qy) > _LEVEL:
+        if abs(qx) > _LEVEL_TOLERANCE or abs(qy) > _LEVEL_TOLERANCE:
             return None
-        back = invert(fixed)
-        px, py, _ = rotate(back.rotation, (x, y, 0.0))
-        return px + back.translation[0], py + back.translation[1]
+        return transform_point(invert(fixed), (x, y, 0.0))[:2]
 
     def is_fixed(self, topic: str) -> bool:
-        """Whether what is fixed is the same in every recording of a topic."""
+        """Whether one fixed transform places the poses of all recordings of a topic."""
         if self.frame_id == self.pose_frame:
             return True
         found = [
@@ -129,15 +125,15 @@ class MapPlacement:
 
     def _fixed(self, recording: Path, at: Ns) -> Transform | None:
         if self.frame_id == self.pose_frame:
-            return _NOWHERE
-        return self._of(self._session(recording, at)).fixed
+            return _IDENTITY
+        return self._transforms_of(self._session(recording, at)).fixed
 
     def _pose(self, recording: Path, time: Ns) -> Transform | None:
-        """The pose of the poses' frame in that of the places."""
+        """Returns the pose of the poses' frame in that of the places."""
         if self.frame_id == self.pose_frame:
-            return _NOWHERE
+            return _IDENTITY
         session = self._session(recording, time)
-        known = self._of(session)
+        known = self._transforms_of(session)
         if known.fixed is not None:
             return known.fixed
         number = bisect_right(known.changes, time + AT_OR_BEFORE_SLACK_NS)
@@ -145,7 +141,7 @@ class MapPlacement:
         if graph is None:
             if session not in self._moving:
                 self._moving[session] = moving_in(self.view, self._window, session)
-            static = holding_at(known.static, known.changes[number - 1] if number else MIN_NS)
+            static = static_at(known.static, known.changes[number - 1] if number else MIN_NS)
             graph = graph_of(self.view, static, self._moving[session])
             self._graphs[session, number] = graph
         try:
@@ -154,24 +150,24 @@ class MapPlacement:
             return None
 
     def _session(self, recording: Path, at: Ns) -> Session:
-        """Whose transforms place the poses of a recording; a note says where none do."""
+        """Returns the session that places a recording's poses; a note says if none does."""
         session = lending_to(self.view, recording, (self.frame_id, self.pose_frame), at)
         if not session:
-            self.view.notes.add(Note(_NOWHERE_IN, recording.name))
+            self.view.notes.add(Note(_NOT_PLACED, recording.name))
         return session
 
-    def _of(self, session: Session) -> _Known:
+    def _transforms_of(self, session: Session) -> _SessionTransforms:
         if session not in self._known:
-            static = statics(self.view, session)
-            changes = _changes(static)
+            static = static_transforms(self.view, session)
+            changes = _change_times(static)
             fixed = None
             if not changes and not children_moving(self.view, session) & _children(static):
-                fixed = self._by_static_alone(static)
-            self._known[session] = _Known(static, changes, fixed)
+                fixed = self._fixed_pose(static)
+            self._known[session] = _SessionTransforms(static, changes, fixed)
         return self._known[session]
 
-    def _by_static_alone(self, static: list[StampedTransform]) -> Transform | None:
-        graph = graph_of(self.view, holding_at(static, MIN_NS), ())
+    def _fixed_pose(self, static: list[StampedTransform]) -> Transform | None:
+        graph = graph_of(self.view, static_at(static, MIN_NS), ())
         try:
             return graph.lookup(self.frame_id, self.pose_frame, 0)
         except NoDataError:
@@ -181,24 +177,24 @@ class MapPlacement:
 def map_placement(
     view: View, pose_frame: str, topic: str, frame_id: str | None = None
 ) -> MapPlacement:
-    """How places are told of the poses of a topic in this frame; in `frame_id` where one is asked.
+    """Returns how the poses of a topic in this frame are placed; in `frame_id` where one is given.
 
     Raises:
-        InvalidArgumentsError: places are not told in that frame.
+        InvalidArgumentsError: places are in another frame than `frame_id`.
     """
     own = MapPlacement(view, pose_frame, pose_frame)
-    place = own if frame_id == pose_frame else _best(view, topic, own)
-    if frame_id not in (None, place.frame_id):
-        known = " or ".join(dict.fromkeys((place.frame_id, pose_frame)))
+    placement = own if frame_id == pose_frame else _map_or_own(view, topic, own)
+    if frame_id not in (None, placement.frame_id):
+        known = " or ".join(dict.fromkeys((placement.frame_id, pose_frame)))
         raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)}; places are told in {known}, and "
             "get_transform_at leads from any other frame"
         )
-    return place
+    return placement
 
 
-def _best(view: View, topic: str, own: MapPlacement) -> MapPlacement:
-    """In the map, where the transforms of some recording lead there from its poses' frame."""
+def _map_or_own(view: View, topic: str, own: MapPlacement) -> MapPlacement:
+    """Returns the placement in the map, where transforms of some recording lead there."""
     target, pose_frame = view.memory.limits.map_frame, own.pose_frame
     if not target or target == pose_frame or not connected(view, (target, pose_frame)):
         return own
@@ -209,8 +205,8 @@ def _best(view: View, topic: str, own: MapPlacement) -> MapPlacement:
     return own
 
 
-def _changes(static: list[StampedTransform]) -> list[Ns]:
-    """The log times at which a static transform says something else of its child than before."""
+def _change_times(static: list[StampedTransform]) -> list[Ns]:
+    """Returns the log times at which a child's static transform differs from the one before."""
     changes: dict[Ns, None] = {}
     latest: dict[str, StampedTransform] = {}
     for each in static:

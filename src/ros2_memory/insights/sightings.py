@@ -20,7 +20,7 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.geometry import rotate
+from ros2_memory.core.geometry import transform_point
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -33,7 +33,7 @@ from ros2_memory.history.coverage import note_unread, unix_text
 from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.time_arguments import TimeRange, clamped, last_window, ns_argument
-from ros2_memory.history.transforms import own_holdings, transform_at
+from ros2_memory.history.transforms import session_bags, transform_at
 from ros2_memory.history.view import View
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.results import Sighting, Sightings, Spot
@@ -329,7 +329,7 @@ def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
     Where the session of the match has poses, it is one of these.
     """
     window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
-    own = own_holdings(view, topic, window, seen.bag.recording)
+    own = session_bags(view, topic, window, seen.bag.recording)
     found = view.stream.newest(topic, window)
     if own is not None and (found is None or found.bag not in {held.bag for held in own}):
         found = view.stream.first([topic], window, newest_first=True, among=own)
@@ -362,10 +362,8 @@ def _spot(
             )
         except NoDataError:
             continue
-        pose = found_transform.transform
-        x, y, z = rotate(pose.rotation, thing.place)
-        dx, dy, dz = pose.translation
-        return Spot(thing.label, (x + dx, y + dy, z + dz), target)
+        place = transform_point(found_transform.transform, thing.place)
+        return Spot(thing.label, place, target)
     return Spot(thing.label, thing.place, thing.frame_id)
 
 

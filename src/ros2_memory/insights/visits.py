@@ -296,7 +296,7 @@ class _VisitSearch:
             known = self._digests.of(groups[0])
             if known is not None and self._add_digest(visits, groups[0], *known, here):
                 return
-        self._place.look_at(part)
+        self._place.use_window(part)
         for found, position in self._positions(part):
             self._check_counting()
             distance = self._distance(found, position)
