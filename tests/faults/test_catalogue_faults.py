@@ -28,7 +28,7 @@ from ros2_memory.serving.backfill import (
     keep_backfilled,
 )
 from tests.faults.world import NOW, fill_up, plainly, served, told, write_bag, write_bags
-from tests.support.memories import SettableClock
+from tests.support.clocks import SettableClock
 from tests.support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:

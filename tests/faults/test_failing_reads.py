@@ -29,7 +29,8 @@ from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.faults.failing_disk import LOOK, OPEN, PASSING, failing
 from tests.faults.world import NOW, T0, fill_up, served, told, write_bag, write_bags
 from tests.support.bags import odom, write_db3
-from tests.support.memories import SettableClock, memory_of
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

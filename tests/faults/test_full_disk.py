@@ -16,7 +16,8 @@ from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.temp_files import Scratch
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.faults.world import NOW, told, write_bags
-from tests.support.memories import SettableClock, memory_of
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -14,13 +14,14 @@ from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.cli.index import fill_catalogue
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
-from ros2_memory.core.timebase import NS_PER_S, FixedClock
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.visits import visits
 from tests.support.bags import McapLayout, detections, odom, tf, transform, write_mcap
+from tests.support.clocks import FixedClock
 from tests.support.housekeepers import recorded_before
 from tests.support.memories import memory_of
 

@@ -18,9 +18,10 @@ from ros2_memory import queries
 from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.config import load_settings
-from ros2_memory.core.timebase import NS_PER_S, FixedClock
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from tests.support.bags import detections, odom, tf, transform, write_mcap
+from tests.support.clocks import FixedClock
 from tests.support.housekeepers import recorded_before
 from tests.support.memories import memory_of
 from tests.support.waiting import until

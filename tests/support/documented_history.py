@@ -23,13 +23,14 @@ from ros2_memory.bag_dir.heartbeat import (
     write_heartbeat,
 )
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE
-from ros2_memory.bag_dir.moment_file import SavedMoment, write_saved_moment
+from ros2_memory.bag_dir.moment_file import SavedMoment, SaveRequest, write_saved_moment
 from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import McapLayout, Msg, detections, odom, text, tf, transform, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.housekeepers import recorder_at_work
-from tests.support.memories import SettableClock, memory_of
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -165,9 +166,8 @@ def shown_files(bag_dir: Path) -> dict[str, str]:
     overlap = Overlap(cut - 2 * NS_PER_S, cut + 2 * NS_PER_S, (f"{RECORDING}_5.mcap",))
     write_handover(bag_dir, Handover(next="rec_20261120T080058Z", counts_until=cut, end=overlap))
     start = (START_S + 34) * NS_PER_S
-    write_saved_moment(
-        bag_dir, SavedMoment("5f0c" * 8, "scissors found", start, NOW, NOW, pending=False)
-    )
+    request = SaveRequest("5f0c" * 8, "scissors found", start, NOW, NOW)
+    write_saved_moment(bag_dir, SavedMoment(request, pending=False))
     names = (HEARTBEAT_FILE, HANDOVER_FILE, MOMENT_FILE)
     return {name: (bag_dir / name).read_text(encoding="utf-8") for name in names}
 

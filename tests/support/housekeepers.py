@@ -16,7 +16,7 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.memories import SettableClock
+from tests.support.clocks import SettableClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

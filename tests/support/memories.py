@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.clocks import SettableClock
 
 if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
@@ -30,16 +30,6 @@ def extractor() -> SchemaExtractor:
     """The extractor of the shipped schema map."""
     text = (ROOT / "config" / "message_schemas.yaml").read_text(encoding="utf-8")
     return SchemaExtractor(yaml.safe_load(text)["schemas"], max_array_length=50)
-
-
-@dataclass
-class SettableClock(Clock):
-    """A clock that a test moves."""
-
-    at: int
-
-    def now(self) -> int:
-        return self.at
 
 
 def memory_of(

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from ros2_memory.bag_dir.layout import MOMENT_FILE
 from ros2_memory.bag_dir.request_queue import PendingRequest
 from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.housekeepers import keeper_of
-from tests.support.memories import SettableClock
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -30,7 +30,8 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import SettableClock, memory_of
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -67,21 +67,12 @@ class SavedMoment:
     """A moment as its file describes it.
 
     `pending`: it waits for bags that are still being written. `missing` are sentences on parts that
-    were not saved. The other fields are those of its request.
+    were not saved. By default nothing is saved yet.
     """
 
-    number: str
-    label: str
-    start: Ns
-    end: Ns
-    asked: Ns
+    request: SaveRequest
     pending: bool = True
     missing: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, request: SaveRequest) -> SavedMoment:
-        """Returns a moment of which nothing is saved yet."""
-        return cls(*request)
 
 
 class StoredMoment(NamedTuple):
@@ -143,9 +134,8 @@ def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    request = SaveRequest(moment.number, moment.label, moment.start, moment.end, moment.asked)
     content = {
-        **request.to_json(),
+        **moment.request.to_json(),
         "pending": moment.pending,
         "complete": not (moment.pending or moment.missing),
         "missing": list(moment.missing),
@@ -162,7 +152,7 @@ def read_saved_moment(folder: Path) -> SavedMoment | None:
         pending, missing = fields.get("pending"), fields.get("missing")
         if not isinstance(pending, bool) or not isinstance(missing, list):
             return None
-        return SavedMoment(*request, pending, tuple(str(each) for each in missing))
+        return SavedMoment(request, pending, tuple(str(each) for each in missing))
     except (OSError, ValueError, RecursionError):
         return None
 

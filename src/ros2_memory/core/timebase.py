@@ -87,17 +87,6 @@ class WallClock(Clock):
 
 
 @dataclass(frozen=True, slots=True)
-class FixedClock(Clock):
-    """A clock that stands still, for tests and for reproducing an answer."""
-
-    at: Ns
-
-    def now(self) -> Ns:
-        """Always the same moment."""
-        return self.at
-
-
-@dataclass(frozen=True, slots=True)
 class Deadline:
     """A monotonic moment after which a query must give up; `Deadline.never()` has none."""
 

@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import FileNotes, FileState, classify
-from ros2_memory.index.scan import Tree
+from ros2_memory.index.scan import ScanResult, Tree
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.index.unchanged_bags import UnchangedBags
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.file_state import Classification, KnownFile, ScanContext
-    from ros2_memory.index.scan import ScanResult, Stamp
+    from ros2_memory.index.scan import Stamp
     from ros2_memory.storage.base import BagReader
 
 PATROL: Final = 256
@@ -64,15 +64,6 @@ class TableChange(NamedTuple):
     is_new: bool
 
 
-class _Surroundings(NamedTuple):
-    """What a scan finds besides bag files."""
-
-    damaged: tuple[SetAside, ...] = ()
-    links: tuple[SetAside, ...] = ()
-    problem: str | None = None
-    metadata_folders: tuple[str, ...] = ()
-
-
 class BagTable:
     """The known files of one bag directory. Not for several threads at once.
 
@@ -105,7 +96,7 @@ class BagTable:
         self._hidden: set[str] = set()
         self._watched: set[str] = set()
         self._patrol: list[str] = []
-        self._surroundings: _Surroundings | None = None
+        self._scanned: ScanResult | None = None
         self._timeline = Timeline()
 
     def update(self, context: ScanContext, *, patrolling: bool) -> TableChange:
@@ -124,19 +115,13 @@ class BagTable:
         changed |= hidden - self._hidden
         added = [*restored, *added]
         self._timeline = self._timeline.changed(removed, added)
-        before = self._surroundings
-        self._surroundings = _Surroundings(
-            _by_path(scanned.damaged),
-            _by_path(scanned.links),
-            scanned.problem,
-            tuple(sorted(scanned.metadata_folders)),
-        )
-        is_new = bool(changed or restored) or self._surroundings != before
+        is_new = bool(changed or restored) or not scanned.is_like(self._scanned)
+        self._scanned = scanned
         return TableChange(removed, added, is_new)
 
     def snapshot(self, now: Ns) -> Snapshot:
         """Returns what is known since the last scan."""
-        timeline, surroundings = self._timeline, self._surroundings or _Surroundings()
+        timeline, scanned = self._timeline, self._scanned or ScanResult()
         aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
         empty = 0
@@ -149,13 +134,13 @@ class BagTable:
         return Snapshot(
             bags=timeline.recorded,
             active=_by_path(aside.get(FileState.ACTIVE, ())),
-            damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *surroundings.damaged]),
-            unread=_by_path([*aside.get(FileState.UNREAD, ()), *surroundings.links]),
+            damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *scanned.damaged]),
+            unread=_by_path([*aside.get(FileState.UNREAD, ()), *scanned.links]),
             empty=empty,
             silent_topics=frozenset(silent - timeline.types.keys()),
             scanned_at=now,
-            problem=surroundings.problem,
-            metadata_folders=surroundings.metadata_folders,
+            problem=scanned.problem,
+            metadata_folders=tuple(sorted(scanned.metadata_folders)),
             timeline=timeline,
         )
 

@@ -95,6 +95,16 @@ class ScanResult:
     problem: str | None = None
     metadata_folders: list[str] = field(default_factory=list)
 
+    def is_like(self, before: ScanResult | None) -> bool:
+        """Returns whether an earlier scan found the same, apart from bag files."""
+        return before is not None and (self.problem, *self._names()) == (
+            before.problem,
+            *before._names(),
+        )
+
+    def _names(self) -> tuple[set[SetAside], set[SetAside], set[str]]:
+        return set(self.damaged), set(self.links), set(self.metadata_folders)
+
 
 @dataclass(slots=True)
 class _Folder:

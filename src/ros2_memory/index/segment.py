@@ -255,16 +255,6 @@ class Segment:
             header.topic for schema in self._schemas for header in schema.topics if header.latched
         )
 
-    @cached_property
-    def transient_state(self) -> frozenset[str]:
-        """The transient local topics without logs: `/rosout` is transient local everywhere."""
-        return frozenset(
-            header.topic
-            for schema in self._schemas
-            for header in schema.topics
-            if header.latched and not is_log(header.type)
-        )
-
     def totals_in(self, topic: str, recording: Path) -> TopicTotals | None:
         """Returns what a recording's bags hold of a topic, under all of its types."""
         if str(recording) not in self.folders or topic not in self.totals:

@@ -230,8 +230,8 @@ class Snapshot:
         return topic in self._timeline.transient_local
 
     def is_transient_state(self, topic: str) -> bool:
-        """Returns whether the topic is transient local, and no log."""
-        return topic in self._timeline.transient_state
+        """Returns whether the topic is transient local, and no log as `/rosout` is everywhere."""
+        return self.is_transient_local(topic) and not self.is_log(topic)
 
     def is_log(self, topic: str) -> bool:
         """Returns whether the topic is a log, whose lines come when something happens."""

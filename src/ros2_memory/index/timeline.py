@@ -150,11 +150,6 @@ class Timeline:
         """The topics that some publisher offered as transient local."""
         return frozenset(chain.from_iterable(each.transient_local for each in self.segments))
 
-    @cached_property
-    def transient_state(self) -> frozenset[str]:
-        """The transient local topics that are no logs."""
-        return frozenset(chain.from_iterable(each.transient_state for each in self.segments))
-
     def pace(self, topic: str, recording: Path) -> Pace:
         """Returns how often a recording has messages of a topic; it must hold some."""
         totals, extents = [], []

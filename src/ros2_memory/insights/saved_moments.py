@@ -77,21 +77,21 @@ def list_moments(memory: Memory, call: Call) -> KeptMoments:
             f"the moments cannot be listed: {error.strerror or error}; this server must be allowed "
             "to read moments/ of the bag directory"
         ) from error
-    newest = sorted(held, key=lambda each: (each.moment.end, each.folder.name), reverse=True)
+    held.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
     listed = (
         KeptMoment(
             each.folder.name,
-            each.moment.label,
-            each.moment.start,
-            each.moment.end,
+            each.moment.request.label,
+            each.moment.request.start,
+            each.moment.request.end,
             len(each.files),
             sum(each.files.values()),
             each.moment.pending,
             each.moment.missing,
         )
-        for each in newest[:MOST_LISTED]
+        for each in held[:MOST_LISTED]
     )
-    return KeptMoments(tuple(listed), len(newest[MOST_LISTED:]), _now(memory, call))
+    return KeptMoments(tuple(listed), len(held[MOST_LISTED:]), _now(memory, call))
 
 
 def _now(memory: Memory, call: Call) -> Ns:

@@ -171,7 +171,7 @@ class MomentKeeper:
         for name, moment in stored.items():
             if moment.moment.pending:
                 stored[name] = self._advance(moment, _all_files(stored), snapshot)
-        numbers = {each.moment.number: each for each in stored.values()}
+        numbers = {each.moment.request.number: each for each in stored.values()}
         for request in self._queue.take(now) if self._queue.has_requests() else ():
             known = numbers.get(request.number)
             outcome = _outcome_of(known) if known else self._grant(request, stored, snapshot)
@@ -236,7 +236,7 @@ class MomentKeeper:
 
     def _begin(self, request: SaveRequest, need: NeededBags) -> StoredMoment:
         folder = make_moment_folder(self._bag_dir, request)
-        begun = SavedMoment.of(request)
+        begun = SavedMoment(request)
         try:
             write_saved_moment(folder, begun)
             missing, files = self._link(folder, need.bags, None)
@@ -254,7 +254,7 @@ class MomentKeeper:
     ) -> StoredMoment:
         """Goes on with a moment; what of it cannot be kept is listed in its file."""
         before = stored.moment
-        need = self._needed(before, snapshot)
+        need = self._needed(before.request, snapshot)
         try:
             missing, linked = self._link(stored.folder, need.bags, files)
         except OSError as error:
@@ -272,7 +272,7 @@ class MomentKeeper:
                 _log.info("moment_complete", folder=stored.folder.name, missing=list(missing))
         return StoredMoment(stored.folder, after, files_now)
 
-    def _needed(self, moment: SaveRequest | SavedMoment, snapshot: Snapshot) -> NeededBags:
+    def _needed(self, moment: SaveRequest, snapshot: Snapshot) -> NeededBags:
         window = window_of(moment.start, moment.end)
         open_files = [snapshot.unread_spans[aside] for aside in snapshot.active]
         bags = snapshot.overlapping(window)

@@ -82,7 +82,7 @@ class TestMomentFiles:
         self, tmp_path_factory: pytest.TempPathFactory, label: str, pending: bool, said: list[str]
     ) -> None:
         folder = tmp_path_factory.mktemp("moment")
-        keepsake = SavedMoment(*wish(label), pending, tuple(said))
+        keepsake = SavedMoment(wish(label), pending, tuple(said))
         write_saved_moment(folder, keepsake)
         assert read_saved_moment(folder) == keepsake
         complete = json.loads((folder / MOMENT_FILE).read_text())["complete"]

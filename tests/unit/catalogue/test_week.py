@@ -13,11 +13,12 @@ from ros2_memory.catalogue.digest import Digest, Digester
 from ros2_memory.catalogue.lookup import DigestCache
 from ros2_memory.catalogue.store import BagKey, Catalogue
 from ros2_memory.core.model import BagFile, BagState, BagSummary
-from ros2_memory.core.timebase import NS_PER_S, FixedClock
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.index.snapshot import Snapshot
 from tests.support.bags import detections, odom, tf, transform
+from tests.support.clocks import FixedClock
 from tests.support.fakes import FakeReader
 from tests.support.memories import extractor
 

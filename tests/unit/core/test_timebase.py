@@ -14,7 +14,6 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     NS_PER_US,
     Deadline,
-    FixedClock,
     WallClock,
     iso_local,
     ms_from_ns,
@@ -22,6 +21,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
     unix_rounded_up,
 )
+from tests.support.clocks import FixedClock
 from tests.support.strategies import moments
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import JsonValue
-from ros2_memory.core.timebase import NS_PER_S, Deadline, FixedClock, WallClock
+from ros2_memory.core.timebase import NS_PER_S, Deadline, WallClock
 from ros2_memory.demo.answer_checks import Asked
 from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.questions import QUESTIONS, judged
@@ -19,6 +19,7 @@ from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
+from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of
 
 BY_WORDS = {question.words: question for question in QUESTIONS}

@@ -16,11 +16,12 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, FixedClock
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
 from ros2_memory.demo import published_topics, robot
 from ros2_memory.demo.messages import VISION_DEFINITIONS, definition, description
 from ros2_memory.demo.published_topics import STREAMS, Stream, Timeline
 from ros2_memory.demo.recording import DemoRecorder
+from tests.support.clocks import FixedClock
 
 T0 = 1_800_000_000 * NS_PER_S + 123 * NS_PER_MS
 START = T0 + 22 * NS_PER_S + 7 * NS_PER_MS

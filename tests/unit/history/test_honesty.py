@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.core.timebase import FixedClock
 from ros2_memory.history.context import Call, QuerySettings
 from tests.support.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
+from tests.support.clocks import FixedClock
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
 from tests.support.tool_calls import asked

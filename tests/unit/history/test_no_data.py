@@ -18,7 +18,8 @@ from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import render
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
-from tests.support.memories import SettableClock, memory_of
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ import pytest
 
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
-from tests.support.memories import SettableClock, memory_of
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 from tests.support.shared_bags import REAL, needs_real
 from tests.support.tool_calls import asked, replied
 from tests.support.with_catalogue import recalling

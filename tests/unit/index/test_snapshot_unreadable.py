@@ -20,7 +20,7 @@ from ros2_memory.index.timeline import SEGMENT_BAGS
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, text, write_mcap
-from tests.support.memories import SettableClock
+from tests.support.clocks import SettableClock
 
 S = 10**9
 T0 = 1_784_023_200 * S

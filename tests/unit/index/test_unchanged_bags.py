@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
-from ros2_memory.core.timebase import FixedClock
 from ros2_memory.index.file_state import KnownFile
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from tests.support.clocks import FixedClock
 from tests.support.plain_text_bags import PlainReader, plain
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.topic_events import MOST_FLAGS, MOST_LABELS
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import EpisodicError
-from ros2_memory.core.timebase import FixedClock, unix_from_ns
+from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.recording import DemoRecorder
@@ -28,8 +28,9 @@ from ros2_memory.results import Event, Recap
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import STATUS_FLAGS, Msg, boolean, detections, make, odom, stamp, write_mcap
+from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS, SPEED
-from tests.support.memories import SettableClock, memory_of
+from tests.support.memories import memory_of
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 from tests.support.with_catalogue import recalling

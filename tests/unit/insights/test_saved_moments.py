@@ -32,8 +32,9 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import odom, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.housekeepers import keeper_of, recorder_at_work
-from tests.support.memories import SettableClock, memory_of
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -198,7 +199,7 @@ class TestTheList:
     def keep(self, bag_dir: Path, number: int, **more: Any) -> None:
         end = T0 + number * S
         wish = SaveRequest(f"{number:032x}", f"number {number}", end - S, end, NOW)
-        write_saved_moment(make_moment_folder(bag_dir, wish), replace(SavedMoment.of(wish), **more))
+        write_saved_moment(make_moment_folder(bag_dir, wish), replace(SavedMoment(wish), **more))
 
     def test_it_has_the_newest_first_and_counts_the_others(self, tmp_path: Path) -> None:
         for number in range(MOST_LISTED + 3):

@@ -21,7 +21,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.timebase import Deadline, FixedClock, unix_from_ns
+from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
@@ -29,6 +29,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import boolean, detections, odom, tf, transform, write_mcap
+from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
 from tests.support.memories import memory_of
 from tests.support.random_histories import write_history

@@ -15,7 +15,8 @@ from ros2_memory.results import Stillness
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
-from tests.support.memories import SettableClock, memory_of
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -20,7 +20,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.timebase import Deadline, FixedClock
+from ros2_memory.core.timebase import Deadline
 from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.recording import DemoRecorder
@@ -29,8 +29,9 @@ from ros2_memory.insights.visits import visits
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, tf, transform, write_mcap
+from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS
-from tests.support.memories import SettableClock, memory_of
+from tests.support.memories import memory_of
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 from tests.support.with_catalogue import recalling

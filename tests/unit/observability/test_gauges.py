@@ -13,7 +13,8 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.retention.policy import RetentionLimits
 from tests.support.bags import text, write_mcap
-from tests.support.memories import SettableClock, memory_of
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

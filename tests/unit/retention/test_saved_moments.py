@@ -34,8 +34,9 @@ from ros2_memory.retention.saved_moments import (
     window_of,
 )
 from tests.support.bags import McapLayout
+from tests.support.clocks import SettableClock
 from tests.support.housekeepers import PLENTY, files_in, recording_now
-from tests.support.memories import LAST_WRITTEN, SettableClock, memory_of
+from tests.support.memories import LAST_WRITTEN, memory_of
 from tests.support.saved_moments import (
     NOW,
     T0,
@@ -258,7 +259,7 @@ class TestCrashes:
         recording(tmp_path, A, 0)
         slot = asked(tmp_path, 15, 25)
         folder = make_moment_folder(tmp_path, slot.request)
-        write_saved_moment(folder, SavedMoment.of(slot.request))
+        write_saved_moment(folder, SavedMoment(slot.request))
         house_of(tmp_path).keep_moments()
         outcome = slot.outcome()
         assert outcome is not None

@@ -28,8 +28,9 @@ from ros2_memory.history.context import Call
 from ros2_memory.serving.backfill import BACKLOG, Backfill, Progress, keep_backfilled
 from ros2_memory.serving.health import Health
 from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.housekeepers import recorded_before
-from tests.support.memories import SettableClock, memory_of
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,7 +17,8 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.health import NAMED, Health, keep_fresh
 from tests.support.bags import McapLayout, text, write_mcap
-from tests.support.memories import SettableClock, memory_of
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

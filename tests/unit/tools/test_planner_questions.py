@@ -15,11 +15,12 @@ from mcp.types import TextContent
 
 from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
-from ros2_memory.core.timebase import FixedClock, ns_from_unix
+from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.demo.answer_checks import Asked, WrongAnswerError
 from ros2_memory.demo.published_topics import Timeline
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.tools.reply_size import to_json_text
+from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of
 from tests.support.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S
 from tests.support.planner_questions import QUESTIONS, Planned

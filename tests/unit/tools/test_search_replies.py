@@ -26,8 +26,9 @@ from tests.support.bags import (
     write_db3,
     write_mcap,
 )
+from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
-from tests.support.memories import SettableClock, memory_of
+from tests.support.memories import memory_of
 from tests.support.shared_bags import REAL, needs_real
 from tests.support.tool_calls import asked
 from tests.support.with_catalogue import recalling

@@ -1,0 +1,31 @@
+"""Clocks that tests read and set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ros2_memory.core.timebase import Clock
+
+if TYPE_CHECKING:
+    from ros2_memory.core.timebase import Ns
+
+
+@dataclass(frozen=True, slots=True)
+class FixedClock(Clock):
+    """A clock that always returns the same time."""
+
+    at: Ns
+
+    def now(self) -> Ns:
+        return self.at
+
+
+@dataclass
+class SettableClock(Clock):
+    """A clock that a test sets."""
+
+    at: Ns
+
+    def now(self) -> Ns:
+        return self.at
