@@ -241,7 +241,7 @@ def _forgotten(
         if recorder is None:
             carried = removal.carry(carrier, snapshot, doomed)
         else:
-            latched = {*carrier.concerned(snapshot, {bag.path for bag in doomed})}
+            latched = {*carrier.with_latched(snapshot, {bag.path for bag in doomed})}
             doomed = [bag for bag in doomed if bag not in latched]
             stays = [
                 f"{_named(bag.path, bag_dir)}: it has latched messages, which nobody else may "

@@ -1,8 +1,8 @@
 """Keeps the bag directory in order for a recorder: repairs what crashes left, deletes by limits.
 
-Before anything is recorded only those recordings are looked at that a crash must have left: the
-ones that were being written, and those whose recorder never wrote its last word. Whatever else is
-found unfinished later on, when nothing writes it, is repaired then.
+Before anything is recorded, only recordings that a crash must have left are examined: those that
+were being written, and those without a complete metadata.yaml. Other unfinished files are repaired
+later, when the index finds them and nothing writes them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 REFRESH_S: Final = 60.0
 MOST_REPAIRED_BYTES: Final = 1 << 30
-"""A larger file would keep a recorder waiting for minutes; it is left to `ros2-memory recover`."""
+"""A larger file would delay recording by minutes; `ros2-memory recover` repairs it."""
 
 _MCAP: Final = ".mcap"
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -59,17 +59,17 @@ class Housekeeping(Housekeeper):
     Args:
         bag_dir: the bag directory.
         reader: reads bags.
-        writer: writes those that are repaired, and the one of carried messages.
+        writer: writes repaired bags, and the bag of carried messages.
         clock: the wall clock.
-        limits: how much is kept, and whether bags of other programs are no part of it. Then those
-            are not repaired either.
+        limits: how much is kept. If bags of other programs do not count, they are not repaired
+            either.
         is_synchronised: whether the system clock is synchronised; may take some seconds.
         split_duration_s: how long the recorder writes one file.
         own: the recordings that the recorder made.
-        moments_bytes: how much of it moments may take that were asked to be kept.
-        static_topics: topics that are latched whatever their publishers say.
-        grace_s: for how long a question may hold what was known of the bags before.
-        measure_free: measures what the disk has left.
+        moments_bytes: how much of the budget saved moments may take.
+        static_topics: topics that are latched whatever their publishers declare.
+        grace_s: for how long a query may work on an older snapshot of the bags.
+        measure_free: measures what the disk has left, in bytes.
         monotonic: a clock that never steps, in seconds.
     """
 
@@ -94,7 +94,7 @@ class Housekeeping(Housekeeper):
         self._recorded = RecordedTime(bag_dir)
         self._own = own or OwnRecordings(bag_dir)
         self._keeps_foreign = limits.keeps_foreign
-        disposal = GarbageCollector(
+        collector = GarbageCollector(
             bag_dir,
             limits,
             Carrier(bag_dir, reader, writer, static_topics),
@@ -111,86 +111,86 @@ class Housekeeping(Housekeeper):
             clock,
             refresh_s=REFRESH_S,
             split_duration_s=split_duration_s,
-            disposal=disposal,
+            collector=collector,
         )
-        self._keeper = MomentKeeper(bag_dir, moments_bytes, clock)
+        self._moments = MomentKeeper(bag_dir, moments_bytes, clock)
         self._repairer = Repairer(reader, writer, bag_dir)
-        self._names = HardLinks(bag_dir)
+        self._links = HardLinks(bag_dir)
         self._clock = clock
         self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
-        self._held = 0
-        self._patience = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
+        self._age_held = 0
+        self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._measure_free = measure_free
         self._tried: set[tuple[Path, int, int]] = set()
-        self._short = False
-        self._foreign = False
+        self._over_budget = False
+        self._has_foreign = False
 
     def repair(self) -> None:
-        """Puts right what a crash left in recordings of this program. Nothing may be recording.
+        """Repairs what a crash left in recordings of this program. Nothing may be recording.
 
         Raises:
-            OSError: the bag directory cannot be listed, or it cannot be read which recordings are
-                the recorder's own.
+            OSError: the bag directory, or the list of the recorder's own recordings, cannot be
+                read.
         """
         named = _named(self._bag_dir)
         for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
                 continue
             if self._keeps_foreign:
-                left = self._own.owns(directory)
+                is_own = self._own.owns(directory)
             else:
-                left = directory in named or has_own_name(directory.name)
-            if left and (directory in named or _unfinished(directory)):
+                is_own = directory in named or has_own_name(directory.name)
+            if is_own and (directory in named or _is_unfinished(directory)):
                 self._repair_recording(directory)
 
     def make_room(self, free_bytes_wanted: int) -> None:
         """Deletes, oldest first, until so much of the disk is free, or nothing may be deleted.
 
         Raises:
-            OSError: what is free cannot be measured.
+            OSError: the free space cannot be measured.
         """
         begun = time.perf_counter_ns()
-        self._mind_moments()
-        done = self._index.apply_retention(
+        self._update_moments()
+        collected = self._index.apply_retention(
             free_bytes=lambda: self._measure_free(self._bag_dir), min_free_bytes=free_bytes_wanted
         )
-        self._report(done, begun, free_bytes_wanted=free_bytes_wanted)
-        self._tell_held(done)
+        self._report(collected, begun, free_bytes_wanted=free_bytes_wanted)
+        self._report_held(collected)
 
     def apply(self) -> None:
-        """Deletes what is beyond the budget or too old; repairs what nobody writes any more."""
+        """Deletes what exceeds the budget or is too old; repairs what nothing writes any more."""
         begun = time.perf_counter_ns()
-        self._mind_moments()
-        done = self._index.apply_retention()
-        self._report(done, begun)
-        self._tell_shortage(done)
-        self._tell_held(done)
-        self._tell_foreign(done)
-        if self._repair_left(self._index.snapshot()):
+        self._update_moments()
+        collected = self._index.apply_retention()
+        self._report(collected, begun)
+        self._report_over_budget(collected)
+        self._report_held(collected)
+        self._report_foreign(collected)
+        if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
     def keep_moments(self) -> None:
-        """Keeps from deletion what is asked for, and goes on with moments that wait for bags.
+        """Saves the moments that were asked for, and goes on with those that wait for bags.
 
         Raises:
             OSError: the folders of requests or moments cannot be listed or written to.
         """
-        self._keeper.open()
-        if self._keeper.has_work():
+        self._moments.open()
+        if self._moments.has_work():
             with self._index.undisturbed() as snapshot:
-                self._keeper.keep(snapshot)
+                self._moments.keep(snapshot)
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
     ) -> None:
-        """Counts the time for which these recordings are being written."""
+        """Counts the time for which these recordings are written."""
         self._recorded.note(recordings, bytes_written, monotonic_s)
 
     def age_held(self) -> str | None:
-        """Which bags the last pass kept although their dates make them too old, and why."""
-        if not self._held:
+        """Describes the bags that are kept though their dates make them too old, or None."""
+        if not self._age_held:
             return None
-        bags = counted(self._held, "bag is", "bags are")
+        bags = counted(self._age_held, "bag is", "bags are")
         limit = f"{self._max_age_h:g} h"
         return (
             f"{bags} older than {limit} (retention.max_age_h) by the dates, and kept: the clock is "
@@ -198,16 +198,16 @@ class Housekeeping(Housekeeper):
             f"(timedatectl shows that), or when {limit} have been recorded after them"
         )
 
-    def _mind_moments(self) -> None:
-        """Before anything is deleted: what is asked to be kept, and the sidecars of what is.
+    def _update_moments(self) -> None:
+        """Saves what was asked for and updates sidecars, before anything is deleted.
 
-        Deleting goes on all the same: else a fault here would fill the disk.
+        A fault is only reported: if it stopped the deletion, the disk would fill.
         """
         try:
             with self._index.undisturbed() as snapshot:
-                if self._keeper.has_work():
-                    self._keeper.keep(snapshot)
-                self._keeper.update_sidecars()
+                if self._moments.has_work():
+                    self._moments.keep(snapshot)
+                self._moments.update_sidecars()
         except OSError as error:
             _log.error("moments_not_minded", reason=str(error))
 
@@ -220,48 +220,50 @@ class Housekeeping(Housekeeper):
             for name in names:
                 if name.endswith(_MCAP) and not left_by_repair(name):
                     self._repair(directory / name)
-            # A recording of nothing but empty splits.
+            # In case the recording had nothing but empty splits.
             remove_emptied(self._bag_dir, directory)
         except OSError as error:
             _log.error("not_repaired", path=str(directory), reason=error.strerror or str(error))
 
-    def _repair_left(self, snapshot: Snapshot) -> int:
-        """Repairs what the index found unfinished and nothing writes; how many files."""
+    def _repair_unfinished(self, snapshot: Snapshot) -> int:
+        """Repairs files that the index found unfinished and nothing writes; returns how many."""
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
-        candidates = [path for path in paths if path.suffix == _MCAP and self._is_left(path)]
+        candidates = [path for path in paths if path.suffix == _MCAP and self._may_repair(path)]
         if not candidates:
             return 0
-        named, held = _named(self._bag_dir), open_files()
+        named, opened = _named(self._bag_dir), open_files()
         repaired = 0
         for path in candidates:
             with suppress(OSError):
                 status = path.lstat()
-                if path.parent in named or (status.st_dev, status.st_ino) in held:
+                if path.parent in named or (status.st_dev, status.st_ino) in opened:
                     continue
                 self._tried.add((path, status.st_size, status.st_mtime_ns))
                 repaired += self._repair(path)
         return repaired
 
-    def _is_left(self, path: Path) -> bool:
-        """Whether a file may be repaired that was not tried before as it is.
+    def _may_repair(self, path: Path) -> bool:
+        """Whether a file may be repaired and its repair was not tried before.
 
-        In another's recording it must have lain still: what is not in the heartbeat may be written.
+        In a recording of another program it must not have changed for a while: the heartbeat does
+        not name what other programs write.
         """
         try:
             status = path.lstat()
         except OSError:
             return False
-        tried = (path, status.st_size, status.st_mtime_ns) in self._tried
-        if tried or self._names.is_saved(str(path)):
+        if (path, status.st_size, status.st_mtime_ns) in self._tried:
+            return False
+        if self._links.is_saved(str(path)):
             return False
         if self._keeps_foreign:
             return self._own.owns(path.parent)
-        lay_still = abs(self._clock.now() - status.st_mtime_ns) > self._patience
-        return lay_still or has_own_name(path.parent.name)
+        unchanged_for = abs(self._clock.now() - status.st_mtime_ns)
+        return unchanged_for > self._unwritten_for or has_own_name(path.parent.name)
 
     def _repair(self, path: Path) -> bool:
-        """Repairs one file, and tells what came of it; whether it was not whole."""
+        """Repairs one file and reports the result; returns whether it was not whole."""
         begun = time.perf_counter_ns()
         try:
             repaired = self._repaired(path)
@@ -296,58 +298,58 @@ class Housekeeping(Housekeeper):
             )
         return self._repairer.repair(path)
 
-    def _report(self, done: Collected, begun: int, **values: object) -> None:
-        tell = _log.info if done.bags else _log.debug
-        tell(
+    def _report(self, collected: Collected, begun: int, **values: object) -> None:
+        log = _log.info if collected.bags else _log.debug
+        log(
             "retention_applied",
-            bags=done.bags,
-            bytes=done.bytes,
-            recordings=done.recordings,
-            carried=done.carried,
-            failed=done.failed,
-            total_bytes=done.total_bytes,
-            foreign_bytes=done.foreign_bytes,
+            bags=collected.bags,
+            bytes=collected.bytes,
+            recordings=collected.recordings,
+            carried=collected.carried,
+            failed=collected.failed,
+            total_bytes=collected.total_bytes,
+            foreign_bytes=collected.foreign_bytes,
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
             **values,
         )
 
-    def _tell_held(self, done: Collected) -> None:
-        """Says once that age is held, and once that it no longer is."""
-        before, self._held = self._held, done.held
-        if self._held and not before:
-            _log.warning("age_held", bags=self._held, reason=self.age_held())
-        elif before and not self._held:
+    def _report_held(self, collected: Collected) -> None:
+        """Reports once that bags are kept whose dates make them too old, and once the end of it."""
+        before, self._age_held = self._age_held, collected.held
+        if self._age_held and not before:
+            _log.warning("age_held", bags=self._age_held, reason=self.age_held())
+        elif before and not self._age_held:
             _log.info("age_no_longer_held")
 
-    def _tell_foreign(self, done: Collected) -> None:
-        """Says once that there are bags which no limit counts."""
-        if done.foreign_bytes and not self._foreign:
+    def _report_foreign(self, collected: Collected) -> None:
+        """Reports once that there are bags which no limit counts."""
+        if collected.foreign_bytes and not self._has_foreign:
             _log.warning(
                 "foreign_bags_kept",
-                bytes=done.foreign_bytes,
+                bytes=collected.foreign_bytes,
                 reason="the recorder did not make them, so they are neither deleted nor counted in "
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
             )
-        self._foreign = bool(done.foreign_bytes)
+        self._has_foreign = bool(collected.foreign_bytes)
 
-    def _tell_shortage(self, done: Collected) -> None:
-        """Says once that the budget cannot be held."""
-        if not done.fits and not self._short:
+    def _report_over_budget(self, collected: Collected) -> None:
+        """Reports once that the budget cannot be kept."""
+        if not collected.fits and not self._over_budget:
             _log.error(
                 "budget_not_held",
-                total_bytes=done.total_bytes,
+                total_bytes=collected.total_bytes,
                 reason="what is left may not be deleted: open bags, damaged ones, the newest; "
                 "raise retention.max_total_gb or look for damaged files",
             )
-        self._short = not done.fits
+        self._over_budget = not collected.fits
 
 
 class BackgroundHousekeeper(Housekeeper):
-    """Has another housekeeper delete in threads of its own.
+    """Runs the tasks of another housekeeper in threads, so that its methods return at once.
 
-    The first look at a week of bags takes from seconds to minutes, in which the robot shall be
-    recorded and the service manager hear of it. Repair is waited for: nothing is recorded yet.
+    The first scan of a week of bags takes from seconds to minutes, in which the recorder must go on
+    and answer the service manager's watchdog. Only `repair` waits: nothing is recorded yet.
     """
 
     def __init__(self, housekeeper: Housekeeper) -> None:
@@ -356,7 +358,7 @@ class BackgroundHousekeeper(Housekeeper):
         self._faults: dict[str, str] = {}
 
     def repair(self) -> None:
-        """Puts right what a crash left, and returns when that is done."""
+        """Repairs what a crash left, and returns when that is done."""
         self._housekeeper.repair()
 
     def make_room(self, free_bytes_wanted: int) -> None:
@@ -372,21 +374,21 @@ class BackgroundHousekeeper(Housekeeper):
         self._begin("apply", self._housekeeper.apply)
 
     def keep_moments(self) -> None:
-        """Begins to keep what is asked for, unless that is still under way."""
+        """Begins to save the moments that were asked for, unless that is still under way."""
         self._begin("keep_moments", self._housekeeper.keep_moments)
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
     ) -> None:
-        """Counts the time for which these recordings are being written."""
+        """Counts the time for which these recordings are written."""
         self._housekeeper.note_recorded(recordings, bytes_written, monotonic_s)
 
     def age_held(self) -> str | None:
-        """Which bags age should delete by their dates, and does not, and why."""
+        """Describes the bags that are kept though their dates make them too old, or None."""
         return self._housekeeper.age_held()
 
     def faults(self) -> Mapping[str, str]:
-        """By task why it failed the last time; what has since been done is not among them."""
+        """Maps each task whose last run failed to the reason."""
         return dict(self._faults)
 
     def wait(self) -> None:
@@ -408,7 +410,7 @@ class BackgroundHousekeeper(Housekeeper):
             do()
         except (EpisodicError, OSError) as error:
             self._faults[task] = str(error)
-        except Exception as error:  # noqa: BLE001 - or it ends unheard, and the disk fills
+        except Exception as error:  # noqa: BLE001 - or its thread ends silently, and the disk fills
             _log.exception("housekeeping_faulty", task=task)
             self._faults[task] = f"a fault in this program ({type(error).__name__}); see its log"
         else:
@@ -420,13 +422,13 @@ class BackgroundHousekeeper(Housekeeper):
 
 
 def _named(bag_dir: Path) -> frozenset[Path]:
-    """The recordings that a recorder last said it was writing, whether it still lives or not."""
+    """Returns the recordings that the last heartbeat names, live or not."""
     heartbeat = read_heartbeat(bag_dir).heartbeat
     return frozenset(bag_dir / name for name in heartbeat.recordings) if heartbeat else frozenset()
 
 
-def _unfinished(recording: Path) -> bool:
-    """Whether its recorder never wrote its last word, or the disk was full when it did."""
+def _is_unfinished(recording: Path) -> bool:
+    """Whether its metadata.yaml was never written, or the disk was full at that time."""
     try:
         return (recording / METADATA_FILE).lstat().st_size == 0
     except OSError:

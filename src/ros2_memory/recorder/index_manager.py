@@ -1,9 +1,9 @@
-"""Keeps what is known of the bag directory: which bags answer, and what was set aside.
+"""Keeps the index of the bag directory: which bags answer queries, and what was set aside.
 
-A scan looks at what changed (see `survey`), and swaps a whole new `Snapshot` in: a query that holds
-one sees one consistent index for as long as it likes. No thread is started: whoever asks a
-question, or calls `refresh` now and then, scans. Nothing is written or deleted, unless it was built
-to dispose of bags, as the recorder's daemon alone does.
+A scan reads what changed (see `index.bag_table`) and swaps in a new `Snapshot`: a query that has
+one works on a consistent index for as long as it needs. No thread is started: a query, or a caller
+of `refresh`, runs the scan itself. Nothing is written or deleted without a `GarbageCollector`,
+which only the recorder daemon has.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -43,24 +43,29 @@ if TYPE_CHECKING:
 __all__ = ["IndexManager", "Snapshot"]
 
 SPLITS_OF_PATIENCE: Final = 3
-"""A file that lay still for so many splits is not being written, unless a heartbeat says so."""
+"""A file unchanged for so many splits is not being written, unless a heartbeat names it."""
 
 
 class IndexManager:
-    """Keeps the snapshot of one bag directory. Safe for several threads at once.
+    """Keeps the snapshot of one bag directory. Thread-safe.
 
-    `refresh_s` is how old a snapshot may become before a question has it renewed;
-    `split_duration_s` is how long the recorder writes one file. `disposal` deletes bags by its
-    limits when it is told to; without it nothing here deletes anything. `known` tells, by path, of
-    closed files that were read earlier: a scan that begins anew does not read them again while they
-    look as they did. `include_active`: what is whole of a file that is being written answers, too;
-    not where bags are disposed of, repaired or kept, which is for those that are finished.
-    `trusts_mtime`: a file without an end that is young is being written; else it may be a copy, and
-    what is in it decides.
+    Args:
+        bag_dir: the bag directory.
+        reader: reads bags.
+        clock: the wall clock.
+        refresh_s: how old a snapshot may become before a query has it renewed.
+        split_duration_s: how long the recorder writes one file.
+        collector: deletes bags that exceed its limits; nothing is deleted without it.
+        known: gives, by path, closed files that were read earlier. A first scan does not read them
+            again if they are unchanged.
+        include_active: whether the readable part of a file that is being written answers, too. Not
+            for programs that delete, repair or save bags, which work on finished files.
+        trusts_mtime: whether a young file without an end is being written; else it may be a copy,
+            and its content decides.
 
     Attributes:
         bag_dir: the bag directory.
-        published: what the last scan gave, however old; None before the first has ended.
+        published: the result of the last scan, however old; None before the first has ended.
     """
 
     def __init__(
@@ -71,7 +76,7 @@ class IndexManager:
         *,
         refresh_s: float,
         split_duration_s: float,
-        disposal: GarbageCollector | None = None,
+        collector: GarbageCollector | None = None,
         known: Callable[[], Mapping[str, KnownFile]] | None = None,
         include_active: bool = False,
         trusts_mtime: bool = True,
@@ -80,7 +85,7 @@ class IndexManager:
         self.bag_dir = bag_dir
         self._known = known
         self._include_active = include_active
-        self._disposal = disposal
+        self._collector = collector
         self._reader = reader
         self._clock = clock
         self._refresh: Ns = ns_from_unix(refresh_s)
@@ -89,14 +94,14 @@ class IndexManager:
         self._lock = threading.Lock()
         self._foreign = ForeignBags(bag_dir)
         self.published: Snapshot | None = None
-        self._survey = self._new_survey()
+        self._table = self._new_table()
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
-        """The current snapshot, scanned anew where it may not do.
+        """Returns the current snapshot, after a new scan if it is out of date.
 
-        That is: it is older than `refresh_s`, or `reach`, the latest log time that the question is
-        about, lies past the end of the newest bag. Callers that come while a scan runs wait for it
-        and share its result.
+        It is when it is older than `refresh_s`, or when `reach`, the latest log time that the query
+        is about, lies past the end of the newest bag. Callers that come while a scan runs wait for
+        it and share its result.
         """
         current = self.published
         if current is not None and not self._is_stale(current, reach):
@@ -104,51 +109,52 @@ class IndexManager:
         with self._lock:
             if self.published is not None and self.published is not current:
                 return self.published
-            # A question waits for what changes by itself, the newest bags; `refresh` patrols.
+            # A query waits only for the newest bags, which change by themselves; `refresh` also
+            # looks at unchanged directories again.
             return self._scan(patrolling=False)
 
     def refresh(self) -> Snapshot:
-        """Scans now, and gives the result."""
+        """Scans now, and returns the result."""
         with self._lock:
             return self._scan()
 
     @contextmanager
     def undisturbed(self) -> Iterator[Snapshot]:
-        """The result of a scan, and nothing is deleted while it is looked at."""
+        """Yields the result of a scan; nothing is deleted within the block."""
         with self._lock:
             yield self._scan(patrolling=False)
 
     def apply_retention(
         self, *, free_bytes: Callable[[], int] | None = None, min_free_bytes: int | None = None
     ) -> Collected:
-        """Scans, and deletes what the limits do not allow to keep; nothing without a `disposal`.
+        """Scans, and deletes what exceeds the limits; nothing without a `collector`.
 
-        `free_bytes` measures what the disk has left, where that is to count; `min_free_bytes` is
-        what it must have, where that is not as the limits say.
+        `free_bytes` measures what the disk has left, if that is to count; `min_free_bytes` is what
+        it must have, in place of the limits' own figure.
         """
-        if self._disposal is None:
+        if self._collector is None:
             return Collected()
         with self._lock:
             snapshot = self._scan()
             heartbeat = self.heartbeat()
             named = () if heartbeat is None else heartbeat.recordings
-            done = self._disposal.apply(
-                self._survey.known(named, snapshot.scanned_at),
+            collected = self._collector.apply(
+                self._table.known(named, snapshot.scanned_at),
                 snapshot,
                 free_bytes=free_bytes,
                 min_free_bytes=min_free_bytes,
             )
-            if done.bags:
+            if collected.bags:
                 self._scan()
-            return done
+            return collected
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
-        """What bags take that the recorder of this directory did not make; None where not known."""
+        """Measures the bags that the recorder did not make; returns None if that is unknown."""
         heartbeat = self.heartbeat()
         return self._foreign.measured(snapshot, () if heartbeat is None else heartbeat.recordings)
 
     def heartbeat(self) -> Heartbeat | None:
-        """What the recorder last wrote of itself, live or not; None where that cannot be read."""
+        """Returns the recorder's last heartbeat, live or not; None if it cannot be read."""
         return read_heartbeat(self.bag_dir).heartbeat
 
     def _is_stale(self, snapshot: Snapshot, reach: Ns | None) -> bool:
@@ -156,39 +162,37 @@ class IndexManager:
             return True
         return reach is not None and (snapshot.latest is None or reach > snapshot.latest)
 
-    # What follows runs under the lock.
+    # The methods below run under the lock.
 
-    def _new_survey(self) -> BagTable:
-        # Disposal weighs more than bags.
-        keep_all_notes = self._disposal is not None
+    def _new_table(self) -> BagTable:
+        # Retention counts more than the bags that answer.
+        keep_all_notes = self._collector is not None
         return BagTable(
             self.bag_dir, self._reader, known=self._known, keep_all_notes=keep_all_notes
         )
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
-        if self.published is not None:
-            return self._look_through(patrolling=patrolling)
-        with _collector_resting():
-            return self._look_through(patrolling=patrolling)
+        with _gc_paused() if self.published is None else nullcontext():
+            return self._scan_changes(patrolling=patrolling)
 
-    def _look_through(self, *, patrolling: bool = True) -> Snapshot:
+    def _scan_changes(self, *, patrolling: bool) -> Snapshot:
         begun = time.perf_counter_ns()
-        scene = self._scene()
+        context = self._context()
         try:
-            change = self._survey.update(scene, patrolling=patrolling)
+            change = self._table.update(context, patrolling=patrolling)
         except BaseException:
-            # The walk does not show a second time what it has shown once.
-            self._survey = self._new_survey()
+            # A new table: the interrupted one will not be shown again what changed.
+            self._table = self._new_table()
             raise
         before = self.published
         if before is not None and not change.is_new:
-            self.published = replace(before, scanned_at=scene.now)
+            self.published = replace(before, scanned_at=context.now)
             return self.published
-        self.published = self._survey.snapshot(scene.now)
+        self.published = self._table.snapshot(context.now)
         self._report(before, self.published, change, begun)
         return self.published
 
-    def _scene(self) -> ScanContext:
+    def _context(self) -> ScanContext:
         now = self._clock.now()
         heartbeat = self.heartbeat()
         live = heartbeat is not None and heartbeat.is_live(now)
@@ -210,7 +214,7 @@ class IndexManager:
         for each in after.damaged:
             if each not in known:
                 self._log.warning("bag_damaged", path=str(each.path), reason=each.reason)
-        # One that grows and answers does so with every question.
+        # A file that grows and answers is read again with every query: not worth a line each time.
         grew = removed and all(bag.state is BagState.ACTIVE for bag in (*removed, *added))
         (self._log.debug if grew else self._log.info)(
             "index_scanned",
@@ -228,11 +232,11 @@ class IndexManager:
 
 
 @contextmanager
-def _collector_resting() -> Iterator[None]:
-    """Within the block no garbage is looked for, and afterwards not among what it made.
+def _gc_paused() -> Iterator[None]:
+    """Pauses Python's garbage collector, and exempts from it what the block made.
 
-    What the first scan makes of a week's files stays, and looking through all of it again and
-    again takes longer than making it.
+    The objects that the first scan makes of a week's files stay alive, and examining all of them
+    again and again takes longer than making them.
     """
     if not gc.isenabled():
         yield
@@ -241,7 +245,7 @@ def _collector_resting() -> Iterator[None]:
     try:
         yield
     finally:
-        # From the youngest generation into the oldest, which is seldom looked through.
+        # Moves all objects from the youngest generation into the oldest, which is rarely examined.
         gc.freeze()
         gc.unfreeze()
         gc.enable()

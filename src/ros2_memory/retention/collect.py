@@ -198,7 +198,7 @@ class GarbageCollector:
         run: _Pass,
     ) -> None:
         leaving = {Path(bag.path) for bag in to_delete} | {Path(path) for path in run.deleted}
-        latched = {str(bag.path) for bag in self._carrier.concerned(snapshot, leaving)}
+        latched = {str(bag.path) for bag in self._carrier.with_latched(snapshot, leaving)}
         try:
             run.saved |= {
                 Path(bag.path)

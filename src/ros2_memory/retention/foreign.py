@@ -1,4 +1,4 @@
-"""How much of a bag directory bags take that its recorder did not make."""
+"""Measures the bags in a bag directory that its recorder did not make."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 class Foreign(NamedTuple):
-    """The bags that the recorder did not make, as retention keeps them.
+    """The bags that the recorder did not make, which retention neither counts nor deletes.
 
-    `folders` are the directories that they lie in. `bag_bytes` is what those among them take that
-    answer, `total_bytes` what all do.
+    `folders` are the directories that they lie in. `bag_bytes` is the size of those that answer
+    queries, `total_bytes` that of all.
     """
 
     folders: frozenset[str]
@@ -33,9 +33,9 @@ class Foreign(NamedTuple):
 
 
 class ForeignBags:
-    """Measures the foreign bags of one bag directory. Safe for several threads at once.
+    """Measures the foreign bags of one bag directory. Thread-safe.
 
-    What was measured stays while the index and the list stay as they are.
+    The last result is returned again while neither the index nor the list changed.
     """
 
     def __init__(self, bag_dir: Path) -> None:
@@ -44,9 +44,9 @@ class ForeignBags:
         self._known: tuple[tuple[object, ...], Foreign] | None = None
 
     def measured(self, snapshot: Snapshot, recording: Collection[str]) -> Foreign | None:
-        """What they take; None where no recorder has noted yet which recordings are its own.
+        """Measures them; returns None if no recorder has listed yet which recordings are its own.
 
-        `recording` are the recordings that a recorder says it is writing.
+        `recording` are the recordings that the recorder's heartbeat names.
         """
         try:
             if not self._own.exists():

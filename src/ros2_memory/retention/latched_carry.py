@@ -1,21 +1,21 @@
-"""Carries latched messages past the deletion of the bags that they stand in.
+"""Carries latched messages past the deletion of the bags that contain them.
 
-A latched message holds until the next one, so an answer about today may need one received weeks
-ago: a transform of `/tf_static` stands only in the split in which it was received. What answers
-still need is therefore carried into one small bag, `latched/carried.mcap`, before its split is
-deleted. Everything of a message stays as it is but the file that it stands in, so that an answer
-stays the same to the nanosecond; its channel says of which recordings it was (see `origin`).
+A latched message is valid until the next one, so an answer about today may need one received weeks
+ago: a transform of `/tf_static` is only in the split in which it was received. Messages that are
+still needed are therefore copied into one small bag, `latched/carried.mcap`, before their split is
+deleted. Nothing of a message changes but its file, so that answers stay the same to the nanosecond;
+its channel records from which recordings it came (see `bag_dir.carried_origin`).
 
-What is needed, of all messages that would be gone otherwise:
+These messages are needed, of those that would otherwise be gone:
 
 - The newest message of a topic; and of transforms the newest of each child frame, since every
   broadcaster publishes only its own.
-- One that held while something was recorded that is kept. Deleting goes by age, so mostly that is
-  the newest only; but clocks step.
-- One that a kept bag repeats because its recording received it again: only the earliest copy tells
-  when it was first received.
+- A message that was valid while something was recorded that is kept. Bags are deleted by age, so
+  mostly that is the newest only; but clocks step.
+- A message that a kept bag repeats because its recording received it again: only the earliest copy
+  shows when it was first received.
 
-Whatever is superseded leaves the bag when that is written the next time, so it stays small.
+A superseded message is left out when the bag is written the next time, so the bag stays small.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-class Identity(NamedTuple):
+class MessageIdentity(NamedTuple):
     """What all copies of one message share, whichever recording received them."""
 
     topic: str
@@ -64,38 +64,39 @@ class Identity(NamedTuple):
 class Latched(NamedTuple):
     """One latched message without its payload.
 
-    `holds` names what it holds for: its topic, and each child frame of its transforms.
+    `subjects` are its topic, and that topic with each child frame of its transforms: what a newer
+    message must share to supersede it.
     """
 
     log_time: Ns
-    identity: Identity
-    holds: tuple[tuple[str, str], ...]
+    identity: MessageIdentity
+    subjects: tuple[tuple[str, str], ...]
 
 
 def latched_message(record: Record, frames: Collection[str]) -> Latched:
-    """What is to know of a message; `frames` are the child frames of its transforms, if any."""
+    """Returns a message without its payload; `frames` are the child frames of its transforms."""
     topic = record.channel.topic
     digest = hashlib.blake2b(record.payload, digest_size=16).digest()
-    holds = ((topic, ""), *((topic, frame) for frame in frames))
-    return Latched(record.log_time, Identity(topic, record.publish_time, digest), holds)
+    subjects = ((topic, ""), *((topic, frame) for frame in frames))
+    return Latched(record.log_time, MessageIdentity(topic, record.publish_time, digest), subjects)
 
 
 def is_late(message: Latched) -> bool:
-    """Whether it may have been received before, by another recording."""
+    """Whether an earlier recording may have received it before."""
     return message.log_time - message.identity.publish_time > RECEIVED_AGAIN_NS
 
 
 def worth_carrying(
     messages: Iterable[Latched],
     recorded_in: Callable[[Ns, Ns], bool],
-    repeated: Mapping[Identity, Ns],
+    repeated: Mapping[MessageIdentity, Ns],
 ) -> set[Latched]:
-    """Which of these messages are still needed when the bags that they stand in are gone.
+    """Returns those of the messages that are still needed when their bags are deleted.
 
     Args:
-        messages: all that would be gone, those carried before included, in any order.
+        messages: all that would be gone, including those carried before, in any order.
         recorded_in: whether anything is kept that was recorded in `[start, stop)`.
-        repeated: late messages that stand in kept bags, and their earliest log time there.
+        repeated: late messages in kept bags, and their earliest log time there.
     """
     missing = [
         each
@@ -103,13 +104,13 @@ def worth_carrying(
         if repeated.get(each.identity, MAX_NS) > each.log_time
     ]
     needed = {each for each in missing if each.identity in repeated}
-    by_hold: defaultdict[tuple[str, str], list[Latched]] = defaultdict(list)
+    by_subject: defaultdict[tuple[str, str], list[Latched]] = defaultdict(list)
     for each in sorted(missing):
-        for hold in each.holds:
-            by_hold[hold].append(each)
-    for (_, frame), held in by_hold.items():
+        for subject in each.subjects:
+            by_subject[subject].append(each)
+    for (_, frame), held in by_subject.items():
         needed.add(held[-1])
-        # A static transform holds before it was received, too.
+        # A static transform is valid before it was received, too.
         since = MIN_NS if frame else held[0].log_time
         for message, following in pairwise(held):
             if message not in needed and recorded_in(since, following.log_time):
@@ -119,7 +120,7 @@ def worth_carrying(
 
 
 def _earliest_copies(messages: Iterable[Latched]) -> Collection[Latched]:
-    earliest: dict[Identity, Latched] = {}
+    earliest: dict[MessageIdentity, Latched] = {}
     for each in messages:
         known = earliest.get(each.identity)
         if known is None or each.log_time < known.log_time:
@@ -144,43 +145,45 @@ class Carrier:
         self._reader = reader
         self._writer = writer
         self._static_topics = frozenset(static_topics)
-        self._late: dict[tuple[Path, Ns, str], dict[Identity, Ns]] = {}
+        self._late: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
 
-    def concerned(self, snapshot: Snapshot, doomed: Collection[Path]) -> tuple[BagFile, ...]:
-        """Those of the bags that hold messages of a latched topic."""
+    def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
+        """Returns those of the bags that contain messages of a latched topic."""
         found: dict[str, BagFile] = {}
-        leaving = {str(path) for path in doomed}
+        wanted = {str(path) for path in paths}
         everything = TimeWindow.everything()
         for topic in self._topics(snapshot):
-            held = snapshot.extents(topic, everything)
-            found.update((bag.file, bag) for bag, *_ in held if bag.file in leaving)
+            extents = snapshot.extents(topic, everything)
+            found.update((bag.file, bag) for bag, *_ in extents if bag.file in wanted)
         return tuple(found.values())
 
     def carry(
-        self, snapshot: Snapshot, doomed: Collection[Path], kept: Collection[Path] = ()
+        self, snapshot: Snapshot, to_delete: Collection[Path], saved: Collection[Path] = ()
     ) -> int | None:
-        """Writes what must outlive these bags; how many messages are carried then.
+        """Writes the messages that must outlive these bags, durably.
 
-        Of the doomed some are `kept` under another name: what was recorded in them stays. None
-        where nothing had to be written. All is on the disk when this returns.
+        Returns how many messages are carried then, or None if nothing had to be written. Bags that
+        are also `saved` under another name count as kept.
 
         Raises:
             BagError: it cannot be written; what was carried before still is.
             OSError: likewise.
         """
-        leaving = self.concerned(snapshot, doomed)
+        leaving = self.with_latched(snapshot, to_delete)
         if not leaving:
             return None
         topics = self._topics(snapshot)
-        gone = {*doomed} - {*kept}
-        there = [bag for bag in snapshot.bags if bag.path not in gone and not is_carried(bag.path)]
+        gone = {*to_delete} - {*saved}
+        kept = [bag for bag in snapshot.bags if bag.path not in gone and not is_carried(bag.path)]
         carried = dict(self._carried(topics))
         origins = dict(carried)
-        staying = {self._folder(bag.path) for bag in there}
+        remaining = {self._folder(bag.path) for bag in kept}
         for bag in leaving:
             origins.update(self._read(snapshot, bag, topics))
-        wanted = worth_carrying(origins, _presence(there), self._repeated(snapshot, topics, doomed))
-        chosen = {each[:2]: _united(each, origins, staying) for each in wanted}
+        wanted = worth_carrying(
+            origins, _recorded_in(kept), self._repeated(snapshot, topics, to_delete)
+        )
+        chosen = {each[:2]: _merged_origin(each, origins, remaining) for each in wanted}
         if chosen == {each[:2]: origin for each, origin in carried.items()}:
             return None
         sources = [self.path, *(bag.path for bag in leaving)]
@@ -191,7 +194,7 @@ class Carrier:
         return len(wanted)
 
     def _topics(self, snapshot: Snapshot) -> tuple[str, ...]:
-        """Also of topics that say much: nobody may have said since what the last message did."""
+        """Returns the latched topics, also frequent ones: their last message may still be valid."""
         return tuple(
             topic
             for topic in snapshot.topics()
@@ -199,28 +202,28 @@ class Carrier:
         )
 
     def _carried(self, topics: Collection[str]) -> Iterator[tuple[Latched, Origin | None]]:
-        """What is carried already."""
+        """Yields the messages that are carried already."""
         for record in self._records(self.path, topics):
             yield latched_message(record, self._frames(record)), origin_of(record.channel)
 
     def _read(
         self, snapshot: Snapshot, bag: BagFile, topics: Collection[str]
     ) -> Iterator[tuple[Latched, Origin]]:
-        """The messages of these topics; of a bag that cannot be read to its end, the readable.
+        """Yields the messages of these topics; of a damaged bag, those that can be read.
 
-        Of a topic that has many only the newest: what it said before holds no longer.
+        Of a frequent topic only the newest: the earlier ones are superseded.
         """
         folder = self._folder(bag.path)
         here = [topic for topic in topics if bag.summary.of(topic)]
-        often = {topic for topic in here if self._is_often(snapshot, topic, bag.recording)}
-        for record in self._records(bag.path, [topic for topic in here if topic not in often]):
+        frequent = {topic for topic in here if self._is_frequent(snapshot, topic, bag.recording)}
+        for record in self._records(bag.path, [topic for topic in here if topic not in frequent]):
             yield latched_message(record, self._frames(record)), Origin((folder,), often=False)
-        for topic in often:
+        for topic in frequent:
             for record in self._newest(bag.path, topic):
                 yield latched_message(record, ()), Origin((folder,), often=True)
 
     def _newest(self, path: Path, topic: str) -> Iterator[Record]:
-        """The newest message of a topic that can be read."""
+        """Yields the newest readable message of a topic, if any."""
         try:
             newest = self._reader.newest(path, topic, TimeWindow.everything())
         except BagVanishedError:
@@ -231,23 +234,23 @@ class Carrier:
         if newest is not None:
             yield newest
 
-    def _is_often(self, snapshot: Snapshot, topic: str, recording: Path) -> bool:
-        """Whether a recording has messages of a topic often; transforms are of many frames."""
+    def _is_frequent(self, snapshot: Snapshot, topic: str, recording: Path) -> bool:
+        """Whether a recording has frequent messages of a topic; never if they are transforms."""
         if topic in self._static_topics or any(map(_is_tf, snapshot.types_of(topic))):
             return False
         return not snapshot.pace(topic, recording).is_rare
 
     def _folder(self, bag: Path) -> str:
-        """The folder of a bag's recording, from the bag directory on; also of a moment's bag."""
+        """Returns the directory of a bag's recording, relative to the bag directory."""
         bag_dir = self.path.parent.parent
         return os.path.relpath(HardLinks(bag_dir).recorded_as(str(bag.parent)), bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
-        """The messages of these topics.
+        """Yields the messages of these topics.
 
         Raises:
-            BagError: the bag of carried messages cannot be read. What it holds stands nowhere
-                else, so it must not be replaced by one without it.
+            BagError: the bag of carried messages cannot be read. Its messages are nowhere else, so
+                it must not be replaced by a bag without them.
         """
         try:
             yield from self._reader.records(path, topics, TimeWindow.everything())
@@ -263,9 +266,9 @@ class Carrier:
         self,
         sources: Iterable[Path],
         topics: Collection[str],
-        chosen: Mapping[tuple[Ns, Identity], Origin | None],
+        chosen: Mapping[tuple[Ns, MessageIdentity], Origin | None],
     ) -> Iterator[Record]:
-        """The messages themselves, with their origins; they are few, so they are held at once."""
+        """Yields the chosen messages with their payload and origin."""
         missing = {*chosen}
         for path in sources:
             for record in self._records(path, topics):
@@ -276,7 +279,7 @@ class Carrier:
                     yield record if origin is None else with_origin(record, origin)
 
     def _frames(self, record: Record) -> tuple[str, ...]:
-        """The child frames of a message of transforms, as they are written in it."""
+        """Returns the child frames of a message of transforms, as they are written in it."""
         if not _is_tf(record.channel.type):
             return ()
         try:
@@ -287,30 +290,30 @@ class Carrier:
         return tuple({str(getattr(each, "child_frame_id", "")) for each in transforms})
 
     def _repeated(
-        self, snapshot: Snapshot, topics: Iterable[str], doomed: Collection[Path]
-    ) -> dict[Identity, Ns]:
-        """The late messages of kept bags, and their earliest log time.
+        self, snapshot: Snapshot, topics: Iterable[str], to_delete: Collection[Path]
+    ) -> dict[MessageIdentity, Ns]:
+        """Returns the late messages of kept bags, and their earliest log time.
 
         They come first in a recording, when its recorder has just subscribed.
         """
-        repeated: dict[Identity, Ns] = {}
-        asked: dict[tuple[Path, Ns, str], dict[Identity, Ns]] = {}
+        repeated: dict[MessageIdentity, Ns] = {}
+        found: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
         for topic in topics:
             seen: set[Path] = set()
             for bag, *_ in snapshot.extents(topic, TimeWindow.everything()):
-                if bag.recording in seen or bag.path in doomed or is_carried(bag.path):
+                if bag.recording in seen or bag.path in to_delete or is_carried(bag.path):
                     continue
                 seen.add(bag.recording)
                 key = (bag.path, bag.mtime_ns, topic)
                 known = self._late.get(key)
-                asked[key] = self._late_in(bag.path, topic) if known is None else known
-                for identity, moment in asked[key].items():
-                    repeated[identity] = min(moment, repeated.get(identity, moment))
-        self._late = asked
+                found[key] = self._late_in(bag.path, topic) if known is None else known
+                for identity, logged in found[key].items():
+                    repeated[identity] = min(logged, repeated.get(identity, logged))
+        self._late = found
         return repeated
 
-    def _late_in(self, path: Path, topic: str) -> dict[Identity, Ns]:
-        late: dict[Identity, Ns] = {}
+    def _late_in(self, path: Path, topic: str) -> dict[MessageIdentity, Ns]:
+        late: dict[MessageIdentity, Ns] = {}
         for record in self._records(path, (topic,)):
             message = latched_message(record, ())
             if not is_late(message):
@@ -343,10 +346,10 @@ def _is_tf(type_name: str) -> bool:
     return type_name.rpartition("/")[2].lower() == "tfmessage"
 
 
-def _united(
-    wanted: Latched, origins: Mapping[Latched, Origin | None], staying: Collection[str]
+def _merged_origin(
+    wanted: Latched, origins: Mapping[Latched, Origin | None], remaining: Collection[str]
 ) -> Origin | None:
-    """The origin of a message and its copies: of these the recordings that still have bags."""
+    """Merges the origins of a message and its copies, of recordings that still have bags."""
     own = origins[wanted]
     if own is None:
         return None
@@ -355,14 +358,14 @@ def _united(
         for each, origin in origins.items()
         if each.identity == wanted.identity and origin is not None
         for recording in origin.recordings
-        if recording in staying
+        if recording in remaining
     ]
     first, *others = own.recordings
     return replace(own, recordings=(first, *sorted({*others, *copies} - {first})))
 
 
-def _presence(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:
-    """Tells whether any of these bags has a moment in `[start, stop)`."""
+def _recorded_in(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:
+    """Returns a function: whether any of these bags was recorded in `[start, stop)`."""
     spans = sorted((bag.start, bag.end) for bag in bags)
     starts = [start for start, _ in spans]
     reach = list(accumulate((end for _, end in spans), max))

@@ -1,10 +1,9 @@
-"""How long has been recorded since each recording ended, whatever the wall clock did meanwhile.
+"""Measures how long was recorded since each recording ended, whatever the wall clock did.
 
-The monotonic clock begins anew at every boot, so the time that was recorded is added up, and kept
-in `.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,
-with the recorded time at which it was last seen to grow. The last line of a recording counts. A
-recording that has no line counts as recorded when it is first asked about: nothing says that it is
-older.
+The monotonic clock begins anew at every boot, so recorded time is added up and stored in
+`.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,
+with the total recorded time when it last grew. The last line of a recording counts. A recording
+without a line counts as recorded when it is first asked about: nothing shows that it is older.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SAVE_S: Final = 60.0
-"""A crash forgets at most so much of what was recorded, and so keeps bags for longer."""
+"""A crash loses at most so much of the recorded time, and so bags are kept for longer."""
 LONGEST_SILENCE_S: Final = 60.0
-"""Of a pause in which nothing reached the disk no more than this counts as recorded."""
+"""A pause in which nothing reached the disk counts as recorded for at most so long."""
 _MOST_LINES: Final = 20_000
 _MOST_BYTES: Final = 1 << 26
 _LONGEST_S: Final = 1e9
@@ -42,10 +41,10 @@ _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 class RecordedTime:
-    """The recorded time of one bag directory, whose lock the caller holds. Safe for threads.
+    """The recorded time of one bag directory, whose lock the caller holds. Thread-safe.
 
-    Nothing is read or written before it is first asked or told. Recordings are directories
-    relative to the bag directory, with forward slashes.
+    The file is first read when a method is called. Recordings are directories relative to the bag
+    directory, with forward slashes.
     """
 
     def __init__(self, bag_dir: Path) -> None:
@@ -54,7 +53,7 @@ class RecordedTime:
         self._lock = threading.Lock()
         self._loaded = False
         self._total_s = 0.0
-        self._seen_s: dict[str, float] = {}
+        self._last_grew_s: dict[str, float] = {}
         self._unsaved: set[str] = set()
         self._lines = 0
         self._grew: tuple[float, int] | None = None
@@ -81,7 +80,7 @@ class RecordedTime:
                 self._total_s += min(monotonic_s - self._grew[0], LONGEST_SILENCE_S)
                 self._grew = (monotonic_s, bytes_written)
             for name in recordings:
-                self._seen_s[name] = self._total_s
+                self._last_grew_s[name] = self._total_s
             self._unsaved |= self._recording
             # While nothing is recorded the disk may be away.
             changed = self._recording != before
@@ -90,16 +89,18 @@ class RecordedTime:
                 self._save()
 
     def since(self, recordings: Iterable[str]) -> dict[str, Ns]:
-        """By recording, how long was recorded after it."""
+        """Maps each recording to how long was recorded after it."""
         with self._lock:
             self._load()
-            return {name: ns_from_unix(self._total_s - self._seen(name)) for name in recordings}
+            return {
+                name: ns_from_unix(self._total_s - self._last_grew(name)) for name in recordings
+            }
 
-    def _seen(self, name: str) -> float:
-        if name not in self._seen_s:
-            self._seen_s[name] = self._total_s
+    def _last_grew(self, name: str) -> float:
+        if name not in self._last_grew_s:
+            self._last_grew_s[name] = self._total_s
             self._unsaved.add(name)
-        return self._seen_s[name]
+        return self._last_grew_s[name]
 
     def _load(self) -> None:
         if self._loaded:
@@ -113,35 +114,39 @@ class RecordedTime:
             return
         except (OSError, ValueError) as error:
             _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
-        self._total_s = max(self._seen_s.values(), default=0.0)
-        # The greatest is the total: it stays, though its recording may be gone.
-        newest = max(self._seen_s, key=self._seen_s.__getitem__, default=None)
-        self._seen_s = {
-            name: seen_s
-            for name, seen_s in self._seen_s.items()
+        self._total_s = max(self._last_grew_s.values(), default=0.0)
+        # The greatest is the total: it stays even if its recording is gone.
+        newest = max(self._last_grew_s, key=self._last_grew_s.__getitem__, default=None)
+        self._last_grew_s = {
+            name: recorded_s
+            for name, recorded_s in self._last_grew_s.items()
             if name == newest or (self._bag_dir / name).is_dir()
         }
-        self._lines = _MOST_LINES  # has the next save leave out what is gone
+        self._lines = _MOST_LINES  # so that the next save leaves out what is gone
 
     def _take(self, line: bytes) -> None:
-        """Takes in one line; one that a crash cut short says nothing."""
+        """Reads one line; ignores one that a crash cut short."""
         try:
             value: object = json.loads(line)
         except (ValueError, RecursionError):
             return
         if not isinstance(value, dict):
             return
-        name, seen_s = value.get("recording"), value.get("recorded_s")
-        if isinstance(name, str) and isinstance(seen_s, int | float) and 0 <= seen_s <= _LONGEST_S:
-            self._seen_s[name] = float(seen_s)
+        name, recorded_s = value.get("recording"), value.get("recorded_s")
+        if (
+            isinstance(name, str)
+            and isinstance(recorded_s, int | float)
+            and 0 <= recorded_s <= _LONGEST_S
+        ):
+            self._last_grew_s[name] = float(recorded_s)
 
     def _save(self) -> None:
         names = sorted(self._unsaved)
         try:
             make_folder(self._path.parent)
             if self._lines + len(names) > _MOST_LINES:
-                write_durably(self._path, self._text(self._seen_s))
-                self._lines = len(self._seen_s)
+                write_durably(self._path, self._text(self._last_grew_s))
+                self._lines = len(self._last_grew_s)
             elif names:
                 append_durably(self._path, self._text(names))
                 self._lines += len(names)
@@ -155,14 +160,14 @@ class RecordedTime:
             self._reported = None
 
     def _text(self, names: Iterable[str]) -> str:
-        # A line break before, too: what a full disk cut short must not swallow the next line.
+        # A line break before, too: a line that a full disk cut short must not swallow the next.
         lines = (
-            json.dumps({"recording": name, "recorded_s": round(self._seen_s[name], 3)})
+            json.dumps({"recording": name, "recorded_s": round(self._last_grew_s[name], 3)})
             for name in names
         )
         return "".join(f"\n{line}\n" for line in lines)
 
 
 def relative_recording(recording: str, bag_dir: Path) -> str:
-    """A recording's directory as lines name it."""
+    """Returns a recording's directory relative to the bag directory, as the file names it."""
     return recording.removeprefix(f"{str(bag_dir).rstrip(os.sep)}{os.sep}")

@@ -1,8 +1,8 @@
-"""Puts right what a crash left open: the bag keeps its name, and is whole afterwards.
+"""Repairs bags that a crash left open: each keeps its name and is whole afterwards.
 
-A file of 0 bytes is removed: nothing had reached the disk. One that was cut short is rewritten
-beside itself from all that can be read of it, read back, compared and flushed; only then it takes
-the name of the original, which stays as it is in every other case.
+A file of 0 bytes is removed: nothing had reached the disk. A truncated file is rewritten beside
+itself from all that can be read of it, read back, compared and flushed. Only then does it take the
+name of the original, which is left as it is in every other case.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
-    """What became of one file.
+    """The result of repairing one file.
 
-    `was_bytes` and `is_bytes` are its sizes before and after; `rewritten` says what was recovered,
-    None where an empty file was removed.
+    `was_bytes` and `is_bytes` are its sizes before and after. `rewritten` describes what was
+    recovered; it is None for an empty file, which was removed.
     """
 
     path: Path
@@ -43,9 +43,9 @@ class Repaired:
 
 
 class Repairer:
-    """Repairs MCAP files in place. Whoever calls knows that nobody writes them any more.
+    """Repairs MCAP files in place. The caller must know that nothing writes them any more.
 
-    What is repaired lies below `root`, and is not reached through a symbolic link there.
+    Files must lie below `root`, and no symbolic link below it is followed.
     """
 
     def __init__(self, reader: BagReader, writer: BagWriter, root: Path = Path("/")) -> None:
@@ -57,27 +57,27 @@ class Repairer:
         """Whether the writer of a file finished it, so that there is nothing to repair.
 
         Raises:
-            BagVanishedError: it is not there.
+            BagVanishedError: it does not exist.
             BagError: it cannot be opened, or is no MCAP file.
         """
         whole = self._reader.closing(path) is Closing.CLOSED
         if whole:
-            # What is no bag at all counts as closed; here it is said to be none.
+            # A file that is no bag at all counts as closed; this raises for it.
             self._reader.channels(path)
         return whole
 
     def repair(self, path: Path, progress: Callable[[int], None] | None = None) -> Repaired | None:
-        """Repairs one file; None where its writer had finished it.
+        """Repairs one file; returns None if its writer had finished it.
 
-        `progress` is told how many bytes of it were read.
+        `progress` is called with the number of bytes read so far.
 
         Raises:
-            BagVanishedError: it is not there.
-            BagError: it cannot be repaired, and is as it was.
+            BagVanishedError: it does not exist.
+            BagError: it cannot be repaired, and is unchanged.
         """
         try:
             with directories.opened(self._root, path.parent.absolute()) as folder:
-                # The directory itself, whatever takes its name meanwhile.
+                # The open directory itself, even if something else takes its name meanwhile.
                 here = Path(f"/proc/self/fd/{folder}", path.name)
                 repaired = self._repair(here, path, progress)
         except BagVanishedError as error:
@@ -116,7 +116,7 @@ class Repairer:
         beside.unlink(missing_ok=True)
         try:
             rewritten = self._writer.rewrite(path, beside, progress)
-            _like(beside, before)
+            _copy_attributes(beside, before)
             _require_same(path, before)
             beside.replace(path)
         except BaseException:
@@ -128,7 +128,7 @@ class Repairer:
 
 
 def open_files() -> frozenset[tuple[int, int]]:
-    """The files (device and inode) that processes hold open, as far as they may be looked at."""
+    """Returns device and inode of every open file that /proc shows."""
     found: set[tuple[int, int]] = set()
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError), os.scandir(process / "fd") as descriptors:
@@ -140,11 +140,11 @@ def open_files() -> frozenset[tuple[int, int]]:
 
 
 def _status(path: Path) -> os.stat_result:
-    """The status of a regular file.
+    """Returns the status of a regular file.
 
     Raises:
         BagError: it is something else.
-        OSError: it cannot be looked at.
+        OSError: its status cannot be read.
     """
     status = path.lstat()
     if not stat.S_ISREG(status.st_mode):
@@ -159,8 +159,8 @@ def _require_same(path: Path, before: os.stat_result) -> None:
             raise BagError(str(path), "it was written to while it was being repaired")
 
 
-def _like(path: Path, model: os.stat_result) -> None:
-    """Gives a file the rights, the owner and the time of another."""
+def _copy_attributes(path: Path, model: os.stat_result) -> None:
+    """Gives a file the mode, the owner and the times of another."""
     path.chmod(stat.S_IMODE(model.st_mode))
     with suppress(OSError):
         shutil.chown(path, model.st_uid, model.st_gid)

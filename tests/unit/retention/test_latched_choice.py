@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.history import merged_stream
 from ros2_memory.retention import latched_carry
-from ros2_memory.retention.latched_carry import Identity, Latched, worth_carrying
+from ros2_memory.retention.latched_carry import Latched, MessageIdentity, worth_carrying
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,7 +54,7 @@ class TestWorthCarrying:
 def message(moment: int, topic: str, child: str = "", *, published: int | None = None) -> Latched:
     holds = ((topic, ""), (topic, child)) if child else ((topic, ""),)
     sent = moment if published is None else published
-    return Latched(moment, Identity(topic, sent, child.encode()), holds)
+    return Latched(moment, MessageIdentity(topic, sent, child.encode()), holds)
 
 
 def nowhere(start: int, stop: int) -> bool:

@@ -88,7 +88,7 @@ class TestKeeping:
         slot = asked(tmp_path, 15, 25)
         with house._index.undisturbed() as snapshot:
             made[1].unlink()
-            house._keeper.keep(snapshot)
+            house._moments.keep(snapshot)
         outcome = slot.outcome()
         assert outcome is not None
         assert outcome.bags == 1
@@ -111,7 +111,7 @@ class TestKeeping:
 
         monkeypatch.setattr(type(sidecar), "samefile", gone)
         with structlog.testing.capture_logs() as logs:
-            house._keeper.update_sidecars()
+            house._moments.update_sidecars()
         assert [each for each in logs if each["event"] == "moment_not_followed"] == []
 
     def test_what_was_never_recorded_is_refused(self, tmp_path: Path) -> None:
