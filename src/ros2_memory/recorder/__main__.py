@@ -10,13 +10,12 @@ import argparse
 import signal
 import sys
 import time
-from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Final, Self
+from contextlib import ExitStack, contextmanager, suppress
+from typing import TYPE_CHECKING, Final
 
 import structlog
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_housekeeper, build_reader, build_recorder, claim
@@ -30,14 +29,13 @@ from ros2_memory.core.sd_notify import (
     ServiceManager,
     watchdog_interval_s,
 )
-from ros2_memory.recorder.handover.recovery import recover_handovers
+from ros2_memory.recorder.handover.recovery import recover_handovers, recover_unwritten
 from ros2_memory.recorder.process.topics import load_topics
 from ros2_memory.retention.clear import clear_bags, refuse_homes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
-    from types import FrameType
 
     from ros2_memory.config import Settings
     from ros2_memory.recorder.base import Housekeeper, Recorder
@@ -103,7 +101,7 @@ def _record(settings: Settings) -> None:
             _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
         _put_in_order(bag_dir, reader, housekeeper)
         _log.info("starting", bag_dir=str(bag_dir))
-        _record_until_signal(recorder, BagDirUpkeep(bag_dir, reader, lock))
+        _record_until_signal(recorder, bag_dir, reader, lock)
         _log.info("stopped")
     finally:
         lock.release()
@@ -153,9 +151,13 @@ def _put_in_order(bag_dir: Path, reader: BagReader, housekeeper: Housekeeper) ->
             _log.error("not_prepared", task=name, reason=str(error))
 
 
-def _record_until_signal(recorder: Recorder, upkeep: BagDirUpkeep) -> None:
+def _record_until_signal(
+    recorder: Recorder, bag_dir: Path, reader: BagReader, lock: BagDirLock
+) -> None:
     """Records until SIGTERM, SIGINT or SIGHUP comes, and ends what it started.
 
+    Meanwhile it takes the lock again if its file has gone, and completes handovers that could not
+    be completed, as on a full disk: until then the messages of the new recording do not count.
     Must be called from the main thread, which the recorder's processes die with.
 
     Raises:
@@ -164,99 +166,49 @@ def _record_until_signal(recorder: Recorder, upkeep: BagDirUpkeep) -> None:
     manager = ServiceManager()
     interval_s = watchdog_interval_s()
     next_sign_s = 0.0
-    with EndingSignals() as signals:
+    recover_at_s = time.monotonic() + RECOVER_EVERY_S
+    with _ending_signals() as received:
         try:
             recorder.start()
             manager.tell(READY)
-            while not signals.wait(TICK_S):
+            while not received:
+                # A signal does not cut this short: Python runs its handler and sleeps on (PEP 475).
+                time.sleep(TICK_S)
                 recorder.tick()
-                upkeep.tick()
-                if interval_s is not None and time.monotonic() >= next_sign_s:
+                if lock.renew():
+                    _log.warning("lock_renewed", reason="its file had gone from the bag directory")
+                now_s = time.monotonic()
+                if now_s >= recover_at_s:
+                    recover_at_s = now_s + RECOVER_EVERY_S
+                    # The recorder reports a directory that cannot be listed.
+                    with suppress(OSError):
+                        recover_unwritten(bag_dir, reader)
+                if interval_s is not None and now_s >= next_sign_s:
                     manager.tell(WATCHDOG)
-                    next_sign_s = time.monotonic() + interval_s / 2
+                    next_sign_s = now_s + interval_s / 2
+            _log.info("signal_received", signal=signal.Signals(received[0]).name)
         finally:
             manager.tell(STOPPING)
             recorder.stop()
 
 
-class BagDirUpkeep:
-    """Keeps the bag directory locked and its handovers complete while it is recorded into.
-
-    The lock is taken again where its file has gone. A handover that could not be completed, as on
-    a full disk, is tried again: until then the messages of its new recording do not count.
-    """
-
-    def __init__(self, bag_dir: Path, reader: BagReader, lock: BagDirLock) -> None:
-        self._bag_dir = bag_dir
-        self._reader = reader
-        self._lock = lock
-        self._recover_at_s = time.monotonic() + RECOVER_EVERY_S
-
-    def tick(self) -> None:
-        """Does what is due.
-
-        Raises:
-            RecorderError: another recorder took the bag directory.
-        """
-        if self._lock.renew():
-            _log.warning("lock_renewed", reason="its file had gone from the bag directory")
-        if time.monotonic() >= self._recover_at_s:
-            self._recover_at_s = time.monotonic() + RECOVER_EVERY_S
-            self.recover()
-
-    def recover(self) -> None:
-        """Completes the handovers of recordings that are no longer written."""
-        heartbeat = read_heartbeat(self._bag_dir).heartbeat
-        running = heartbeat.recordings if heartbeat else ()
-        # The recorder reports a directory that cannot be listed.
-        with suppress(OSError):
-            recover_handovers(self._bag_dir, self._reader, running)
-
-
-class EndingSignals:
-    """Notes the ending signals while it is entered; they interrupt nothing.
+@contextmanager
+def _ending_signals() -> Iterator[list[int]]:
+    """Yields a list to which the ending signals are appended; they interrupt nothing.
 
     They are not blocked and waited for with sigwait(3): a thread that a library started before
     would receive them, and they would end the program. SIGCHLD is not ignored either, or the system
     would reap children, and other processes could take their numbers.
     """
-
-    def __init__(self) -> None:
-        self._received: int | None = None
-        self._restore = ExitStack()
-
-    def __enter__(self) -> Self:
-        """Installs the handlers. Only in the main thread."""
+    received: list[int] = []
+    with ExitStack() as restore:
         for number in ENDING_SIGNALS:
-            self._handle(number, self._note)
-        self._handle(signal.SIGCHLD, signal.SIG_DFL)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Restores the handlers that were installed before."""
-        self._restore.close()
-
-    def wait(self, seconds: float) -> bool:
-        """Waits for so long, and returns whether a signal has come.
-
-        A signal does not cut the wait short: Python runs the handler and sleeps on (PEP 475).
-        """
-        if self._received is None:
-            time.sleep(seconds)
-        if self._received is None:
-            return False
-        _log.info("signal_received", signal=signal.Signals(self._received).name)
-        return True
-
-    def _handle(
-        self,
-        number: signal.Signals,
-        handler: Callable[[int, FrameType | None], None] | signal.Handlers,
-    ) -> None:
-        self._restore.callback(signal.signal, number, signal.signal(number, handler))
-
-    def _note(self, number: int, _frame: FrameType | None) -> None:
-        self._received = number
+            before = signal.signal(number, lambda number, _frame: received.append(number))
+            restore.callback(signal.signal, number, before)
+        restore.callback(
+            signal.signal, signal.SIGCHLD, signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        )
+        yield received
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,9 +1,9 @@
-"""One recording takes over from another: when each step is due, and what is written down. Pure.
+"""Plans how one recording takes over from another: when each step is due, and the sidecars. Pure.
 
-The new recorder is started beside the old one and waited for until it has subscribed to all that
-the old one had, though not for ever, since a publisher may be gone. Then both run for two seconds
-more. The cut lies in the middle of those: whatever was published about it stands in both, so that
-neither a message under way nor a clock that is off by less than a second is lost or counts twice.
+The new recorder is started beside the old one, and waits until it has subscribed to all topics of
+the old one, but not for ever, since a publisher may be gone. Then both run for two more seconds.
+The cut lies in the middle of those: messages published around it are in both recordings, so that a
+message in transit, or a clock that is off by less than a second, loses and doubles nothing.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ if TYPE_CHECKING:
 
 SUBSCRIBE_TIMEOUT_S: Final = 20.0
 READY_TIMEOUT_S: Final = 120.0
-"""A recorder that has not begun after so long does not begin."""
+"""A recorder that has not begun to record after so long is given up."""
 BOTH_S: Final = 2.0
 STEP_NS: Final[Ns] = 100 * NS_PER_MS
 """A clock that falls behind by so much at once was set back; a slewed one falls behind slowly."""
 
-LAST_WORDS_NS: Final[Ns] = 30 * NS_PER_S
-"""How long the old recorder may still receive after it was told to end."""
+LATE_MESSAGES_NS: Final[Ns] = 30 * NS_PER_S
+"""How long the old recorder may still receive messages after it was asked to end."""
 
 
 class ClockReading(NamedTuple):
-    """One moment by the two clocks: seconds that never step, and the wall clock."""
+    """Both clocks, read at the same time: seconds that never step, and the wall clock."""
 
     monotonic_s: float
     wall: Ns
 
 
 def set_back(earlier: ClockReading, later: ClockReading, by_ns: Ns = STEP_NS) -> bool:
-    """Whether the wall clock was set back by more between two moments that lie close together.
+    """Whether the wall clock was set back by more than `by_ns` between two readings close together.
 
-    A clock that is set forward does no harm: what was published before and after it still falls on
-    either side of one cut.
+    A clock that is set forward does no harm: messages published before and after the step are still
+    on either side of one cut.
     """
     passed = round((later.monotonic_s - earlier.monotonic_s) * NS_PER_S)
     return passed - (later.wall - earlier.wall) > by_ns
@@ -57,14 +57,14 @@ class Step(Enum):
 
     WAIT = auto()
     COMPLETE = auto()
-    # The new recorder does not begin, or the clock was set back: then one cut cannot part what was
-    # published before and after it.
+    # The new recorder does not begin, or the clock was set back: then no single cut separates the
+    # messages published before it from those published after it.
     ABANDON = auto()
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """The times of a handover that is complete: both recorders received from `both` to `ended`."""
+    """The times of a complete handover: both recorders received from `both` to `ended`."""
 
     began: Ns
     both: Ns
@@ -73,7 +73,7 @@ class Bounds:
 
 
 class HandoverPlan:
-    """A handover under way, from the moment before the new recorder was started."""
+    """A handover under way, since just before the new recorder was started."""
 
     def __init__(
         self,
@@ -88,26 +88,21 @@ class HandoverPlan:
         self._both: ClockReading | None = None
         self._last = began
 
-    @property
-    def overlapping(self) -> bool:
-        """Whether the new recorder receives all that the old one does."""
-        return self._both is not None
-
     def advance(self, now: ClockReading, *, ready: bool, missing: Collection[str]) -> Step:
-        """What is due. To be asked several times a second.
+        """Returns the step that is due. Must be called several times a second.
 
         Args:
-            now: this moment.
+            now: the present time.
             ready: whether the new recorder records, into a directory that exists.
-            missing: the topics that the old one has subscribed to, and the new one not yet.
+            missing: the topics that the old one has subscribed to and the new one has not.
         """
         before, self._last = self._last, now
         if set_back(before, now):
             return Step.ABANDON
         age_s = now.monotonic_s - self.began.monotonic_s
         if missing and age_s < self._timeout_s:
-            # Also of a publisher that appears while both run: what it sends before the new one has
-            # subscribed stands in the old one alone, and must not lie behind the cut.
+            # Also if a publisher appears while both run: what it sends before the new recorder has
+            # subscribed is in the old recording alone, and must not lie after the cut.
             self._both = None
         elif self._both is None and ready:
             self._both = now
@@ -117,7 +112,7 @@ class HandoverPlan:
         return Step.COMPLETE if over else Step.WAIT
 
     def bounds(self, now: ClockReading) -> Bounds | None:
-        """The times of the handover if it is completed now; None while the two do not overlap."""
+        """Returns the times of a handover completed now; None while the two do not overlap."""
         if self._both is None:
             return None
         middle = (self._both.wall + now.wall) // 2
@@ -125,29 +120,29 @@ class HandoverPlan:
 
 
 class Sidecars(NamedTuple):
-    """What is written down for the old and for the new recording."""
+    """The sidecars of the old and of the new recording."""
 
     old: Handover
     new: Handover
 
 
 def intended(old: Handover, new_name: str) -> Handover:
-    """For the old recording, before the new one is started: a crash may come at any moment."""
+    """Returns the old sidecar before the new recording is started, as a crash may come any time."""
     return replace(old, next=new_name, counts_until=None, end=None)
 
 
 def pending(old_name: str) -> Handover:
-    """For the new recording, as soon as its directory exists: until the cut it does not count."""
+    """Returns the new sidecar as soon as its directory exists: until the cut it does not count."""
     return Handover(state=Counting.PENDING, previous=old_name)
 
 
 def void(old_name: str) -> Handover:
-    """For a new recording that did not take over: the old one went on, and has all of it."""
+    """Returns the sidecar of a new recording that did not take over: the old one has all of it."""
     return Handover(state=Counting.VOID, previous=old_name)
 
 
 def withdrawn(old: Handover) -> Handover:
-    """For the old recording, when the new one did not take over."""
+    """Returns the old sidecar when the new recording did not take over."""
     return replace(old, next=None, counts_until=None, end=None)
 
 
@@ -162,10 +157,10 @@ def complete_sidecars(
     simulated: bool,
     clock: CutClock,
 ) -> Sidecars:
-    """What is written down when a handover is complete, for the new recording first.
+    """Returns both sidecars of a complete handover. The new one must be written first.
 
     Args:
-        old: the sidecar of the old recording as it stands.
+        old: the present sidecar of the old recording.
         old_name: the old recording.
         new_name: the new recording.
         bounds: the times of the handover.
@@ -174,7 +169,7 @@ def complete_sidecars(
         simulated: whether log times are those of a simulated clock.
         clock: whether publish times differ from log times.
     """
-    both, last = (None, None) if simulated else (bounds.both, bounds.ended + LAST_WORDS_NS)
+    both, last = (None, None) if simulated else (bounds.both, bounds.ended + LATE_MESSAGES_NS)
     began, ended = (None, None) if simulated else (bounds.began, bounds.ended)
     notes = (LOG_CLOCK_NOTE,) if clock is CutClock.LOG else ()
     return Sidecars(

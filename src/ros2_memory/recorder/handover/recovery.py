@@ -1,8 +1,8 @@
-"""Handovers that a crash cut short: which recording has what, found by reading both.
+"""Completes handovers that a crash interrupted, by reading both recordings.
 
-The old recording names the new one before it is started, so nothing is inferred from times: only
-of a pair that is known to have overlapped is it asked how far the old one reaches. What it holds
-counts there, and the new one counts from then on.
+The old recording names the new one before that is started, so nothing is inferred from times: only
+for a pair that is known to have overlapped is the end of the old one read. Its messages count up to
+there, and those of the new one from then on.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ros2_memory.bag_dir.handover_file import (
     read_handover,
     write_handover,
 )
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
@@ -34,25 +35,25 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader, Record
 
 JITTER_NS: Final[Ns] = 100 * NS_PER_MS
-"""By less than this two recorders differ in when they received one message."""
+"""Two recorders differ by less than this in when they received one message."""
 LONGEST_NS: Final[Ns] = 60 * NS_PER_S
-"""For longer than this two recorders never run side by side, whatever a clock that was set says."""
+"""Two recorders never run side by side for longer, whatever a clock that was set shows."""
 SAMPLE: Final = 2000
-"""Messages looked at to tell whether publish times differ from log times."""
+"""Messages read to find out whether publish times differ from log times."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) -> None:
-    """Brings every handover below the bag directory to its end. Reports what it cannot settle.
+    """Completes every handover below the bag directory; reports those that it cannot complete.
 
-    `running` are recordings that are being written: those may yet come to the end of theirs.
+    `running` are recordings that are being written, which may still complete theirs.
 
     Raises:
         OSError: the bag directory cannot be listed.
     """
     for directory in sorted(each for each in bag_dir.iterdir() if _is_folder(each)):
-        new_name = None if directory.name in running else unsettled(directory)
+        new_name = None if directory.name in running else incomplete_handover(directory)
         if new_name is None:
             continue
         try:
@@ -61,34 +62,44 @@ def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str]
             _log.error("handover_not_settled", recording=directory.name, reason=str(error))
 
 
+def recover_unwritten(bag_dir: Path, reader: BagReader) -> None:
+    """Completes the handovers of recordings that the heartbeat does not name as being written.
+
+    Raises:
+        OSError: the bag directory cannot be listed.
+    """
+    heartbeat = read_heartbeat(bag_dir).heartbeat
+    recover_handovers(bag_dir, reader, heartbeat.recordings if heartbeat else ())
+
+
 def _is_folder(path: Path) -> bool:
-    """Whether it is a directory itself, and not a link to one elsewhere."""
+    """Whether it is a directory, and not a link to one elsewhere."""
     return path.is_dir() and not path.is_symlink()
 
 
-def unsettled(recording: Path) -> str | None:
-    """The recording that this one was handing over to when it was cut short; None mostly."""
+def incomplete_handover(recording: Path) -> str | None:
+    """Returns the recording that this one was handing over to when it was interrupted, or None."""
     handover = read_handover(recording).handover
     return handover.next if handover.counts_until is None else None
 
 
 def recover_handover(old: Path, new: Path, reader: BagReader) -> None:
-    """Writes down which of two overlapping recordings has what, after both have ended.
+    """Writes which messages of two overlapping recordings count, after both have ended.
 
     Raises:
-        RecorderError: the recordings cannot be looked at, or it cannot be written.
+        RecorderError: the recordings cannot be read, or the sidecars cannot be written.
     """
     try:
-        _settle(old, new, reader)
+        _complete(old, new, reader)
     except OSError as error:
         raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
     except BagUnreachableError as error:
-        # What a disk hides for the moment must not be written down as missing.
+        # Files that the disk cannot show at present must not be recorded as missing.
         raise RecorderError(str(error)) from error
     _log.info("handover_settled", recording=old.name, next=new.name)
 
 
-def _settle(old: Path, new: Path, reader: BagReader) -> None:
+def _complete(old: Path, new: Path, reader: BagReader) -> None:
     before = handover_to_change(old)
     if not _is_folder(new):
         write_handover(old, withdrawn(before))
@@ -107,7 +118,7 @@ def _settle(old: Path, new: Path, reader: BagReader) -> None:
 
 
 def cut_clock(bag: Path, reader: BagReader) -> CutClock:
-    """Whether publish times differ from log times in a bag file; they do where it is empty.
+    """Finds out whether publish times differ from log times in a bag file; yes if it is empty.
 
     Raises:
         RecorderError: the disk fails.
@@ -122,28 +133,28 @@ def cut_clock(bag: Path, reader: BagReader) -> CutClock:
     return CutClock.LOG if equal else CutClock.PUBLISH
 
 
-class _Reach(NamedTuple):
+class _End(NamedTuple):
     publish_time: Ns
     log_time: Ns
 
 
 def _cut_at_the_end(old: Path, new: Path, found: Sidecars, reader: BagReader) -> None:
-    """The old recording counts as far as it reaches, the new one from there.
+    """Has the old recording count up to its end, and the new one from there.
 
-    The new one may have handed over itself since, where this could not be written down at once:
-    what its sidecar says of its own end stands.
+    The new one may itself have handed over since, if this could not be written at once: what its
+    sidecar records about its own end is kept.
     """
     before, after = found
-    reach = _reach(old, reader)
-    if reach is None:
+    last = _end_of(old, reader)
+    if last is None:
         write_handover(new, replace(after, state=Counting.COUNTS, previous=old.name))
         write_handover(old, withdrawn(before))
         return
     bags = _bags(new, reader)
-    first = min((summary.start for _, summary in bags), default=reach.log_time)
-    cut, until = reach.publish_time + 1, min(reach.log_time + JITTER_NS, first + LONGEST_NS)
+    first = min((summary.start for _, summary in bags), default=last.log_time)
+    cut, until = last.publish_time + 1, min(last.log_time + JITTER_NS, first + LONGEST_NS)
     later = {name for name, summary in bags if summary.start >= until}
-    # One that cannot be read yet is still being written.
+    # A file that cannot be read yet is still being written.
     files = tuple(path.name for path in _files(new, reader) if path.name not in later)
     begin = Overlap(None, until, files)
     start = replace(after, state=Counting.COUNTS, previous=old.name, counts_from=cut, begin=begin)
@@ -151,18 +162,18 @@ def _cut_at_the_end(old: Path, new: Path, found: Sidecars, reader: BagReader) ->
     write_handover(old, replace(before, counts_until=cut, end=Overlap(None, None, ())))
 
 
-def _reach(recording: Path, reader: BagReader) -> _Reach | None:
-    """The newest publish time and log time in the last bag file that holds anything."""
+def _end_of(recording: Path, reader: BagReader) -> _End | None:
+    """Returns the newest publish time and log time in the last bag file that is not empty."""
     bags = _bags(recording, reader)
     if not bags:
         return None
     name, _ = max(bags, key=lambda each: each[1].end)
-    newest: _Reach | None = None
+    newest: _End | None = None
     try:
         for record in _records(recording / name, reader):
             if newest is None:
-                newest = _Reach(record.publish_time, record.log_time)
-            newest = _Reach(
+                newest = _End(record.publish_time, record.log_time)
+            newest = _End(
                 max(newest.publish_time, record.publish_time),
                 max(newest.log_time, record.log_time),
             )
@@ -174,7 +185,7 @@ def _reach(recording: Path, reader: BagReader) -> _Reach | None:
 
 
 def _bags(recording: Path, reader: BagReader) -> list[tuple[str, BagSummary]]:
-    """The bag files with at least one message, by name."""
+    """Returns name and summary of each bag file that is not empty."""
     found: list[tuple[str, BagSummary]] = []
     for path in _files(recording, reader):
         try:
@@ -193,7 +204,7 @@ def _files(recording: Path, reader: BagReader) -> list[Path]:
 
 
 def _records(bag: Path, reader: BagReader) -> Iterator[Record]:
-    """The messages on topics that are not latched: a latched one may be published long before."""
+    """Yields messages of topics that are not latched: latched ones may be published long before."""
     topics = [each.topic for each in reader.summarize(bag).topics if not each.latched]
     return reader.records(bag, topics, TimeWindow(MIN_NS, MAX_NS))
 

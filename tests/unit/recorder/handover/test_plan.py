@@ -32,72 +32,70 @@ def at(seconds: float, *, stepped_s: float = 0.0) -> ClockReading:
     return ClockReading(500.0 + seconds, T0 + round((seconds + stepped_s) * S))
 
 
-def waited(
-    passage: HandoverPlan, *seconds: float, ready: bool, missing: tuple[str, ...] = ()
-) -> Step:
-    steps = [passage.advance(at(each), ready=ready, missing=missing) for each in seconds]
+def waited(plan: HandoverPlan, *seconds: float, ready: bool, missing: tuple[str, ...] = ()) -> Step:
+    steps = [plan.advance(at(each), ready=ready, missing=missing) for each in seconds]
     assert set(steps[:-1]) <= {Step.WAIT}
     return steps[-1]
 
 
 class TestSteps:
     def test_two_seconds_after_everything_is_subscribed_the_handover_is_complete(self) -> None:
-        passage = HandoverPlan(at(0))
-        assert waited(passage, 0.2, 1.0, ready=True, missing=("/odom",)) is Step.WAIT
-        assert passage.bounds(at(1)) is None
-        assert waited(passage, 3.0, 4.9, ready=True) is Step.WAIT
-        assert passage.overlapping
-        assert waited(passage, 5.0, ready=True) is Step.COMPLETE
+        plan = HandoverPlan(at(0))
+        assert waited(plan, 0.2, 1.0, ready=True, missing=("/odom",)) is Step.WAIT
+        assert plan.bounds(at(1)) is None
+        assert waited(plan, 3.0, 4.9, ready=True) is Step.WAIT
+        assert plan.bounds(at(5)) is not None
+        assert waited(plan, 5.0, ready=True) is Step.COMPLETE
 
     def test_a_recorder_that_is_not_ready_is_waited_for(self) -> None:
-        passage = HandoverPlan(at(0))
-        assert waited(passage, 1.0, 10.0, 100.0, ready=False) is Step.WAIT
-        assert not passage.overlapping
+        plan = HandoverPlan(at(0))
+        assert waited(plan, 1.0, 10.0, 100.0, ready=False) is Step.WAIT
+        assert plan.bounds(at(100)) is None
 
     def test_a_topic_that_nobody_publishes_any_more_is_waited_for_until_the_timeout(self) -> None:
-        passage = HandoverPlan(at(0), subscribe_timeout_s=20)
-        assert waited(passage, 19.9, ready=True, missing=("/gone",)) is Step.WAIT
-        assert not passage.overlapping
-        assert waited(passage, 20.0, 21.9, ready=True, missing=("/gone",)) is Step.WAIT
-        assert waited(passage, 22.0, ready=True, missing=("/gone",)) is Step.COMPLETE
+        plan = HandoverPlan(at(0), subscribe_timeout_s=20)
+        assert waited(plan, 19.9, ready=True, missing=("/gone",)) is Step.WAIT
+        assert plan.bounds(at(100)) is None
+        assert waited(plan, 20.0, 21.9, ready=True, missing=("/gone",)) is Step.WAIT
+        assert waited(plan, 22.0, ready=True, missing=("/gone",)) is Step.COMPLETE
 
     def test_a_publisher_that_appears_while_both_record_is_waited_for_anew(self) -> None:
-        passage = HandoverPlan(at(0), subscribe_timeout_s=20)
-        assert waited(passage, 1.0, 2.5, ready=True) is Step.WAIT
-        assert waited(passage, 2.7, 3.9, ready=True, missing=("/late",)) is Step.WAIT
-        assert not passage.overlapping
-        assert waited(passage, 4.0, 5.9, ready=True) is Step.WAIT
-        assert waited(passage, 6.0, ready=True) is Step.COMPLETE
+        plan = HandoverPlan(at(0), subscribe_timeout_s=20)
+        assert waited(plan, 1.0, 2.5, ready=True) is Step.WAIT
+        assert waited(plan, 2.7, 3.9, ready=True, missing=("/late",)) is Step.WAIT
+        assert plan.bounds(at(100)) is None
+        assert waited(plan, 4.0, 5.9, ready=True) is Step.WAIT
+        assert waited(plan, 6.0, ready=True) is Step.COMPLETE
 
     def test_one_that_appears_after_the_timeout_is_not(self) -> None:
-        passage = HandoverPlan(at(0), subscribe_timeout_s=20)
-        assert waited(passage, 19.0, ready=True) is Step.WAIT
-        assert waited(passage, 20.5, ready=True, missing=("/late",)) is Step.WAIT
-        assert waited(passage, 21.0, ready=True, missing=("/late",)) is Step.COMPLETE
+        plan = HandoverPlan(at(0), subscribe_timeout_s=20)
+        assert waited(plan, 19.0, ready=True) is Step.WAIT
+        assert waited(plan, 20.5, ready=True, missing=("/late",)) is Step.WAIT
+        assert waited(plan, 21.0, ready=True, missing=("/late",)) is Step.COMPLETE
 
     def test_the_clock_set_back_abandons_it(self) -> None:
-        passage = HandoverPlan(at(0))
-        waited(passage, 0.2, ready=True)
-        step = passage.advance(at(0.4, stepped_s=-0.15), ready=True, missing=())
+        plan = HandoverPlan(at(0))
+        waited(plan, 0.2, ready=True)
+        step = plan.advance(at(0.4, stepped_s=-0.15), ready=True, missing=())
         assert step is Step.ABANDON
 
     def test_the_clock_set_forward_does_not(self) -> None:
-        passage = HandoverPlan(at(0))
-        waited(passage, 0.2, ready=True)
-        assert passage.advance(at(0.4, stepped_s=3600), ready=True, missing=()) is Step.WAIT
-        assert passage.advance(at(2.3, stepped_s=3600), ready=True, missing=()) is Step.COMPLETE
+        plan = HandoverPlan(at(0))
+        waited(plan, 0.2, ready=True)
+        assert plan.advance(at(0.4, stepped_s=3600), ready=True, missing=()) is Step.WAIT
+        assert plan.advance(at(2.3, stepped_s=3600), ready=True, missing=()) is Step.COMPLETE
 
     def test_a_clock_that_is_slewed_does_not(self) -> None:
-        passage = HandoverPlan(at(0))
+        plan = HandoverPlan(at(0))
         moments = [at(t / 5, stepped_s=-t / 5 * 0.08) for t in range(1, 12)]
-        steps = [passage.advance(moment, ready=True, missing=()) for moment in moments]
+        steps = [plan.advance(moment, ready=True, missing=()) for moment in moments]
         assert steps == [*[Step.WAIT] * 10, Step.COMPLETE]
 
     def test_the_cut_lies_in_the_middle_of_the_time_that_both_recorded(self) -> None:
-        passage = HandoverPlan(at(0))
-        assert passage.bounds(at(1)) is None
-        waited(passage, 3.0, 5.0, ready=True)
-        assert passage.bounds(at(5)) == Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
+        plan = HandoverPlan(at(0))
+        assert plan.bounds(at(1)) is None
+        waited(plan, 3.0, 5.0, ready=True)
+        assert plan.bounds(at(5)) == Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
 
 
 @pytest.mark.parametrize(
