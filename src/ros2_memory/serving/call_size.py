@@ -1,7 +1,8 @@
-"""How much one call may hold, told before anything of it is parsed or checked.
+"""How many values one call may hold, checked before anything of it is parsed.
 
 The arguments of a call are some dozen short values. Parsing hundreds of thousands of them, or
-checking them against a schema, takes the event loop half a second, in which nobody is served.
+validating them against a schema, blocks the event loop for half a second, in which no client is
+served.
 """
 
 from __future__ import annotations
@@ -12,58 +13,59 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-MOST_VALUES: Final = 10_000
-"""Names and values of one message, as its commas and brackets tell."""
-DEEPEST: Final = 64
-_MOST_QUOTES: Final = 4 * MOST_VALUES
-"""Each begins a text to be skipped; a name and a value that is a text have four."""
+MAX_VALUES: Final = 10_000
+"""Keys and values of one message, counted by its commas and brackets."""
+MAX_DEPTH: Final = 64
+_MAX_QUOTES: Final = 4 * MAX_VALUES
+"""A key and a value that is a string have four."""
 
-# An unfinished text ends with the message: nothing of it is looked at twice, whatever stands there.
-_TEXT: Final = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?$)', re.DOTALL)
+# Possessive quantifiers: a string that does not end takes the rest of the message, and no byte is
+# looked at twice, whatever a client sends.
+_STRING: Final = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?$)', re.DOTALL)
 _ALL_BUT_STRUCTURE: Final = bytes(set(range(256)) - set(b"[]{},"))
 _OPENING: Final = b"[{"
 
 
-def too_much_in(text: bytes) -> str | None:
-    """Why a message in JSON is not taken in; None where it may be.
+def excess_in_json(text: bytes) -> str | None:
+    """Returns why a JSON message is refused; None if it may be parsed.
 
-    It need not be well-formed; but its encoding must be UTF-8, as RFC 8259 has it, since in
-    another one it could not be looked through as bytes.
+    The message need not be well-formed, but must be UTF-8, as RFC 8259 demands: another encoding
+    could not be searched as bytes.
     """
     if b"\0" in text:
         return "The request is no JSON in UTF-8.\n"
-    if text.count(b'"') > _MOST_QUOTES:
-        return f"The request holds more than {_MOST_QUOTES} quotation marks.\n"
-    structure = _TEXT.sub(b"", text).translate(None, _ALL_BUT_STRUCTURE)
-    if len(structure) > MOST_VALUES:
-        return f"The request holds more than {MOST_VALUES} values.\n"
+    if text.count(b'"') > _MAX_QUOTES:
+        return f"The request holds more than {_MAX_QUOTES} quotation marks.\n"
+    structure = _STRING.sub(b"", text).translate(None, _ALL_BUT_STRUCTURE)
+    if len(structure) > MAX_VALUES:
+        return f"The request holds more than {MAX_VALUES} values.\n"
     depth = 0
     for bracket in structure.translate(None, b","):
         depth += 1 if bracket in _OPENING else -1
-        if depth > DEEPEST:
-            return f"The request is nested deeper than {DEEPEST} levels.\n"
+        if depth > MAX_DEPTH:
+            return f"The request is nested deeper than {MAX_DEPTH} levels.\n"
     return None
 
 
-def too_much_of(given: Mapping[str, object]) -> str | None:
-    """What is too much of the arguments of a call, naming one; None where all is well.
+def excess_in_arguments(given: Mapping[str, object]) -> str | None:
+    """Returns why the arguments of a call are refused, naming one; None if they are accepted.
 
-    Takes no longer for more than is allowed than for what is.
+    Stops at the limit, so that more than is allowed takes no longer than what is.
     """
-    left = MOST_VALUES - len(given)
+    left = MAX_VALUES - len(given)
     if left < 0:
-        return f"more than {MOST_VALUES} arguments were given; a call has a few"
+        return f"more than {MAX_VALUES} arguments were given; a call has a few"
     for name, argument in given.items():
-        waiting: list[tuple[object, int]] = [(argument, 1)]
-        while waiting:
-            value, depth = waiting.pop()
+        pending: list[tuple[object, int]] = [(argument, 1)]
+        while pending:
+            value, depth = pending.pop()
             if not isinstance(value, dict | list | tuple):
                 continue
             left -= len(value)
             if left < 0:
-                return f"{name[:80]} holds more than {MOST_VALUES} values; a call needs a few"
-            if depth >= DEEPEST:
-                return f"{name[:80]} is nested deeper than {DEEPEST} levels"
+                return f"{name[:80]} holds more than {MAX_VALUES} values; a call needs a few"
+            if depth >= MAX_DEPTH:
+                return f"{name[:80]} is nested deeper than {MAX_DEPTH} levels"
             inner = value.values() if isinstance(value, dict) else value
-            waiting.extend((each, depth + 1) for each in inner)
+            pending.extend((each, depth + 1) for each in inner)
     return None

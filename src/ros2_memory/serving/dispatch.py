@@ -1,7 +1,7 @@
-"""One tool call from arguments to reply: its turn, a worker thread, a deadline, one log event.
+"""Dispatches tool calls: a turn in a queue, a worker thread, a deadline, one log event for each.
 
-Nothing escapes: what a query raises becomes a reply, and what it should not have raised is logged
-with its traceback under the call's correlation id, which is all that the client learns of it.
+Every exception becomes a reply. An unexpected one is logged with its traceback under the call's
+correlation id, and the client receives only that id.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.serving.call_size import too_much_of
+from ros2_memory.serving.call_size import excess_in_arguments
 from ros2_memory.serving.fair_queue import FairQueue
 
 if TYPE_CHECKING:
@@ -44,13 +44,13 @@ QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2
 """Queries are mostly Python, which runs one at a time: more threads would only slow each other.
 
-Those that may take long have places of their own, so that a quick one never waits for them.
+Those that may take long have threads of their own, so that a quick one never waits for them.
 """
 
-_SOONER_S: Final = 0.5
-"""How much before the call a query gives up, so that its own sentence is what the client reads."""
+_QUERY_MARGIN_S: Final = 0.5
+"""How much before the call its query times out, so that the client receives the query's error."""
 
-_WORTH_TELLING_S: Final = 0.5
+_REPORTED_WAIT_S: Final = 0.5
 _LOGGED_CHARS: Final = 300
 _LONGEST_NAME: Final = 64
 
@@ -60,11 +60,13 @@ log = get_logger(__name__)
 class Dispatcher:
     """Answers tool calls from one memory, a bounded number at a time.
 
-    `readable`: what no tool call reaches, but a resource that is read. `log_arguments`: whether log
-    events show what a caller wrote, cut short.
+    `readable`: tools that only the resources use. `log_arguments`: whether log events show what a
+    caller wrote, cut short.
 
     Attributes:
-        tools: what a call can name, in the order of their declaration.
+        tools: the tools that a call can name, in the order of their declaration.
+        quick: the queue of the other tools.
+        blocking: the queue of the tools that are declared as blocking.
     """
 
     def __init__(
@@ -91,7 +93,7 @@ class Dispatcher:
         self._stopping = threading.Event()
 
     def stop(self) -> None:
-        """Has every query that still runs give up, and begins no other: the program can end."""
+        """Makes running queries time out, and begins no others, so that the program can end."""
         self._stopping.set()
         self.quick.stop()
         self.blocking.stop()
@@ -99,58 +101,57 @@ class Dispatcher:
     async def answer(
         self, name: str, given: Mapping[str, object], client: Hashable = None
     ) -> Reply:
-        """The reply to one call, within `call_timeout_s`. Raises nothing but cancellation.
+        """Returns the reply to a call, within `call_timeout_s`. Raises nothing but cancellation.
 
-        Where there are more calls than places, they are begun in turn for each `client`.
+        Where more calls wait than there are threads, `client`s take turns.
         """
         return await self._answer(self._tools, name, given, client)
 
     async def read(self, name: str, given: Mapping[str, object], client: Hashable = None) -> Reply:
-        """The reply to the question behind a resource; the rest as for a call."""
+        """Returns the reply of the tool behind a resource; otherwise as `answer`."""
         return await self._answer(self._readable, name, given, client)
 
     async def _answer(
         self,
-        asked: Mapping[str, Tool],
+        tools: Mapping[str, Tool],
         name: str,
         given: Mapping[str, object],
         client: Hashable,
     ) -> Reply:
         begun = time.perf_counter_ns()
-        patience_s = max(self._call_timeout_s - _SOONER_S, self._call_timeout_s * 0.9)
+        query_timeout_s = max(self._call_timeout_s - _QUERY_MARGIN_S, self._call_timeout_s * 0.9)
         over = threading.Event()
-        call = Call(Deadline.after(patience_s, partial(self._monotonic, over)))
+        call = Call(Deadline.after(query_timeout_s, partial(self._monotonic, over)))
         outcome, chars = "cancelled", 0
         correlation_id = uuid.uuid4().hex[:12]
         with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
             try:
                 try:
-                    outcome, reply = await self._outcome(asked, name, given, call, client)
+                    outcome, reply = await self._outcome(tools, name, given, call, client)
                 except Exception:
                     log.exception("tool_failed")
-                    outcome, reply = self._fault()
+                    outcome, reply = self._internal()
                 chars = len(reply.text)
             finally:
                 over.set()
-                known = name in asked
                 done = Answered(
-                    name if known else UNKNOWN_TOOL,
+                    name if name in tools else UNKNOWN_TOOL,
                     outcome,
                     unix_from_ns(time.perf_counter_ns() - begun),
                     chars,
                     correlation_id,
                     call.stages.as_ms(),
                 )
-                self._tell(done, name, given)
+                self._report(done, name, given)
         return reply
 
-    def _tell(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
-        """Of a call that is over: the log, and whoever observes."""
-        tool, _log = done.tool, log
+    def _report(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
+        """Logs a call that is over, and passes it to the observers."""
+        tool, tool_log = done.tool, log
         if self._log_arguments:
             tool = name if tool != UNKNOWN_TOOL else abbreviate(name)
-            _log = log.bind(arguments=abbreviate(given, _LOGGED_CHARS))
-        _log.info(
+            tool_log = log.bind(arguments=abbreviate(given, _LOGGED_CHARS))
+        tool_log.info(
             "tool_call",
             tool=tool,
             outcome=done.outcome,
@@ -161,74 +162,66 @@ class Dispatcher:
         try:
             self._telemetry.answered(done)
         except Exception:
-            # No answer is worth losing for it.
+            # A fault of an observer must not cost the reply.
             log.exception("telemetry_failed")
 
     def _monotonic(self, over: threading.Event) -> float:
-        """The clock of one call's deadline: its time is up when nobody waits for it any more."""
+        """Returns the time of a call's deadline: infinite when nobody waits for it any more."""
         return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
 
     async def _outcome(
         self,
-        asked: Mapping[str, Tool],
+        tools: Mapping[str, Tool],
         name: str,
         given: Mapping[str, object],
         call: Call,
         client: Hashable,
     ) -> tuple[str, Reply]:
+        wait = _Wait()
         try:
-            tool = _named(name, asked)
-            question = _asked(tool, given)
-        except InvalidArgumentsError as error:
-            return error.code, self._replies.error(error)
-        waits = _Waits()
-        lane = self.blocking if tool.blocking else self.quick
-        late: EpisodicError
-        try:
+            tool = _named(name, tools)
+            if excess := excess_in_arguments(given):
+                raise InvalidArgumentsError(excess)
+            question = tool.question(given)
+            queue = self.blocking if tool.blocking else self.quick
             with anyio.move_on_after(self._call_timeout_s):
-                return await lane.run(client, partial(self._ask, question, call, waits))
-        except BusyError as busy:
-            late = busy
-        else:
-            late = self._late(name, waits)
-        return late.code, self._replies.error(late)
+                return await queue.run(client, partial(self._ask, question, call, wait))
+            raise self._timeout(name, wait)
+        except EpisodicError as error:
+            return error.code, self._replies.error(error)
 
-    def _late(self, name: str, waits: _Waits) -> EpisodicError:
-        """Why there is no answer when the time of a call is up."""
-        if waits.ended_s is None:
+    def _timeout(self, name: str, wait: _Wait) -> EpisodicError:
+        """Returns why there is no answer when the time of a call is up."""
+        if wait.ended_s is None:
             return BusyError(
                 f"{name} waited {self._call_timeout_s:g} s behind other questions and was not "
                 "begun; ask again, and fewer at once"
             )
         return QueryTimeoutError(
-            f"{name} needs more than {self._call_timeout_s:g} s{waits.told()}; "
+            f"{name} needs more than {self._call_timeout_s:g} s{wait.note()}; "
             "ask about a shorter window or a single topic"
         )
 
-    def _ask(self, question: Question, call: Call, waits: _Waits) -> tuple[str, Reply]:
-        """Runs in a worker thread: the query, and the rendering of what it gives."""
-        waits.end()
-        try:
-            return self._told(question, call, waits)
-        except Exception:
-            # Here too, for a thread that nobody waits for any more.
-            log.exception("tool_failed")
-            return self._fault()
-
-    def _told(self, question: Question, call: Call, waits: _Waits) -> tuple[str, Reply]:
+    def _ask(self, question: Question, call: Call, wait: _Wait) -> tuple[str, Reply]:
+        """Runs the query and renders its answer, in a worker thread."""
+        wait.end()
         try:
             answer = question(self._memory, call)
             return "ok", self._replies.answer(answer, from_active=call.used_active)
         except NoDataError as error:
             return f"{error.code}: {error.reason}", self._replies.error(error)
         except QueryTimeoutError as error:
-            told = QueryTimeoutError(f"{error}{waits.told()}", error.searched_back_to)
-            return told.code, self._replies.error(told)
+            noted = QueryTimeoutError(f"{error}{wait.note()}", error.searched_back_to)
+            return noted.code, self._replies.error(noted)
         except EpisodicError as error:
             return error.code, self._replies.error(error)
+        except Exception:
+            # Caught here too, because nobody may be waiting for this thread any more.
+            log.exception("tool_failed")
+            return self._internal()
 
-    def _fault(self) -> tuple[str, Reply]:
-        """The reply to a call that failed through a fault of this program."""
+    def _internal(self) -> tuple[str, Reply]:
+        """Returns the reply to a call that failed through a fault of this program."""
         context = structlog.contextvars.get_contextvars()
         return "internal", self._replies.internal(str(context.get("correlation_id")))
 
@@ -241,13 +234,7 @@ def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
     raise InvalidArgumentsError(f"there is no tool {abbreviate(name)}; {hint}")
 
 
-def _asked(tool: Tool, given: Mapping[str, object]) -> Question:
-    if too_much := too_much_of(given):
-        raise InvalidArgumentsError(too_much)
-    return tool.question(given)
-
-
-class _Waits:
+class _Wait:
     """How long a call waited for its turn."""
 
     def __init__(self) -> None:
@@ -255,12 +242,12 @@ class _Waits:
         self.ended_s: float | None = None
 
     def end(self) -> None:
-        """Its turn has come."""
+        """Ends the wait: the call's turn has come."""
         self.ended_s = time.monotonic()
 
-    def told(self) -> str:
-        """What a sentence on lack of time says of it; nothing where it was short."""
+    def note(self) -> str:
+        """Returns what the error of a timeout says about the wait; nothing if it was short."""
         waited = 0.0 if self.ended_s is None else self.ended_s - self._begun_s
-        if waited < _WORTH_TELLING_S:
+        if waited < _REPORTED_WAIT_S:
             return ""
         return f" (it waited {waited:.1f} s of its time behind other questions)"

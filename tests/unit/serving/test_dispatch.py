@@ -365,7 +365,7 @@ async def test_questions_that_cannot_be_stopped_do_not_become_ever_more_threads(
 async def test_a_timeout_after_a_wait_says_how_long_the_wait_was(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("ros2_memory.serving.dispatch._WORTH_TELLING_S", 0.0)
+    monkeypatch.setattr("ros2_memory.serving.dispatch._REPORTED_WAIT_S", 0.0)
     late = tool("late", raising(QueryTimeoutError("too long", 5)))
     reply = await served(late).dispatcher.answer("late", {})
     told = json.loads(reply.text)

@@ -176,7 +176,7 @@ async def test_health_answers_while_the_first_scan_runs(tmp_path: Path) -> None:
 
     memory = memory_at(tmp_path)
     slow = Slow(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
-    told = await Health(replace(memory, index=slow), "1", patience_s=0.01)()
+    told = await Health(replace(memory, index=slow), "1", timeout_s=0.01)()
     released.set()
     # On a busy machine patience may end before it is even begun.
     assert not begun.is_set() or ended.wait(10)
@@ -198,7 +198,7 @@ async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
 
     memory = memory_at(tmp_path)
     index = Hanging(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
-    health = Health(replace(memory, index=index), "1", patience_s=0.001)
+    health = Health(replace(memory, index=index), "1", timeout_s=0.001)
     before = threading.active_count()
     told = [await health() for _ in range(10)]
     during = threading.active_count()

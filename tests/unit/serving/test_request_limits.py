@@ -7,7 +7,7 @@ import anyio
 import pytest
 
 from ros2_memory.serving import request_limits
-from ros2_memory.serving.request_limits import MOST_BODY_BYTES, MOST_UNREAD, RequestLimits
+from ros2_memory.serving.request_limits import MAX_BODY_BYTES, MAX_UNREAD, RequestLimits
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -96,11 +96,11 @@ async def test_a_body_is_passed_on_whole(parts: list[bytes]) -> None:
 async def test_a_body_too_large_is_refused_by_what_is_counted() -> None:
     client = await asked(RequestLimits(echo), Client(*[b"x" * MIB] * 1000, content_length="5"))
     assert client.status == 413
-    assert client.told == f"The request is larger than {MOST_BODY_BYTES} bytes.\n"
-    assert client.taken == MOST_BODY_BYTES // MIB + 1
+    assert client.told == f"The request is larger than {MAX_BODY_BYTES} bytes.\n"
+    assert client.taken == MAX_BODY_BYTES // MIB + 1
 
 
-@pytest.mark.parametrize("length", [str(MOST_BODY_BYTES + 1), "9" * 5000])
+@pytest.mark.parametrize("length", [str(MAX_BODY_BYTES + 1), "9" * 5000])
 async def test_a_body_too_large_is_refused_by_its_stated_length_before_it_is_read(
     length: str,
 ) -> None:
@@ -111,7 +111,7 @@ async def test_a_body_too_large_is_refused_by_its_stated_length_before_it_is_rea
 async def test_all_bodies_together_are_bounded_and_given_back(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(request_limits, "MOST_HELD_BYTES", 3 * MIB // 2)
+    monkeypatch.setattr(request_limits, "MAX_BUFFERED_BYTES", 3 * MIB // 2)
     answering = anyio.Event()
 
     async def slow(scope: Any, receive: Any, send: Any) -> None:
@@ -226,7 +226,7 @@ async def test_messages_are_taken_without_bound_while_the_stream_is_read() -> No
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(asked, app, stream)
         await anyio.wait_all_tasks_blocked()
-        for _ in range(3 * MOST_UNREAD):
+        for _ in range(3 * MAX_UNREAD):
             assert (await asked(app, message())).status == 202
         await events.aclose()
 
@@ -240,8 +240,8 @@ async def test_few_messages_are_taken_from_a_client_that_does_not_read_its_strea
         stream.reads = anyio.Event()
         await events.send(b"unread")
         await anyio.wait_all_tasks_blocked()
-        statuses = [(await asked(app, message())).status for _ in range(MOST_UNREAD + 3)]
-        assert statuses == [202] * MOST_UNREAD + [429] * 3
+        statuses = [(await asked(app, message())).status for _ in range(MAX_UNREAD + 3)]
+        assert statuses == [202] * MAX_UNREAD + [429] * 3
         other = Client(b"{}", path="/messages/", query="session_id=" + "f" * 32)
         assert (await asked(app, other)).status == 202
         stream.reads.set()
@@ -271,8 +271,8 @@ async def test_messages_are_bounded_however_their_session_is_spelt(query: str) -
         stream.reads = anyio.Event()
         await events.send(b"unread")
         await anyio.wait_all_tasks_blocked()
-        statuses = [(await asked(app, message(query))).status for _ in range(MOST_UNREAD + 1)]
-        assert statuses == [202] * MOST_UNREAD + [429]
+        statuses = [(await asked(app, message(query))).status for _ in range(MAX_UNREAD + 1)]
+        assert statuses == [202] * MAX_UNREAD + [429]
         stream.reads.set()
         await events.aclose()
 
