@@ -1,6 +1,8 @@
 """`ros2-memory-server`: the query server, over stdio or over HTTP.
 
-In stdio mode stdout is the wire, so nothing else is ever written there; logs go to stderr.
+Parses the command line, loads the configuration, builds the server and serves. Calls are dispatched
+in `serving/dispatch.py`. Over stdio, stdout carries the protocol, so nothing else is ever written
+there; logs go to stderr.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import signal
 import sys
 import threading
 from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn
 
 import anyio
 import uvicorn
@@ -42,9 +44,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import FrameType
 
-    from pydantic import SecretStr
-
-    from ros2_memory.config import ServerSettings
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.listen import Address
@@ -60,24 +59,24 @@ log = get_logger("ros2_memory.server")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Serves until it is told to stop, and returns the exit code.
+    """Serves until a signal or the end of stdin, and returns the exit code.
 
     0: stopped by SIGTERM, SIGINT or the end of stdin; 1: the address cannot be listened on; 2: the
     configuration or the command line is refused, or a token is missing where there must be one.
     """
     overrides: list[str] = _parser().parse_args(argv).overrides
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, _stopped)
+        signal.signal(number, _exit_on_signal)
     try:
         _run(overrides)
     except CannotListenError as error:
         sys.stderr.write(f"{PROGRAM}: {error}\n")
-        return _left(CANNOT_LISTEN)
-    return _left(0)
+        return _end_threads(CANNOT_LISTEN)
+    return _end_threads(0)
 
 
 def _run(overrides: Sequence[str]) -> None:
-    """Serves until it is told to stop.
+    """Loads the configuration, builds the server, and serves.
 
     Raises:
         CannotListenError: the address cannot be listened on.
@@ -88,57 +87,45 @@ def _run(overrides: Sequence[str]) -> None:
         configure_logging(
             settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
         )
-        front = None if settings.server.transport == "stdio" else _front(settings.server)
+        at = settings.server
+        address, token = None, None
+        if at.transport != "stdio":
+            # Before anything is built, so that a refusal comes at once.
+            address = resolved(at.host, at.port)
+            token = take_token(os.environ, host=at.host, loopback=address.is_loopback)
         memory = build_memory(settings)
         telemetry = build_telemetry(settings, memory)
         server = build_server(settings, memory, telemetry)
-    filler = build_backfill(settings, memory)
-    health = Health(memory, package_version(), filler)
-    background = partial(_in_background, memory, filler, settings.reader.index_refresh_s, overrides)
+    backfill = build_backfill(settings, memory)
+    health = Health(memory, package_version(), backfill)
+    background = partial(
+        _in_background, memory, backfill, settings.reader.index_refresh_s, overrides
+    )
     log.info(
         "starting",
         version=package_version(),
         bag_dir=str(settings.recording.bag_dir.absolute()),
-        transport=settings.server.transport,
+        transport=at.transport,
     )
     try:
-        if front is None:
+        if address is None:
             anyio.run(_serve_stdio, server, background)
         else:
             app = web_app(
                 server,
-                host=settings.server.host,
+                host=at.host,
                 health=health,
                 background=background,
-                api_token=front.token.get_secret_value() if front.token else None,
+                api_token=token.get_secret_value() if token else None,
                 metrics=telemetry.metrics,
             )
-            _serve_http(server, app, front.address)
+            _serve_http(server, app, address)
     except SystemExit:
         log.info("stopped")
     finally:
         server.dispatcher.stop()
         health.stop()
         telemetry.stop()
-
-
-class _Front(NamedTuple):
-    """Where clients come to, and what they have to show there."""
-
-    address: Address
-    token: SecretStr | None
-
-
-def _front(at: ServerSettings) -> _Front:
-    """Finds both before anything is built.
-
-    Raises:
-        CannotListenError: the host stands for no address.
-        ConfigError: a token is missing, or cannot be used.
-    """
-    address = resolved(at.host, at.port)
-    token = take_token(os.environ, host=at.host, loopback=address.is_loopback)
-    return _Front(address, token)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -159,16 +146,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _stopped(_number: int, _frame: FrameType | None) -> NoReturn:
-    """Stopping is what was asked for: exit code 0."""
+def _exit_on_signal(_number: int, _frame: FrameType | None) -> NoReturn:
     raise SystemExit(0)
 
 
-def _left(code: int) -> int:
-    """The exit code, for a program whose threads are done.
+def _end_threads(code: int) -> int:
+    """Returns the exit code, or ends the process where a thread goes on.
 
-    A thread that waits for stdin, or scans a large directory, cannot be told to stop; the
-    interpreter would wait for it. Nothing is lost with it: bags are only read.
+    A thread that waits for stdin, or scans a large directory, cannot be stopped, and the
+    interpreter would wait for it. Ending it loses nothing: bags are only read.
     """
     others = [
         thread
@@ -185,14 +171,14 @@ def _left(code: int) -> int:
 
 
 async def _in_background(
-    memory: Memory, filler: Backfill, every_s: float, overrides: Sequence[str]
+    memory: Memory, backfill: Backfill, every_s: float, overrides: Sequence[str]
 ) -> None:
     """Keeps the index fresh and the catalogue full, until it is cancelled."""
     program = [sys.executable, "-m", "ros2_memory.cli", "index"]
     helper = [*program, "--for-server", str(os.getpid()), "--", *overrides]
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(keep_fresh, memory, every_s)
-        tasks.start_soon(keep_backfilled, filler, helper, every_s)
+        tasks.start_soon(keep_backfilled, backfill, helper, every_s)
 
 
 async def _serve_stdio(server: EpisodicServer, background: Background) -> None:
@@ -211,7 +197,7 @@ def _serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
         ws="none",
         log_config=None,
         log_level="warning",
-        # Nobody needs it, and it would show whatever somebody puts into a query string.
+        # It would show whatever a client puts into a query string.
         access_log=False,
         timeout_graceful_shutdown=1,
     )
@@ -220,7 +206,7 @@ def _serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
 
 
 class _Listener(uvicorn.Server):
-    """Uvicorn, with an end to the event streams and the queries when it stops."""
+    """Runs uvicorn, and ends the event streams and the queries when it stops."""
 
     def __init__(self, config: uvicorn.Config, server: EpisodicServer, app: WebApp) -> None:
         super().__init__(config)
@@ -230,7 +216,7 @@ class _Listener(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
         for each in sockets or []:
-            # More may wait for their turn than are taken in at once.
+            # More connections may wait than are accepted at once.
             each.listen(BACKLOG)
             host, port = each.getsockname()[:2]
             shown = f"[{host}]" if ":" in host else host

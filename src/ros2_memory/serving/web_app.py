@@ -1,4 +1,4 @@
-"""The one web application: `/sse` with `/messages/`, `/mcp`, `/health` and a page, on one port."""
+"""The web application: `/sse` with `/messages/`, `/mcp`, `/health`, `/metrics` and a page."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 STREAM_PATH: Final = "/sse"
 METRICS_PATH: Final = "/metrics"
 GRACE_S: Final = 0.4
-"""How long requests under way may still take when the server stops; event streams end at once."""
+"""How long requests may still take when the server stops; event streams end at once."""
 
 THREADS: Final = 4
-"""For what nobody asked, such as a look at the bags. One that was needed once stays a while."""
+"""For work in the background, such as scans. anyio keeps an idle thread for a while."""
 
 _MCP_PATH: Final = "/mcp"
 _SESSION_HEADER: Final = "mcp-session-id"
@@ -59,14 +59,18 @@ def web_app(
     api_token: str | None = None,
     metrics: Callable[[], Awaitable[Exposition]] | None = None,
 ) -> WebApp:
-    """The application that listens on `host`.
+    """Returns the application that listens on `host`.
 
-    `background` runs from start to end of the application, and is cancelled then. `metrics` gives
-    what `/metrics` shows; without it there is no such path. `api_token` is demanded of every
-    request; without it `/health` shows its status alone, and on the loopback address the page is
-    shown, which asks for it.
+    Args:
+        server: answers `/sse`, `/messages/` and `/mcp`.
+        host: the name or address that it listens on.
+        health: returns what `/health` shows.
+        background: runs from start to end of the application, and is cancelled then.
+        api_token: demanded of every request, if there is one. Requests without it see only the
+            status of `/health`, and on the loopback address the page, which asks for it.
+        metrics: returns what `/metrics` shows; without it there is no such path.
     """
-    # `ForgeryGuard` stands before all routes, and knows the addresses of a host such as 0.0.0.0.
+    # `ForgeryGuard` checks all routes instead, and knows the addresses of a host such as 0.0.0.0.
     guarded = TransportSecuritySettings(enable_dns_rebinding_protection=False)
     streams = server.sse_app(sse_path=STREAM_PATH, transport_security=guarded)
     requests = server.streamable_http_app(
@@ -74,11 +78,11 @@ def web_app(
     )
 
     async def show_health(request: Request) -> JSONResponse:
-        told = await health()
+        report = await health()
         if api_token is not None and not request.scope.get(AUTHENTICATED, False):
-            # Enough for whoever only watches that the server is up.
-            told = {"status": told["status"]}
-        return JSONResponse(told)
+            # Enough for a monitor that only watches that the server is up.
+            report = {"status": report["status"]}
+        return JSONResponse(report)
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
@@ -90,59 +94,54 @@ def web_app(
 
     routes = [*streams.routes, *requests.routes, Route(HEALTH_PATH, show_health, methods=["GET"])]
     if metrics is not None:
-        routes.append(Route(METRICS_PATH, _showing(metrics), methods=["GET"]))
+
+        async def show_metrics(_request: Request) -> Response:
+            exposition = await metrics()
+            return Response(exposition.body, headers={"content-type": exposition.content_type})
+
+        routes.append(Route(METRICS_PATH, show_metrics, methods=["GET"]))
     app: ASGIApp = RequestLimits(SessionIds(Starlette(routes=routes, lifespan=lifespan)))
     if host.lower() not in LOOPBACK_NAMES:
         app = Page(app)
     if api_token is not None:
         app = TokenGate(app, api_token)
     if host.lower() in LOOPBACK_NAMES:
-        # It holds no data, and a browser cannot show a token before it has a page to ask for it.
-        # Where others can reach the server, the token comes first nevertheless.
+        # The page comes before the token: it holds no data, and asks for the token. Where other
+        # machines can reach the server, the token comes first.
         app = Page(app)
     return WebApp(ForgeryGuard(app, host, admits=api_token is None))
 
 
-def _showing(
-    metrics: Callable[[], Awaitable[Exposition]],
-) -> Callable[[Request], Awaitable[Response]]:
-    async def show(_request: Request) -> Response:
-        shown = await metrics()
-        return Response(shown.body, headers={"content-type": shown.content_type})
-
-    return show
-
-
 class WebApp:
-    """Ends what is under way when the server stops, which an event stream never does by itself."""
+    """Ends open requests when the server stops, which an event stream never does by itself."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._under_way: set[_Exchange] = set()
+        self._open: set[_OpenRequest] = set()
 
     def stop(self) -> None:
         """Ends the event streams now, and other requests after `GRACE_S`."""
-        for exchange in self._under_way:
-            exchange.stop()
+        for request in self._open:
+            request.stop()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
+        """Handles an ASGI connection."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        exchange = _Exchange(scope, receive, send)
-        self._under_way.add(exchange)
+        request = _OpenRequest(scope, receive, send)
+        self._open.add(request)
         try:
-            await exchange.run(self._app)
+            await request.run(self._app)
         finally:
-            self._under_way.discard(exchange)
+            self._open.discard(request)
 
 
-class _Exchange:
+class _OpenRequest:
     """One request and its response.
 
-    An event stream is ended by telling the application that the client has left, which is the end
-    that it knows how to come to; whatever it sends after that goes nowhere.
+    An event stream is ended by a disconnect message, which the application handles as if the
+    client had left; what it sends afterwards is discarded.
     """
 
     def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -150,49 +149,49 @@ class _Exchange:
         self._receive = receive
         self._send = send
         self._is_stream = scope["path"] == STREAM_PATH
-        self._begun = False
-        self._left = anyio.Event()
+        self._has_begun = False
+        self._disconnected = anyio.Event()
         self._limit = anyio.CancelScope()
 
     def stop(self) -> None:
-        """Ends it: a stream at once, what else there is within `GRACE_S`."""
+        """Ends an event stream at once, and another request after `GRACE_S`."""
         if self._is_stream:
-            self._left.set()
+            self._disconnected.set()
         self._limit.deadline = anyio.current_time() + GRACE_S
 
     async def run(self, app: ASGIApp) -> None:
-        """Runs it; a response that was stopped on its way is brought to an end."""
+        """Runs the application, and completes a response that was stopped."""
         with self._limit:
             await app(self._scope, self.receive, self.send)
-        if not self._limit.cancelled_caught and not self._left.is_set():
+        if not self._limit.cancelled_caught and not self._disconnected.is_set():
             return
-        if self._begun:
+        if self._has_begun:
             await self._send({"type": "http.response.body", "body": b"", "more_body": False})
         else:
             stopping = PlainTextResponse("The server is stopping.\n", status_code=503)
             await stopping(self._scope, self._receive, self._send)
 
     async def receive(self) -> Message:
-        """The client's next message, or its leaving where the stream is to end."""
+        """Returns the client's next message, or a disconnect where the stream is to end."""
         if not self._is_stream:
             return await self._receive()
         message: Message = {"type": "http.disconnect"}
 
-        async def hear() -> None:
+        async def forward() -> None:
             nonlocal message
             message = await self._receive()
             tasks.cancel_scope.cancel()
 
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(hear)
-            await self._left.wait()
+            tasks.start_soon(forward)
+            await self._disconnected.wait()
             tasks.cancel_scope.cancel()
         return message
 
     async def send(self, message: Message) -> None:
-        """Passes a message to the client."""
-        if not self._left.is_set():
-            self._begun = True
+        """Passes a message to the client, unless the stream was ended."""
+        if not self._disconnected.is_set():
+            self._has_begun = True
             await self._send(message)
 
 
