@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from benchmarks import backlog, digests, footprint, ours, report, serving
+from benchmarks import backlog, commands, digests, footprint, ours, report, serving
 from benchmarks.bags import HOUR, MESSAGES_OF_A_SPLIT, WEEK, made
 from benchmarks.copies import copied
 from benchmarks.questions import QUESTIONS, Case
@@ -82,7 +82,12 @@ def _hour(
     rows = measured({slug: QUESTIONS[slug] for slug in slugs}, case, runs)
     if not whole:
         return rows, []
-    return rows, [digests.cost(case, runs), *backlog.figures(history), *footprint.figures(history)]
+    return rows, [
+        digests.cost(case, runs),
+        *backlog.figures(history),
+        *footprint.figures(history),
+        *commands.figures(history),
+    ]
 
 
 def _week(

@@ -47,7 +47,11 @@ class Endless:
 async def serving(query: Endless) -> AsyncIterator[tuple[int, Dispatcher]]:
     schema: dict[str, Any] = {"type": "object", "properties": {}}
     asked = Tool(
-        "endless", "Endless", "Never ends.", schema, True, lambda _: lambda _, call: query.ask(call)
+        "endless",
+        "Endless",
+        lambda: ("Never ends.", schema),
+        True,
+        lambda _: lambda _, call: query.ask(call),
     )
     replies = Replies(Path("bags"), 1000)
     dispatcher = Dispatcher(cast("Memory", None), [asked], replies, call_timeout_s=3600)

@@ -4,7 +4,6 @@ A command's module is imported when the command is run, so that `--help` and she
 wait for the libraries of all of them.
 """
 
-import gc
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -161,14 +160,7 @@ class LazyCommand(TyperCommand):
 
     def _load(self) -> "Command":
         module, _, attribute = COMMANDS[self._name].path.rpartition(".")
-        # Modules live as long as the process. Collecting garbage among them while they are imported
-        # finds nothing, and takes about a tenth of the processor time of a command's start.
-        gc.disable()
-        try:
-            loaded: object = getattr(import_module(f"{__package__}.{module}"), attribute)
-        finally:
-            gc.freeze()
-            gc.enable()
+        loaded: object = getattr(import_module(f"{__package__}.{module}"), attribute)
         parent = typer.Typer(add_completion=False, rich_markup_mode=None)
         if isinstance(loaded, typer.Typer):
             parent.add_typer(loaded, name=self._name, epilog=epilog(self._name))

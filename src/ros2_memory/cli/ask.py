@@ -67,12 +67,13 @@ def ask(
         loaded = load_for(bag_dir, settings)
         memory = open_memory(loaded, verbose=verbose)
         dispatcher = build_dispatcher(loaded, memory)
-        schemas = {each.name: each.schema for each in dispatcher.tools}
+        tools = {each.name: each for each in dispatcher.tools}
         if tool is None:
-            rows: list[JsonValue] = [_tool_row(*each) for each in schemas.items()]
+            rows: list[JsonValue] = [_tool_row(each.name, each.schema) for each in dispatcher.tools]
             print_reply(stdout_console(), rows)
             return
-        arguments = parse_arguments(given or (), schemas.get(tool, {}))
+        schema = tools[tool].schema if tool in tools else {}
+        arguments = parse_arguments(given or (), schema)
         with spinner(f"asking {tool}"):
             (reply,) = call_tools(dispatcher, {tool: arguments})
     answer: JsonValue = json.loads(reply.text)
@@ -82,8 +83,8 @@ def ask(
         print_line(NEVER)
     else:
         print_reply(stdout_console(), answer, unix_from_ns(present(memory)))
-    if tool not in schemas:
-        typer.echo(f"tools: {', '.join(schemas)}", err=True)
+    if tool not in tools:
+        typer.echo(f"tools: {', '.join(tools)}", err=True)
     if reply.is_error or is_error(answer):
         raise typer.Exit(EXIT_NEGATIVE)
 

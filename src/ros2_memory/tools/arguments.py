@@ -162,7 +162,8 @@ _SearchField: TypeAlias = Annotated[
 class Arguments(BaseModel):
     """The arguments of one query. Unknown ones are refused before a model sees them."""
 
-    model_config = ConfigDict(frozen=True)
+    # Few of them are needed by a program that asks one question: each is built when it is used.
+    model_config = ConfigDict(frozen=True, defer_build=True)
 
 
 class TimeArgument(Arguments, ABC):

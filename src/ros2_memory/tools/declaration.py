@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
 from ros2_memory.tools.arguments import Arguments
@@ -24,21 +24,35 @@ Question: TypeAlias = "Callable[[Memory, Call], Answer]"
 A = TypeVar("A", bound=Arguments)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Tool:
     """One tool as clients see it.
 
-    `question` checks a call's arguments and binds them to the query. `writes`: it changes what is
-    stored.
+    `describe` returns the description and the JSON schema of the arguments. `question` checks a
+    call's arguments and binds them to the query. `writes`: it changes what is stored.
     """
 
     name: str
     title: str
-    description: str
-    schema: JsonObject
+    describe: Callable[[], tuple[str, JsonObject]]
     blocking: bool
     question: Callable[[Mapping[str, object]], Question]
     writes: bool = False
+
+    @property
+    def description(self) -> str:
+        """The text that tells planners what the tool answers."""
+        return self._described[0]
+
+    @property
+    def schema(self) -> JsonObject:
+        """The JSON schema of the arguments."""
+        return self._described[1]
+
+    @cached_property
+    def _described(self) -> tuple[str, JsonObject]:
+        # Made when it is asked for: 20 ms for all tools, of which a program may call one.
+        return self.describe()
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,19 +85,23 @@ class ToolDeclaration(Generic[A]):
         """Yields a tool for each name; `defaults` fill the description's placeholders."""
         for each in self.names:
             signature = Signature(self.arguments, each.when)
-            description = self._description(each, defaults)
-            text = f"{description} Example: {to_json_text(signature.example)}"
-            if self.blocking:
-                text = f"Blocking, up to {defaults['timeout']} s. {text}"
             yield Tool(
                 each.name,
                 each.title,
-                text,
-                signature.json_schema(),
+                partial(self._describe, each, signature, defaults),
                 self.blocking,
                 partial(self._question, signature),
                 self.writes,
             )
+
+    def _describe(
+        self, name: ToolName, signature: Signature[A], defaults: Mapping[str, object]
+    ) -> tuple[str, JsonObject]:
+        description = self._description(name, defaults)
+        text = f"{description} Example: {to_json_text(signature.example)}"
+        if self.blocking:
+            text = f"Blocking, up to {defaults['timeout']} s. {text}"
+        return text, signature.json_schema()
 
     def _description(self, name: ToolName, defaults: Mapping[str, object]) -> str:
         """Returns the full description for the first name, and a reference to it for the others."""

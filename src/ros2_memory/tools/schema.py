@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
+from functools import cached_property
 from itertools import islice
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
@@ -40,13 +41,21 @@ class Signature(Generic[A]):
     def __init__(self, arguments: type[A], when: type[TimeArgument] | None = None) -> None:
         self._arguments = arguments
         self._when = when
-        self._properties: dict[str, JsonObject] = {}
-        for name, schema in _properties(arguments).items():
-            unfolded = when is not None and name == when.replaces
-            self._properties.update(_properties(when) if when and unfolded else {name: schema})
-        self._required = [
-            name for name, schema in self._properties.items() if "default" not in schema
-        ]
+
+    @cached_property
+    def _properties(self) -> dict[str, JsonObject]:
+        """The JSON schema of each argument."""
+        properties: dict[str, JsonObject] = {}
+        for name, schema in _properties(self._arguments).items():
+            if self._when is not None and name == self._when.replaces:
+                properties.update(_properties(self._when))
+            else:
+                properties[name] = schema
+        return properties
+
+    @cached_property
+    def _required(self) -> list[str]:
+        return [name for name, schema in self._properties.items() if "default" not in schema]
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -57,7 +57,13 @@ def dispatcher(*observers: Observer) -> Dispatcher:
     schema: dict[str, Any] = {"type": "object", "properties": {}}
     questions: dict[str, Any] = {"good": good, "empty": empty, "broken": broken}
     tools = [
-        Tool(name, name, "Asks.", schema, blocking=False, question=partial(asking, question))
+        Tool(
+            name,
+            name,
+            lambda: ("Asks.", schema),
+            blocking=False,
+            question=partial(asking, question),
+        )
         for name, question in questions.items()
     ]
     replies = Replies(Path("bags"), 1000)

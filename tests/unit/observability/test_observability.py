@@ -78,7 +78,9 @@ class TestMetrics:
 
     async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole(self) -> None:
         metrics = Metrics(lambda: (), "1")
-        tools = [Tool("full", "f", "A.", {}, blocking=False, question=partial(asking, "full"))]
+        tools = [
+            Tool("full", "f", lambda: ("A.", {}), blocking=False, question=partial(asking, "full"))
+        ]
         dispatcher = Dispatcher(
             cast("Memory", None),
             tools,
@@ -169,7 +171,7 @@ def asking(name: str, _given: Any) -> Any:
 def traced() -> EpisodicServer:
     schema: dict[str, Any] = {"type": "object", "properties": {}}
     tools = [
-        Tool(name, name, "Asks.", schema, blocking=False, question=partial(asking, name))
+        Tool(name, name, lambda: ("Asks.", schema), blocking=False, question=partial(asking, name))
         for name in ("full", "empty")
     ]
     provider: Any = trace.get_tracer_provider()

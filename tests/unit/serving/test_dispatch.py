@@ -51,7 +51,7 @@ def tool(name: str, ask: Callable[[Call], Answer], *, blocking: bool = False) ->
         return lambda _memory, call: ask(call)
 
     schema: dict[str, Any] = {"type": "object", "properties": {}}
-    return Tool(name, name.title(), f"What {name} does.", schema, blocking, question)
+    return Tool(name, name.title(), lambda: (f"What {name} does.", schema), blocking, question)
 
 
 def value(shown: Any) -> results.TopicValue:

@@ -38,7 +38,9 @@ def app(
 ) -> WebApp:
     schema: dict[str, Any] = {"type": "object", "properties": {}}
     reply = results.TopicValue("/a", "a/msg/A", Sample(0, 7))
-    tool = Tool("ask", "Ask", "Asks.", schema, blocking=False, question=lambda _: lambda *_: reply)
+    tool = Tool(
+        "ask", "Ask", lambda: ("Asks.", schema), blocking=False, question=lambda _: lambda *_: reply
+    )
     dispatcher = Dispatcher(
         cast("Memory", None), [tool], Replies(Path("bags"), 1000), call_timeout_s=5
     )
