@@ -130,11 +130,11 @@ def _moved_events(story: TopicEvents, by: int) -> TopicEvents:
         story,
         first=story.first + by,
         last=story.last + by,
-        seen=story.seen.moved(by),
+        visible=story.visible.moved(by),
         known=tuple(each._replace(at=each.at + by) for each in story.known),
-        flips=tuple(each._replace(time=each.time + by) for each in story.flips),
-        faults=tuple(
-            each._replace(first=each.first + by, last=each.last + by) for each in story.faults
+        toggles=tuple(each._replace(time=each.time + by) for each in story.toggles),
+        errors=tuple(
+            each._replace(first=each.first + by, last=each.last + by) for each in story.errors
         ),
     )
 

@@ -1,4 +1,4 @@
-"""Poses near a place as stays: when each began and ended, and how near the robot came."""
+"""Groups poses near a point into dwells: when each began and ended, and how near the robot came."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import TimeWindow
 
 FLICKER_NS: Final[Ns] = 3 * NS_PER_S
-"""A robot that is outside for less did not leave."""
+"""A robot that is outside for less than this did not leave."""
 
 
 class Approach(NamedTuple):
-    """A distance (m, in the plane) from the place, and when; the lesser of two is the closer."""
+    """A distance (m, in the plane) from the point, and when; the lesser of two is the closer."""
 
     distance_m: float
     time: Ns
@@ -25,7 +25,7 @@ class Approach(NamedTuple):
 class Unread(NamedTuple):
     """A time in which every pose is within the radius, and none is closer than the bound.
 
-    `here` is where the place is (m) in the frame of these poses.
+    `here` is the point (m) in the frame of these poses.
     """
 
     bound: Approach
@@ -35,10 +35,10 @@ class Unread(NamedTuple):
 
 @dataclass(slots=True)
 class Dwell:
-    """A visit that is gone through from its end.
+    """A visit, which is read from its end backwards.
 
-    `closest` is that of the poses read one by one; `unread` are the times of the others. `left`:
-    before it, so far as it is known, the robot was elsewhere; `begun`: it began here.
+    `closest` is the closest of the poses read one by one; `unread` are the times of the others.
+    `left`: before it, as far as is known, the robot was elsewhere; `begun`: its begin is known.
     """
 
     departed: Ns
@@ -50,10 +50,10 @@ class Dwell:
 
 
 class DwellBuilder:
-    """Takes poses from the newest on, near the place or not.
+    """Takes poses from the newest on, near the point or not.
 
     Attributes:
-        all: the stays so far, newest first.
+        all: the dwells so far, newest first.
     """
 
     def __init__(self, limit: int) -> None:
@@ -62,31 +62,31 @@ class DwellBuilder:
         self._open: Dwell | None = None
 
     def near(self, approach: Approach, last: Ns | None = None) -> None:
-        """A pose is within the radius; with `last`, every one until then is, at the same place."""
-        stay = self._at(approach.time, approach.time if last is None else last)
-        stay.closest = approach if stay.closest is None else min(approach, stay.closest)
+        """Takes a pose within the radius; with `last`, all until then are at that place."""
+        dwell = self._at(approach.time, approach.time if last is None else last)
+        dwell.closest = approach if dwell.closest is None else min(approach, dwell.closest)
 
     def near_throughout(self, first: Ns, last: Ns, unread: Unread) -> None:
-        """Every pose from `first` to `last` is within the radius, none long after another."""
+        """Takes a time in which every pose is within the radius, none long after another."""
         self._at(first, last).unread.append(unread)
 
     def _at(self, first: Ns, last: Ns) -> Dwell:
-        """The stay that goes on from `first` to `last`."""
-        stay = self._open
-        if stay is not None:
-            allowed = FLICKER_NS if stay.left else SILENCE_NS
-            if stay.arrived - last > allowed:
+        """Returns the dwell that goes on from `first` to `last`."""
+        dwell = self._open
+        if dwell is not None:
+            allowed = FLICKER_NS if dwell.left else SILENCE_NS
+            if dwell.arrived - last > allowed:
                 self.end()
-                stay = None
-        if stay is None:
-            self._open = stay = Dwell(last, first)
-            self.all.append(stay)
-        stay.arrived = first
-        stay.left = False
-        return stay
+                dwell = None
+        if dwell is None:
+            self._open = dwell = Dwell(last, first)
+            self.all.append(dwell)
+        dwell.arrived = first
+        dwell.left = False
+        return dwell
 
     def away(self, at: Ns) -> bool:
-        """The robot was elsewhere then; gives whether a stay may still go on further back."""
+        """Takes a pose that is elsewhere; returns whether a dwell may still go on further back."""
         if self._open is not None:
             self._open.left = True
             if self._open.arrived - at > FLICKER_NS:
@@ -94,17 +94,17 @@ class DwellBuilder:
         return self._open is not None
 
     def end(self) -> None:
-        """What comes next belongs to another visit."""
+        """Ends the dwell: what comes next belongs to another."""
         if self._open is not None:
             self._open.begun = True
             self._open = None
 
     @property
     def under_way(self) -> bool:
-        """Whether a visit may go on further back."""
+        """Whether a dwell may go on further back."""
         return self._open is not None
 
     @property
     def enough(self) -> bool:
-        """Whether nothing that comes can change the newest visits."""
-        return len(self.all) > self._limit and all(stay.begun for stay in self.all[: self._limit])
+        """Whether no older pose can change the newest dwells."""
+        return len(self.all) > self._limit and all(dwell.begun for dwell in self.all[: self._limit])

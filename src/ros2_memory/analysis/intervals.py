@@ -1,11 +1,11 @@
-"""When things were in view: message by message, or whole bags at once as columns of numbers.
+"""Visible intervals: when objects were in view, by message or by whole bags as columns of numbers.
 
-A thing stays in view from one message that has it to the next where these follow each other on its
-topic within `SILENCE_NS`, or lie within `FLICKER_NS` whatever is between them: detectors miss
-things now and then. Where a history is cut into bags changes nothing.
+An object stays in view from one message that contains it to the next where these follow each other
+on the topic within `SILENCE_NS`, or are within `FLICKER_NS` whatever is between them: detectors
+miss objects now and then. Where a history is cut into bags changes nothing.
 
-Many detectors publish only what they see, so a presence alone does not show that the thing was seen
-all the time. It was seen where its messages follow each other at the detector's own usual rate: no
+Many detectors publish only what they see, so an interval alone does not show that the object was
+seen all the time. It was where its messages follow each other at the detector's own usual rate: no
 farther apart than `USUAL_PERIODS` times their mean distance, or `SHORT_NS`.
 """
 
@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SILENCE_NS: Final[Ns] = 10 * NS_PER_S
-"""After so long without a message a thing counts as gone: many detectors speak only of what is."""
+"""After so long without a message an object counts as gone: many detectors publish only what
+they see."""
 FLICKER_NS: Final[Ns] = 3 * NS_PER_S
-"""A thing that is missed for less did not leave."""
+"""An object that is missed for less did not leave."""
 USUAL_PERIODS: Final = 3
 SHORT_NS: Final[Ns] = NS_PER_S
 
@@ -47,7 +48,7 @@ _TO_END: Final = 2
 
 
 class VisibleInterval(NamedTuple):
-    """A thing in view: log times of the first and last message that has it (inclusive)."""
+    """An object in view: log times of the first and last message that contain it (inclusive)."""
 
     label: str
     first: Ns
@@ -55,12 +56,14 @@ class VisibleInterval(NamedTuple):
 
 
 class IntervalTable(NamedTuple):
-    """Presences, by the time of their first message, then by label; a week of bags has many.
+    """Visible intervals by the time of their first message, then by label, as a packed numpy table.
+
+    A week of bags has too many for an object each.
 
     Attributes:
-        labels: the names of the things, sorted.
-        rows: of each presence its first and last time, the place of its label, whether the first
-            and the last message of all have it, how many messages have it, and the longest time
+        labels: the labels, sorted.
+        rows: of each interval its first and last time, the index of its label, whether the first
+            and the last message of all contain it, how many messages do, and the longest time
             between two of these.
     """
 
@@ -69,25 +72,25 @@ class IntervalTable(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many presences there are."""
+        """How many intervals there are."""
         return len(self.rows) // _ROW.itemsize
 
     @property
     def is_sound(self) -> bool:
-        """Whether every row is of one of the labels; what is read from a file may not be."""
+        """Whether every row has one of the labels; a damaged file may contain others."""
         if len(self.rows) % _ROW.itemsize:
             return False
         return not self.rows or int(_rows(self.rows)["label"].max()) < len(self.labels)
 
-    def presences(self) -> tuple[VisibleInterval, ...]:
-        """Each of them."""
-        told = _rows(self.rows).tolist()
+    def intervals(self) -> tuple[VisibleInterval, ...]:
+        """Returns each of them."""
+        rows = _rows(self.rows).tolist()
         return tuple(
-            VisibleInterval(self.labels[label], first, last) for first, last, label, *_ in told
+            VisibleInterval(self.labels[label], first, last) for first, last, label, *_ in rows
         )
 
     def most_lasting(self, at_most: int) -> IntervalTable:
-        """So many of them, those that lasted longest; of equal ones the earliest."""
+        """Returns the longest intervals, in order of time; of equally long ones the earliest."""
         if self.size <= at_most:
             return self
         rows = _rows(self.rows)
@@ -96,7 +99,7 @@ class IntervalTable(NamedTuple):
         return IntervalTable(tuple(self.labels[place] for place in kept.tolist()), rows.tobytes())
 
     def throughout(self, start: Ns, end: Ns) -> list[str]:
-        """The things that were seen all the time between two moments, at their usual rate."""
+        """Returns the labels seen at their usual rate all the time from `start` to `end`."""
         rows = _rows(self.rows)
         pause = _longest_pause(rows)
         chosen = (rows["longest"] <= pause) & (rows["count"] > 1)
@@ -104,7 +107,7 @@ class IntervalTable(NamedTuple):
         return self._named(rows[chosen])
 
     def at_end(self, last: Ns, known_to: Ns) -> list[str]:
-        """The things of the last message, at `last`, that may be in view still at `known_to`."""
+        """Returns labels of the last message, at `last`, that may be visible until `known_to`."""
         rows = _rows(self.rows)
         return self._named(rows[(rows["last"] == last) & (known_to - last <= _longest_pause(rows))])
 
@@ -112,7 +115,7 @@ class IntervalTable(NamedTuple):
         return [self.labels[place] for place in rows["label"].tolist()]
 
     def without(self, labels: Collection[str]) -> IntervalTable:
-        """The presences of all other things."""
+        """Returns the intervals of all other labels."""
         places = [place for place, label in enumerate(self.labels) if label in labels]
         if not places:
             return self
@@ -120,34 +123,34 @@ class IntervalTable(NamedTuple):
         return IntervalTable(self.labels, rows[~np.isin(rows["label"], places)].tobytes())
 
     def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
-        """Those that lasted longest, the longest first; of equal ones the earliest."""
+        """Returns the longest intervals, the longest first; of equal ones the earliest first."""
         rows = _rows(self.rows)
-        return IntervalTable(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).presences()
+        return IntervalTable(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).intervals()
 
     def moved(self, by: Ns) -> IntervalTable:
-        """The same so many nanoseconds later."""
+        """Returns the same intervals so many nanoseconds later."""
         rows = _rows(self.rows).copy()
         rows["first"] += by
         rows["last"] += by
         return IntervalTable(self.labels, rows.tobytes())
 
 
-class Part(NamedTuple):
-    """Messages of one topic that follow each other: first and last log time, what was in view."""
+class IntervalPart(NamedTuple):
+    """Consecutive messages of one topic: first and last log time, and what was visible."""
 
     first: Ns
     last: Ns
-    seen: IntervalTable
+    visible: IntervalTable
 
 
 class IntervalBuilder:
     """Takes the messages of one topic in log-time order.
 
     Args:
-        at_most: how many presences are held; what is beyond is counted.
+        at_most: how many intervals are held; the rest is counted.
 
     Attributes:
-        left_out: how many there were beyond.
+        left_out: how many were not held.
     """
 
     def __init__(self, at_most: int) -> None:
@@ -160,11 +163,11 @@ class IntervalBuilder:
         self._over: list[tuple[str, _Open]] = []
 
     def add(self, time: Ns, labels: Iterable[str]) -> None:
-        """Takes the next message, which has these things."""
+        """Takes the next message, with the labels in it."""
         if self._first is None:
             self._first = time
         elif time - self._last > SILENCE_NS:
-            self._nth += 1  # as if a message without anything came between
+            self._nth += 1  # as if an empty message came between
         self._nth += 1
         self._last = time
         for label in labels:
@@ -180,12 +183,13 @@ class IntervalBuilder:
                     self.left_out += 1
                 self._open[label] = _Open(time, self._nth)
 
-    def part(self) -> Part | None:
-        """What was seen so far; None without a message."""
+    def part(self) -> IntervalPart | None:
+        """Returns what was visible so far; None without a message."""
         if self._first is None:
             return None
-        told = sorted([*self._over, *self._open.items()], key=lambda each: (each[1].first, each[0]))
-        labels = tuple(sorted({label for label, _ in told}))
+        every = [*self._over, *self._open.items()]
+        every.sort(key=lambda each: (each[1].first, each[0]))
+        labels = tuple(sorted({label for label, _ in every}))
         place = {label: at for at, label in enumerate(labels)}
         rows = [
             (
@@ -196,13 +200,15 @@ class IntervalBuilder:
                 each.count,
                 each.longest,
             )
-            for label, each in told
+            for label, each in every
         ]
-        return Part(self._first, self._last, IntervalTable(labels, np.array(rows, _ROW).tobytes()))
+        return IntervalPart(
+            self._first, self._last, IntervalTable(labels, np.array(rows, _ROW).tobytes())
+        )
 
 
 class _Open:
-    """A presence that may go on; `began` and `nth` are its first and last message's number."""
+    """An interval that may go on; `began` and `nth` number its first and last message."""
 
     __slots__ = ("began", "count", "first", "last", "longest", "nth")
 
@@ -218,20 +224,20 @@ class _Open:
         self.count += 1
 
 
-def joined(parts: Sequence[Part]) -> Part:
-    """Parts that follow each other as one: a thing may stay in view from one to the next."""
+def joined(parts: Sequence[IntervalPart]) -> IntervalPart:
+    """Merges parts that follow each other: an object may stay visible from one to the next."""
     follow = [after.first - before.last <= SILENCE_NS for before, after in pairwise(parts)]
-    seen = _merged([part.seen for part in parts], np.array([False, *follow]))
-    return Part(parts[0].first, parts[-1].last, seen)
+    seen = _merged([part.visible for part in parts], np.array([False, *follow]))
+    return IntervalPart(parts[0].first, parts[-1].last, seen)
 
 
 def united(seen: Sequence[IntervalTable]) -> IntervalTable:
-    """What several topics saw in the same time: a thing is in view while one of them has it."""
+    """Merges the tables of several topics of one time: visible on one of them is visible."""
     return _merged(seen, np.zeros(len(seen), np.bool_))
 
 
 def _merged(seen: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> IntervalTable:
-    """All presences, those of one thing joined that overlap or go on in the part that follows."""
+    """Merges tables: joins intervals of one label that overlap, or that go on in the next part."""
     rows = _rows(b"".join([each.rows for each in seen]))
     if not rows.size:
         return IntervalTable()
@@ -249,7 +255,7 @@ def _merged(seen: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> Interva
     found = np.empty(len(begins), _ROW)
     found["first"], found["last"], found["label"] = first[begins], reach[stops], label[begins]
     found["count"] = np.add.reduceat(rows["count"], begins)
-    # Times below may be as far apart as any two can be: only those of one presence are told.
+    # Times below may be as far apart as any two can be: only those of one interval are subtracted.
     pauses = np.append(0, np.where(goes_on, np.maximum(first[1:] - reach[:-1], 0), 0))
     found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
     found["ends"] = (ends[begins] & _FROM_START) * (part[begins] == 0)
@@ -260,7 +266,7 @@ def _merged(seen: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> Interva
 def _shared_labels(
     seen: Sequence[IntervalTable], part: NDArray[np.intp], label: NDArray[np.uint32]
 ) -> tuple[tuple[str, ...], NDArray[np.intp]]:
-    """The labels of all, sorted, and of each row the place of its own among them."""
+    """Returns the labels of all tables, sorted, and for each row the index of its label in them."""
     labels = tuple(sorted({label for each in seen for label in each.labels}))
     place = {label: at for at, label in enumerate(labels)}
     places: list[int] = []
@@ -274,22 +280,22 @@ def _shared_labels(
 
 
 def _reach(label: NDArray[np.intp], last: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of rows sorted by label the latest time of each and those of its label before it."""
+    """Returns the latest end of each row and of those before it of its label; sorted by label."""
     if bool(((last[1:] >= last[:-1]) | (label[1:] != label[:-1])).all()):
         return last
     by_time = np.argsort(last, kind="stable")
     rank = np.empty(len(last), np.intp)
     rank[by_time] = np.arange(len(last))
-    # In whole labels apart, so that the greatest so far is of the same one.
+    # Labels are whole tables apart, so that the running maximum starts anew at each label.
     far = label * len(last)
     latest: NDArray[np.int64] = last[by_time[np.maximum.accumulate(rank + far) - far]]
     return latest
 
 
 def _longest_pause(rows: Rows) -> NDArray[np.int64]:
-    """Of each row the longest time between two of its messages at the detector's usual rate."""
+    """Returns, for each row, the longest pause between messages at the detector's usual rate."""
     spans = rows["last"] - rows["first"]
-    # How often a thing is seen that is seen once is not known: it is missed for a moment, at most.
+    # An object seen once has no known rate: it may have been missed for a moment, at most.
     usual = USUAL_PERIODS * spans // np.maximum(rows["count"].astype(np.int64) - 1, 1)
     pause = np.where(rows["count"] > 1, np.maximum(usual, SHORT_NS), FLICKER_NS)
     longest: NDArray[np.int64] = np.minimum(pause, SILENCE_NS)
@@ -297,7 +303,7 @@ def _longest_pause(rows: Rows) -> NDArray[np.int64]:
 
 
 def _by_length(rows: Rows) -> NDArray[np.intp]:
-    """The places of the rows, that which lasted longest first; of equal ones the earliest."""
+    """Returns the indices of the rows, the longest interval first; of equal ones the earliest."""
     return np.argsort(rows["first"] - rows["last"], kind="stable")
 
 

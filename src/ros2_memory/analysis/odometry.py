@@ -1,9 +1,9 @@
 """Distance, speed, gaps, jumps and resets along poses in log-time order.
 
-Everything can be put together from parts: what a bag's poses amount to is a `PoseDigest`, and
-digests joined in order give what all their poses together give. Lengths so joined differ a little
-from those of the same poses in other parts, since noise is judged in each part for itself; where
-positions carry no noise they do not.
+Everything can be joined from parts: a `PoseDigest` describes the poses of one bag, and digests
+joined in order give what all their poses together give. Lengths so joined differ a little from
+those of the same poses in other parts, since noise is estimated in each part; without noise they do
+not.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Quaternion, Vector3
 
 ARRIVAL_JITTER_NS: Final[Ns] = 100 * NS_PER_MS
-"""What an arrival may be off: the shortest time that the distance of two poses is divided by.
+"""The jitter of arrivals: the shortest time that the distance of two poses is divided by.
 
 Log time is the time of arrival. Transports and a busy recorder deliver in bursts: public bags
-hold poses 3 ms apart that lie 0.2 m apart, which is GNSS noise and not 72 m/s.
+contain poses 3 ms apart in time and 0.2 m in space, which is GNSS noise and not 72 m/s.
 """
 
 GAP_NS: Final[Ns] = NS_PER_S
@@ -39,36 +39,39 @@ _NEARBY: Final = 8
 """The usual period around a pair of poses is the median of so many intervals on either side."""
 
 MOVED_M: Final = 1.0
-"""Odometry that begins anew does so within this of its origin, having been farther from there."""
+"""Odometry that is reset begins within this of its origin, having been farther away."""
 
 _RESTART_M: Final = 0.25
-"""A step this long may be a restart of odometry by what its neighbours are alone."""
+"""A longer step may be a reset of odometry by comparison with its neighbours alone."""
 _AT_ORIGIN_M: Final = 0.05
-"""Odometry that begins anew is so near its origin, or within two steps of it."""
+"""Odometry that is reset begins so near its origin, or within two steps of it."""
 _LONGER: Final = 4.0
 _FASTER: Final = 2.0
-"""What led to the origin is so many times longer, and faster, than what is near it."""
+"""A step to the origin is a reset if it is so many times longer, and faster, than those near it."""
 _DENSE_NS: Final[Ns] = 250 * NS_PER_MS
 _HARD_MPS2: Final = (2.0, 10.0)
-"""Accelerations (m/s^2) that such a step must take: among poses that follow closely, where a whole
-start and stop cannot hide between two of them, and among others, more than wheels can transmit."""
+"""Accelerations (m/s^2) that such a step would need at least, to be a reset.
+
+The first among poses that follow closely, where no whole start and stop fits between two of them;
+the second among others: more than wheels can transmit.
+"""
 
 FARTHEST_M: Final = 1e12
-"""Coordinates beyond this are no place on Earth but memory that nobody filled in."""
+"""Coordinates beyond this (m) are no place on Earth but memory that was never initialised."""
 
 _DOUBTFUL: Final = 0.25
-"""Noise of this share of the mean step makes a way longer by some 3 %."""
+"""Noise of this share of the mean step makes a path longer by some 3 %."""
 
-_MOST_RESETS: Final = 1000
+_MAX_RESETS: Final = 1000
 _UNCERTAIN: Final = 4.0
-"""Standard deviations by which a step must exceed what its neighbours are to count as more."""
+"""Standard deviations by which a step must exceed its neighbours to be longer than them."""
 
 Vertex: TypeAlias = "tuple[Ns, Vector3, Quaternion | float | None]"
 """A pose on a drawn path: its orientation as a quaternion or as a heading (rad) about Z."""
 
 Times: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 Link: TypeAlias = Literal["driven", "gap", "jump", "reset"]
-"""What lies between two poses in a row; only what is driven counts as driven."""
+"""What is between two consecutive poses; only `driven` counts as distance."""
 
 
 class TimedPosition(NamedTuple):
@@ -78,18 +81,18 @@ class TimedPosition(NamedTuple):
     position: Vector3
 
 
-class Pace(NamedTuple):
+class NearbyMotion(NamedTuple):
     """How a robot moves near a pose: its longest step (m) and its highest speed."""
 
     step_m: float
     speed_mps: float
 
-    def or_more(self, other: Pace) -> Pace:
-        """The longer step and the higher speed of two."""
-        return Pace(max(self.step_m, other.step_m), max(self.speed_mps, other.speed_mps))
+    def or_more(self, other: NearbyMotion) -> NearbyMotion:
+        """Returns the longer step and the higher speed of two."""
+        return NearbyMotion(max(self.step_m, other.step_m), max(self.speed_mps, other.speed_mps))
 
 
-STILL: Final = Pace(0.0, 0.0)
+_STATIONARY: Final = NearbyMotion(0.0, 0.0)
 
 
 def link(
@@ -97,14 +100,14 @@ def link(
     after: TimedPosition,
     usual_ns: Ns | None,
     fastest_mps: float,
-    near: Pace | None = None,
+    near: NearbyMotion | None = None,
 ) -> Link:
-    """What lies between two poses in a row.
+    """Returns what is between two consecutive poses.
 
-    A jump is faster than is plausible. A gap is time in which nothing was recorded: more than a
+    A jump is faster than plausible. A gap is time in which nothing was recorded: more than a
     second, and more than five usual periods (ns), where these are known. A jump or a gap to the
-    origin of odometry is a reset, and so is a step to it that the robot, by its pace near the step,
-    cannot have driven.
+    origin of odometry is a reset, and so is a step to it that the robot, by its motion near the
+    step, cannot have driven.
     """
     elapsed = after.time - before.time
     is_gap = elapsed > GAP_NS and usual_ns is not None and elapsed > GAP_PERIODS * usual_ns
@@ -121,7 +124,7 @@ def link(
 
 
 def _is_jump(before: TimedPosition, after: TimedPosition, fastest_mps: float) -> bool:
-    # A burst squeezes the time between two poses to nothing; it does not make a jump of them.
+    # A burst shortens the time between two poses to nothing, which is no jump.
     elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
     return distance(before.position, after.position) > fastest_mps * elapsed_s * (1 + 1e-9)
 
@@ -131,7 +134,9 @@ def _leads_to_origin(before: TimedPosition, after: TimedPosition) -> bool:
     return step_m > MOVED_M and math.hypot(*after.position) <= MOVED_M
 
 
-def _is_restart(before: TimedPosition, after: TimedPosition, usual_ns: Ns, near: Pace) -> bool:
+def _is_restart(
+    before: TimedPosition, after: TimedPosition, usual_ns: Ns, near: NearbyMotion
+) -> bool:
     step_m = distance(before.position, after.position)
     if step_m <= max(_RESTART_M, _LONGER * near.step_m):
         return False
@@ -143,10 +148,10 @@ def _is_restart(before: TimedPosition, after: TimedPosition, usual_ns: Ns, near:
     return step_m > max(_FASTER * near.speed_mps * elapsed_s, hard_mps2 * elapsed_s * elapsed_s / 4)
 
 
-def _pace(stops: Sequence[TimedPosition]) -> Pace:
-    """The longest step of a few poses in a row, and the highest speed over half of them."""
+def _motion_of(stops: Sequence[TimedPosition]) -> NearbyMotion:
+    """Returns the longest step of consecutive poses, and the highest speed over half of them."""
     if len(stops) < 2:
-        return STILL
+        return _STATIONARY
     half = max(len(stops) // 2, 1)
     speed_mps = max(
         distance(here.position, there.position)
@@ -154,25 +159,25 @@ def _pace(stops: Sequence[TimedPosition]) -> Pace:
         for here, there in zip(stops[:-half], stops[half:], strict=True)
     )
     steps = (distance(here.position, there.position) for here, there in pairwise(stops))
-    return Pace(max(steps), speed_mps)
+    return NearbyMotion(max(steps), speed_mps)
 
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """A path driven in one go: no gap, no jump and no reset in it.
+    """A path driven without a gap, a jump or a reset.
 
     Attributes:
         first: its first pose.
         last: its last pose.
         poses: how many it has.
         period_ns: the usual time between two of them; None for one alone.
-        length_m: its length but for the creeps at its ends (see `path_length`).
+        length_m: its length except for the creeps at its ends (see `path_length`).
         sum_m: the sum of the distances between its poses.
         head: how it begins.
         tail: how it ends.
-        still: one creep from end to end: that of the head and of the tail.
-        setting_out: its pace near its first pose.
-        arriving: its pace near its last pose.
+        still: whether it is one creep from end to end: that of the head and of the tail.
+        near_first: the motion near its first pose.
+        near_last: the motion near its last pose.
     """
 
     first: TimedPosition
@@ -184,8 +189,8 @@ class Leg:
     head: End
     tail: End
     still: bool
-    setting_out: Pace
-    arriving: Pace
+    near_first: NearbyMotion
+    near_last: NearbyMotion
 
     @property
     def total_m(self) -> float:
@@ -195,14 +200,14 @@ class Leg:
 
     @property
     def in_doubt(self) -> bool:
-        """Whether noise may be much of its length: poses too seldom to tell it from turns."""
+        """Whether noise may be much of its length: poses too rare to distinguish it from turns."""
         if self.poses < FEWEST or self.period_ns is None or self.period_ns <= _DENSE_NS:
             return False
         noise_m = max(self.head.noise_m, self.tail.noise_m)
         return self.total_m > MOVED_M and noise_m > _DOUBTFUL * self.sum_m / (self.poses - 1)
 
     def joined(self, later: Leg) -> Leg:
-        """This leg driven on, without a break, as a later one."""
+        """Returns this leg continued, without a break, by a later one."""
         step_m = distance(self.last.position, later.first.position)
         whole = replace(
             self,
@@ -215,12 +220,12 @@ class Leg:
             sum_m=self.sum_m + step_m + later.sum_m,
             tail=later.tail,
             still=False,
-            setting_out=self.setting_out
+            near_first=self.near_first
             if self.poses > _NEARBY
-            else self.setting_out.or_more(later.setting_out),
-            arriving=later.arriving
+            else self.near_first.or_more(later.near_first),
+            near_last=later.near_last
             if later.poses > _NEARBY
-            else later.arriving.or_more(self.arriving),
+            else later.near_last.or_more(self.near_last),
         )
         if (self.poses < FEWEST) != (later.poses < FEWEST):
             return self._bridged(later, whole, step_m)
@@ -240,7 +245,7 @@ class Leg:
                 return replace(whole, tail=later.tail._replace(creep=creep))
             return replace(whole, length_m=whole.length_m + creep.length_m)
         inner_m = _step_m(self.tail, later.head, 1, step_m, step_m)
-        # A creep that filled its leg reaches but one end of the whole.
+        # A creep that filled its leg reaches only one end of the whole.
         if self.still:
             whole = replace(whole, head=self.head)
         elif before is not None:
@@ -250,7 +255,7 @@ class Leg:
         return replace(whole, length_m=whole.length_m + inner_m)
 
     def _bridged(self, later: Leg, whole: Leg, step_m: float) -> Leg:
-        """Joined where one of the two is too short to be judged by itself."""
+        """Joins two legs one of which has too few poses to estimate its noise."""
         if later.poses < FEWEST:
             net_m = distance(self.last.position, later.last.position)
             end, short, long = self.tail, later, self
@@ -263,7 +268,7 @@ class Leg:
 
 
 def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -> float:
-    """The length of some steps between two ends: what their paces are, unless it is clearly more.
+    """Returns the length of some steps between two ends: their paces, unless it is clearly more.
 
     `net_m`: the distance from end to end; `plain_m`: the sum of the distances between.
     """
@@ -278,29 +283,29 @@ def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -
 
 @dataclass(frozen=True, slots=True)
 class PoseDigest:
-    """What the poses of one bag amount to; a coordinate that is no place makes a pose invalid.
+    """The poses of one bag, summed up; a pose is valid where its coordinates are a place.
 
     Attributes:
-        poses: valid poses.
-        invalid: the others.
+        poses: how many valid poses.
+        invalid: how many others.
         first: the first valid pose; None without one, and then nothing below counts.
         last: the last valid pose.
         head: the first leg; None where there are few poses: then `vertices` are all of them, and
-            who joins them measures them anew.
+            joining measures them anew.
         tail: the last leg; None where the first is the only one.
         length_m: of the legs between these.
         sum_m: the sum of the distances between poses, of the legs between these.
-        jumps: steps that were faster than is plausible; some of them are resets too.
+        jumps: steps that were faster than plausible; some of them are resets too.
         jumped_m: their total length.
         gaps: times in which nothing was recorded.
-        gap_m: the way across them in straight lines.
-        resets: the first poses of odometry that began anew; the earliest, of very many.
+        gap_m: the distance across them in straight lines.
+        resets: the first pose after each reset of odometry; the earliest, of very many.
         speed_mps: the highest speed measured; None where the poses are too few.
         twist: the highest speed (m/s) that a message states; None where none states one.
         frames: the frames of all poses, in order of appearance.
-        vertices: the drawn path, first and last pose among them; parted where the robot jumped
-            (see `paths.PARTED`).
-        error_m: no valid pose lies farther than this from the drawn path.
+        vertices: the drawn path, first and last pose among them, split where the robot jumped
+            (see `polyline.PARTED`).
+        error_m: no valid pose is farther than this from the drawn path.
     """
 
     poses: int
@@ -324,7 +329,7 @@ class PoseDigest:
 
 
 class Motion:
-    """Distance, speed, gaps, jumps and resets of poses that come in order, many at a time.
+    """Measures poses that come in order, many at a time.
 
     Attributes:
         first: the first pose; None without one.
@@ -378,9 +383,9 @@ class Motion:
         return unix_from_ns(self.last.time - self.first.time)
 
     def add(self, stops: Sequence[TimedPosition]) -> list[int]:
-        """Takes the poses that come next; gives the indices of those that a jump or reset led to.
+        """Takes the poses that come next; returns the indices of those that a jump or reset led to.
 
-        The more at a time, the better noise is told from driving.
+        The more at a time, the better noise is distinguished from driving.
         """
         times = np.array([stop.time for stop in stops], dtype=np.int64)
         positions = np.array([stop.position for stop in stops], dtype=np.float64)
@@ -401,12 +406,12 @@ class Motion:
                 stops[index + 1 : index + 2 + _NEARBY],
             )
             known = sum(map(len, sides))
-            near = _pace(sides[0]).or_more(_pace(sides[1]))
+            near = _motion_of(sides[0]).or_more(_motion_of(sides[1]))
             leg = self.tail or self.head
             if index < begin + _NEARBY and before is not None and leg is not None:
                 known += leg.poses
-                near = near.or_more(leg.arriving)
-            # Of too few poses nobody knows what is usual.
+                near = near.or_more(leg.near_last)
+            # Too few poses do not show what is usual.
             usual = near if known >= _NEARBY else None
             kind = link(here, there, usual_ns, self._fastest_mps, usual)
             if kind == "driven":
@@ -422,7 +427,7 @@ class Motion:
         return parted
 
     def join(self, whole: PoseDigest) -> bool:
-        """Takes the legs of a digest that come next; gives whether a jump or reset led to them."""
+        """Takes the legs of a digest that come next; returns whether a jump or reset led there."""
         if whole.head is None:
             return False
         parted = self._go_on(self.last, (whole.head, whole.speed_mps, 0.0))
@@ -430,7 +435,7 @@ class Motion:
         self.jumped_m += whole.jumped_m
         self.gaps += whole.gaps
         self.gap_m += whole.gap_m
-        self.resets += whole.resets[: _MOST_RESETS - len(self.resets)]
+        self.resets += whole.resets[: _MAX_RESETS - len(self.resets)]
         if whole.tail is not None:
             self._end_leg()
             self.length_m += whole.length_m
@@ -445,7 +450,7 @@ class Motion:
         return None if leg is None else leg.period_ns
 
     def _go_on(self, before: TimedPosition | None, measured_leg: _MeasuredLeg) -> bool:
-        """Takes the leg that comes next; gives whether a jump or reset led to it from `before`."""
+        """Takes the leg that comes next; returns whether a jump or reset led to it."""
         leg, speed_mps, step_mps = measured_leg
         if speed_mps is not None:
             self.speed_mps = max(self.speed_mps or 0.0, speed_mps)
@@ -456,7 +461,7 @@ class Motion:
             last = self.tail or self.head
             near = None
             if last is not None and last.poses + leg.poses >= _NEARBY:
-                near = last.arriving.or_more(leg.setting_out)
+                near = last.near_last.or_more(leg.near_first)
             kind = link(before, leg.first, max(periods, default=None), self._fastest_mps, near)
         self.last = leg.last
         if kind == "driven":
@@ -491,7 +496,7 @@ class Motion:
         if _is_jump(before, after, self._fastest_mps):
             self.jumps += 1
             self.jumped_m += step_m
-        if kind == "reset" and len(self.resets) < _MOST_RESETS:
+        if kind == "reset" and len(self.resets) < _MAX_RESETS:
             self.resets.append(after.time)
 
 
@@ -499,7 +504,7 @@ _MeasuredLeg: TypeAlias = "tuple[Leg, float | None, float]"
 
 
 def _leg(stops: Sequence[TimedPosition]) -> _MeasuredLeg:
-    """A leg, the highest speed on it if its poses are enough, else that from one to the next."""
+    """Measures a leg; returns the highest speed on it or, of few poses, from one to the next."""
     times = np.array([stop.time for stop in stops], dtype=np.int64)
     apart = np.diff(times)
     seconds = (times - times[0]) / NS_PER_S
@@ -516,8 +521,8 @@ def _leg(stops: Sequence[TimedPosition]) -> _MeasuredLeg:
         head,
         tail,
         still,
-        setting_out=_pace(stops[: _NEARBY + 1]),
-        arriving=_pace(stops[-_NEARBY - 1 :]),
+        near_first=_motion_of(stops[: _NEARBY + 1]),
+        near_last=_motion_of(stops[-_NEARBY - 1 :]),
     )
     step_mps = 0.0
     if len(stops) <= SPEED_STEPS:
@@ -535,21 +540,21 @@ def _leg(stops: Sequence[TimedPosition]) -> _MeasuredLeg:
 def _usual_ns(
     apart: np.ndarray[tuple[int], np.dtype[np.int64]], index: int, known: Ns | None
 ) -> Ns:
-    """The usual time between poses around an interval, which itself says least."""
+    """Returns the usual time between poses around an interval, which itself counts least."""
     near: list[Ns] = apart[max(index - _NEARBY, 0) : index + 1 + _NEARBY].tolist()
     own = near.pop(min(index, _NEARBY))
     return median_low(near or [known or own])
 
 
 def is_place(position: Vector3) -> bool:
-    """Whether these are coordinates of a place: finite, and not beyond any."""
+    """Returns whether coordinates are a place: finite, and on Earth."""
     x, y, z = position
     # A comparison with NaN is false, so this one refuses all three kinds.
     return abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and abs(z) < FARTHEST_M
 
 
 def faster(stated: float | None, speed_mps: float | None) -> float | None:
-    """The higher of two speeds that messages state; one that is no number states nothing."""
+    """Returns the higher of two speeds that messages state; NaN and infinity state nothing."""
     if speed_mps is None or not math.isfinite(speed_mps):
         return stated
     return max(stated or 0.0, abs(speed_mps))

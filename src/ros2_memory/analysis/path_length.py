@@ -1,26 +1,28 @@
-"""How far a robot drove, by positions that carry noise.
+"""How far a robot drove, measured from positions with noise.
 
-The sum of the distances between noisy positions grows with their number, also where the robot
-stands: 10 mm of noise at 50 Hz are 1.1 m a second. So the length of each step is taken from the
+The sum of the distances between noisy positions grows with their number, also where the robot is
+stationary: 10 mm of noise at 50 Hz add up to 1.1 m a second. So the length of each step is the
 slope of a line fitted to the positions around it, over as few of them as the noise allows:
 
-- The noise of each axis comes from the positions themselves, by their fourth differences, which a
-  smooth path hardly has (difference-based variance estimation: Gasser, Sroka and Jennen-Steinmetz,
-  Biometrika 73, 1986; Hall, Kay and Titterington, Biometrika 77, 1990). These are averaged by
-  their square roots, so that a corner does not count as noise.
+- The noise of each axis is estimated from the positions themselves, by their fourth differences,
+  which are nearly zero on a smooth path (difference-based variance estimation: Gasser, Sroka and
+  Jennen-Steinmetz, Biometrika 73, 1986; Hall, Kay and Titterington, Biometrika 77, 1990). These are
+  averaged by their square roots, so that a corner does not count as noise.
 - A least-squares slope over n positions has the variance 12 s^2 / (n (n^2 - 1)). Of the widths 2,
   4, 8, 16 and 32 each step takes the smallest one at which the slopes around it are clear of their
   noise (Lepski's rule: Theory of Probability and its Applications 36, 1991). Width 2 is the plain
   distance of two positions: paths without noise keep their plain length.
 - Noise across the path makes a slope longer, by its variance over twice the slope at first order:
-  that is taken off the square (Gudbjartsson and Patz, Magnetic Resonance in Medicine 34, 1995).
-- Positions more than 0.25 s apart say nothing of turns between them: they keep their plain length,
-  but where they scatter around one place as their noise does (von Neumann's ratio, Annals of
+  that is subtracted from the square (Gudbjartsson and Patz, Magnetic Resonance in Medicine 34,
+  1995).
+- Between positions more than 0.25 s apart turns are unknown: they keep their plain length, except
+  where they scatter around one place as their noise does (von Neumann's ratio, Annals of
   Mathematical Statistics 12, 1941).
 - Where not even the widest slope is clear of the noise for long, the robot stands or creeps: only
-  when the mean of 33 positions leaves the last such place by more than noise does is that a way.
+  when the mean of 33 positions leaves the last such place by more than the noise, that counts as
+  driven.
 
-Noise that is slow, as a drift over seconds, cannot be told from driving and counts as that.
+Noise that is slow, as a drift over seconds, cannot be distinguished from driving and counts as it.
 """
 
 from __future__ import annotations
@@ -44,31 +46,31 @@ Rows: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 Marks: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 
 FEWEST: Final = 16
-"""Positions that a noise is estimated from; of fewer the plain sum counts."""
+"""Positions below which no noise is estimated, and the plain sum is the length."""
 
 _WIDTHS: Final = (2, 4, 8, 16, 32)
 _ORDER: Final = 4
 _NOISE_SPAN: Final = 32
 """Fourth differences on either side of a position whose mean is the noise there."""
 _SLOPE_SPAN: Final = 6
-"""Slopes on either side of a step whose mean square is held against their noise."""
+"""Slopes on either side of a step whose mean square is compared with their noise."""
 _CLEAR: Final = 12.0
 """A mean square slope is clear of noise from so many times the variance of a slope on."""
-_STANDING: Final = 9.0
-"""The widest slopes below so many times their variance are those of a standing robot.
+_STATIONARY: Final = 9.0
+"""The widest slopes below so many times their variance are those of a stationary robot.
 
 Of noise alone they are above it once in some 10^5 independent windows (chi-square, 3 degrees).
 """
 _PLAIN: Final = 0.002
 """Where noise adds less than this share, the distance of two positions stays as it is."""
-_STAND_STEPS: Final = _WIDTHS[-1]
-_PLACE_SPAN: Final = 16
+_STATIONARY_STEPS: Final = _WIDTHS[-1]
+_MEAN_SPAN: Final = 16
 _DENSE_S: Final = 0.25
-"""Fourth differences of positions farther apart in time tell turns of the robot as noise."""
+"""Fourth differences of positions farther apart in time take turns of the robot for noise."""
 _SPREAD: Final = (0.6, 2.0)
 """How far positions that far apart spread around a place, in units of their noise."""
 _LEFT: Final = 6.0
-"""A robot left a place when the distance is more than so many standard deviations."""
+"""A robot left a place when it is more than so many standard deviations away."""
 _ROOT_MEAN: Final = (2**0.25 * math.gamma(0.75) / math.sqrt(math.pi)) ** 2
 """The squared mean square root of a standard normal variable's magnitude."""
 _GROWTH: Final = math.sqrt(math.comb(2 * _ORDER, _ORDER))
@@ -81,7 +83,7 @@ _SLACK_S: Final = 1e-6
 
 
 class Creep(NamedTuple):
-    """The way of a robot that stands or creeps: from place to place that it clearly left.
+    """The path of a robot that stands or creeps: from place to place that it clearly left.
 
     Attributes:
         start: the first place.
@@ -103,7 +105,7 @@ class Creep(NamedTuple):
         return 0.0 if self.second is None else distance(self.start, self.second) + self.middle_m
 
     def to(self, place: Vector3) -> Creep:
-        """With one more place, if it is off the last one."""
+        """Returns the creep with one more place, if that is off the last one."""
         step = distance(self.end, place)
         if step <= self.reach_m:
             return self
@@ -112,7 +114,7 @@ class Creep(NamedTuple):
         return self._replace(middle_m=self.middle_m + step, end=place)
 
     def joined(self, later: Creep) -> Creep:
-        """This creep gone on with a later one."""
+        """Returns this creep continued by a later one."""
         reach_m = max(self.reach_m, later.reach_m)
         whole = self._replace(reach_m=reach_m).to(later.start)
         if later.second is None:
@@ -124,13 +126,13 @@ class Creep(NamedTuple):
 
 
 class End(NamedTuple):
-    """How a path begins or ends, for what is joined to it there.
+    """How a path begins or ends, for joining another to it.
 
     Attributes:
         pace_m: the length of the step at this end.
         noise_m: the standard deviation of a position.
-        plain: the step is the plain distance of its positions.
-        creep: the standing or creeping that reaches this end; its length is not counted yet.
+        plain: whether the step is the plain distance of its positions.
+        creep: the creep that reaches this end; its length is not counted yet.
     """
 
     pace_m: float
@@ -140,14 +142,14 @@ class End(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What a path in one piece comes to.
+    """The measurements of a path in one piece.
 
     Attributes:
-        length_m: its length but for the creeps at its ends.
+        length_m: its length except for the creeps at its ends.
         sum_m: the sum of the distances between its positions.
         head: how it begins.
         tail: how it ends.
-        still: one creep from end to end: that of the head and of the tail.
+        still: whether it is one creep from end to end: that of the head and of the tail.
         speed_mps: the highest speed over a second and eight steps; None for too few positions.
     """
 
@@ -160,7 +162,7 @@ class Measured(NamedTuple):
 
 
 def measured(seconds: Numbers, positions: Sequence[Vector3]) -> Measured:
-    """The length of a path and the highest speed on it.
+    """Measures the length of a path and the highest speed on it.
 
     Args:
         seconds: when each position was taken, ascending.
@@ -180,14 +182,14 @@ def measured(seconds: Numbers, positions: Sequence[Vector3]) -> Measured:
         )
         return Measured(total, total, ends[0], ends[1], still=False, speed_mps=speed_mps)
     noise = _noise(points)
-    lengths, as_plain, standing = _steps(points, plain, noise)
+    lengths, as_plain, stationary = _steps(points, plain, noise)
     if np.median(apart) > _DENSE_S:
-        standing &= _scatters(points, noise)
-        lengths, as_plain = plain, ~standing
+        stationary &= _scatters(points, noise)
+        lengths, as_plain = plain, ~stationary
     creeps = [
         (begin, end, _creep(points, noise, begin, end, positions[0]))
-        for begin, end in _rows(standing)
-        if end - begin >= _STAND_STEPS or end - begin == len(plain)
+        for begin, end in _rows(stationary)
+        if end - begin >= _STATIONARY_STEPS or end - begin == len(plain)
     ]
     moved = lengths.copy()
     for begin, end, _ in creeps:
@@ -207,7 +209,7 @@ def measured(seconds: Numbers, positions: Sequence[Vector3]) -> Measured:
 
 
 def _noise(points: Rows) -> Rows:
-    """The standard deviation of each axis at each position."""
+    """Returns the standard deviation of each axis at each position."""
     roots = np.sqrt(np.abs(np.diff(points, _ORDER, axis=0)))
     means = _moving_mean(roots, _NOISE_SPAN) ** 2 / (_ROOT_MEAN * _GROWTH)
     at = np.clip(np.arange(len(points)) - _ORDER // 2, 0, len(means) - 1)
@@ -215,15 +217,15 @@ def _noise(points: Rows) -> Rows:
 
 
 def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, Marks]:
-    """The length of each step, whether it is the plain one, and whether it drowns in noise."""
+    """Returns the length of each step, whether it is the plain one, and whether it is noise."""
     variance = (noise[1:] ** 2 + noise[:-1] ** 2) / 2
     whole = variance.sum(axis=1)
     lengths = np.zeros(len(plain))
     as_plain = np.zeros(len(plain), dtype=bool)
-    open_yet = np.ones(len(plain), dtype=bool)
+    unsettled = np.ones(len(plain), dtype=bool)
     energy = share = np.zeros(len(plain))
     for width in _WIDTHS:
-        if width > len(points) or not open_yet.any():
+        if width > len(points) or not unsettled.any():
             break
         slopes = np.diff(points, axis=0) if width == 2 else _slopes(points, width)
         square = (slopes**2).sum(axis=1)
@@ -231,25 +233,25 @@ def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, M
         share = 12 / (width * (width * width - 1)) * whole
         along = (variance * slopes**2).sum(axis=1) / np.where(square > 0, square, 1.0)
         across = 12 / (width * (width * width - 1)) * (whole - along)
-        settled = open_yet & (energy >= _CLEAR * share)
+        settled = unsettled & (energy >= _CLEAR * share)
         if width == 2:
             as_plain = settled & (share <= 2 * _PLAIN * energy)
-        # What is open yet at the widest keeps the length by that.
-        lengths[open_yet] = np.sqrt(np.maximum(square - across, 0.0))[open_yet]
-        open_yet &= ~settled
+        # A step that never settles keeps the length by the widest slope.
+        lengths[unsettled] = np.sqrt(np.maximum(square - across, 0.0))[unsettled]
+        unsettled &= ~settled
     lengths[as_plain] = plain[as_plain]
-    # A wide slope beside a sudden start has some of what the steps after it have already.
+    # A wide slope beside a sudden start counts part of the steps after it, which count already.
     for begin, end in _rows(~as_plain):
         most, found = plain[begin:end].sum(), lengths[begin:end].sum()
         if found > most:
             lengths[begin:end] *= most / found
-    return lengths, as_plain, open_yet & (energy < _STANDING * share)
+    return lengths, as_plain, unsettled & (energy < _STATIONARY * share)
 
 
 def _scatters(points: Rows, noise: Rows) -> Marks:
-    """At which steps the positions spread around one place as far as their noise makes them."""
-    places = _moving_mean(points, _PLACE_SPAN)
-    spread = _moving_mean(points**2, _PLACE_SPAN) - places**2
+    """Returns at which steps the positions spread around one place as far as their noise does."""
+    places = _moving_mean(points, _MEAN_SPAN)
+    spread = _moving_mean(points**2, _MEAN_SPAN) - places**2
     ratio = spread.sum(axis=1) / np.maximum((noise**2).sum(axis=1), 1e-300)
     low, high = _SPREAD
     around: Marks = (low * low <= ratio) & (ratio <= high * high)
@@ -258,9 +260,9 @@ def _scatters(points: Rows, noise: Rows) -> Marks:
 
 
 def _slopes(points: Rows, width: int) -> Rows:
-    """For each step the slope of the line fitted to the `width` positions around it.
+    """Returns for each step the slope of the line fitted to the `width` positions around it.
 
-    Where the path ends too near it is fitted to the first or last ones.
+    Near an end of the path it is fitted to the first or last ones.
     """
     weights = np.arange(width) - (width - 1) / 2
     weights /= weights @ weights
@@ -270,7 +272,7 @@ def _slopes(points: Rows, width: int) -> Rows:
 
 
 def _moving_mean(rows: Rows, span: int) -> Rows:
-    """Means over a row and `span` ones to either side; over as many at the ends."""
+    """Returns means over each row and `span` ones to either side; over as many at the ends."""
     width = min(2 * span + 1, len(rows))
     sums = np.zeros((len(rows) + 1, rows.shape[1]))
     np.cumsum(rows, axis=0, out=sums[1:])
@@ -279,15 +281,15 @@ def _moving_mean(rows: Rows, span: int) -> Rows:
 
 
 def _rows(marks: Marks) -> Iterator[tuple[int, int]]:
-    """The half-open ranges in which marks are set."""
+    """Returns the half-open ranges in which marks are set."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], marks, [False])).astype(np.int8)))
     return iter([(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)])
 
 
 def _creep(points: Rows, noise: Rows, begin: int, end: int, origin: Vector3) -> Creep:
-    """The places that a robot left from one position to another (inclusive)."""
-    places = _moving_mean(points, _PLACE_SPAN)[begin : end + 1]
-    width = min(2 * _PLACE_SPAN + 1, len(points))
+    """Returns the places that a robot left from one position to another (inclusive)."""
+    places = _moving_mean(points, _MEAN_SPAN)[begin : end + 1]
+    width = min(2 * _MEAN_SPAN + 1, len(points))
     reach = _LEFT * math.sqrt(2 / width) * noise[begin : end + 1].max(axis=1)
     found = [0]
     while True:
@@ -304,8 +306,8 @@ def _creep(points: Rows, noise: Rows, begin: int, end: int, origin: Vector3) -> 
 
 
 def _highest_speed(seconds: Numbers, lengths: Numbers) -> float:
-    """The highest speed over windows of a second, and of eight steps at least."""
-    # A single step that is far longer than those around it is a correction of the position.
+    """Returns the highest speed over windows of a second, and of eight steps at least."""
+    # A single step far longer than those around it is a correction of the position, not speed.
     usual = _moving_mean(np.sqrt(lengths)[:, None], SPEED_STEPS)[:, 0] ** 2
     gone = np.concatenate(([0.0], np.cumsum(np.minimum(lengths, 2 * usual))))
     begin = np.arange(len(lengths) - SPEED_STEPS + 1)
@@ -323,7 +325,7 @@ def _highest_speed(seconds: Numbers, lengths: Numbers) -> float:
 
 
 def _sparse_speed(lengths: Numbers, apart: Numbers) -> float | None:
-    """The highest median speed of eight steps that take a second or longer; None without any."""
+    """Returns the highest median speed of eight steps that take a second or longer, if any do."""
     if len(lengths) < SPEED_STEPS:
         return None
     long = sliding_window_view(apart, SPEED_STEPS).sum(axis=1) >= SPEED_WINDOW_S - _SLACK_S

@@ -1,10 +1,10 @@
-"""The drawn path of a robot: few vertices, no pose far from them, and no line where it jumped.
+"""The drawn path of a robot: few vertices, no pose far from them, and no line across a jump.
 
-It is drawn in space and time: where the robot turned back, or stopped, is a vertex too.
+It is drawn in space and time: where the robot turned back, or stopped, there is a vertex too.
 
-Built vertex by vertex in bounded memory. Where a robot jumped (a localisation that was corrected,
-a simulator that was reset) the path is parted: both ends of the jump are kept, and nothing is drawn
-between them.
+Built vertex by vertex in bounded memory. Where a robot jumped (a localisation that was corrected, a
+simulator that was reset) the path is split into pieces: both ends of the jump are kept, and nothing
+is drawn between them.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.odometry import Vertex
 
 PARTED: Final[Vertex] = (0, (math.nan, math.nan, math.nan), None)
-"""Stands between two pieces of a path where both stand in one row; no pose is nowhere."""
+"""Separates two pieces of a path that are stored in one row; no pose has NaN coordinates."""
 
 _BLOCK: Final = 4096
-_MOST_VERTICES: Final = 20_000
-_MOST_PIECES: Final = 1000
-_STAY_NS: Final[Ns] = NS_PER_S
-"""Of a longer stay on a spot the end is drawn too."""
+_MAX_VERTICES: Final = 20_000
+_MAX_PIECES: Final = 1000
+_STOP_NS: Final[Ns] = NS_PER_S
+"""The end of a stop that is longer is a vertex too."""
 
 
 class Drawn(NamedTuple):
-    """The pieces of a path, none empty, and how far (m) any pose lies from them at most."""
+    """The pieces of a path, none empty, and how far (m) any pose is from them at most."""
 
     pieces: list[list[Vertex]]
     error_m: float
 
     def row(self) -> tuple[Vertex, ...]:
-        """All vertices in one row, `PARTED` between the pieces."""
+        """Returns all vertices in one row, `PARTED` between the pieces."""
         row: list[Vertex] = []
         for piece in self.pieces:
             row += [PARTED, *piece] if row else piece
@@ -46,13 +46,13 @@ class Drawn(NamedTuple):
 
 
 class DrawnPath:
-    """Vertices that are enough, and how far any pose may lie off them.
+    """Draws a path with few vertices, and bounds how far any pose is from it.
 
-    A simplification of a simplification: the deviations add and do no more, since a vertex that
-    the second drops lies beside the same kept segment as its neighbours. A quarter of the
-    tolerance goes to merging small steps, a quarter to the blocks, and what is left to the whole;
-    paths that are kept of bags have taken an eighth of it. Where that keeps too many vertices the
-    first two quarters are doubled.
+    Simplifies a simplification: the deviations add up and do no more, since a vertex that the
+    second drops is beside the same kept segment as its neighbours. A quarter of the tolerance goes
+    to merging small steps, a quarter to the blocks, and the rest to the whole; paths that were
+    stored for bags have used an eighth of it. Where too many vertices remain, the first two
+    quarters are doubled.
     """
 
     def __init__(self, tolerance_m: float) -> None:
@@ -79,7 +79,7 @@ class DrawnPath:
                 self._merged_m = max(self._merged_m, off)
                 self._merged = vertex
                 return
-        if self._merged is not None and self._merged[0] - self._block[-1][0] > _STAY_NS:
+        if self._merged is not None and self._merged[0] - self._block[-1][0] > _STOP_NS:
             self._block.append(self._merged)  # where a stop ends
         self._merged = None
         self._block.append(vertex)
@@ -90,9 +90,9 @@ class DrawnPath:
     def part(self) -> None:
         """Ends a piece: the robot jumps from the last pose to the next one.
 
-        Of a path in very many pieces the later jumps are drawn as if they were ways.
+        Of a path in very many pieces the later jumps are drawn as if they were driven.
         """
-        if not self._block or len(self._done) >= _MOST_PIECES:
+        if not self._block or len(self._done) >= _MAX_PIECES:
             return
         self._close_block()
         if self._merged is not None:
@@ -101,7 +101,7 @@ class DrawnPath:
         self._kept, self._block, self._merged = [], [], None
 
     def extend(self, row: Iterable[Vertex], error_m: float) -> None:
-        """Takes a path that is drawn already, from which poses lie `error_m` off at most."""
+        """Takes a path that is drawn already, from which poses are `error_m` off at most."""
         self._given_m = max(self._given_m, error_m)
         for vertex in row:
             if math.isnan(vertex[1][0]):
@@ -110,7 +110,7 @@ class DrawnPath:
                 self.add(vertex)
 
     def drawn(self, at_most: int) -> Drawn:
-        """The path with at most so many vertices; then only the longest jumps may part it."""
+        """Returns the path with so many vertices at most; then only the longest jumps split it."""
         last = [*self._kept, *self._block]
         if self._merged is not None:
             last.append(self._merged)
@@ -121,16 +121,16 @@ class DrawnPath:
         return Drawn(kept, so_far + error_m)
 
     def _close_block(self) -> list[Vertex]:
-        """Keeps the vertices that draw the block, and gives them."""
+        """Keeps the vertices that draw the block, and returns them."""
         kept, error = _thinned(self._block, self._stage_m, _BLOCK)
         self._dropped_m = max(self._dropped_m, error)
         self._kept += kept
-        while self.size - len(self._block) > _MOST_VERTICES:
+        while self.size - len(self._block) > _MAX_VERTICES:
             self._thin_all()
         return kept
 
     def _thin_all(self) -> None:
-        while self.size - len(self._block) > _MOST_VERTICES // 2:
+        while self.size - len(self._block) > _MAX_VERTICES // 2:
             self._stage_m *= 2
             thinned = [
                 _thinned(piece, self._stage_m, len(piece)) for piece in (*self._done, self._kept)
@@ -140,7 +140,7 @@ class DrawnPath:
 
 
 def _joined(pieces: Sequence[list[Vertex]], at_most: int) -> list[list[Vertex]]:
-    """The pieces, joined across the shortest jumps until two vertices for each are not too many."""
+    """Joins pieces across the shortest jumps until two vertices for each are not too many."""
     jumps = [
         (distance(before[-1][1], after[0][1]), number)
         for number, (before, after) in enumerate(pairwise(pieces), 1)
@@ -158,7 +158,7 @@ def _joined(pieces: Sequence[list[Vertex]], at_most: int) -> list[list[Vertex]]:
 def _drawn(
     pieces: Sequence[list[Vertex]], tolerance_m: float, at_most: int
 ) -> tuple[list[list[Vertex]], float]:
-    """Each piece thinned; all to one tolerance, widened until they fit."""
+    """Simplifies each piece; all to one tolerance, which is widened until they fit."""
     if len(pieces) == 1:
         kept, error = _thinned(pieces[0], tolerance_m, at_most)
         return [kept], error

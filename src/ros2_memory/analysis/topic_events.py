@@ -1,6 +1,6 @@
-"""What changed on a topic: things came and went, booleans flipped, errors were reported.
+"""Events on a topic: objects came into view and left, booleans toggled, errors were reported.
 
-Message by message or a whole bag at once; where a history is cut into bags changes nothing, as
+Collected message by message or by whole bags; where a history is cut into bags changes nothing, as
 long as nothing is left out for being too much.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.intervals import IntervalBuilder, IntervalTable, Part, joined
+from ros2_memory.analysis.intervals import IntervalBuilder, IntervalPart, IntervalTable, joined
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
@@ -19,51 +19,51 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
 
 MAX_PER_BAG: Final = 64
-"""Presences, flips and faults of one topic in one bag that are kept, each; the rest is counted."""
-MOST_HELD: Final = 20_000
-"""Flips and faults of a topic in all bags together: what a question about a week may hold."""
-MOST_SEEN: Final = 100_000
-"""Presences likewise; they are held as numbers."""
-MOST_FLAGS: Final = 512
-"""Booleans of one message that are followed; the rest is counted."""
-MOST_LABELS: Final = 256
-"""Names of things in one message, likewise."""
+"""Intervals, toggles and errors of one topic in one bag that are stored; the rest is counted."""
+MAX_HELD: Final = 20_000
+"""Toggles and errors of a topic in all bags together, which a question about a week may hold."""
+MAX_SEEN: Final = 100_000
+"""Intervals likewise; they are held as numbers."""
+MAX_FLAGS: Final = 512
+"""Booleans of one message that are tracked; the rest is counted."""
+MAX_LABELS: Final = 256
+"""Labels of one message, likewise."""
 
-_ERROR: Final = 2
-_STALE: Final = 3
+_ERROR_LEVEL: Final = 2
+_STALE_LEVEL: Final = 3
 _ERROR_LEVELS: Final = {
     "rcl_interfaces/msg/Log": 40,
-    "diagnostic_msgs/msg/DiagnosticArray": _ERROR,
+    "diagnostic_msgs/msg/DiagnosticArray": _ERROR_LEVEL,
 }
-_LONGEST_TEXT: Final = 160
-_TOLD_OF: Final = frozenset({"sensor_msgs/msg/BatteryState"})
-_MEASURING: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "tf2_msgs/")
-"""Packages whose messages are measurements: nothing in them comes, goes or flips."""
+_MAX_TEXT_CHARS: Final = 160
+_MEASURED_WITH_EVENTS: Final = frozenset({"sensor_msgs/msg/BatteryState"})
+_MEASUREMENT_PACKAGES: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "tf2_msgs/")
+"""Packages whose messages are measurements: they contain no events."""
 
 
 class State(NamedTuple):
-    """What one message says: names of things, booleans by dot-path, errors as sentences.
+    """What one message states: labels of objects, booleans by dot-path, errors as sentences.
 
-    `beyond` is how many names and booleans it has besides.
+    `beyond` is how many more labels and booleans it has.
     """
 
     labels: tuple[str, ...] = ()
     flags: tuple[tuple[str, bool], ...] = ()
-    faults: tuple[str, ...] = ()
+    errors: tuple[str, ...] = ()
     beyond: int = 0
 
     @property
-    def says_nothing(self) -> bool:
-        """Whether there is nothing in it."""
-        return not (self.labels or self.flags or self.faults)
+    def is_empty(self) -> bool:
+        """Whether the message states nothing."""
+        return not (self.labels or self.flags or self.errors)
 
 
-NOTHING: Final = State()
-NOBODY: Final = IntervalTable()
+EMPTY_STATE: Final = State()
+_NOTHING_VISIBLE: Final = IntervalTable()
 
 
 class Toggle(NamedTuple):
-    """A boolean that is `value` from `time` on, and was the other before."""
+    """A boolean that is `value` from `time` on, and was the opposite before."""
 
     path: str
     time: Ns
@@ -80,7 +80,7 @@ class ReportedError(NamedTuple):
 
 
 class KnownFlag(NamedTuple):
-    """A boolean as it stood at the first message of a bag that has it, and at the last."""
+    """A boolean's value at the first message of a bag that has it, and at the last."""
 
     path: str
     at: Ns
@@ -90,72 +90,72 @@ class KnownFlag(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TopicEvents:
-    """What one bag holds of one topic, to be joined with what is before and after.
+    """The events of one topic in one bag, to be joined with those before and after.
 
     Attributes:
-        first: log time of its first message.
-        last: of its last.
-        seen: the presences.
+        first: log time of the first message.
+        last: of the last.
+        visible: the intervals in which objects were visible.
         known: each boolean's value at either end.
-        flips: in order.
-        faults: by the time of their first report.
-        left_out: presences, flips and faults beyond what is kept: of presences those that lasted
-            longest are, of the others the earliest.
-        undecodable: messages that cannot be decoded, of which nothing is told; where there are no
-            others, `first` lies after `last`.
-        beyond: names of things and booleans of one message that are not followed, at most.
+        toggles: in order.
+        errors: by the time of their first report.
+        left_out: intervals, toggles and errors beyond what is stored: the longest intervals are,
+            and the earliest of the others.
+        undecodable: messages that cannot be decoded; where there are no others, `first` is after
+            `last`.
+        beyond: labels and booleans of one message that are not tracked, at most.
     """
 
     first: Ns
     last: Ns
-    seen: IntervalTable = NOBODY
+    visible: IntervalTable = _NOTHING_VISIBLE
     known: tuple[KnownFlag, ...] = ()
-    flips: tuple[Toggle, ...] = ()
-    faults: tuple[ReportedError, ...] = ()
+    toggles: tuple[Toggle, ...] = ()
+    errors: tuple[ReportedError, ...] = ()
     left_out: int = 0
     undecodable: int = 0
     beyond: int = 0
 
     @property
-    def says_nothing(self) -> bool:
-        """Whether it is only that there were messages."""
-        return not (self.seen.rows or self.known or self.faults or self.undecodable)
+    def is_empty(self) -> bool:
+        """Whether there were only messages without an event."""
+        return not (self.visible.rows or self.known or self.errors or self.undecodable)
 
 
 NO_EVENTS: Final = TopicEvents(0, 0)
-"""Stands for the story of messages that say nothing, whenever they were."""
+"""Stands for the events of messages without any, whenever they were."""
 
 
 def has_events(type_name: str) -> bool:
-    """Whether messages of a type can say anything."""
-    return type_name in _TOLD_OF or not type_name.startswith(_MEASURING)
+    """Returns whether messages of a type can contain events."""
+    return type_name in _MEASURED_WITH_EVENTS or not type_name.startswith(_MEASUREMENT_PACKAGES)
 
 
 def state_of(value: JsonValue, type_name: str) -> State:
-    """What an extracted message of a type says."""
+    """Returns what an extracted message of a type states."""
     if not has_events(type_name):
-        return NOTHING
-    faults = tuple(_faults(value, _ERROR_LEVELS.get(type_name)))
+        return EMPTY_STATE
+    errors = tuple(_errors_in(value, _ERROR_LEVELS.get(type_name)))
     if type_name in _ERROR_LEVELS:
-        return State(faults=faults) if faults else NOTHING
-    labels = tuple(dict.fromkeys(thing.label for thing in detections_of(value)))
-    flags = tuple(_flags(value, ""))
+        return State(errors=errors) if errors else EMPTY_STATE
+    labels = tuple(dict.fromkeys(detection.label for detection in detections_of(value)))
+    flags = tuple(_flags_in(value, ""))
     if not (labels or flags):
-        return NOTHING
-    beyond = len(labels[MOST_LABELS:]) + len(flags[MOST_FLAGS:])
-    return State(labels[:MOST_LABELS], flags[:MOST_FLAGS], faults, beyond)
+        return EMPTY_STATE
+    beyond = len(labels[MAX_LABELS:]) + len(flags[MAX_FLAGS:])
+    return State(labels[:MAX_LABELS], flags[:MAX_FLAGS], errors, beyond)
 
 
 class TopicEventsBuilder:
     """Takes the messages of one topic, or whole bags of them, in log-time order."""
 
     def __init__(self) -> None:
-        self._parts: list[Part] = []
+        self._parts: list[IntervalPart] = []
         self._rows = 0
-        self._watcher: IntervalBuilder | None = None
+        self._builder: IntervalBuilder | None = None
         self._known: dict[str, KnownFlag] = {}
-        self._flips: list[Toggle] = []
-        self._faults: dict[str, ReportedError] = {}
+        self._toggles: list[Toggle] = []
+        self._errors: dict[str, ReportedError] = {}
         self._left_out = 0
         self._undecodable = 0
         self._beyond = 0
@@ -166,126 +166,126 @@ class TopicEventsBuilder:
 
     def add(self, time: Ns, state: State) -> None:
         """Takes the next message."""
-        if self._watcher is None:
-            self._watcher = IntervalBuilder(MOST_SEEN)
-        self._watcher.add(time, state.labels)
+        if self._builder is None:
+            self._builder = IntervalBuilder(MAX_SEEN)
+        self._builder.add(time, state.labels)
         self._beyond = max(self._beyond, state.beyond)
         for path, value in state.flags:
-            self._flag(KnownFlag(path, time, value, value))
-        for text in state.faults:
-            self._fault(ReportedError(text, time, time, 1))
+            self._add_flag(KnownFlag(path, time, value, value))
+        for text in state.errors:
+            self._add_error(ReportedError(text, time, time, 1))
 
-    def join(self, story: TopicEvents) -> None:
+    def join(self, events: TopicEvents) -> None:
         """Takes all messages of a bag that come next, as if they were added one by one."""
-        self._undecodable += story.undecodable
-        if story.first > story.last:
+        self._undecodable += events.undecodable
+        if events.first > events.last:
             return
-        self._settle()
-        self._take(Part(story.first, story.last, story.seen))
-        if story.known:
-            flips = [
+        self._close_part()
+        self._take(IntervalPart(events.first, events.last, events.visible))
+        if events.known:
+            toggles = [
                 Toggle(known.path, known.at, known.first)
-                for known in story.known
-                if self._turns(known)
+                for known in events.known
+                if self._is_toggled(known)
             ]
-            for flip in sorted([*flips, *story.flips], key=lambda flip: flip.time):
-                self._turn(flip)
-            for known in story.known:
-                self._learn(known)
-        for fault in story.faults:
-            self._fault(fault)
-        self._left_out += story.left_out
-        self._beyond = max(self._beyond, story.beyond)
+            for toggle in sorted([*toggles, *events.toggles], key=lambda toggle: toggle.time):
+                self._add_toggle(toggle)
+            for known in events.known:
+                self._remember_flag(known)
+        for error in events.errors:
+            self._add_error(error)
+        self._left_out += events.left_out
+        self._beyond = max(self._beyond, events.beyond)
 
     def events(self, at_most: int | None = None) -> TopicEvents | None:
-        """What was told so far, `at_most` of each kind; None without a message."""
-        self._settle()
+        """Returns the events so far, `at_most` of each kind; None without a message."""
+        self._close_part()
         if not self._parts:
             return TopicEvents(1, 0, undecodable=self._undecodable) if self._undecodable else None
-        first, last, seen = self._one_part()
-        faults = sorted(self._faults.values(), key=lambda each: (each.first, each.text))
-        told = (seen.size, len(self._flips), len(faults))
-        left_out = 0 if at_most is None else sum(max(0, many - at_most) for many in told)
+        first, last, visible = self._merge_parts()
+        errors = sorted(self._errors.values(), key=lambda each: (each.first, each.text))
+        counts = (visible.size, len(self._toggles), len(errors))
+        left_out = 0 if at_most is None else sum(max(0, many - at_most) for many in counts)
         return TopicEvents(
             first,
             last,
-            seen if at_most is None else seen.most_lasting(at_most),
+            visible if at_most is None else visible.most_lasting(at_most),
             tuple(self._known.values()),
-            tuple(self._flips[:at_most]),
-            tuple(faults[:at_most]),
+            tuple(self._toggles[:at_most]),
+            tuple(errors[:at_most]),
             self._left_out + left_out,
             self._undecodable,
             self._beyond,
         )
 
-    def _settle(self) -> None:
-        """Takes what was added message by message."""
-        part = None if self._watcher is None else self._watcher.part()
-        if self._watcher is not None and part is not None:
-            self._left_out += self._watcher.left_out
-            self._watcher = None
+    def _close_part(self) -> None:
+        """Takes over what was added message by message."""
+        part = None if self._builder is None else self._builder.part()
+        if self._builder is not None and part is not None:
+            self._left_out += self._builder.left_out
+            self._builder = None
             self._take(part)
 
-    def _take(self, part: Part) -> None:
+    def _take(self, part: IntervalPart) -> None:
         self._parts.append(part)
-        self._rows += part.seen.size
-        if self._rows > 2 * MOST_SEEN:
-            self._one_part()
+        self._rows += part.visible.size
+        if self._rows > 2 * MAX_SEEN:
+            self._merge_parts()
 
-    def _one_part(self) -> Part:
-        """All parts as one, and no more presences than may be held."""
+    def _merge_parts(self) -> IntervalPart:
+        """Returns all parts as one, without more intervals than may be held."""
         part = self._parts[0] if len(self._parts) == 1 else joined(self._parts)
-        seen = part.seen.most_lasting(MOST_SEEN)
-        self._left_out += part.seen.size - seen.size
-        self._parts, self._rows = [part._replace(seen=seen)], seen.size
+        visible = part.visible.most_lasting(MAX_SEEN)
+        self._left_out += part.visible.size - visible.size
+        self._parts, self._rows = [part._replace(visible=visible)], visible.size
         return self._parts[0]
 
-    def _turns(self, known: KnownFlag) -> bool:
+    def _is_toggled(self, known: KnownFlag) -> bool:
         before = self._known.get(known.path)
         return before is not None and before.last != known.first
 
-    def _flag(self, known: KnownFlag) -> None:
-        if self._turns(known):
-            self._turn(Toggle(known.path, known.at, known.first))
-        self._learn(known)
+    def _add_flag(self, known: KnownFlag) -> None:
+        if self._is_toggled(known):
+            self._add_toggle(Toggle(known.path, known.at, known.first))
+        self._remember_flag(known)
 
-    def _learn(self, known: KnownFlag) -> None:
+    def _remember_flag(self, known: KnownFlag) -> None:
         before = self._known.get(known.path)
-        if before is None and len(self._known) >= MOST_HELD:
+        if before is None and len(self._known) >= MAX_HELD:
             self._left_out += 1
             return
         self._known[known.path] = known if before is None else before._replace(last=known.last)
 
-    def _turn(self, flip: Toggle) -> None:
-        """Adds a flip, or counts it where there are too many."""
-        if len(self._flips) < MOST_HELD:
-            self._flips.append(flip)
+    def _add_toggle(self, toggle: Toggle) -> None:
+        """Adds a toggle, or counts it where there are too many."""
+        if len(self._toggles) < MAX_HELD:
+            self._toggles.append(toggle)
         else:
             self._left_out += 1
 
-    def _fault(self, fault: ReportedError) -> None:
-        before = self._faults.get(fault.text)
-        if before is None and len(self._faults) >= MOST_HELD:
+    def _add_error(self, error: ReportedError) -> None:
+        before = self._errors.get(error.text)
+        if before is None and len(self._errors) >= MAX_HELD:
             self._left_out += 1
             return
-        self._faults[fault.text] = (
-            fault
+        self._errors[error.text] = (
+            error
             if before is None
-            else before._replace(last=fault.last, reports=before.reports + fault.reports)
+            else before._replace(last=error.last, reports=before.reports + error.reports)
         )
 
 
-def _flags(value: JsonValue, path: str) -> Iterator[tuple[str, bool]]:
-    """The booleans of an object and of the objects in it, by dot-path; none of lists."""
+def _flags_in(value: JsonValue, path: str) -> Iterator[tuple[str, bool]]:
+    """Yields the booleans of an object and of nested objects, by dot-path; none of lists."""
     if isinstance(value, bool):
         yield path, value
     elif isinstance(value, dict):
         for name, inner in value.items():
-            yield from _flags(inner, f"{path}.{name}" if path else name)
+            yield from _flags_in(inner, f"{path}.{name}" if path else name)
 
 
-def _faults(value: JsonValue, least: int | None) -> Iterator[str]:
-    """The errors in a log entry, or in a list of diagnostics: who says it, and what."""
+def _errors_in(value: JsonValue, least: int | None) -> Iterator[str]:
+    """Yields the errors in a log entry or a list of diagnostics: who reports it, and what."""
     if least is None:
         return
     status = value.get("status") if isinstance(value, dict) else None
@@ -293,7 +293,11 @@ def _faults(value: JsonValue, least: int | None) -> Iterator[str]:
         if not isinstance(each, dict):
             continue
         level, name = each.get("level"), each.get("name")
-        said = each.get("msg", each.get("message"))
-        if isinstance(level, int) and level >= least and not (level == _STALE and least == _ERROR):
-            text = ": ".join(part for part in (name, said) if isinstance(part, str) and part)
-            yield text if len(text) <= _LONGEST_TEXT else text[: _LONGEST_TEXT - 1] + "…"
+        message = each.get("msg", each.get("message"))
+        if (
+            isinstance(level, int)
+            and level >= least
+            and not (level == _STALE_LEVEL and least == _ERROR_LEVEL)
+        ):
+            text = ": ".join(part for part in (name, message) if isinstance(part, str) and part)
+            yield text if len(text) <= _MAX_TEXT_CHARS else text[: _MAX_TEXT_CHARS - 1] + "…"

@@ -1,8 +1,8 @@
-"""The way driven, summed up pose by pose in bounded memory.
+"""The driven path, measured and drawn in bounded memory.
 
-Poses are measured many at a time (see `motion` and `path_length`). The drawn path is simplified on
-the way (see `paths`); the deviations of all stages add up to at most the tolerance, unless a limit
-on count widens it. Where the robot jumped the path is parted.
+Poses are measured many at a time (see `odometry` and `path_length`). The drawn path is simplified
+on the way (see `polyline`); the deviations of all stages add up to at most the tolerance, unless a
+limit on the count of vertices widens it.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
 
 TOLERANCE_M: Final = 0.05
-"""How far a pose may lie from the drawn path, unless a limit on count widens it."""
+"""How far a pose may be from the drawn path, unless a limit on count widens it."""
 
 _BAG_VERTICES: Final = 32
-"""Vertices of the path that is kept of one bag; all of its poses, where they are no more."""
+"""Vertices of the path that is stored of one bag; all of its poses, where they are no more."""
 
 _NOISY_SHARE: Final = 0.02
 _NOISY_M: Final = 0.001
 
-_AT_ONCE: Final = 2048
+_BATCH: Final = 2048
 """Poses that are measured together."""
 
 
@@ -43,7 +43,7 @@ _AT_ONCE: Final = 2048
 class Waypoint:
     """One vertex of the drawn path: a pose as recorded (m, rad; no yaw without orientation).
 
-    `jump`: the robot jumped here from the waypoint before it, and did not drive.
+    `jump`: the robot jumped here from the waypoint before, instead of driving.
     """
 
     time: Ns
@@ -54,10 +54,10 @@ class Waypoint:
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """What is said of the way driven.
+    """The measurements of a driven path.
 
     Attributes:
-        distance_m: path length in 3D in log-time order, by what its noise allows (see
+        distance_m: path length in 3D in log-time order, as far as its noise allows (see
             `path_length`); gaps, jumps and resets left out.
         duration_s: from the first to the last valid pose.
         avg_speed: `distance_m / duration_s` (m/s); 0 where there is no duration.
@@ -65,16 +65,16 @@ class Trajectory:
         max_speed_from: `twist`: the messages' own; `positions`: over a second and eight poses.
         waypoints: vertices of the path drawn in space and time: first and last pose, corners,
             turning points, ends of stops, and both ends of the longest jumps.
-        waypoint_error_m: no pose lies farther than this from the drawn path.
-        poses: valid poses counted.
+        waypoint_error_m: no pose is farther than this from the drawn path.
+        poses: how many valid poses.
         invalid: poses left out, since a coordinate is NaN, infinite or beyond any place.
-        jumps: steps faster than is plausible, left out of distance and speed.
+        jumps: steps faster than plausible, left out of distance and speed.
         jumped_m: their total length.
-        path_sum_m: the sum of the distances between the poses of `distance_m`, noise and all.
+        path_sum_m: the sum of the distances between the poses of `distance_m`, noise included.
         gaps: times in which nothing was recorded.
-        gap_m: the way across them in straight lines, left out of distance.
-        resets: the first poses after odometry began anew; what led there is left out.
-        in_doubt: noise may be much of the length: the poses come too seldom to tell it from turns.
+        gap_m: the distance across them in straight lines, left out of the distance.
+        resets: the first pose after each reset of odometry; the step to it is left out.
+        in_doubt: whether noise may be much of the length, where poses are too rare to tell.
     """
 
     distance_m: float
@@ -96,7 +96,7 @@ class Trajectory:
 
     @property
     def is_known(self) -> bool:
-        """Whether any pose is a place."""
+        """Whether there is a valid pose."""
         return self.poses > 0
 
     @property
@@ -130,11 +130,11 @@ class _Poses:
     def _add(self, vertex: Vertex) -> None:
         self._poses += 1
         self._waiting.append(vertex)
-        if len(self._waiting) == _AT_ONCE:
+        if len(self._waiting) == _BATCH:
             self._measure()
 
     def _measure(self) -> None:
-        """Measures and draws the poses that wait."""
+        """Measures and draws the waiting poses."""
         waiting, self._waiting = self._waiting, []
         if not waiting:
             return
@@ -148,7 +148,7 @@ class _Poses:
 
 
 class TrajectoryBuilder(_Poses):
-    """Takes poses in log-time order, one at a time, and holds a bounded number of them.
+    """Builds a trajectory from poses in log-time order; holds a bounded number of them.
 
     A step that would take more than `max_plausible_speed_mps` (m/s) is a jump. The path is drawn
     with at most `max_waypoints`, within `tolerance_m` (m) where these are enough.
@@ -197,12 +197,12 @@ class TrajectoryBuilder(_Poses):
         return self._path.size + len(self._waiting)
 
     def result(self) -> Trajectory:
-        """The trajectory so far; more poses may be added after."""
+        """Returns the trajectory so far; more poses may be added after."""
         self._measure()
         motion = self._motion
         duration_s = motion.duration_s
         avg_speed = motion.distance_m / duration_s if duration_s > 0 else 0.0
-        # Drivers that know no twist leave it zero: then it says nothing of a robot that moved.
+        # Drivers without a twist leave it zero, which is wrong where the robot moved.
         stated = self._twist if self._twist or not motion.distance_m else None
         measured = motion.speed_mps or (motion.step_mps if self._poses <= SPEED_STEPS else 0.0)
         drawn = self._path.drawn(self._max_waypoints)
@@ -231,7 +231,7 @@ class TrajectoryBuilder(_Poses):
 
 
 class PoseCollector(_Poses):
-    """Makes the digest of one bag's poses, which come in log-time order.
+    """Builds the digest of one bag's poses, which come in log-time order.
 
     `max_plausible_speed_mps` must be that of the trajectories which join the digest.
     """
@@ -240,7 +240,7 @@ class PoseCollector(_Poses):
         super().__init__(max_plausible_speed_mps, TOLERANCE_M / 8)
 
     def digest(self) -> PoseDigest:
-        """What the poses amount to."""
+        """Returns the digest."""
         few = self._waiting if self._poses <= _BAG_VERTICES else None
         self._measure()
         motion = self._motion
@@ -269,7 +269,7 @@ class PoseCollector(_Poses):
 
 
 def _heading(turn: Quaternion | float | None) -> float | None:
-    """The heading (rad) of a vertex; None where it has none."""
+    """Returns the heading (rad) of a vertex; None where it has none."""
     if turn is None or isinstance(turn, float):
         return turn
     unit = normalised(turn)

@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.intervals import IntervalTable
-from ros2_memory.analysis.odometry import Leg, Pace, PoseDigest, TimedPosition
+from ros2_memory.analysis.odometry import Leg, NearbyMotion, PoseDigest, TimedPosition
 from ros2_memory.analysis.path_length import Creep, End
 from ros2_memory.analysis.standstills import ChainDigest, StandstillDigest
 from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
@@ -89,8 +89,8 @@ def _packed_leg(leg: Leg) -> bytes:
         leg.head.noise_m,
         leg.tail.pace_m,
         leg.tail.noise_m,
-        *leg.setting_out,
-        *leg.arriving,
+        *leg.near_first,
+        *leg.near_last,
     )
     return packed + b"".join(
         _CREEP.pack(
@@ -149,21 +149,21 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
     )
 
 
-def encode_topic_events(story: TopicEvents) -> bytes:
-    """A story as bytes."""
-    counts = (story.first, story.last, story.left_out, story.undecodable, story.beyond)
+def encode_topic_events(events: TopicEvents) -> bytes:
+    """A events as bytes."""
+    counts = (events.first, events.last, events.left_out, events.undecodable, events.beyond)
     # Many booleans have the same paths, and times counted from the first message, in every bag.
     known = [
-        [each.path for each in story.known],
-        [each.at - story.first for each in story.known],
-        "".join(str(each.first + 2 * each.last) for each in story.known),
+        [each.path for each in events.known],
+        [each.at - events.first for each in events.known],
+        "".join(str(each.first + 2 * each.last) for each in events.known),
     ]
     rest = json.dumps(
-        [story.seen.labels, known, story.flips, story.faults],
+        [events.visible.labels, known, events.toggles, events.errors],
         ensure_ascii=False,
         separators=(",", ":"),
     )
-    rows = story.seen.rows
+    rows = events.visible.rows
     # Half a pair of surrogates is no UTF-8, and is kept all the same.
     text = rest.encode("utf-8", "surrogatepass")
     shorter = zlib.compress(text) if len(text) > _SHORT_TEXT else text
@@ -171,7 +171,7 @@ def encode_topic_events(story: TopicEvents) -> bytes:
 
 
 def decode_topic_events(packed: bytes) -> TopicEvents:
-    """The story that these bytes are of.
+    """The events that these bytes are of.
 
     Raises:
         ValueError: they are of none.
@@ -185,10 +185,10 @@ def decode_topic_events(packed: bytes) -> TopicEvents:
             for path, at, value in zip(paths, after, values, strict=True)
         )
     except (TypeError, struct.error, zlib.error) as error:
-        raise ValueError(f"not a story: {error}") from error
+        raise ValueError(f"not a events: {error}") from error
     seen = IntervalTable(labels, packed[_STORY.size : end])
     if not seen.is_sound:
-        raise ValueError("not a story: it tells of things without a name")
+        raise ValueError("not a events: it tells of things without a name")
     return TopicEvents(first, last, seen, known, flips, faults, left_out, undecodable, beyond)
 
 
@@ -198,7 +198,7 @@ def _told(
 ) -> tuple[
     tuple[str, ...], tuple[list[str], list[int], str], tuple[Toggle, ...], tuple[ReportedError, ...]
 ]:
-    """What a story says in words: of many bags the same, and asked of an hour again and again."""
+    """What a events says in words: of many bags the same, and asked of an hour again and again."""
     plain = text if text.startswith(b"[") else zlib.decompress(text)
     labels, (paths, after, values), flips, faults = json.loads(
         plain.decode("utf-8", "surrogatepass")
@@ -276,8 +276,8 @@ def _unpacked_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
         End(paces[0], paces[1], bool(flags & 2), creeps[0]),
         End(paces[2], paces[3], bool(flags & 4), creeps[0] if still else creeps[1]),
         still,
-        setting_out=Pace(paces[4], paces[5]),
-        arriving=Pace(paces[6], paces[7]),
+        near_first=NearbyMotion(paces[4], paces[5]),
+        near_last=NearbyMotion(paces[6], paces[7]),
     )
     return leg, begin
 

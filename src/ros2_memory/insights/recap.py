@@ -128,10 +128,10 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     newest = view.snapshot.latest
     known_to = window.stop if newest is None else min(window.stop, newest)
     for topic, story in _stories(view, window):
-        events += [*_flips(topic, story), *map(_error, story.faults)]
-        seen.append(story.seen)
-        throughout.update(story.seen.throughout(start, end))
-        there_still |= dict.fromkeys(story.seen.at_end(story.last, known_to), story.last)
+        events += [*_flips(topic, story), *map(_error, story.errors)]
+        seen.append(story.visible)
+        throughout.update(story.visible.throughout(start, end))
+        there_still |= dict.fromkeys(story.visible.at_end(story.last, known_to), story.last)
         if story.undecodable:
             messages = counted(story.undecodable, "message")
             view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
@@ -205,7 +205,7 @@ def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, TopicEvents]
     for topic in view.snapshot.topics():
         if any(map(has_events, view.snapshot.types_of(topic))):
             story = _events_in(view, topic, window)
-            if story is not None and not story.says_nothing:
+            if story is not None and not story.is_empty:
                 yield topic, story
 
 
@@ -218,7 +218,7 @@ def _stops(drive: _Drive) -> Iterator[Event]:
 def _flips(topic: str, story: TopicEvents) -> Iterator[Event]:
     """Each flip, and how long it held; up to the end where it still did."""
     until: dict[str, Ns] = {}
-    for flip in reversed(story.flips):
+    for flip in reversed(story.toggles):
         name = topic if flip.path == "value" else f"{topic} {flip.path}"
         text = f"{name} became {'true' if flip.value else 'false'}"
         held = until.get(flip.path)

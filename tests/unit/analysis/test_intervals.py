@@ -11,8 +11,8 @@ from ros2_memory.analysis.intervals import (
     FLICKER_NS,
     SILENCE_NS,
     IntervalBuilder,
+    IntervalPart,
     IntervalTable,
-    Part,
     VisibleInterval,
     joined,
     united,
@@ -41,7 +41,7 @@ def histories(draw: st.DrawFn, begin: int = 0) -> Messages:
     return messages
 
 
-def watched(messages: Messages, at_most: int = 1000) -> Part:
+def watched(messages: Messages, at_most: int = 1000) -> IntervalPart:
     watcher = IntervalBuilder(at_most)
     for time, labels in messages:
         watcher.add(time, labels)
@@ -73,7 +73,7 @@ def by_hand(messages: Messages) -> list[VisibleInterval]:
 @given(histories())
 def test_a_thing_is_in_view_as_long_as_it_is_missed_for_a_moment_only(messages: Messages) -> None:
     part = watched(messages)
-    assert list(part.seen.presences()) == by_hand(messages)
+    assert list(part.visible.intervals()) == by_hand(messages)
     assert (part.first, part.last) == (messages[0][0], messages[-1][0])
 
 
@@ -98,10 +98,10 @@ def test_where_messages_are_cut_into_parts_changes_nothing(
 def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
     topics: list[Messages],
 ) -> None:
-    each = [watched(messages).seen for messages in topics]
+    each = [watched(messages).visible for messages in topics]
     together = united(each)
-    spans = [one for seen in each for one in seen.presences()]
-    for presence in together.presences():
+    spans = [one for seen in each for one in seen.intervals()]
+    for presence in together.intervals():
         mine = [
             one
             for one in spans
@@ -114,7 +114,7 @@ def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
         for nth in range(1, len(mine)):
             assert mine[nth].first - max(one.last for one in mine[:nth]) <= FLICKER_NS
     for label in "abc":
-        own = [one for one in together.presences() if one.label == label]
+        own = [one for one in together.intervals() if one.label == label]
         assert all(after.first - before.last > FLICKER_NS for before, after in pairwise(own))
         inside = [one for one in spans if one.label == label]
         for one in inside:
@@ -123,7 +123,7 @@ def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
 
 
 def test_what_lasted_longest_comes_first_and_of_equals_the_earliest() -> None:
-    seen = watched([(0, ("b", "a")), (NS_PER_S, ("a",)), (20 * NS_PER_S, ("c",))]).seen
+    seen = watched([(0, ("b", "a")), (NS_PER_S, ("a",)), (20 * NS_PER_S, ("c",))]).visible
     assert [each.label for each in seen.longest(3)] == ["a", "b", "c"]
     assert [each.label for each in seen.longest(1)] == ["a"]
 
@@ -132,21 +132,21 @@ def test_the_most_lasting_are_kept_in_order_with_the_names_that_they_need() -> N
     late = 40 * NS_PER_S
     seen = watched(
         [(0, ("b",)), (1, ("b",)), (20 * NS_PER_S, ("a",)), (late, ("c",)), (late + 1, ("c",))]
-    ).seen
+    ).visible
     assert seen.labels == ("a", "b", "c")
     kept = seen.most_lasting(2)
     assert kept.labels == ("b", "c")
-    assert kept.presences() == (
+    assert kept.intervals() == (
         VisibleInterval("b", 0, 1),
         VisibleInterval("c", late, late + 1),
     )
-    assert [each.label for each in seen.most_lasting(1).presences()] == ["b"]
+    assert [each.label for each in seen.most_lasting(1).intervals()] == ["b"]
     assert seen.most_lasting(3) is seen
 
 
 def test_presences_without_some_things_are_those_of_the_others() -> None:
-    seen = watched([(0, ("a", "b")), (20 * NS_PER_S, ("a",))]).seen
-    assert seen.without({"a", "x"}).presences() == (VisibleInterval("b", 0, 0),)
+    seen = watched([(0, ("a", "b")), (20 * NS_PER_S, ("a",))]).visible
+    assert seen.without({"a", "x"}).intervals() == (VisibleInterval("b", 0, 0),)
     assert seen.without({"x"}) is seen
 
 
@@ -175,17 +175,17 @@ def each_s(begin: float, end: float, period: float, *labels: str) -> Messages:
 def test_a_thing_is_seen_throughout_where_it_is_seen_at_the_usual_rate(
     messages: Messages, is_seen: bool
 ) -> None:
-    seen = watched(messages).seen
+    seen = watched(messages).visible
     assert ("a" in seen.throughout(0, 65 * NS_PER_S)) is is_seen
     half = len(messages) // 2 or 1
     parts = [watched(part) for part in (messages[:half], messages[half:]) if part]
-    assert ("a" in joined(parts).seen.throughout(0, 65 * NS_PER_S)) is is_seen
+    assert ("a" in joined(parts).visible.throughout(0, 65 * NS_PER_S)) is is_seen
 
 
 def test_a_thing_that_is_not_seen_any_more_is_not_there_still() -> None:
     messages = each_s(0, 20, 0.2, "a")
     last = messages[-1][0]
-    seen = watched(messages).seen
+    seen = watched(messages).visible
     assert seen.at_end(last, last + NS_PER_S) == ["a"]
     assert seen.at_end(last, last + 2 * NS_PER_S) == []
     assert seen.at_end(last - 1, last) == []
@@ -195,7 +195,7 @@ def test_a_thing_that_is_not_seen_any_more_is_not_there_still() -> None:
 def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
     messages: Messages,
 ) -> None:
-    seen = watched(messages).seen
+    seen = watched(messages).visible
     start, end = messages[0][0], messages[-1][0]
     for label in seen.throughout(start, end):
         times = [time for time, labels in messages if label in labels]
@@ -206,15 +206,15 @@ def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
 
 def test_nothing_seen_is_joined_to_nothing_seen() -> None:
     nothing = watched([(0, ())])
-    assert joined([nothing, watched([(1, ())])]) == Part(0, 1, IntervalTable())
+    assert joined([nothing, watched([(1, ())])]) == IntervalPart(0, 1, IntervalTable())
     assert united([]) == IntervalTable()
     assert IntervalTable().longest(3) == ()
 
 
 def test_times_at_either_end_of_what_can_be_said_are_far_apart() -> None:
     ends = [watched([(time, ("a",))]) for time in (MIN_NS, MAX_NS)]
-    assert joined(ends).seen.size == 2
-    assert united([each.seen for each in ends]).size == 2
+    assert joined(ends).visible.size == 2
+    assert united([each.visible for each in ends]).size == 2
 
 
 def test_presences_are_counted_beyond_what_may_be_held() -> None:
@@ -224,17 +224,17 @@ def test_presences_are_counted_beyond_what_may_be_held() -> None:
     assert watcher.left_out == 3
     part = watcher.part()
     assert part is not None
-    assert part.seen.size == 3
+    assert part.visible.size == 3
 
 
 @pytest.mark.parametrize(
     "seen",
     [
-        IntervalTable((), watched([(0, ("a",))]).seen.rows),
-        IntervalTable(("a",), watched([(0, ("a", "b"))]).seen.rows),
+        IntervalTable((), watched([(0, ("a",))]).visible.rows),
+        IntervalTable(("a",), watched([(0, ("a", "b"))]).visible.rows),
         IntervalTable(("a",), b"rows"),
     ],
 )
 def test_rows_without_a_name_are_told_from_sound_ones(seen: IntervalTable) -> None:
     assert not seen.is_sound
-    assert watched([(0, ("a", "b"))]).seen.is_sound
+    assert watched([(0, ("a", "b"))]).visible.is_sound

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis import topic_events
 from ros2_memory.analysis.intervals import IntervalBuilder, IntervalTable
 from ros2_memory.analysis.topic_events import (
-    NOTHING,
+    EMPTY_STATE,
     KnownFlag,
     ReportedError,
     State,
@@ -31,7 +31,7 @@ def told(messages: Messages, at_most: int | None = None) -> TopicEvents | None:
 
 
 def seeing(*labels: str) -> State:
-    return State(labels) if labels else NOTHING
+    return State(labels) if labels else EMPTY_STATE
 
 
 def each_second(*states: State) -> Messages:
@@ -43,7 +43,7 @@ STATES = st.builds(
     st.sets(st.sampled_from("abc")),
     st.sampled_from([(), (("x", True),), (("x", False),), (("x", True), ("y", False))]),
     st.sampled_from([(), ("hot",), ("cold",), ("hot", "cold")]),
-).map(lambda state: NOTHING if state.says_nothing else state)
+).map(lambda state: EMPTY_STATE if state.is_empty else state)
 
 
 @st.composite
@@ -66,10 +66,10 @@ def histories(draw: st.DrawFn) -> tuple[Messages, list[int]]:
 def _comparable(story: TopicEvents | None) -> object:
     """Flips of several booleans at one time stand in no order."""
     assert story is not None
-    flips = sorted(story.flips, key=lambda flip: (flip.time, flip.path))
+    flips = sorted(story.toggles, key=lambda flip: (flip.time, flip.path))
     known = sorted(story.known)
-    seen = story.seen.presences()
-    return (story.first, story.last, seen, known, flips, story.faults, story.left_out)
+    seen = story.visible.intervals()
+    return (story.first, story.last, seen, known, flips, story.errors, story.left_out)
 
 
 def _glimpse(label: str, at: int) -> IntervalTable:
@@ -77,7 +77,7 @@ def _glimpse(label: str, at: int) -> IntervalTable:
     watcher.add(at, [label])
     part = watcher.part()
     assert part is not None
-    return part.seen
+    return part.visible
 
 
 @given(histories())
@@ -97,32 +97,32 @@ def test_a_boolean_that_flips_is_told_with_its_new_value() -> None:
     flags = [State(flags=(("value", value),)) for value in (False, False, True, False)]
     story = told(each_second(*flags))
     assert story is not None
-    assert story.flips == (
+    assert story.toggles == (
         Toggle("value", 2 * NS_PER_S, True),
         Toggle("value", 3 * NS_PER_S, False),
     )
 
 
 def test_an_error_that_is_reported_again_is_told_once_with_its_count() -> None:
-    hot = State(faults=("motor: hot",))
-    story = told(each_second(hot, NOTHING, hot, hot))
+    hot = State(errors=("motor: hot",))
+    story = told(each_second(hot, EMPTY_STATE, hot, hot))
     assert story is not None
-    assert story.faults == (ReportedError("motor: hot", 0, 3 * NS_PER_S, 3),)
+    assert story.errors == (ReportedError("motor: hot", 0, 3 * NS_PER_S, 3),)
 
 
 def test_what_is_beyond_the_limit_is_counted() -> None:
     blinking = [seeing("cup") if nth % 4 == 0 else seeing() for nth in range(40)]
     story = told(each_second(*blinking), at_most=3)
     assert story is not None
-    assert [each.first for each in story.seen.presences()] == [0, 4 * NS_PER_S, 8 * NS_PER_S]
+    assert [each.first for each in story.visible.intervals()] == [0, 4 * NS_PER_S, 8 * NS_PER_S]
     assert story.left_out == 7
 
 
 def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(topic_events, "MOST_HELD", 10)
-    monkeypatch.setattr(topic_events, "MOST_SEEN", 10)
+    monkeypatch.setattr(topic_events, "MAX_HELD", 10)
+    monkeypatch.setattr(topic_events, "MAX_SEEN", 10)
     builder = TopicEventsBuilder()
     for nth in range(15):
         at = nth * 100 * NS_PER_S
@@ -131,24 +131,24 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
             TopicEvents(
                 at,
                 at + NS_PER_S,
-                seen=_glimpse(f"cup {nth}", at),
+                visible=_glimpse(f"cup {nth}", at),
                 known=tuple(known),
-                flips=tuple(Toggle(each.path, at + 1, True) for each in known),
-                faults=(ReportedError(f"error {nth}", at, at, 1),),
+                toggles=tuple(Toggle(each.path, at + 1, True) for each in known),
+                errors=(ReportedError(f"error {nth}", at, at, 1),),
             )
         )
     story = builder.events()
     assert story is not None
-    assert story.seen.size == len(story.flips) == len(story.faults) == 10
-    assert story.seen.presences()[0].label == "cup 0"
+    assert story.visible.size == len(story.toggles) == len(story.errors) == 10
+    assert story.visible.intervals()[0].label == "cup 0"
     flips = 2 * 15 + 2 * 14
     assert story.left_out == (15 - 10) + (flips - 10) + (15 - 10)
 
 
 def test_messages_that_say_nothing_make_a_story_that_says_nothing() -> None:
-    story = told(each_second(NOTHING, NOTHING))
+    story = told(each_second(EMPTY_STATE, EMPTY_STATE))
     assert story is not None
-    assert story.says_nothing
+    assert story.is_empty
     assert told([]) is None
 
 
@@ -159,16 +159,16 @@ def test_labels_booleans_and_errors_are_found_in_values() -> None:
     assert state_of({"value": True}, "std_msgs/msg/Bool").flags == (("value", True),)
     assert state_of({"a": {"b": False, "list": [True]}}, "x/msg/Y").flags == (("a.b", False),)
     log: dict[str, JsonValue] = {"level": 40, "name": "planner", "msg": "no path"}
-    assert state_of(log, "rcl_interfaces/msg/Log").faults == ("planner: no path",)
-    assert state_of({**log, "level": 30}, "rcl_interfaces/msg/Log") is NOTHING
+    assert state_of(log, "rcl_interfaces/msg/Log").errors == ("planner: no path",)
+    assert state_of({**log, "level": 30}, "rcl_interfaces/msg/Log") is EMPTY_STATE
     status: list[JsonValue] = [
         {"level": 0, "name": "lidar", "message": "fine"},
         {"level": 2, "name": "motor", "message": "hot"},
         {"level": 3, "name": "imu", "message": "stale"},
     ]
     found = state_of({"status": status}, "diagnostic_msgs/msg/DiagnosticArray")
-    assert found.faults == ("motor: hot",)
-    assert state_of({"value": 3.5}, "std_msgs/msg/Float64") is NOTHING
+    assert found.errors == ("motor: hot",)
+    assert state_of({"value": 3.5}, "std_msgs/msg/Float64") is EMPTY_STATE
 
 
 @given(histories(), st.integers(0, 700))
@@ -178,6 +178,6 @@ def test_a_story_comes_back_from_its_bytes_as_it_was(
     messages, _ = history
     at = messages[-1][0]
     many = State(flags=tuple((f"flag_{nth}", nth % 3 == 0) for nth in range(booleans)), beyond=3)
-    story = told([*messages, (at, many), (at + 1, NOTHING)])
+    story = told([*messages, (at, many), (at + 1, EMPTY_STATE)])
     assert story is not None
     assert decode_topic_events(encode_topic_events(story)) == story

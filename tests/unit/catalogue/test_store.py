@@ -90,9 +90,7 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
         assert again.poses(held.topic, [number]).get(number) == held.poses
         assert again.standstills(held.topic, [number]).get(number) == held.standstills
         assert again.topic_events(held.topic, [number]) == {
-            number: NO_EVENTS
-            if held.events is not None and held.events.says_nothing
-            else held.events
+            number: NO_EVENTS if held.events is not None and held.events.is_empty else held.events
         }
         assert again.edges(held.topic, [number]).get(number) == held.edges
         assert again.messages(held.topic, [number]).get(number) == held.kept
@@ -102,7 +100,7 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
     assert standstills is not None
     assert standstills.head
     assert story is not None
-    assert len(story.flips) == 1
+    assert len(story.toggles) == 1
 
 
 def test_a_topic_that_cannot_be_decoded_has_no_story_and_is_not_taken_for_a_quiet_one(
