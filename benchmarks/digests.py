@@ -13,10 +13,10 @@ from benchmarks.report import Figure
 from ros2_memory.analysis.standstills import (
     BLOCK_NS,
     ChainDigest,
-    packed_blocks,
-    packed_poses,
-    unpacked_blocks,
-    unpacked_poses,
+    decode_blocks,
+    decode_positions,
+    encode_blocks,
+    encode_positions,
 )
 from ros2_memory.bootstrap import build_backfill
 from ros2_memory.catalogue.digest import Digester
@@ -99,21 +99,21 @@ def _moved_standstills(digest: StandstillDigest, by: int) -> StandstillDigest:
 
     return replace(
         digest,
-        head=packed_poses(_later(unpacked_poses(digest.head), by)),
+        head=encode_positions(_later(decode_positions(digest.head), by)),
         head_until=digest.head_until + by,
-        tail=packed_poses(_later(unpacked_poses(digest.tail), by)),
+        tail=encode_positions(_later(decode_positions(digest.tail), by)),
         tail_since=digest.tail_since + by,
         chains=tuple(
             ChainDigest(
                 later(each.start),
                 later(each.end),
-                packed_blocks(
+                encode_blocks(
                     block._replace(
                         number=block.number + by // BLOCK_NS,
                         first=block.first + by,
                         last=block.last + by,
                     )
-                    for block in unpacked_blocks(each.blocks)
+                    for block in decode_blocks(each.blocks)
                 ),
             )
             for each in digest.chains

@@ -3,19 +3,19 @@
 A standstill is a time of at least `SHORTEST_NS` in which the robot stays in a box that does not
 grow with time. It begins with the first pose at that place and ends with the last.
 
-Poses are averaged in slots of `SLOT_NS`, counted from the epoch, so that noise averages out. Slots
-that follow each other are linked where their means are no farther apart than a drift of `DRIFT_MPS`
-or the noise of their own poses explains, and linked slots form a chain. The ends of a chain are
-then found pose by pose: a slot that is clearly inside gives the place and its noise, and poses are
-followed outwards, through the last slot of the chain and the one beyond, until one lies elsewhere.
+Poses are averaged in slots of `SLOT_NS`, counted from the epoch, so that noise averages out.
+Consecutive slots are linked where their means are no farther apart than a drift of `DRIFT_MPS` or
+the noise of their own poses explains, and linked slots form a chain. The ends of a chain are then
+found pose by pose: a slot that is clearly inside gives the place and its noise, and poses are
+followed outwards, through the last slot of the chain and the one beyond, until one is elsewhere.
 Slow motion that noise hides from two slots shows in blocks of `BLOCK_NS`: a block whose means
-spread farther than drift and noise explain is motion, and parts the chain. So are still blocks that
-lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. A standstill that drifts out of
+spread farther than drift and noise explain is motion, and splits the chain. So are still blocks
+that lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. A standstill that drifts out of
 `LARGEST_M` in a longer time ends there, and the next one begins.
 
-All of this depends on poses a few slots around alone, and slots and blocks are counted from the
-epoch, and all positions are rounded alike (`_STEP_M`). So a standstill is the same whatever window
-is asked about, and however a history is cut into bags.
+All of this depends only on poses a few slots around; slots and blocks are counted from the epoch,
+and all positions are rounded alike (`_STEP_M`). So a standstill is the same whatever window is
+asked about, and however a history is cut into bags.
 
 The noise of a slot is estimated from second differences, which a steady motion leaves at zero: see
 J. von Neumann et al., "The mean square successive difference", Ann. Math. Statist. 12 (1941), for
@@ -42,33 +42,33 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Vector3
 
 SHORTEST_NS: Final[Ns] = 3 * NS_PER_S
-"""A robot that stands for less is turning round, or minding its step."""
+"""A robot that is still for less is turning, or driving with care."""
 SILENCE_NS: Final[Ns] = 5 * NS_PER_S // 2
-"""Poses farther apart say nothing of the time between them: a standstill ends there."""
+"""Between poses farther apart nothing is known: a standstill ends there."""
 SLOT_NS: Final[Ns] = 2 * NS_PER_S // 5
 BLOCK_NS: Final[Ns] = 5 * SLOT_NS
 CREEP_NS: Final[Ns] = 15 * BLOCK_NS
-"""A robot that gets farther than `LARGEST_M` in this time creeps; a slower one drifts."""
+"""A robot that moves farther than `LARGEST_M` in this time creeps; a slower one drifts."""
 CONTEXT_NS: Final[Ns] = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
-"""Poses so far outside of a window decide whether the robot stood inside of it."""
+"""Poses so far outside a window decide whether the robot stood still inside it."""
 DRIFT_MPS: Final = 0.008
-"""The mean of a robot that stands may move so fast: odometry drifts."""
+"""The mean position of a still robot may move so fast: odometry drifts."""
 LARGEST_M: Final = 0.1
 CREEP_MPS: Final = LARGEST_M / unix_from_ns(CREEP_NS)
-"""A robot that is slower than this cannot be told from one that stands."""
+"""A slower robot cannot be distinguished from one that stands still."""
 
 _NOISE_FACTOR: Final = 5.5
 _NEAREST_M: Final = 0.0003
-"""Poses without noise are at one place where they are no farther apart than this."""
+"""Poses without noise are at one place if they are no farther apart than this."""
 _STEP_M: Final = 0.0001
 """What positions and their means are rounded to."""
-_MOST_IN_SLOT: Final = 1_000
+_MAX_IN_SLOT: Final = 1_000
 _EDGE_SLOTS: Final = 3
 _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
 
 
 class Box3(NamedTuple):
-    """The smallest box (m) around places."""
+    """The smallest box (m) around some positions."""
 
     low: Vector3
     high: Vector3
@@ -85,14 +85,14 @@ class Box3(NamedTuple):
         return math.dist(self.low, self.high)
 
     def united(self, other: Box3) -> Box3:
-        """The box around both."""
+        """Returns the box around both."""
         (a, b, c), (d, e, f) = self
         (g, h, i), (j, k, m) = other
         return Box3((min(a, g), min(b, h), min(c, i)), (max(d, j), max(e, k), max(f, m)))
 
 
 class Standstill(NamedTuple):
-    """A time in which the robot stood: from its first pose there to its last (inclusive).
+    """A time in which the robot stood still: from its first pose there to its last (inclusive).
 
     `box` is around the mean positions of its slots.
     """
@@ -121,15 +121,15 @@ class Block(NamedTuple):
         return self.box.diagonal <= min(explained, LARGEST_M)
 
     def is_far_from(self, other: Block) -> bool:
-        """Whether more than noise lies between them beyond `LARGEST_M`."""
+        """Returns whether the distance exceeds `LARGEST_M` by more than noise."""
         apart_m = math.dist(self.box.centre, other.box.centre)
         return apart_m > LARGEST_M + 2 * (self.noise + other.noise)
 
 
 class ChainDigest(NamedTuple):
-    """Linked slots of one bag; an end that the poses of other bags decide is None.
+    """Linked slots of one bag; an end that depends on the poses of other bags is None.
 
-    `blocks` are packed; see `packed_blocks`.
+    `blocks` are encoded by `encode_blocks`.
     """
 
     start: Ns | None
@@ -145,13 +145,13 @@ class StandstillDigest:
     the slots between them; those with two known ends last at least `SHORTEST_NS`.
 
     Attributes:
-        head: poses of the first three slots; of all where there are fewer than five. Packed; see
-            `packed_poses`.
+        head: poses of the first three slots; of all where there are fewer than five. Encoded by
+            `encode_positions`.
         head_until: the log time of the last of these.
-        tail: poses of the last three slots; empty where `head` holds all.
+        tail: poses of the last three slots; empty where `head` has all.
         tail_since: the log time of the first of these.
-        chains: in order. The first one's start is None where it holds the second slot, the last
-            one's end where it holds the last slot but one.
+        chains: in order. The first one's start is None where it includes the second slot, the last
+            one's end where it includes the last slot but one.
     """
 
     head: bytes
@@ -174,7 +174,7 @@ class _Slot:
 
     def add(self, pose: TimedPosition) -> None:
         self._mean = self._bends = None
-        if len(self.poses) < _MOST_IN_SLOT:
+        if len(self.poses) < _MAX_IN_SLOT:
             self.poses.append(pose)
         else:
             self.poses[-1] = pose
@@ -209,13 +209,13 @@ class _Slot:
         return self._bends
 
     def reach(self) -> float:
-        """How far (m) from its mean a pose may lie and be at the same place."""
+        """Returns how far (m) from its mean a pose may be and still be at the same place."""
         farthest = max(math.dist(position, self.mean) for _, position in self.poses)
         return max(_NEAREST_M, 4.5 * _noise(self.bends), 1.5 * farthest)
 
 
 def _noise(bends: Sequence[float]) -> float:
-    """Standard deviation (m) of poses in space: a median, since a robot that stops bends once."""
+    """Returns the standard deviation (m) of poses; a median, since a stopping robot bends once."""
     if not bends:
         return 0.0
     middle = sorted(bends)[(len(bends) - 1) // 2]
@@ -224,14 +224,14 @@ def _noise(bends: Sequence[float]) -> float:
 
 
 def _linked(slot: _Slot, after: _Slot) -> bool:
-    """Whether the robot may have stood from one slot to the next that has poses."""
+    """Returns whether the robot may have stood still from one slot to the next that has poses."""
     if not _follows(slot, after):
         return False
     allowed = DRIFT_MPS * unix_from_ns((after.number - slot.number) * SLOT_NS)
     bends = [*slot.bends, *after.bends]
     if bends:
         spread = math.sqrt(1 / len(slot.poses) + 1 / len(after.poses))
-        # Few of them may show much less noise than there is.
+        # Few of them may show much less noise than there is, hence the allowance.
         allowed = max(allowed, _NOISE_FACTOR * (1 + 4 / len(bends)) * _noise(bends) * spread)
     return math.dist(slot.mean, after.mean) <= allowed
 
@@ -241,23 +241,25 @@ def _follows(slot: _Slot, after: _Slot) -> bool:
 
 
 def _begin(before: _Slot | None, first: _Slot, inside: _Slot) -> Ns:
-    """The first pose of a chain's standstill; `inside` is the second slot of the chain."""
+    """Returns the first pose of a chain's standstill; `inside` is the second slot of the chain."""
     slots = [inside, first]
     if before is not None and _follows(before, first):
         slots.append(before)
-    return _followed(inside, (pose for slot in slots for pose in reversed(slot.poses)), inside.last)
+    return _last_there(
+        inside, (pose for slot in slots for pose in reversed(slot.poses)), inside.last
+    )
 
 
 def _end(inside: _Slot, last: _Slot, after: _Slot | None) -> Ns:
-    """The last pose of a chain's standstill; `inside` is the last slot of the chain but one."""
+    """Returns the last pose of a chain's standstill; `inside` is the last slot but one."""
     slots = [inside, last]
     if after is not None and _follows(last, after):
         slots.append(after)
-    return _followed(inside, (pose for slot in slots for pose in slot.poses), inside.first)
+    return _last_there(inside, (pose for slot in slots for pose in slot.poses), inside.first)
 
 
-def _followed(inside: _Slot, poses: Iterable[TimedPosition], until: Ns) -> Ns:
-    """The last of the poses up to which all are at the place of a slot."""
+def _last_there(inside: _Slot, poses: Iterable[TimedPosition], until: Ns) -> Ns:
+    """Returns the last of the poses up to which all are at the place of a slot."""
     place, reach = inside.mean, inside.reach()
     for time, position in poses:
         if math.dist(position, place) > reach:
@@ -272,12 +274,12 @@ class _Chain:
     def __init__(self, start: Ns | None, blocks: Iterable[Block] = ()) -> None:
         self.start = start
         self.end: Ns | None = None
-        self.blocks = [*blocks]  # that are not settled
+        self.blocks = [*blocks]  # not settled yet
         self._found: list[Standstill] = []
-        self._parts: list[Standstill] = []  # of the standstill under way: it drifts on
-        self._settled: Block | None = None  # the newest
-        self._taken: Ns = 0
-        self._looked_at: list[Block] = []  # still ones, one after another, as long as a creep
+        self._parts: list[Standstill] = []  # of the open standstill, which drifts
+        self._settled: Block | None = None  # the newest settled one
+        self._not_before: Ns = 0
+        self._checked: list[Block] = []  # consecutive still ones, over the time of a creep
         self._creeps: deque[tuple[int, int]] = deque()  # the numbers of first and last block
 
     def add(self, slot: _Slot) -> None:
@@ -297,27 +299,27 @@ class _Chain:
             else:
                 self.blocks.append(block)
 
-    def settle(self, taken: Ns, *, is_over: bool = False) -> None:
-        """Turn blocks into standstills: those that no slot or block to come can change, or all.
+    def settle(self, not_before: Ns, *, is_over: bool = False) -> None:
+        """Turns blocks into standstills: those that no later slot or block can change, or all.
 
-        They begin at `taken` or later, where the standstill of the chain before ends: chains follow
-        poses into each other's slots.
+        They begin at `not_before` or later, where the standstill of the chain before ends: the ends
+        of chains are followed into each other's slots.
         """
-        self._taken = taken
+        self._not_before = not_before
         newest = self.blocks[-1].number if self.blocks else 0
         for block in self.blocks if is_over else self.blocks[:-1]:
-            if not self._looked_at or block.number > self._looked_at[-1].number:
-                self._look_for_creep(block)
+            if not self._checked or block.number > self._checked[-1].number:
+                self._mark_creep(block)
         many = sum(is_over or newest - each.number >= _CREEP_BLOCKS for each in self.blocks)
         settled, self.blocks = self.blocks[:many], self.blocks[many:]
         for block in settled:
             self._settle(block)
             self._settled = block
 
-    def _look_for_creep(self, block: Block) -> None:
-        """Mark the blocks of the shortest creep that ends in a block."""
+    def _mark_creep(self, block: Block) -> None:
+        """Marks the blocks of the shortest creep that ends in a block."""
         oldest = block.number - _CREEP_BLOCKS + 1
-        before = [each for each in self._looked_at if each.is_still and each.number >= oldest]
+        before = [each for each in self._checked if each.is_still and each.number >= oldest]
         if not block.is_still:
             before = []
         since = self._creeps[-1][0] if self._creeps else -1
@@ -327,16 +329,16 @@ class _Chain:
             if each.is_far_from(block):
                 self._creeps.append((each.number, block.number))
                 break
-        self._looked_at = [*before, block]
+        self._checked = [*before, block]
 
     @property
     def is_long(self) -> bool:
         """Whether a standstill may be in it."""
         return self.start is None or self.end is None or self.end - self.start >= SHORTEST_NS
 
-    def standstills(self, taken: Ns) -> list[Standstill]:
-        """Return the standstills of a chain that is over, from `taken` on; see `settle`."""
-        self.settle(taken, is_over=True)
+    def standstills(self, not_before: Ns) -> list[Standstill]:
+        """Returns the standstills of a chain that has ended, from `not_before` on; see `settle`."""
+        self.settle(not_before, is_over=True)
         if self.end is not None:
             self._finish(self.end)
         return self._found
@@ -361,11 +363,11 @@ class _Chain:
             self._parts.append(here)
 
     def _finish(self, end: Ns) -> None:
-        """End the standstill under way."""
+        """Ends the open standstill."""
         parts, self._parts = self._parts, []
         if not parts:
             return
-        begin = max(parts[0].start, self._taken)
+        begin = max(parts[0].start, self._not_before)
         if end - begin < SHORTEST_NS:
             return
         parts[-1] = parts[-1]._replace(end=end)
@@ -376,7 +378,7 @@ class _Chain:
 
 
 class _Linking:
-    """Takes complete slots in order, and gives the chains among them."""
+    """Takes complete slots in order, and links them to chains."""
 
     def __init__(self) -> None:
         self.before: _Slot | None = None
@@ -384,7 +386,7 @@ class _Linking:
         self.chain: _Chain | None = None
 
     def take(self, slot: _Slot) -> _Chain | None:
-        """Take the next slot; a chain that it ends is returned."""
+        """Takes the next slot; returns the chain that it ends."""
         before, newest, over = self.before, self.newest, None
         if newest is not None:
             if _linked(newest, slot):
@@ -398,19 +400,19 @@ class _Linking:
         return over
 
     def end(self, after: _Slot | None) -> _Chain | None:
-        """End the chain under way, if there is one, with the newest slot."""
+        """Ends the open chain, if there is one, with the newest slot."""
         chain, self.chain = self.chain, None
         if chain is not None and self.before is not None and self.newest is not None:
             chain.end = _end(self.before, self.newest, after)
         return chain
 
     def resume(self, before: _Slot, newest: _Slot) -> None:
-        """Go on after slots that were taken elsewhere."""
+        """Continues after slots that were taken elsewhere."""
         self.before, self.newest = before, newest
 
 
 class StandstillCollector:
-    """Makes the digest of one bag's poses, which come in log-time order."""
+    """Builds the digest of one bag's poses, which come in log-time order."""
 
     def __init__(self) -> None:
         self._slots: list[_Slot] = []  # the first three and the newest three
@@ -419,7 +421,7 @@ class StandstillCollector:
         self._first: _Chain | None = None  # holds the second slot
 
     def add(self, time: Ns, position: Vector3) -> None:
-        """Take the next pose (m), which must be finite."""
+        """Takes the next pose (m), which must be finite."""
         pose = TimedPosition(time, _rounded(position))
         if self._slots and time // SLOT_NS == self._slots[-1].number:
             self._slots[-1].add(pose)
@@ -431,25 +433,25 @@ class StandstillCollector:
             del self._slots[_EDGE_SLOTS]
 
     def digest(self) -> StandstillDigest | None:
-        """Return what the poses amount to; None without a pose."""
+        """Returns the digest; None without a pose."""
         slots = self._slots
         if not slots:
             return None
         if len(slots) < _EDGE_SLOTS + 2:
-            return StandstillDigest(packed_poses(_poses(slots)), slots[-1].last)
+            return StandstillDigest(encode_positions(_poses(slots)), slots[-1].last)
         under_way = self._linking.chain
         chains = self._chains if under_way is None else [*self._chains, under_way]
         head, tail = slots[:_EDGE_SLOTS], slots[-_EDGE_SLOTS:]
         return StandstillDigest(
-            packed_poses(_poses(head)),
+            encode_positions(_poses(head)),
             head[-1].last,
-            packed_poses(_poses(tail)),
+            encode_positions(_poses(tail)),
             tail[0].first,
             tuple(
                 ChainDigest(
                     None if chain is self._first else chain.start,
                     chain.end,
-                    packed_blocks(chain.blocks),
+                    encode_blocks(chain.blocks),
                 )
                 for chain in chains
                 if chain is self._first or chain.is_long
@@ -457,7 +459,7 @@ class StandstillCollector:
         )
 
     def _take(self, slot: _Slot) -> None:
-        """Take a slot that is neither the first nor the last one."""
+        """Takes a slot that is neither the first nor the last one."""
         second = self._linking.newest is not None and self._linking.before is None
         over = self._linking.take(slot)
         if second:
@@ -467,7 +469,7 @@ class StandstillCollector:
 
 
 class StandstillBuilder:
-    """Takes poses, or whole bags of them, in log-time order, and finds where the robot stood."""
+    """Finds where the robot stood still, from poses or whole bags of them in log-time order."""
 
     def __init__(self) -> None:
         self._linking = _Linking()
@@ -476,32 +478,32 @@ class StandstillBuilder:
         self._done: list[Standstill] = []
 
     def add(self, time: Ns, position: Vector3) -> None:
-        """Take the next pose (m), which must be finite."""
-        self._unpack_tail()
+        """Takes the next pose (m), which must be finite."""
+        self._decode_tail()
         self._add(TimedPosition(time, _rounded(position)))
 
     def join(self, bag: StandstillDigest) -> None:
-        """Take all poses of a bag that come next, as if they were added one by one."""
+        """Takes all poses of a bag that come next, as if they were added one by one."""
         if not bag.tail:
-            self._unpack_tail()
-            for pose in unpacked_poses(bag.head):
+            self._decode_tail()
+            for pose in decode_positions(bag.head):
                 self._add(pose)
             return
         chains = [*bag.chains]
-        if self._may_stand_into(bag):
-            chain = self._stand_across(bag)
+        if self._may_continue_into(bag):
+            chain = self._continue_across(bag)
             if chain is None:
-                self._unpack_tail()
-                chain = self._cross(bag)
+                self._decode_tail()
+                chain = self._join_edges(bag)
             if chain is not None:
-                self._go_on(chain, chains.pop(0))
+                self._add_chain(chain, chains.pop(0))
         for each in chains:
-            self._go_on(_Chain(each.start), each)
+            self._add_chain(_Chain(each.start), each)
         self._tail = (bag.tail, bag.tail_since)
 
     def standstills(self) -> tuple[Standstill, ...]:
-        """Return the standstills of all poses, in order; no pose may be added after."""
-        self._unpack_tail()
+        """Returns the standstills of all poses, in order; no pose may be added after."""
+        self._decode_tail()
         if self._open is not None:
             self._close(self._linking.take(self._open))
         self._close(self._linking.end(None))
@@ -513,16 +515,19 @@ class StandstillBuilder:
         newest = self._linking.newest
         return None if newest is None else newest.last
 
-    def _may_stand_into(self, bag: StandstillDigest) -> bool:
-        """Whether a standstill that is long enough may lie where a bag begins."""
-        if _opens(bag) or self._linking.chain is not None or self._tail is None:
+    def _may_continue_into(self, bag: StandstillDigest) -> bool:
+        """Returns whether a long enough standstill may be where a bag begins."""
+        if _begins_linked(bag) or self._linking.chain is not None or self._tail is None:
             return True
         return bag.head_until - self._tail[1] >= SHORTEST_NS
 
-    def _stand_across(self, bag: StandstillDigest) -> _Chain | None:
-        """Return the chain that surely goes on into a bag; looks at no single pose."""
+    def _continue_across(self, bag: StandstillDigest) -> _Chain | None:
+        """Returns the chain that certainly continues into a bag, without decoding single poses.
+
+        A robot that stands for hours has thousands of such bags.
+        """
         chain = self._linking.chain
-        if chain is None or self._tail is None or not _opens(bag):
+        if chain is None or self._tail is None or not _begins_linked(bag):
             return None
         rows = np.hstack([_columns(self._tail[0], 4), _columns(bag.head, 4)])
         low, high = rows[1:].min(axis=1) * _STEP_M, rows[1:].max(axis=1) * _STEP_M
@@ -534,7 +539,8 @@ class StandstillBuilder:
         numbers = times // SLOT_NS
         parts = sorted(set(numbers.tolist()))
         a, b, c = ((low + high) / 2).tolist()
-        # All but the last slot but one of the bag before, and the second one of this, are new.
+        # The chains have the slots up to the last but one of the bag before, and from the second
+        # of this bag on: the slots between are added here.
         for number in parts[2:-2]:
             here = times[numbers == number].tolist()
             box = Box3((a, b, c), (a, b, c))
@@ -542,35 +548,35 @@ class StandstillBuilder:
         self._linking.chain = self._tail = None
         return chain
 
-    def _cross(self, bag: StandstillDigest) -> _Chain | None:
-        """Take the first two slots of a bag; a chain that goes on from there is returned."""
-        first, second, third = _slots(unpacked_poses(bag.head))
+    def _join_edges(self, bag: StandstillDigest) -> _Chain | None:
+        """Takes the first two slots of a bag; returns a chain that continues from there."""
+        first, second, third = _slots(decode_positions(bag.head))
         for pose in first.poses:
             self._add(pose)
         first, self._open = self._open or first, None
         self._close(self._linking.take(first))
         self._close(self._linking.take(second))
-        if not _opens(bag):
+        if not _begins_linked(bag):
             self._close(self._linking.end(third))
             return None
         chain, self._linking.chain = self._linking.chain, None
         return chain or _Chain(_begin(first, second, third))
 
-    def _go_on(self, chain: _Chain, stored: ChainDigest) -> None:
-        """Add a chain of a bag, which is the newest there is, to what it goes on from."""
-        chain.extend(unpacked_blocks(stored.blocks))
-        chain.settle(self._taken)
+    def _add_chain(self, chain: _Chain, stored: ChainDigest) -> None:
+        """Appends a chain of a bag, the newest there is, to the one that it continues."""
+        chain.extend(decode_blocks(stored.blocks))
+        chain.settle(self._not_before)
         chain.end = stored.end
         if stored.end is None:
             self._linking.chain = chain
         else:
             self._close(chain)
 
-    def _unpack_tail(self) -> None:
-        """Take the last slots of the bag before."""
+    def _decode_tail(self) -> None:
+        """Takes the last slots of the bag before."""
         if self._tail is None:
             return
-        before, newest, self._open = _slots(unpacked_poses(self._tail[0]))
+        before, newest, self._open = _slots(decode_positions(self._tail[0]))
         self._linking.resume(before, newest)
         self._tail = None
 
@@ -585,21 +591,21 @@ class StandstillBuilder:
 
     def _close(self, chain: _Chain | None) -> None:
         if chain is not None:
-            self._done += chain.standstills(self._taken)
+            self._done += chain.standstills(self._not_before)
 
     @property
-    def _taken(self) -> Ns:
+    def _not_before(self) -> Ns:
         """Where the newest standstill ends."""
         return self._done[-1].end if self._done else 0
 
 
-def _opens(bag: StandstillDigest) -> bool:
-    """Whether the second and third slot of a bag are linked."""
+def _begins_linked(bag: StandstillDigest) -> bool:
+    """Returns whether the second and third slot of a bag are linked."""
     return bool(bag.chains) and bag.chains[0].start is None
 
 
 def _rounded(position: Vector3) -> Vector3:
-    """A position as it comes back out of its bytes, so that cuts into bags change nothing."""
+    """Rounds a position as its encoding does, so that cuts into bags change nothing."""
     x, y, z = position
     return (
         round(x / _STEP_M) * _STEP_M,
@@ -608,24 +614,24 @@ def _rounded(position: Vector3) -> Vector3:
     )
 
 
-def packed_poses(poses: Iterable[TimedPosition]) -> bytes:
-    """Return poses as bytes, rounded to `_STEP_M`; their log times stay exact."""
-    return _packed(
+def encode_positions(poses: Iterable[TimedPosition]) -> bytes:
+    """Encodes poses, rounded to `_STEP_M`; their log times stay exact."""
+    return _encode(
         [(time, *(round(each / _STEP_M) for each in position)) for time, position in poses]
     )
 
 
-def unpacked_poses(packed: bytes) -> list[TimedPosition]:
-    """Return the poses that these bytes are of."""
+def decode_positions(packed: bytes) -> list[TimedPosition]:
+    """Decodes what `encode_positions` returned."""
     return [
         TimedPosition(time, (x * _STEP_M, y * _STEP_M, z * _STEP_M))
-        for time, x, y, z in _unpacked(packed, 4)
+        for time, x, y, z in _decode(packed, 4)
     ]
 
 
-def packed_blocks(blocks: Iterable[Block]) -> bytes:
-    """Return blocks as bytes, their boxes rounded to `_STEP_M`."""
-    return _packed(
+def encode_blocks(blocks: Iterable[Block]) -> bytes:
+    """Encodes blocks, their boxes rounded to `_STEP_M`."""
+    return _encode(
         [
             (number, first, last, *(round(each / _STEP_M) for each in (noise, *box.low, *box.high)))
             for number, first, last, noise, box in blocks
@@ -633,8 +639,8 @@ def packed_blocks(blocks: Iterable[Block]) -> bytes:
     )
 
 
-def unpacked_blocks(packed: bytes) -> list[Block]:
-    """Return the blocks that these bytes are of."""
+def decode_blocks(packed: bytes) -> list[Block]:
+    """Decodes what `encode_blocks` returned."""
     return [
         Block(
             number,
@@ -643,7 +649,7 @@ def unpacked_blocks(packed: bytes) -> list[Block]:
             noise * _STEP_M,
             Box3((a * _STEP_M, b * _STEP_M, c * _STEP_M), (d * _STEP_M, e * _STEP_M, f * _STEP_M)),
         )
-        for number, first, last, noise, a, b, c, d, e, f in _unpacked(packed, 10)
+        for number, first, last, noise, a, b, c, d, e, f in _decode(packed, 10)
     ]
 
 
@@ -651,15 +657,15 @@ def _poses(slots: Iterable[_Slot]) -> list[TimedPosition]:
     return [pose for slot in slots for pose in slot.poses]
 
 
-def _packed(rows: Sequence[tuple[int, ...]]) -> bytes:
-    """Rows of whole numbers, column by column as differences."""
+def _encode(rows: Sequence[tuple[int, ...]]) -> bytes:
+    """Encodes rows of integers, column by column as differences, which compress well."""
     if not rows:
         return b""
     columns: NDArray[np.int64] = np.diff(np.array(rows, "<i8").T, prepend=0)
     return columns.tobytes()
 
 
-def _unpacked(packed: bytes, columns: int) -> list[list[int]]:
+def _decode(packed: bytes, columns: int) -> list[list[int]]:
     rows: list[list[int]] = _columns(packed, columns).T.tolist()
     return rows
 
@@ -669,7 +675,7 @@ def _columns(packed: bytes, columns: int) -> NDArray[np.int64]:
 
 
 def _slots(poses: Iterable[TimedPosition]) -> list[_Slot]:
-    """The slots of poses in order."""
+    """Returns the slots of poses in order."""
     slots: list[_Slot] = []
     for pose in poses:
         if slots and slots[-1].number == pose.time // SLOT_NS:

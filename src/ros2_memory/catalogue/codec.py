@@ -1,4 +1,4 @@
-"""Digests as the bytes and texts that the catalogue keeps, and back. Exact: floats stay bit by bit.
+"""Encodes digests as the bytes and texts in the catalogue. Exact: floats stay bit by bit.
 
 All integers and floats are little-endian. The layouts belong to the catalogue's schema version.
 """
@@ -30,14 +30,14 @@ _HEAD: Final = struct.Struct("<qqqqqqBdddddddqdddqddd")
 _LEG: Final = struct.Struct("<qdddqdddqqddBdddddddd")
 _CREEP: Final = struct.Struct("<ddddddddddd")
 _VERTEX: Final = struct.Struct("<qdddd")
-_STORY: Final = struct.Struct("<qqqqqI")
-_SHORT_TEXT: Final = 256
-"""A text of so many bytes is not worth compressing."""
+_EVENTS: Final = struct.Struct("<qqqqqI")
+_MIN_COMPRESSED_BYTES: Final = 256
+"""A shorter text is not worth compressing."""
 _NOWHERE: Final = TimedPosition(0, (math.nan, math.nan, math.nan))
 
 
 def encode_poses(poses: PoseDigest) -> bytes:
-    """A digest of poses as bytes."""
+    """Encodes a digest of poses."""
     legs = [leg for leg in (poses.head, poses.tail) if leg is not None]
     first, last = (_NOWHERE if stop is None else stop for stop in (poses.first, poses.last))
     head = _HEAD.pack(
@@ -66,10 +66,10 @@ def encode_poses(poses: PoseDigest) -> bytes:
     )
     resets = struct.pack(f"<{len(poses.resets)}q", *poses.resets)
     frames = json.dumps(poses.frames).encode()
-    return b"".join((head, *map(_packed_leg, legs), resets, vertices, frames))
+    return b"".join((head, *map(_encode_leg, legs), resets, vertices, frames))
 
 
-def _packed_leg(leg: Leg) -> bytes:
+def _encode_leg(leg: Leg) -> bytes:
     ends = (leg.head,) if leg.still else (leg.head, leg.tail)
     creeps = [end.creep for end in ends]
     flags = leg.still | leg.head.plain << 1 | leg.tail.plain << 2
@@ -106,19 +106,19 @@ def _packed_leg(leg: Leg) -> bytes:
 
 
 def decode_poses(packed: bytes) -> PoseDigest:
-    """The digest that these bytes are of.
+    """Decodes a digest of poses.
 
     Raises:
-        ValueError: they are of none.
+        ValueError: the bytes are not one.
     """
     try:
-        return _unpacked_poses(packed)
+        return _decode_poses(packed)
     except struct.error as error:
         raise ValueError(f"not a digest of poses: {error}") from error
 
 
 def encode_standstills(digest: StandstillDigest) -> bytes:
-    """A digest of standstills as bytes."""
+    """Encodes a digest of standstills."""
     chains = [[each.start, each.end, len(each.blocks)] for each in digest.chains]
     head, tail = digest.head, digest.tail
     sizes = json.dumps([len(head), digest.head_until, len(tail), digest.tail_since, chains])
@@ -127,10 +127,10 @@ def encode_standstills(digest: StandstillDigest) -> bytes:
 
 
 def decode_standstills(packed: bytes) -> StandstillDigest:
-    """The digest that these bytes are of.
+    """Decodes a digest of standstills.
 
     Raises:
-        ValueError: they are of none.
+        ValueError: the bytes are not one.
     """
     try:
         sizes, _, body = zlib.decompress(packed).partition(b"\n")
@@ -150,9 +150,10 @@ def decode_standstills(packed: bytes) -> StandstillDigest:
 
 
 def encode_topic_events(events: TopicEvents) -> bytes:
-    """A events as bytes."""
+    """Encodes the events of a topic."""
     counts = (events.first, events.last, events.left_out, events.undecodable, events.beyond)
-    # Many booleans have the same paths, and times counted from the first message, in every bag.
+    # Paths, and times relative to the first message, are equal in many bags: _decode_text caches
+    # them.
     known = [
         [each.path for each in events.known],
         [each.at - events.first for each in events.known],
@@ -164,41 +165,41 @@ def encode_topic_events(events: TopicEvents) -> bytes:
         separators=(",", ":"),
     )
     rows = events.visible.rows
-    # Half a pair of surrogates is no UTF-8, and is kept all the same.
+    # A lone surrogate is not valid UTF-8, and JSON of a message may contain one.
     text = rest.encode("utf-8", "surrogatepass")
-    shorter = zlib.compress(text) if len(text) > _SHORT_TEXT else text
-    return _STORY.pack(*counts, len(rows)) + rows + shorter
+    shorter = zlib.compress(text) if len(text) > _MIN_COMPRESSED_BYTES else text
+    return _EVENTS.pack(*counts, len(rows)) + rows + shorter
 
 
 def decode_topic_events(packed: bytes) -> TopicEvents:
-    """The events that these bytes are of.
+    """Decodes the events of a topic.
 
     Raises:
-        ValueError: they are of none.
+        ValueError: the bytes are not those of any.
     """
     try:
-        first, last, left_out, undecodable, beyond, size = _STORY.unpack_from(packed)
-        end = _STORY.size + size
-        labels, (paths, after, values), flips, faults = _told(packed[end:])
+        first, last, left_out, undecodable, beyond, size = _EVENTS.unpack_from(packed)
+        end = _EVENTS.size + size
+        labels, (paths, after, values), flips, faults = _decode_text(packed[end:])
         known = tuple(
             KnownFlag(path, first + at, value in "13", value in "23")
             for path, at, value in zip(paths, after, values, strict=True)
         )
     except (TypeError, struct.error, zlib.error) as error:
         raise ValueError(f"not a events: {error}") from error
-    seen = IntervalTable(labels, packed[_STORY.size : end])
+    seen = IntervalTable(labels, packed[_EVENTS.size : end])
     if not seen.is_sound:
         raise ValueError("not a events: it tells of things without a name")
     return TopicEvents(first, last, seen, known, flips, faults, left_out, undecodable, beyond)
 
 
 @lru_cache(2048)
-def _told(
+def _decode_text(
     text: bytes,
 ) -> tuple[
     tuple[str, ...], tuple[list[str], list[int], str], tuple[Toggle, ...], tuple[ReportedError, ...]
 ]:
-    """What a events says in words: of many bags the same, and asked of an hour again and again."""
+    """Decodes labels, flags, toggles and errors; cached, since those of many bags are equal."""
     plain = text if text.startswith(b"[") else zlib.decompress(text)
     labels, (paths, after, values), flips, faults = json.loads(
         plain.decode("utf-8", "surrogatepass")
@@ -211,14 +212,14 @@ def _told(
     )
 
 
-def _unpacked_poses(packed: bytes) -> PoseDigest:
+def _decode_poses(packed: bytes) -> PoseDigest:
     poses, invalid, jumps, gaps, reset, count, legs, *numbers = _HEAD.unpack_from(packed)
     length_m, sum_m, jumped_m, gap_m, speed_mps, twist, error_m, *ends_of_all = numbers
-    first, last = _stops(ends_of_all)
+    first, last = _ends(ends_of_all)
     begin = _HEAD.size
     ends: list[Leg] = []
     for _ in range(legs):
-        leg, begin = _unpacked_leg(packed, begin)
+        leg, begin = _decode_leg(packed, begin)
         ends.append(leg)
     resets = struct.unpack_from(f"<{reset}q", packed, begin)
     begin += 8 * len(resets)
@@ -249,13 +250,13 @@ def _unpacked_poses(packed: bytes) -> PoseDigest:
     )
 
 
-def _stops(numbers: Sequence[float]) -> tuple[TimedPosition, TimedPosition]:
+def _ends(numbers: Sequence[float]) -> tuple[TimedPosition, TimedPosition]:
     first, ax, ay, az, last, bx, by, bz = numbers
     return TimedPosition(int(first), (ax, ay, az)), TimedPosition(int(last), (bx, by, bz))
 
 
-def _unpacked_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
-    """The leg that begins at a byte, and where it ends."""
+def _decode_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
+    """Returns the leg that begins at a byte, and where it ends."""
     numbers = _LEG.unpack_from(packed, begin)
     poses, period_ns, length_m, sum_m, flags, *paces = numbers[8:]
     begin += _LEG.size
@@ -268,7 +269,7 @@ def _unpacked_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
             begin += _CREEP.size
     still = bool(flags & 1)
     leg = Leg(
-        *_stops(numbers[:8]),
+        *_ends(numbers[:8]),
         poses,
         None if period_ns < 0 else period_ns,
         length_m,
@@ -284,28 +285,26 @@ def _unpacked_leg(packed: bytes, begin: int) -> tuple[Leg, int]:
 
 @lru_cache(256)
 def _frames(text: bytes) -> tuple[str, ...]:
-    """The frames that this text lists: those of nearly all bags are the same."""
+    """Decodes the list of frames, which is equal for nearly all bags."""
     return tuple(json.loads(text))
 
 
-def encode_schema(shape: SummarySchema) -> str:
-    """A shape as a text, the same for equal ones."""
-    topics: JsonValue = [[*heading] for heading in shape.topics]
-    return json.dumps([topics, [*shape.silent], shape.complete, [*shape.notes], shape.set_back])
+def encode_schema(schema: SummarySchema) -> str:
+    """Encodes a summary schema; equal ones give equal texts."""
+    topics: JsonValue = [[*header] for header in schema.topics]
+    return json.dumps([topics, [*schema.silent], schema.complete, [*schema.notes], schema.set_back])
 
 
 def decode_schema(text: str) -> SummarySchema:
-    """The shape that this text is of.
+    """Decodes a summary schema.
 
     Raises:
-        ValueError: it is of none.
+        ValueError: the text is not one.
         TypeError: likewise.
     """
     topics, silent, complete, notes, set_back = json.loads(text)
-    headings = (
+    headers = (
         TopicHeader(topic, type_name, encoding, bool(latched))
         for topic, type_name, encoding, latched in topics
     )
-    return shared_schema(
-        tuple(headings), tuple(silent), bool(complete), tuple(notes), int(set_back)
-    )
+    return shared_schema(tuple(headers), tuple(silent), bool(complete), tuple(notes), int(set_back))

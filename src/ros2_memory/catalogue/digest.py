@@ -1,8 +1,7 @@
-"""One closed bag read once: what it holds of each topic, short enough to be kept of every bag.
+"""Digests one closed bag: reads it once, and returns what is stored of each of its topics.
 
-A digest answers a question about the bag, or rules the bag out, without opening it. What it
-cannot say for sure it leaves open: then the bag is read. Pure: reads through the port, keeps
-nothing.
+A digest answers a question about the bag, or rules the bag out, without opening it. Where it is not
+certain the bag is read. Pure: reads through the port, stores nothing.
 """
 
 from __future__ import annotations
@@ -23,29 +22,29 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 DIGEST_VERSION: Final = 9
-"""Of what is found in a bag and how; another one has every bag digested again."""
+"""Version of what is stored of a bag and how; another one has every bag digested again."""
 _ALWAYS_READ_BYTES: Final = 64 << 20
 _MESSAGE_BYTES: Final = 200
-"""What a message is counted as besides its payload: looking at it takes time too."""
-_MOST_TIMES_PACKED: Final = 100
-"""A bag whose messages unpack to more times its size is left to be read when it is asked for."""
+"""Counted for each message besides its payload, since decoding it takes time too."""
+_MAX_EXPANSION: Final = 100
+"""A bag whose messages decompress to more times its size is not digested."""
 
 
 @dataclass(frozen=True, slots=True)
 class Digest:
-    """What one closed bag holds."""
+    """What is stored of one closed bag."""
 
     summary: BagSummary
     topics: tuple[TopicDigest, ...]
 
 
 class Digester:
-    """Makes digests, the same from the same bag.
+    """Builds digests; equal ones for the same bag.
 
     Args:
         reader: gives the messages that count.
         extractor: gives the values that conditions are tested on.
-        max_plausible_speed_mps: what makes a jump of a step of the robot.
+        max_plausible_speed_mps: the speed above which a step of the robot is a jump.
     """
 
     def __init__(
@@ -56,11 +55,11 @@ class Digester:
         self._max_plausible_speed_mps = max_plausible_speed_mps
 
     def digest(self, path: Path) -> Digest:
-        """What the bag holds.
+        """Reads a bag and returns its digest.
 
         Raises:
-            BagVanishedError: the file is not there any more.
-            BagError: some of it cannot be read.
+            BagVanishedError: the file is gone.
+            BagError: some of it cannot be read, or it decompresses to more than it can be worth.
         """
         summary = self._reader.summarize(path)
         latched: dict[str, bool] = {}
@@ -76,7 +75,7 @@ class Digester:
             )
             for topic, is_latched in latched.items()
         }
-        left = _ALWAYS_READ_BYTES + _MOST_TIMES_PACKED * _size(path)
+        left = _ALWAYS_READ_BYTES + _MAX_EXPANSION * _size(path)
         for record in self._reader.records(path, tuple(latched), TimeWindow.everything()):
             left -= len(record.payload) + _MESSAGE_BYTES
             if left < 0:
@@ -89,7 +88,7 @@ class Digester:
         )
 
     def _reasons(self, path: Path) -> dict[str, dict[str, str]]:
-        """By topic and type, why messages cannot be decoded."""
+        """Returns, by topic and type, why messages cannot be decoded."""
         reasons: dict[str, dict[str, str]] = {}
         for channel in self._reader.channels(path):
             reason = self._reader.undecodable(channel)
