@@ -69,7 +69,7 @@ class Channel:
         return self.schema.name
 
     @property
-    def bytes_held(self) -> int:
+    def memory_bytes(self) -> int:
         """About how much memory its texts take."""
         held = len(self.topic) + len(self.schema.name) + len(self.schema.text)
         for name, text in self.metadata:
@@ -267,7 +267,7 @@ class BagWriter(ABC):
         """
 
 
-class Held(NamedTuple):
+class ChannelTotal(NamedTuple):
     """The messages of one channel: how many (at least one), the earliest and the latest."""
 
     channel: Channel
@@ -276,8 +276,8 @@ class Held(NamedTuple):
     last: Ns
 
 
-def bag_summary(
-    held: Iterable[Held],
+def summarize_channels(
+    held: Iterable[ChannelTotal],
     declared: Iterable[Channel],
     *,
     complete: bool = True,
@@ -285,7 +285,7 @@ def bag_summary(
     set_back: Ns = 0,
 ) -> BagSummary:
     """The summary of a file: channels of one topic and type count as one."""
-    found: dict[tuple[str, str], Held] = {}
+    found: dict[tuple[str, str], ChannelTotal] = {}
     for each in held:
         key = (each.channel.topic, each.channel.type)
         other = found.get(key)
@@ -301,10 +301,10 @@ def bag_summary(
     return BagSummary.decoded(shape, shape.numbers.pack(*numbers))
 
 
-def _together(one: Held, other: Held) -> Held:
+def _together(one: ChannelTotal, other: ChannelTotal) -> ChannelTotal:
     """Two channels of one topic and type."""
     channel = one.channel
     if other.channel.latched and not channel.latched:
         channel = replace(channel, latched=True)
     first, last = min(one.first, other.first), max(one.last, other.last)
-    return Held(channel, one.messages + other.messages, first, last)
+    return ChannelTotal(channel, one.messages + other.messages, first, last)

@@ -59,12 +59,12 @@ def shared(channel: Channel) -> Channel:
 
     A channel with long texts is returned as it is, so that no more than 16 MiB are held.
     """
-    return _first_met(channel) if channel.bytes_held <= _SHARED_BYTES else channel
+    return _first_met(channel) if channel.memory_bytes <= _SHARED_BYTES else channel
 
 
 def unshared_bytes(channels: Mapping[int, Channel]) -> int:
     """Returns about how much memory channels take that no other file shares."""
-    sizes = [channel.bytes_held for channel in channels.values()]
+    sizes = [channel.memory_bytes for channel in channels.values()]
     return 300 * len(sizes) + sum([size for size in sizes if size > _SHARED_BYTES])
 
 

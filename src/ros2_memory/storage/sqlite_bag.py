@@ -23,11 +23,11 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import (
     ROS2_PROFILE,
     Channel,
+    ChannelTotal,
     Closing,
-    Held,
     Record,
     Schema,
-    bag_summary,
+    summarize_channels,
 )
 from ros2_memory.storage.cache import ByteLru, shared
 from ros2_memory.storage.errors import (
@@ -131,7 +131,7 @@ class SqliteBags:
             )
         rows = [row for row in found if not row[5]]
         held = [
-            Held(topics.channels[number], count, first, last)
+            ChannelTotal(topics.channels[number], count, first, last)
             for number, count, first, last, *_ in rows
             if number in topics.channels
         ]
@@ -141,7 +141,7 @@ class SqliteBags:
             notes.append(f"{orphans} messages belong to no topic and were left out")
         if impossible := sum(row[1] for row in found if row[5]):
             notes.append(f"{impossible} messages bear no possible log time")
-        return bag_summary(held, topics.channels.values(), notes=tuple(notes))
+        return summarize_channels(held, topics.channels.values(), notes=tuple(notes))
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """The topics declared in the file."""
@@ -258,7 +258,7 @@ class SqliteBags:
             if topics is None:
                 require_plain_tables(base)
                 topics = _Topics(key, self._channels(base))
-                size = 1000 + sum(300 + c.bytes_held for c in topics.channels.values())
+                size = 1000 + sum(300 + c.memory_bytes for c in topics.channels.values())
                 self._known.put(key, topics, size)
             yield base, topics
 

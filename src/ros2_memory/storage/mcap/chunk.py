@@ -50,7 +50,6 @@ _IMPOSSIBLE_TIMES: Final = "damaged: a message index holds impossible log times"
 NOT_THERE: Final = "damaged: a message is not where its index says"
 _MESSAGE: Final = int(Opcode.MESSAGE)
 _MESSAGE_OPCODE: Final = bytes((_MESSAGE,))
-_message: Final = MESSAGE.unpack_from
 _MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
 _LENGTH_AT: Final = 1
 _CHANNEL_AT: Final = 9
@@ -62,7 +61,6 @@ _UINT64: Final = np.dtype("<u8")
 _EVERY_BYTE: Final = (1,)
 _EVERY_PAIR: Final = (_PAIR_BYTES,)
 _FEW: Final = 100
-_FEW_MESSAGES: Final = 24
 """So many numbers, or messages, are sooner looked through one by one than made an array."""
 _EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
 _NOUGHT: Final[Ints] = np.zeros(1, dtype=np.int64)
@@ -78,7 +76,7 @@ class Column(NamedTuple):
     places: Ints
 
     @property
-    def bytes_held(self) -> int:
+    def memory_bytes(self) -> int:
         """About how much memory it takes."""
         return 2 * self.times.nbytes + 300
 
@@ -161,14 +159,6 @@ def require_indexed(data: bytes, channel: int, column: Column) -> None:
         return
     if stop <= 0 or places.min() < 0:
         raise UnreadableError(NOT_THERE)
-    if count <= _FEW_MESSAGES:
-        for time, place in zip(times.tolist(), places.tolist(), strict=True):
-            if place >= stop:
-                raise UnreadableError(NOT_THERE)
-            opcode, _, number, _, log_time, _ = _message(data, place)
-            if log_time != time or number != channel or opcode != _MESSAGE:
-                raise UnreadableError(NOT_THERE)
-        return
     # Views of the bytes that begin at every byte: all the fields of a kind are gathered at once.
     try:
         opcodes = np.ndarray(stop, np.uint8, data, 0, _EVERY_BYTE)[places]

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.records import Statistics
 from mcap.writer import MCAP0_MAGIC
 
 from ros2_memory.storage.base import Channel, Closing, Schema
@@ -32,7 +33,6 @@ from ros2_memory.storage.file_io import EMPTY_FILE
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.file_io import OpenFile
 
 __all__ = [
@@ -62,10 +62,9 @@ CHUNK_TIMES: Final = struct.Struct("<QQQI")
 """A chunk's first and last log time, uncompressed size and CRC; compression and data follow."""
 FOOTER: Final = struct.Struct("<BQQQI")
 """Opcode, length, start of the summary section, start of the summary offsets, summary CRC."""
-_STATISTICS: Final = struct.Struct("<QHIIIIQQI")
-"""Messages, schemas, channels, attachments, metadata, chunks, first and last log time, and the
-bytes of the counts by channel."""
-_COUNT: Final = struct.Struct("<HQ")
+_COUNTS_AT: Final = 46
+"""Where the counts by channel begin in the body of a statistics record, behind their size."""
+_COUNT_BYTES: Final = 10
 _LONGEST_CACHED: Final = 16 * 1024
 
 # QoS stands in a channel's metadata as YAML; parsing it costs fifty times this search. Newer
@@ -96,27 +95,19 @@ def framed(section: bytes, position: int = 0) -> Iterator[tuple[int, int, int]]:
         yield opcode, begin, position
 
 
-@dataclass(frozen=True, slots=True)
-class Statistics:
-    """What a file says of itself: how much it holds, and its first and last log time."""
-
-    counts: dict[int, int]
-    messages: int
-    start: Ns
-    end: Ns
-    chunks: int
-    channels: int
-
-
 def statistics(body: bytes) -> Statistics:
-    """A statistics record."""
-    messages, _, channels, _, _, chunks, start, end, size = _STATISTICS.unpack_from(body)
-    stop = _STATISTICS.size + size
-    if stop > len(body) or size % _COUNT.size:
+    """Decodes a statistics record, without channels that have no message.
+
+    Raises:
+        UnreadableError: the record is shorter than it states.
+    """
+    size = int.from_bytes(body[_COUNTS_AT - 4 : _COUNTS_AT], "little")
+    if _COUNTS_AT + size > len(body) or size % _COUNT_BYTES:
         raise UnreadableError("damaged: the statistics are shorter than they state")
-    pairs = _COUNT.iter_unpack(body[_STATISTICS.size : stop])
-    counts = {channel: count for channel, count in dict(pairs).items() if count}
-    return Statistics(counts, messages, start, end, chunks, channels)
+    stated: Statistics = Statistics.read(ReadDataStream(BytesIO(body)))
+    counts = stated.channel_message_counts.items()
+    stated.channel_message_counts = {channel: count for channel, count in counts if count}
+    return stated
 
 
 @dataclass(slots=True)
