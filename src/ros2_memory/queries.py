@@ -243,7 +243,7 @@ def find_last_match(
     found = ReverseSearch(view, topic, condition).newest(until)
     if found is None:
         return results.Match(None, not_covered(view, TimeWindow(MIN_NS, until)))
-    note_robots_near(view, found)
+    _note_robots(view, found)
     note_unread(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
     if counted_from is not None and found.time > counted_from + FUTURE_NS:
@@ -277,7 +277,7 @@ def value_when(
     if found is None:
         return results.ValueWhen(None, notes=not_covered(view, TimeWindow(MIN_NS, until)))
     note_unread(view, _searched(view, found, until, now), search=True)
-    note_robots_near(view, found)
+    _note_robots(view, found)
     matched = _value(view, found, (), None)
     upto = TimeWindow.until(found.time)
     held = _newest_beside(view, name, upto, found)
@@ -435,7 +435,7 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Stor
             found = None
     if found is None:
         raise no_data_at(view, (topic,), at, tolerance)
-    note_robots_near(view, found)
+    _note_robots(view, found)
     note_unread(view, TimeWindow(found.time, stop))
     return found
 
@@ -455,6 +455,12 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
     if view.memory.limits.latching.holds(view.snapshot, found):
         topic = found.record.channel.topic
         view.notes.add(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
+
+
+def _note_robots(view: View, found: StoredMessage) -> None:
+    """Notes recordings of several robots around a message; a single recording is of one."""
+    if len(view.snapshot.recordings(found.record.channel.topic)) > 1:
+        note_robots_near(view, found)
 
 
 def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:

@@ -147,8 +147,8 @@ class Typestores:
         finished: set[str] = set()
         members = unrolled = 0
 
-        def add(name: str, trail: tuple[str, ...]) -> None:
-            nonlocal members, unrolled
+        def enter(name: str, trail: tuple[str, ...]) -> Iterator[FieldDesc]:
+            nonlocal members
             if name in trail:
                 raise _UnusableError(f"its definition contains itself: {' > '.join(trail)}")
             if len(trail) > MAX_NESTING:
@@ -159,7 +159,14 @@ class Typestores:
                 if members > MAX_MEMBERS:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
                 found.update(definition)
-            for _, field in found[name][1]:
+            return (field for _, field in found[name][1])
+
+        # Depth first: the trail to a type is what names a definition that contains itself.
+        nowhere: tuple[str, ...] = ()
+        waiting = [(root, nowhere, enter(root, nowhere))]
+        while waiting:
+            name, trail, fields = waiting[-1]
+            for field in fields:
                 unrolled += _unrolled(field)
                 if unrolled > MAX_UNROLLED:
                     raise _UnusableError(
@@ -168,10 +175,12 @@ class Typestores:
                     )
                 nested = _nested_type(field)
                 if nested is not None and nested not in finished:
-                    add(nested, (*trail, name))
-            finished.add(name)
-
-        add(root, ())
+                    inside = (*trail, name)
+                    waiting.append((nested, inside, enter(nested, inside)))
+                    break
+            else:
+                finished.add(name)
+                waiting.pop()
         return {name: found[name] for name in finished}
 
     def _definition(

@@ -215,7 +215,10 @@ class BagDirReader(BagReader):
 
     def _exclusions(self, path: Path, window: TimeWindow) -> list[Exclusion] | None:
         """Returns what does not count among the log times of a window; None: nothing does."""
-        handover = self._handover(path).handover
+        reading = self._handover(path)
+        if reading is _NO_SIDECAR:
+            return []
+        handover = reading.handover
         return None if handover.hides_all else _touching(handover.exclusions(path.name), window)
 
     def _handover(self, path: Path) -> HandoverReading:

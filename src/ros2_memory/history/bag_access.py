@@ -17,8 +17,8 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.history.context import Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
-from ros2_memory.history.notes import Note, Notes, short_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -251,11 +251,11 @@ class BagAccess:
         if self.memory.recall is None or len(topics) != 1:
             return None
         [topic] = topics
-        if is_carried(bag.path):
-            return None  # its channels say which recording each message is of, the catalogue not
         static = topic in self.memory.limits.tf_static_topics
         if not static and not self.snapshot.is_transient_local(topic):
             return None
+        if is_carried(bag.path):
+            return None  # its channels say which recording each message is of, the catalogue not
         entry = self.entry(bag)
         if entry is None:
             return None

@@ -33,7 +33,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_rounded_up,
 )
-from ros2_memory.history.notes import short_name
+from ros2_memory.history.context import short_name
 from ros2_memory.index.listed_splits import absent_files
 
 if TYPE_CHECKING:

@@ -16,10 +16,10 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, Un
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import is_covered, note_unread, unix_text
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
 from ros2_memory.history.no_data import matching_topics, undecodable_in
-from ros2_memory.history.notes import Note
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence

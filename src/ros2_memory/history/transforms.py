@@ -34,6 +34,7 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     Ns,
 )
+from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import united
 from ros2_memory.history.no_data import (
@@ -43,7 +44,6 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.notes import Note
 from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from ros2_memory.core.geometry import alike, invert, transform_point
 from ros2_memory.core.model import TimeWindow, Transform
 from ros2_memory.core.text import Reason, abbreviate
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, Ns
-from ros2_memory.history.notes import Note
+from ros2_memory.history.context import Note
 from ros2_memory.history.transforms import (
     children_moving,
     connected,

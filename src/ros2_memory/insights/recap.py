@@ -45,10 +45,10 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_groups import DigestKind, Fold
+from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
 from ros2_memory.history.driven_path import add_poses, driven_path, length_notes
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.notes import Note
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.time_arguments import open_span
 from ros2_memory.results import Event, Recap

@@ -8,10 +8,7 @@ served.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from typing import Final
 
 MAX_VALUES: Final = 10_000
 """Keys and values of one message, counted by its commas and brackets."""
@@ -44,28 +41,4 @@ def excess_in_json(text: bytes) -> str | None:
         depth += 1 if bracket in _OPENING else -1
         if depth > MAX_DEPTH:
             return f"The request is nested deeper than {MAX_DEPTH} levels.\n"
-    return None
-
-
-def excess_in_arguments(given: Mapping[str, object]) -> str | None:
-    """Returns why the arguments of a call are refused, naming one; None if they are accepted.
-
-    Stops at the limit, so that more than is allowed takes no longer than what is.
-    """
-    left = MAX_VALUES - len(given)
-    if left < 0:
-        return f"more than {MAX_VALUES} arguments were given; a call has a few"
-    for name, argument in given.items():
-        pending: list[tuple[object, int]] = [(argument, 1)]
-        while pending:
-            value, depth = pending.pop()
-            if not isinstance(value, dict | list | tuple):
-                continue
-            left -= len(value)
-            if left < 0:
-                return f"{name[:80]} holds more than {MAX_VALUES} values; a call needs a few"
-            if depth >= MAX_DEPTH:
-                return f"{name[:80]} is nested deeper than {MAX_DEPTH} levels"
-            inner = value.values() if isinstance(value, dict) else value
-            pending.extend((each, depth + 1) for each in inner)
     return None

@@ -29,7 +29,7 @@ from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.serving.call_size import excess_in_arguments
+from ros2_memory.serving.call_size import MAX_DEPTH, MAX_VALUES
 from ros2_memory.serving.fair_queue import FairQueue
 
 if TYPE_CHECKING:
@@ -159,6 +159,8 @@ class Dispatcher:
             stages_ms=done.stages_ms,
             chars=done.chars,
         )
+        if not self._telemetry.observers:
+            return
         try:
             self._telemetry.answered(done)
         except Exception:
@@ -251,3 +253,27 @@ class _Wait:
         if waited < _REPORTED_WAIT_S:
             return ""
         return f" (it waited {waited:.1f} s of its time behind other questions)"
+
+
+def excess_in_arguments(given: Mapping[str, object]) -> str | None:
+    """Returns why the arguments of a call are refused, naming one; None if they are accepted.
+
+    Stops at the limit, so that more than is allowed takes no longer than what is.
+    """
+    left = MAX_VALUES - len(given)
+    if left < 0:
+        return f"more than {MAX_VALUES} arguments were given; a call has a few"
+    for name, argument in given.items():
+        pending: list[tuple[object, int]] = [(argument, 1)]
+        while pending:
+            value, depth = pending.pop()
+            if not isinstance(value, dict | list | tuple):
+                continue
+            left -= len(value)
+            if left < 0:
+                return f"{name[:80]} holds more than {MAX_VALUES} values; a call needs a few"
+            if depth >= MAX_DEPTH:
+                return f"{name[:80]} is nested deeper than {MAX_DEPTH} levels"
+            inner = value.values() if isinstance(value, dict) else value
+            pending.extend((each, depth + 1) for each in inner)
+    return None

@@ -14,7 +14,7 @@ import anyio.to_thread
 
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.history.notes import short_name
+from ros2_memory.history.context import short_name
 from ros2_memory.insights.status import clock_faults, left_open, problems_of
 from ros2_memory.serving.fair_queue import FairQueue
 from ros2_memory.tools.reply_json import moment, seconds

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from ros2_memory.serving.call_size import (
     MAX_DEPTH,
     MAX_VALUES,
-    excess_in_arguments,
     excess_in_json,
 )
+from ros2_memory.serving.dispatch import excess_in_arguments
 from ros2_memory.serving.request_limits import MAX_BODY_BYTES
 from tests.unit.serving.test_web_app import MCP_HEADERS, app, call_tool, client, running
 
