@@ -221,10 +221,10 @@ class _Listener(uvicorn.Server):
             host, port = each.getsockname()[:2]
             shown = f"[{host}]" if ":" in host else host
             log.info("listening", url=f"http://{shown}:{port}{STREAM_PATH}", host=host, port=port)
-        ServiceManager().tell(READY)
+        ServiceManager().notify(READY)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        ServiceManager().tell(STOPPING)
+        ServiceManager().notify(STOPPING)
         self._server.dispatcher.stop()
         self._app.stop()
         await super().shutdown(sockets)

@@ -18,11 +18,10 @@ from rich.console import Console
 from ros2_memory.config import Settings, load_explained
 from ros2_memory.config_sources import Sources, quoted
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
-from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
-from ros2_memory.core.withheld import withheld_warnings, withhold_warnings
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

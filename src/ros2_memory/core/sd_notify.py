@@ -1,4 +1,4 @@
-"""Messages to the service manager over `NOTIFY_SOCKET` (sd_notify(3)); none where it is unset."""
+"""Messages to the service manager through `NOTIFY_SOCKET` (sd_notify(3)); none if it is unset."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ STOPPING: Final = "STOPPING=1"
 
 
 class ServiceManager:
-    """Tells systemd how the daemon is. What cannot be delivered is dropped: it cannot be helped.
+    """Notifies systemd of the state of this process. Messages that cannot be sent are dropped.
 
     `env` is the process's own environment where None.
     """
 
     def __init__(self, env: Mapping[str, str] | None = None) -> None:
-        given = os.environ if env is None else env
-        address = given.get("NOTIFY_SOCKET", "")
-        # A leading @ stands for the null byte of an abstract socket (unix(7)).
+        address = (os.environ if env is None else env).get("NOTIFY_SOCKET", "")
+        # A leading @ is the null byte of an abstract socket (unix(7)).
         self._address = "\0" + address[1:] if address.startswith("@") else address
 
-    def tell(self, *assignments: str) -> bool:
-        """Sends assignments such as `READY`; whether they were delivered."""
+    def notify(self, *assignments: str) -> bool:
+        """Sends assignments such as `READY`; returns whether they were sent."""
         if not self._address:
             return False
         try:
@@ -41,9 +40,9 @@ class ServiceManager:
 
 
 def watchdog_interval_s(env: Mapping[str, str] | None = None) -> float | None:
-    """How often systemd is to be told that the daemon lives: half of what it waits for.
+    """Returns how often to send `WATCHDOG`: half of the time after which systemd acts.
 
-    None where it does not ask for that, or asks another process.
+    None where systemd does not expect it, or expects it of another process.
     """
     given = os.environ if env is None else env
     pid = given.get("WATCHDOG_PID", str(os.getpid()))

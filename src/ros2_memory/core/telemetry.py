@@ -1,6 +1,6 @@
-"""What is told of each answered call, and to whom: nobody, unless the configuration asks for it.
+"""The telemetry port: observers of answered calls, and metrics. Empty unless configured.
 
-The port behind which `ros2_memory.observability` has its adapters; nothing here depends on them.
+`ros2_memory.observability` has the adapters; nothing here depends on them.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
 UNKNOWN_TOOL: Final = "unknown"
-"""The name under which calls of tools that do not exist are counted, whatever they were called."""
+"""Counts all calls of tools that do not exist: their names are chosen by clients."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """One call that is over.
+    """One finished call.
 
     Attributes:
         tool: a tool of this server, or `UNKNOWN_TOOL`.
         outcome: `ok`, `cancelled`, `internal` or the code of an error; with `no_data` its reason
             behind a colon, as in `no_data: gap`.
-        duration_s: from arguments to reply, the wait for its turn included.
-        stages_ms: milliseconds spent in `index`, `read` and `extract`; not all of them need occur.
+        duration_s: from arguments to reply, including the wait in the queue.
+        stages_ms: milliseconds spent in `index`, `read` and `extract`, of those that occurred.
         chars: length of the reply.
-        correlation_id: what the log events of the call carry.
+        correlation_id: of the log events of the call.
     """
 
     tool: str
@@ -49,22 +49,22 @@ class Answered:
 
 
 class Observer(ABC):
-    """Somebody who is told of each call when it is over, on the event loop's thread.
+    """Observes each finished call, on the thread of the event loop.
 
-    It must be quick and raise nothing. The call's own context is current meanwhile, so that a span
+    It must be quick and raise nothing. The context of the call is current meanwhile, so that a span
     that a library began for it can be found.
     """
 
     @abstractmethod
     def answered(self, call: Answered) -> None:
-        """A call is over."""
+        """Observes a finished call."""
 
-    def stop(self) -> None:  # noqa: B027 - most have nothing to let go
-        """Lets go of what it holds; waits a moment at most."""
+    def stop(self) -> None:  # noqa: B027 - most have nothing to release
+        """Flushes and releases resources, without waiting for long."""
 
 
 class Exposition(NamedTuple):
-    """What is answered to whoever scrapes."""
+    """The reply to a scrape of `/metrics`."""
 
     content_type: str
     body: bytes
@@ -72,21 +72,21 @@ class Exposition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """Who is told of each call, and what is shown at `/metrics`; nobody and nothing by default."""
+    """The observers of calls, and what `/metrics` returns; none by default."""
 
     observers: tuple[Observer, ...] = ()
     metrics: Callable[[], Awaitable[Exposition]] | None = None
 
     def answered(self, call: Answered) -> None:
-        """Tells every observer of a call that is over."""
+        """Notifies every observer of a finished call."""
         for each in self.observers:
             each.answered(call)
 
     def stop(self) -> None:
-        """Has every observer let go of what it holds."""
+        """Stops every observer."""
         for each in self.observers:
             each.stop()
 
 
 SILENT: Final = Telemetry()
-"""What tells nobody anything."""
+"""Without observers and metrics."""

@@ -1,9 +1,9 @@
-"""Time inside this program: nanosecond ints, and the only place that knows 1e9.
+"""Time: integer nanoseconds inside, float seconds outside, and the conversions between them.
 
-Inside, a moment is an `Ns` (nanoseconds since the Unix epoch) and a window is half-open. Outside,
-a moment is a float of Unix seconds. A float64 near today's epoch resolves about 0.24 microseconds,
-so a moment that leaves is rounded *up* to whole microseconds (`unix_rounded_up`) and a moment that
-comes back is granted `AT_OR_BEFORE_SLACK_NS`: a timestamp fed back finds its own message.
+Inside, a time is an `Ns` (nanoseconds since the Unix epoch) and a window is half-open. Outside, a
+time is a float of Unix seconds. A float64 near the present resolves about 0.24 microseconds, so a
+time in a reply is rounded *up* to whole microseconds (`unix_rounded_up`) and a time in a query is
+granted `AT_OR_BEFORE_SLACK_NS`: a timestamp fed back finds its own message.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 Ns: TypeAlias = int
-"""Nanoseconds: since the Unix epoch for a moment, plain for a duration."""
+"""Nanoseconds: since the Unix epoch, or of a duration."""
 
 NS_PER_S: Final = 1_000_000_000
 NS_PER_MS: Final = 1_000_000
 NS_PER_US: Final = 1_000
 AT_OR_BEFORE_SLACK_NS: Final[Ns] = NS_PER_US
-"""What "at or before t" forgives, because t went through a float of seconds."""
+"""Tolerance of "at or before t", because t was converted to a float of seconds."""
 START_SLACK_NS: Final[Ns] = 2 * AT_OR_BEFORE_SLACK_NS
-"""What "from t on" forgives: a timestamp fed back was also rounded up past its own message."""
+"""Tolerance of "from t on": a timestamp fed back was also rounded up past its own message."""
 
 MIN_NS: Final[Ns] = -(2**63)
 MAX_NS: Final[Ns] = 2**63 - 1
-"""The range of a moment: what a signed 64-bit nanosecond clock (and SQLite) can hold."""
+"""The range of times: what a signed 64-bit nanosecond clock (and SQLite) can hold."""
 
 
 def ns_from_unix(seconds: float) -> Ns:
-    """Nanoseconds for Unix (or plain) seconds, rounded to nearest, saturating at 64 bits.
+    """Returns nanoseconds for Unix (or plain) seconds, rounded to nearest, limited to 64 bits.
 
     Raises:
         ValueError: `seconds` is NaN or infinite.
@@ -48,22 +48,22 @@ def ns_from_unix(seconds: float) -> Ns:
 
 
 def unix_from_ns(ns: Ns) -> float:
-    """Unix (or plain) seconds nearest to `ns`."""
+    """Returns the Unix (or plain) seconds nearest to `ns`."""
     return ns / NS_PER_S
 
 
 def unix_rounded_up(ns: Ns) -> float:
-    """Unix seconds rounded up to whole microseconds: how a timestamp leaves the program."""
+    """Returns Unix seconds rounded up to whole microseconds, as replies have them."""
     return -(-ns // NS_PER_US) / 1e6
 
 
 def ms_from_ns(ns: Ns) -> float:
-    """Milliseconds, for log events."""
+    """Returns milliseconds, for log events."""
     return ns / NS_PER_MS
 
 
 def iso_local(ns: Ns) -> str | None:
-    """The moment as ISO 8601 local time with offset; None where the calendar does not reach."""
+    """Returns ISO 8601 local time with offset; None for years that the calendar does not have."""
     try:
         return datetime.fromtimestamp(ns // NS_PER_S, tz=UTC).astimezone().isoformat()
     except (OverflowError, ValueError, OSError):
@@ -71,24 +71,24 @@ def iso_local(ns: Ns) -> str | None:
 
 
 class Clock(ABC):
-    """What "now" means. Read once for each call, so that one answer has one now."""
+    """The present time. Read once for each call, so that one answer has one present."""
 
     @abstractmethod
     def now(self) -> Ns:
-        """The present moment."""
+        """Returns the present time."""
 
 
 class WallClock(Clock):
-    """The system's clock."""
+    """The clock of the system."""
 
     def now(self) -> Ns:
-        """The present moment by the system's clock."""
+        """Returns the present time by the system's clock."""
         return time.time_ns()
 
 
 @dataclass(frozen=True, slots=True)
 class Deadline:
-    """A monotonic moment after which a query must give up; `Deadline.never()` has none."""
+    """The monotonic time (s) at which a query must give up; `Deadline.never()` has none."""
 
     at_s: float
     budget_s: float
@@ -96,14 +96,14 @@ class Deadline:
 
     @classmethod
     def after(cls, budget_s: float, monotonic: Callable[[], float] = time.monotonic) -> Deadline:
-        """A deadline `budget_s` seconds from now."""
+        """Returns a deadline `budget_s` seconds from now."""
         return cls(monotonic() + budget_s, budget_s, monotonic)
 
     @classmethod
     def never(cls) -> Deadline:
-        """A deadline that does not come."""
+        """Returns a deadline that never expires."""
         return cls(math.inf, math.inf)
 
     def expired(self) -> bool:
-        """Whether the time is up."""
+        """Returns whether the time is up."""
         return self._monotonic() >= self.at_s

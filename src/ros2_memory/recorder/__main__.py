@@ -170,7 +170,7 @@ def _record_until_signal(
     with _ending_signals() as received:
         try:
             recorder.start()
-            manager.tell(READY)
+            manager.notify(READY)
             while not received:
                 # A signal does not cut this short: Python runs its handler and sleeps on (PEP 475).
                 time.sleep(TICK_S)
@@ -184,11 +184,11 @@ def _record_until_signal(
                     with suppress(OSError):
                         recover_unwritten(bag_dir, reader)
                 if interval_s is not None and now_s >= next_sign_s:
-                    manager.tell(WATCHDOG)
+                    manager.notify(WATCHDOG)
                     next_sign_s = now_s + interval_s / 2
             _log.info("signal_received", signal=signal.Signals(received[0]).name)
         finally:
-            manager.tell(STOPPING)
+            manager.notify(STOPPING)
             recorder.stop()
 
 

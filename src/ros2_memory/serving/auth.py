@@ -31,7 +31,7 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.core.logging_setup import Refusals, get_logger
+from ros2_memory.core.logging_setup import LogThrottle, get_logger
 from ros2_memory.serving.page import PAGE_PATH
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class TokenGate:
     ) -> None:
         self._app = app
         self._digest = _digest(token.encode("ascii"))
-        self._refusals = Refusals(monotonic, LOG_INTERVAL_S)
+        self._refusals = LogThrottle(monotonic, LOG_INTERVAL_S)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles an ASGI connection."""
@@ -157,7 +157,7 @@ class ForgeryGuard:
     def __init__(self, app: ASGIApp, host: str, *, admits: bool = False) -> None:
         self._app = app
         self._admits = admits
-        self._refusals = Refusals()
+        self._refusals = LogThrottle()
         self._names = LOOPBACK_NAMES | {host.lower()} - _ANY_ADDRESS
         self._is_reachable = host.lower() not in LOOPBACK_NAMES
         if self._is_reachable:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from ros2_memory.core.logging_setup import Refusals, get_logger
+from ros2_memory.core.logging_setup import LogThrottle, get_logger
 from ros2_memory.serving.auth import is_admitted
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class BoundedConnection(H11Protocol):
     The oldest stranger too many is put out without a word.
     """
 
-    _refusals: ClassVar[Refusals] = Refusals()
+    _refusals: ClassVar[LogThrottle] = LogThrottle()
 
     _phase: _Phase = "reply"
     _deadline: asyncio.TimerHandle | None = None

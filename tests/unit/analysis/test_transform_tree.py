@@ -277,7 +277,7 @@ def test_a_leading_slash_is_no_part_of_a_name() -> None:
     assert shift(graph, "odom", "/laser", 5) == 2.0
 
 
-# Refusals
+# LogThrottle
 
 
 def test_an_unknown_frame_is_named_with_those_spelled_alike() -> None:

@@ -15,8 +15,12 @@ import structlog
 from mcp.server import streamable_http as transport
 
 from ros2_memory.core import logging_setup
-from ros2_memory.core.logging_setup import configure_logging, get_logger
-from ros2_memory.core.withheld import withheld_warnings, withhold_warnings
+from ros2_memory.core.logging_setup import (
+    configure_logging,
+    get_logger,
+    withheld_warnings,
+    withhold_warnings,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -202,7 +206,7 @@ def test_what_a_library_repeats_is_logged_now_and_then(
 
 def test_refusals_are_counted_between_what_is_logged() -> None:
     now = [0.0]
-    refusals = logging_setup.Refusals(lambda: now[0])
+    refusals = logging_setup.LogThrottle(lambda: now[0])
     counts = []
     for second in range(25):
         now[0] = float(second)
@@ -220,7 +224,7 @@ def test_nothing_that_is_logged_is_endless(capsys: pytest.CaptureFixture[str]) -
     get_logger("ros2_memory.test").error("failed", exc_info=fault)
     told = events(capsys)
     assert len(told) == 3
-    assert all(len(json.dumps(each)) < 2 * logging_setup.LONGEST for each in told)
+    assert all(len(json.dumps(each)) < 2 * logging_setup.MAX_CHARS for each in told)
     assert told[2]["exception"].endswith("the end")
 
 

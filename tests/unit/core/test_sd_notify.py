@@ -28,7 +28,7 @@ def test_it_is_told_over_a_socket_in_the_file_system(
 ) -> None:
     with listener:
         listener.bind(str(tmp_path / "notify"))
-        assert ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify")}).tell(READY)
+        assert ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify")}).notify(READY)
         assert listener.recv(100) == b"READY=1"
 
 
@@ -36,13 +36,13 @@ def test_it_is_told_over_an_abstract_socket(listener: socket.socket) -> None:
     name = f"ros2-memory-test-{os.getpid()}"
     with listener:
         listener.bind("\0" + name)
-        assert ServiceManager({"NOTIFY_SOCKET": "@" + name}).tell(STOPPING, "STATUS=over")
+        assert ServiceManager({"NOTIFY_SOCKET": "@" + name}).notify(STOPPING, "STATUS=over")
         assert listener.recv(100) == b"STOPPING=1\nSTATUS=over"
 
 
 @pytest.mark.parametrize("env", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "/nowhere/at/all"}])
 def test_where_nobody_listens_nothing_happens(env: dict[str, str]) -> None:
-    assert not ServiceManager(env).tell(READY)
+    assert not ServiceManager(env).notify(READY)
 
 
 def test_it_is_told_twice_as_often_as_it_asks() -> None:
