@@ -1,9 +1,13 @@
-"""`ros2-memory forget`: deletes the bags of a time window, by the means of retention."""
+"""`ros2-memory forget`: deletes the bags of a time window, as retention deletes bags.
+
+What is deleted and what is kept is decided first, without reading a bag. Then the bags are deleted,
+after the latched messages that later answers need were carried forward.
+"""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +22,7 @@ from ros2_memory.bootstrap import build_reader, supposed_own
 from ros2_memory.catalogue.store import BagKey
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
+    MB,
     BagDir,
     End,
     Last,
@@ -32,7 +37,7 @@ from ros2_memory.cli.options import (
     spinner,
 )
 from ros2_memory.cli.output import format_time
-from ros2_memory.config import NullRecorderNode
+from ros2_memory.config import NullRecorderNode, Settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import (
     BagError,
@@ -49,8 +54,6 @@ from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap.writer import McapWriter
-
-_MB = 1_000_000
 
 
 def forget(
@@ -87,188 +90,209 @@ def forget(
         if snapshot.problem:
             raise RecorderError(snapshot.problem)
         window = parse_window(memory, start, end, last)
-        bag_root = settings.recording.bag_dir
-        own = supposed_own(bag_root) if settings.retention.foreign == "keep" else None
-        plan = planned(snapshot, window, bag_root, own)
-        carrier = Carrier(
-            settings.recording.bag_dir,
-            memory.reader,
-            McapWriter(),
-            settings.data.tf_static_topics,
-        )
-        stays = [*plan.stays, *_beside(memory, carrier, plan, window)]
-        for line in stays:
-            print_line(f"stays: {line}")
-        if not plan.doomed:
+        plan = plan_deletion(settings, snapshot, window)
+        carrier = Carrier(plan.bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics)
+        kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
+        _print_kept(kept)
+        if not plan.to_delete:
             print_line("no closed bag lies wholly inside the window")
         elif dry_run:
-            print_line(f"would be deleted: {_told(plan)}")
-            for bag in plan.doomed:
-                print_line(f"  {_named(bag.path, settings.recording.bag_dir)}")
+            print_line(f"would be deleted: {_describe(plan)}")
+            for bag in plan.to_delete:
+                print_line(f"  {plan.name_of(bag.path)}")
         else:
-            print_line(f"to be deleted: {_told(plan)}")
+            print_line(f"to be deleted: {_describe(plan)}")
             if not yes:
                 typer.confirm("Delete them? This cannot be undone.", abort=True)
-            counts = _counts(build_reader(settings), plan.doomed)
-            stays += _forgotten(bag_root, memory, plan, carrier, counts)
-    if stays:
+            counts = _message_counts(build_reader(settings), plan.to_delete)
+            kept += _delete(memory, plan, carrier, counts)
+    if kept:
         raise typer.Exit(EXIT_NEGATIVE)
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What goes, and, each with its reason, what stays of the window.
+    """The bags of a window that are deleted, and a line with the reason for each that is kept.
 
-    `own` are the recordings of which something may go; all where None.
+    `own` are the recordings of which bags may be deleted; None: all.
     """
 
-    doomed: tuple[BagFile, ...]
-    stays: tuple[str, ...]
-    own: OwnRecordings | None = None
+    bag_dir: Path
+    own: OwnRecordings | None
+    to_delete: tuple[BagFile, ...]
+    kept: tuple[str, ...]
 
-    @property
-    def size(self) -> int:
-        """The bytes of what goes."""
-        return sum(bag.size for bag in self.doomed)
-
-
-def planned(
-    snapshot: Snapshot, window: TimeWindow, bag_dir: Path, own: OwnRecordings | None = None
-) -> Plan:
-    """What a window's forgetting would delete: of the recordings that are its `own`, or of all.
-
-    Reads no bag.
-    """
-    touched = snapshot.overlapping(window)
-    doomed = tuple(
-        bag
-        for bag in touched
-        if bag.state is BagState.CLOSED
-        and window.covers(bag.start, bag.end)
-        and not _is_kept(bag, bag_dir)
-        and (own is None or is_own(bag.path, own))
-    )
-    plan = Plan(doomed, (), own)
-    return replace(plan, stays=tuple(_staying(snapshot, window, bag_dir, plan)))
+    def name_of(self, path: Path) -> str:
+        """Returns a path as people know it: relative to the bag directory, if it is in there."""
+        return _name(path, self.bag_dir)
 
 
-def is_own(bag: Path, own: OwnRecordings) -> bool:
-    """Whether the recorder made a bag file, or keeps it as carried messages or as a moment."""
-    return is_kept_apart(own.name_of(bag.parent)) or own.owns(bag.parent)
-
-
-def _staying(snapshot: Snapshot, window: TimeWindow, bag_dir: Path, plan: Plan) -> Iterator[str]:
-    doomed = frozenset(plan.doomed)
+def plan_deletion(settings: Settings, snapshot: Snapshot, window: TimeWindow) -> Plan:
+    """Decides what is deleted of a window; reads no bag."""
+    bag_dir = settings.recording.bag_dir
+    own = supposed_own(bag_dir) if settings.retention.foreign == "keep" else None
+    to_delete: list[BagFile] = []
+    kept: list[str] = []
     for bag in snapshot.overlapping(window):
-        if bag not in doomed:
-            yield f"{_named(bag.path, bag_dir)}: {_reason(bag, bag_dir, plan.own)}"
-    for aside, place in snapshot.unread_spans.items():
-        if place is not None and place.overlaps(window.start, window.stop - 1):
-            if not aside.answers:
-                yield f"{_named(aside.path, bag_dir)}: {aside.reason}"
-        elif place is None:
-            yield f"{_named(aside.path, bag_dir)}: when it was recorded is unknown ({aside.reason})"
+        reason = _reason_to_keep(bag, window, bag_dir, own)
+        if reason is None:
+            to_delete.append(bag)
+        else:
+            kept.append(f"{_name(bag.path, bag_dir)}: {reason}")
+    for aside, span in snapshot.unread_spans.items():
+        name = _name(aside.path, bag_dir)
+        if span is None:
+            kept.append(f"{name}: when it was recorded is unknown ({aside.reason})")
+        elif span.overlaps(window.start, window.stop - 1) and not aside.answers:
+            kept.append(f"{name}: {aside.reason}")
+    return Plan(bag_dir, own, tuple(to_delete), tuple(kept))
 
 
-def _reason(bag: BagFile, bag_dir: Path, own: OwnRecordings | None) -> str:
-    """Why a bag stays."""
+def _reason_to_keep(
+    bag: BagFile, window: TimeWindow, bag_dir: Path, own: OwnRecordings | None
+) -> str | None:
     if bag.state is BagState.ACTIVE:
         return "it is being written"
-    if own is not None and not is_own(bag.path, own):
-        return _foreign(bag.path, own)
+    if not _may_delete(bag, own):
+        folder = own.name_of(bag.path.parent) if own is not None else ""
+        if folder:
+            adopt = f"`ros2-memory adopt {folder}` first"
+        else:
+            adopt = (
+                "move it into a directory of its own in the bag directory and let "
+                "`ros2-memory adopt` take that"
+            )
+        return f"this recorder did not make it; to forget it, {adopt}"
     if bag.state is BagState.INCOMPLETE:
         closes = "; ros2-memory recover closes it" if bag.path.suffix == ".mcap" else ""
         return f"a crash left it open{closes}"
-    if _is_kept(bag, bag_dir):
+    if bag.path.is_relative_to(bag_dir / MOMENTS_FOLDER):
         return "it was asked to be kept; delete the moment's folder to forget it"
-    return "it reaches beyond the window"
+    return None if window.covers(bag.start, bag.end) else "it reaches beyond the window"
 
 
-def _foreign(bag: Path, own: OwnRecordings) -> str:
-    folder = own.name_of(bag.parent)
-    if not folder:
-        return (
-            "this recorder did not make it; to forget it, move it into a directory of its own in "
-            "the bag directory and let `ros2-memory adopt` take that"
-        )
-    return f"this recorder did not make it; to forget it, `ros2-memory adopt {folder}` first"
+def _may_delete(bag: BagFile, own: OwnRecordings | None) -> bool:
+    """Returns whether the recorder made a bag, or keeps it (carried messages, saved moments)."""
+    folder = bag.path.parent
+    return own is None or is_kept_apart(own.name_of(folder)) or own.owns(folder)
 
 
-def _is_kept(bag: BagFile, bag_dir: Path) -> bool:
-    """Whether only a moment that was to be kept still has it."""
-    return bag.path.is_relative_to(bag_dir / MOMENTS_FOLDER)
-
-
-def _named(path: Path, bag_dir: Path) -> str:
+def _name(path: Path, bag_dir: Path) -> str:
     return str(path.relative_to(bag_dir)) if path.is_relative_to(bag_dir) else str(path)
 
 
-def _counts(reader: BagReader, doomed: Sequence[BagFile]) -> dict[Path, Counter[str]]:
-    """How many messages of which topic each file holds, also those that do not count.
+def _print_kept(lines: Sequence[str]) -> None:
+    for line in lines:
+        print_line(f"stays: {line}")
 
-    For metadata.yaml; of one that cannot be read there is nothing, and then that stays.
+
+def _describe(plan: Plan) -> str:
+    first, last = min(bag.start for bag in plan.to_delete), max(bag.end for bag in plan.to_delete)
+    size = sum(bag.size for bag in plan.to_delete)
+    return (
+        f"{counted(len(plan.to_delete), 'bag')}, {size / MB:.1f} MB, from "
+        f"{format_time(unix_from_ns(first))} to {format_time(unix_from_ns(last))}"
+    )
+
+
+def _kept_elsewhere(
+    memory: Memory, carrier: Carrier, plan: Plan, window: TimeWindow
+) -> Iterator[str]:
+    """Yields what of the window remains readable without the bags that are deleted."""
+    with suppress(BagError):
+        carried = [
+            topic.topic
+            for topic in memory.reader.summarize(carrier.path).topics
+            if window.overlaps(topic.first, topic.last)
+        ]
+        if carried:
+            topics = ", ".join(carried)
+            yield f"latched messages that later answers need, in {carrier.path}: {topics}"
+    linked = _with_other_links(plan.to_delete)
+    if linked:
+        yield (
+            f"{counted(len(linked), 'bag')} of these under other names too, as in moments that "
+            "were to be kept: delete the moment's folder to forget it"
+        )
+
+
+def _with_other_links(bags: Sequence[BagFile]) -> set[Path]:
+    """Returns the bags that have further hard links, as saved moments have."""
+    linked = set()
+    for bag in bags:
+        with suppress(OSError):
+            if bag.path.lstat().st_nlink > 1:
+                linked.add(bag.path)
+    return linked
+
+
+def _message_counts(reader: BagReader, bags: Sequence[BagFile]) -> dict[Path, Counter[str]]:
+    """Returns the messages of each topic in each file, also those that do not count in answers.
+
+    `metadata.yaml` lists them. A file that cannot be read is left out.
     """
     counts: dict[Path, Counter[str]] = {}
-    for bag in doomed:
+    for bag in bags:
         with suppress(BagError):
-            held = counts.setdefault(bag.path, Counter())
+            in_file = counts.setdefault(bag.path, Counter())
             for topic in reader.summarize(bag.path).topics:
-                held[topic.topic] += topic.count
+                in_file[topic.topic] += topic.count
     return counts
 
 
-def _forgotten(
-    bag_dir: Path,
-    memory: Memory,
-    plan: Plan,
-    carrier: Carrier,
-    counts: Mapping[Path, Counter[str]],
+def _delete(
+    memory: Memory, plan: Plan, carrier: Carrier, counts: Mapping[Path, Counter[str]]
 ) -> list[str]:
-    """Deletes what was planned, as far as it is still so; what stays all the same, and why.
+    """Deletes the planned bags that are still there; returns a line for each that is kept.
 
-    A recorder that runs carries latched messages itself, and nobody else may beside it. Bags with
-    such messages stay then.
+    A live recorder carries latched messages itself, and two programs must not do so at a time.
+    Bags with such messages are kept then.
+
+    Raises:
+        BagError: latched messages cannot be carried; nothing is deleted then.
     """
-    stays = []
-    with spinner("deleting"), _alone(bag_dir) as recorder:
-        snapshot, own = memory.index.refresh(), plan.own
-        there = {*snapshot.bags}
-        doomed = [
-            bag for bag in plan.doomed if bag in there and (own is None or is_own(bag.path, own))
-        ]
-        removal = _Removal(bag_dir, memory)
+    kept = []
+    with spinner("deleting"), _recorder_locked_out(plan.bag_dir) as recorder:
+        snapshot = memory.index.refresh()
+        present = {*snapshot.bags}
+        bags = [bag for bag in plan.to_delete if bag in present and _may_delete(bag, plan.own)]
         carried = None
         if recorder is None:
-            carried = removal.carry(carrier, snapshot, doomed)
+            paths = {bag.path for bag in bags}
+            carried = carrier.carry(snapshot, paths, _with_other_links(bags))
         else:
-            latched = {*carrier.with_latched(snapshot, {bag.path for bag in doomed})}
-            doomed = [bag for bag in doomed if bag not in latched]
-            stays = [
-                f"{_named(bag.path, bag_dir)}: it has latched messages, which nobody else may "
+            latched = {*carrier.with_latched(snapshot, {bag.path for bag in bags})}
+            bags = [bag for bag in bags if bag not in latched]
+            kept = [
+                f"{plan.name_of(bag.path)}: it has latched messages, which nobody else may "
                 f"carry on beside a recorder: {recorder}; stop it for a moment, and forget again"
                 for bag in sorted(latched)
             ]
-        removal.remove(doomed)
-        notes = removal.correct_metadata(counts)
-    print_line(
-        f"deleted: {counted(removal.bags, 'bag')}, {removal.freed / _MB:.1f} MB"
-        f"{'' if carried is None else f'; {_carried(carried)} on'}"
-    )
-    stays += removal.faults
-    for line in stays:
-        print_line(f"stays: {line}")
-    for line in notes:
-        print_line(line)
-    return stays
-
-
-def _carried(messages: int) -> str:
-    return counted(messages, "latched message is carried", "latched messages are carried")
+        deleted, freed = _delete_files(plan.bag_dir, bags, kept)
+        open_recordings = _open_recordings(plan.bag_dir)
+        for recording in {bag.recording for bag in deleted} - open_recordings:
+            try:
+                remove_emptied(plan.bag_dir, recording)
+            except OSError as error:
+                kept.append(f"{recording}: {error}")
+        if memory.recall is not None:
+            paths_in_catalogue = [BagKey.of(bag, plan.bag_dir).path for bag in deleted]
+            memory.recall.catalogue.forget(paths_in_catalogue)
+        notes = [*_correct_metadata(plan, deleted, open_recordings, counts)]
+    line = f"deleted: {counted(len(deleted), 'bag')}, {freed / MB:.1f} MB"
+    if carried is not None:
+        messages = counted(carried, "latched message is", "latched messages are")
+        line += f"; {messages} carried on"
+    print_line(line)
+    _print_kept(kept)
+    for note in notes:
+        print_line(note)
+    return kept
 
 
 @contextmanager
-def _alone(bag_dir: Path) -> Iterator[str | None]:
-    """Within the block no recorder begins; gives who records already, None where nobody does."""
+def _recorder_locked_out(bag_dir: Path) -> Iterator[str | None]:
+    """Keeps recorders from starting within the block; yields why one holds the lock, or None."""
     try:
         lock = BagDirLock.acquire(bag_dir, patience_s=0.0)
     except RecorderError as error:
@@ -280,117 +304,59 @@ def _alone(bag_dir: Path) -> Iterator[str | None]:
         lock.release()
 
 
-def _told(plan: Plan) -> str:
-    first, last = min(bag.start for bag in plan.doomed), max(bag.end for bag in plan.doomed)
-    return (
-        f"{counted(len(plan.doomed), 'bag')}, {plan.size / _MB:.1f} MB, from "
-        f"{format_time(unix_from_ns(first))} to {format_time(unix_from_ns(last))}"
-    )
+def _delete_files(
+    bag_dir: Path, bags: Sequence[BagFile], kept: list[str]
+) -> tuple[list[BagFile], int]:
+    """Deletes bags in every form; returns those deleted and their bytes, adds faults to `kept`."""
+    deleted, freed = [], 0
+    for bag in bags:
+        try:
+            for path in (bag.path, Path(other_form(bag.file))):
+                with suppress(FileNotFoundError):
+                    status = path.lstat()
+                    freed += remove_bag(bag_dir, path, (status.st_dev, status.st_ino))
+        except OSError as error:
+            kept.append(f"{bag.path}: {error}")
+        else:
+            deleted.append(bag)
+    return deleted, freed
 
 
-def _beside(memory: Memory, carrier: Carrier, plan: Plan, window: TimeWindow) -> Iterator[str]:
-    """What of the window outlives its bags elsewhere."""
-    with suppress(BagError):
-        held = [
-            topic.topic
-            for topic in memory.reader.summarize(carrier.path).topics
-            if window.overlaps(topic.first, topic.last)
-        ]
-        if held:
-            yield f"latched messages that later answers need, in {carrier.path}: {', '.join(held)}"
-    kept = [bag for bag in plan.doomed if _names(bag.path) > 1]
-    if kept:
-        yield (
-            f"{counted(len(kept), 'bag')} of these under other names too, as in moments that were "
-            "to be kept: delete the moment's folder to forget it"
-        )
+def _open_recordings(bag_dir: Path) -> set[Path]:
+    """Returns the recordings that a recorder says it writes."""
+    heartbeat = read_heartbeat(bag_dir).heartbeat
+    return {bag_dir / name for name in heartbeat.recordings} if heartbeat else set()
 
 
-def _names(path: Path) -> int:
-    try:
-        return path.lstat().st_nlink
-    except OSError:
-        return 0
+def _correct_metadata(
+    plan: Plan,
+    deleted: Sequence[BagFile],
+    open_recordings: Collection[Path],
+    counts: Mapping[Path, Counter[str]],
+) -> Iterator[str]:
+    """Takes deleted bags out of each recording's metadata.yaml; yields a line for each.
 
-
-@dataclass(slots=True)
-class _Removal:
-    """Removes bags, their other forms, their recordings, and what the catalogue knows of them."""
-
-    bag_dir: Path
-    memory: Memory
-    bags: int = 0
-    freed: int = 0
-    faults: list[str] = field(default_factory=list)
-    gone: list[BagFile] = field(default_factory=list)
-
-    def carry(self, carrier: Carrier, snapshot: Snapshot, doomed: Sequence[BagFile]) -> int | None:
-        """Carries latched messages on; how many, where their bag was written anew.
-
-        Raises:
-            BagError: that cannot be done; nothing is deleted then.
-        """
-        kept = {bag.path for bag in doomed if _names(bag.path) > 1}
-        return carrier.carry(snapshot, {bag.path for bag in doomed}, kept)
-
-    def remove(self, doomed: Sequence[BagFile]) -> None:
-        """Deletes them; what cannot be deleted is among the faults."""
-        gone = []
-        for bag in doomed:
-            try:
-                self._delete(bag)
-            except OSError as error:
-                self.faults.append(f"{bag.path}: {error}")
-            else:
-                gone.append(bag)
-        self.bags += len(gone)
-        self.gone += gone
-        heartbeat = read_heartbeat(self.bag_dir).heartbeat
-        named = {self.bag_dir / name for name in heartbeat.recordings} if heartbeat else set()
-        for recording in {bag.recording for bag in gone} - named:
-            try:
-                remove_emptied(self.bag_dir, recording)
-            except OSError as error:
-                self.faults.append(f"{recording}: {error}")
-        if self.memory.recall is not None:
-            paths = [BagKey.of(bag, self.bag_dir).path for bag in gone]
-            self.memory.recall.catalogue.forget(paths)
-
-    def correct_metadata(self, counts: Mapping[Path, Counter[str]]) -> list[str]:
-        """Has metadata.yaml of each recording list what is left of it; what there is to say.
-
-        That of a recording that is being written is its recorder's, who writes it at the end.
-        """
-        heartbeat = read_heartbeat(self.bag_dir).heartbeat
-        open_ones = {self.bag_dir / name for name in heartbeat.recordings} if heartbeat else set()
-        said = []
-        for recording in sorted({bag.recording for bag in self.gone}):
-            name = f"{_named(recording, self.bag_dir)}/{METADATA_FILE}"
-            if recording in open_ones and not (recording / METADATA_FILE).exists():
-                said.append(f"{name} will list what was deleted: its recorder writes it at the end")
-                continue
-            gone = {
-                bag.path.name: counts.get(bag.path, Counter[str]())
-                for bag in self.gone
-                if bag.recording == recording
-            }
-            try:
-                with directories.opened(self.bag_dir, recording):
-                    lists = take_out(recording, gone)
-                if lists:
-                    said.append(f"{name} lists what is left")
-            except FileNotFoundError:
-                continue  # the recording has gone, and its metadata.yaml with it
-            except (OSError, ValueError) as error:
-                said.append(
-                    f"{name} still lists what was deleted ({error}); rosbag2 opens the folder "
-                    f"after `ros2 bag reindex {recording}`"
-                )
-        return said
-
-    def _delete(self, bag: BagFile) -> None:
-        for path in (bag.path, Path(other_form(bag.file))):
-            with suppress(FileNotFoundError):
-                status = path.lstat()
-                inode = (status.st_dev, status.st_ino)
-                self.freed += remove_bag(self.bag_dir, path, inode)
+    That of an open recording is left to its recorder, which writes it at the end.
+    """
+    for recording in sorted({bag.recording for bag in deleted}):
+        name = f"{plan.name_of(recording)}/{METADATA_FILE}"
+        if recording in open_recordings and not (recording / METADATA_FILE).exists():
+            yield f"{name} will list what was deleted: its recorder writes it at the end"
+            continue
+        of_recording = {
+            bag.path.name: counts.get(bag.path, Counter[str]())
+            for bag in deleted
+            if bag.recording == recording
+        }
+        try:
+            with directories.opened(plan.bag_dir, recording):
+                is_listed = take_out(recording, of_recording)
+            if is_listed:
+                yield f"{name} lists what is left"
+        except FileNotFoundError:
+            continue  # the recording was deleted, and its metadata.yaml with it
+        except (OSError, ValueError) as error:
+            yield (
+                f"{name} still lists what was deleted ({error}); rosbag2 opens the folder "
+                f"after `ros2 bag reindex {recording}`"
+            )
