@@ -1,13 +1,15 @@
-"""`ros2-memory watch`: what is being recorded just now, against what is usual."""
+"""`ros2-memory watch`: what is being recorded, compared with what is usual."""
 
+import itertools
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Final
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, Group
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -33,22 +35,26 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status
 from ros2_memory.results import Status
+from ros2_memory.retention.policy import GB
 
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S
-"""The newest data of this length is what goes on just now."""
+"""Current rates are those of the newest data of this length."""
 AS_USUAL: Final = "as usual"
-FRESH_SPLITS: Final = 3
-"""Data is live while it is no older than so many splits (and than `FRESH_NS`)."""
-FRESH_NS: Final[Ns] = 60 * NS_PER_S
-_FEW: Final = 5
-"""So few messages make no rate."""
+LIVE_SPLITS: Final = 3
+LIVE_NS: Final[Ns] = 60 * NS_PER_S
+"""The newest data is live up to this age, or to that of `LIVE_SPLITS` splits if they are longer."""
+_MIN_MESSAGES: Final = 5
+"""Fewer messages give no rate."""
 _SILENT_PERIODS: Final = 10
 _STYLES: Final = {AS_USUAL: "green", "slow": "yellow", "fast": "yellow", "silent": "red"}
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
-    """How one topic goes: rates in Hz, `age_s` of its newest message before the newest of all."""
+class TopicRate:
+    """The current and the usual rate (Hz) of a topic.
+
+    `age_s` is how much older its newest message is than the newest of all topics.
+    """
 
     topic: str
     rate: float
@@ -56,36 +62,41 @@ class Course:
     age_s: float
 
     @property
-    def judged(self) -> str:
-        """What there is to say of it: `as usual`, `slow`, `fast`, `silent`."""
-        usual, span = self.usual, unix_from_ns(WINDOW_NS)
+    def assessment(self) -> str:
+        """`as usual`, `slow`, `fast` or `silent`; `as usual` without a usual rate."""
+        usual, window_s = self.usual, unix_from_ns(WINDOW_NS)
         if usual is None:
             return AS_USUAL
-        if self.age_s > max(span, _SILENT_PERIODS / usual):
+        if self.age_s > max(window_s, _SILENT_PERIODS / usual):
             return "silent"
-        if usual * span >= _FEW and self.rate < usual / 2:
+        if usual * window_s >= _MIN_MESSAGES and self.rate < usual / 2:
             return "slow"
-        if self.rate * span >= _FEW and self.rate > usual * 2:
+        if self.rate * window_s >= _MIN_MESSAGES and self.rate > usual * 2:
             return "fast"
         return AS_USUAL
 
+    def __str__(self) -> str:
+        """Returns the assessment with its rates."""
+        usual = "" if self.usual is None else f", usually {self.usual:.3g}"
+        return f"{self.assessment} ({self.rate:.3g} Hz{usual})"
+
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What was seen at one moment.
+class Observation:
+    """What the command shows at one time.
 
-    `now` is that of the wall clock; ages count from the status's own. Where `live` is False the
-    newest data is old, and rates in it say nothing of what is recorded just now.
+    `now` is the wall clock's time; ages count from the status's own. If `live` is False the newest
+    data is old, and its rates do not describe what is being recorded.
     """
 
     now: Ns
     status: Status
-    courses: tuple[Course, ...]
+    rates: tuple[TopicRate, ...]
     live: bool
 
     @property
     def recorder(self) -> str:
-        """The recorder's state, in some words."""
+        """The recorder's state."""
         status = self.status
         if status.recorder is None:
             return "none"
@@ -93,11 +104,11 @@ class Look:
         return f"{status.recorder}{times}{'' if status.live else ', not alive'}"
 
     @property
-    def troubles(self) -> list[str]:
-        """Why answers may be missing something."""
+    def problems(self) -> list[str]:
+        """Why answers may be incomplete."""
         missing = self.status.missing if self.status.live else ()
-        never = [f"offered by no publisher: {listed(missing)}"] if missing else []
-        return [escape(each) for each in (*never, *self.status.problems)]
+        unoffered = [f"offered by no publisher: {listed(missing)}"] if missing else []
+        return [escape(each) for each in (*unoffered, *self.status.problems)]
 
     @property
     def newest(self) -> str:
@@ -108,6 +119,11 @@ class Look:
         if self.status.now == latest != self.now:
             return f"{format_time(unix_from_ns(latest))}, which is now (data.now=latest)"
         return f"{format_duration(unix_from_ns(self.status.now - latest))} old"
+
+    @property
+    def not_live(self) -> str:
+        """That rates are not assessed."""
+        return f"nothing comes in: {counted(len(self.rates), 'topic')} not judged"
 
 
 def watch(
@@ -133,132 +149,113 @@ def watch(
         console = stdout_console()
         try:
             if console.is_terminal:
-                _live(console, _looks(memory, every, count))
+                with Live(console=console, auto_refresh=False) as live:
+                    for each in _observations(memory, every, count):
+                        live.update(Group(*as_screen(each)), refresh=True)
             else:
-                for look in _looks(memory, every, count):
-                    print_line(line(look))
+                for each in _observations(memory, every, count):
+                    print_line(as_line(each))
         except KeyboardInterrupt:
             raise typer.Exit from None
 
 
-def _live(console: Console, looks: Iterator[Look]) -> None:
-    with Live(console=console, auto_refresh=False) as live:
-        for look in looks:
-            live.update(Group(*shown(look)), refresh=True)
-
-
-def _looks(memory: Memory, every_s: float, count: int | None) -> Iterator[Look]:
-    number = 0
-    while True:
-        yield looked(memory)
-        number += 1
+def _observations(memory: Memory, every_s: float, count: int | None) -> Iterator[Observation]:
+    """Yields what there is to see now, and again every so many seconds."""
+    for number in itertools.count(1):
+        yield observe(memory)
         if number == count:
             return
         time.sleep(every_s)
         memory.index.refresh()
 
 
-def looked(memory: Memory) -> Look:
-    """What there is to see now."""
+def observe(memory: Memory) -> Observation:
+    """Returns what there is to see now."""
     snapshot, wall = memory.index.snapshot(), memory.clock.now()
     status = memory_status(memory, Call())
     live = _is_live(memory, snapshot, status, wall)
-    return Look(wall, status, (*_courses(memory, snapshot),), live)
+    return Observation(wall, status, tuple(_rates(memory, snapshot)), live)
 
 
 def _is_live(memory: Memory, snapshot: Snapshot, status: Status, wall: Ns) -> bool:
-    """Whether the newest data is what is being recorded.
+    """Returns whether the newest data is what is being recorded.
 
-    Where its own time is the present, as in a simulation, only a recorder or a file that grows can
-    tell.
+    With `data.now=latest`, as in a simulation, its age says nothing: a live recorder does, or a
+    file that grows.
     """
     latest = snapshot.dating.latest
     if latest is None:
         return False
     if memory.limits.now == "latest":
-        recording = status.live and status.recorder == RecorderState.RECORDING
-        return recording or bool(snapshot.active)
-    splits = ns_from_unix(FRESH_SPLITS * memory.limits.split_duration_s)
-    return abs(wall - latest) <= max(splits, FRESH_NS)
+        is_recording = status.live and status.recorder == RecorderState.RECORDING
+        return is_recording or bool(snapshot.active)
+    splits = ns_from_unix(LIVE_SPLITS * memory.limits.split_duration_s)
+    return abs(wall - latest) <= max(splits, LIVE_NS)
 
 
-def _courses(memory: Memory, snapshot: Snapshot) -> Iterator[Course]:
+def _rates(memory: Memory, snapshot: Snapshot) -> Iterator[TopicRate]:
+    """Yields the rate of every topic that is not latched."""
     latest = snapshot.dating.latest
     if latest is None:
         return
     window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
+    latching = memory.limits.latching
     for topic in snapshot.topics():
-        if memory.limits.latching.is_latched(snapshot, topic):
+        if latching.is_latched(snapshot, topic):
             continue
         last = max(each.last for each in snapshot.totals(topic).values())
-        heard = _heard(memory, snapshot, topic, window)
+        rate = _count(memory, snapshot, topic, window) / unix_from_ns(WINDOW_NS)
         age_s = max(unix_from_ns(latest - last), 0.0)
-        yield Course(
-            topic,
-            heard / unix_from_ns(WINDOW_NS),
-            usual_rate(snapshot, topic, memory.limits.latching),
-            age_s,
-        )
+        yield TopicRate(topic, rate, usual_rate(snapshot, topic, latching), age_s)
 
 
-def _heard(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -> int:
-    """How many messages of a topic lie in a window, as far as they can be read."""
-    heard = 0
+def _count(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -> int:
+    """Counts the messages of a topic in a window, as far as they can be read."""
+    count = 0
     for bag in dict.fromkeys(bag for bag, *_ in snapshot.extents(topic, window)):
-        try:
-            heard += len(memory.reader.log_times(bag.path, topic, window))
-        except BagError:
-            continue  # it was deleted, or is not whole yet; the next look sees what became of it
-    return heard
+        # Of a bag that was deleted, or is not complete yet, the next observation sees more.
+        with suppress(BagError):
+            count += len(memory.reader.log_times(bag.path, topic, window))
+    return count
 
 
-def line(look: Look) -> str:
-    """One look in one line, for logs: what is not as usual is named."""
-    if look.live:
-        odd = [each for each in look.courses if each.judged != AS_USUAL]
-        usual = counted(len(look.courses) - len(odd), "topic")
-        said = [f"{usual} as usual", *(f"{escape(each.topic)} {_rates(each)}" for each in odd)]
-    else:
-        said = [_not_live(look)] if look.courses else []
-    return (
-        f"{format_time(unix_from_ns(look.now))} recorder: {look.recorder}; newest: {look.newest}"
-        f"{''.join(f'; {each}' for each in [*said, *look.troubles])}"
-    )
+def as_line(seen: Observation) -> str:
+    """Returns an observation in one line, for logs; it names the topics that are not as usual."""
+    parts: list[str] = []
+    if seen.live:
+        unusual = [each for each in seen.rates if each.assessment != AS_USUAL]
+        usual = counted(len(seen.rates) - len(unusual), "topic")
+        parts = [f"{usual} as usual", *(f"{escape(each.topic)} {each}" for each in unusual)]
+    elif seen.rates:
+        parts = [seen.not_live]
+    head = f"recorder: {seen.recorder}; newest: {seen.newest}"
+    return f"{format_time(unix_from_ns(seen.now))} {'; '.join([head, *parts, *seen.problems])}"
 
 
-def _not_live(look: Look) -> str:
-    return f"nothing comes in: {counted(len(look.courses), 'topic')} not judged"
-
-
-def _rates(course: Course) -> str:
-    usual = "" if course.usual is None else f", usually {course.usual:.3g}"
-    return f"{course.judged} ({course.rate:.3g} Hz{usual})"
-
-
-def shown(look: Look) -> Sequence[Text | Table]:
-    """One look on a screen."""
-    budget, gigabyte = look.status.budget, 1e9
-    most = "" if budget.most is None else f" of {budget.most / gigabyte:.3g}"
+def as_screen(seen: Observation) -> Sequence[Text | Table]:
+    """Returns an observation as a screen: a headline, a table of topics, and problems."""
+    budget = seen.status.budget
+    most = "" if budget.most is None else f" of {budget.most / GB:.3g}"
     head = Text.assemble(
-        (format_time(unix_from_ns(look.now)), "bold"),
-        f"  recorder: {look.recorder}  newest: {look.newest}  "
-        f"used: {budget.used / gigabyte:.3g}{most} GB",
+        (format_time(unix_from_ns(seen.now)), "bold"),
+        f"  recorder: {seen.recorder}  newest: {seen.newest}  "
+        f"used: {budget.used / GB:.3g}{most} GB",
     )
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("topic")
     for name in ("Hz", "usually", "last"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("")
-    for each in look.courses:
+    for each in seen.rates:
         table.add_row(
             Text(escape(each.topic)),
             f"{each.rate:.1f}",
             "-" if each.usual is None else f"{each.usual:.1f}",
             f"{each.age_s:.1f} s",
-            Text(each.judged, style=_STYLES[each.judged]) if look.live else Text(""),
+            Text(each.assessment, style=_STYLES[each.assessment]) if seen.live else Text(""),
         )
-    problems = [Text(each, style="red") for each in look.troubles]
-    if look.courses and not look.live:
-        told = f"{_not_live(look)}; the rates are those of the last 10 s of data"
-        problems.insert(0, Text(told, style="yellow"))
+    problems = [Text(each, style="red") for each in seen.problems]
+    if seen.rates and not seen.live:
+        note = f"{seen.not_live}; the rates are those of the last 10 s of data"
+        problems.insert(0, Text(note, style="yellow"))
     return (head, table, *problems)

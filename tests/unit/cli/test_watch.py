@@ -14,7 +14,7 @@ import pytest
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.cli.output import format_duration
-from ros2_memory.cli.watch import AS_USUAL, Course
+from ros2_memory.cli.watch import AS_USUAL, TopicRate
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, odom, text, write_mcap
 
@@ -42,7 +42,7 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("rate", "usual", "age_s", "judged"),
+    ("rate", "usual", "age_s", "assessment"),
     [
         (20.0, 20.0, 0.0, AS_USUAL),
         (9.9, 20.0, 0.0, "slow"),
@@ -54,10 +54,10 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (0.0, None, 1000.0, AS_USUAL),
     ],
 )
-def test_a_course_is_judged_by_what_is_usual(
-    rate: float, usual: float | None, age_s: float, judged: str
+def test_a_rate_is_assessed_by_what_is_usual(
+    rate: float, usual: float | None, age_s: float, assessment: str
 ) -> None:
-    assert Course("/x", rate, usual, age_s).judged == judged
+    assert TopicRate("/x", rate, usual, age_s).assessment == assessment
 
 
 def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(capsys: Capture) -> None:
