@@ -147,11 +147,11 @@ class Dispatcher:
 
     def _report(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
         """Logs a call that is over, and passes it to the observers."""
-        tool, tool_log = done.tool, log
+        tool, _log = done.tool, log
         if self._log_arguments:
             tool = name if tool != UNKNOWN_TOOL else abbreviate(name)
-            tool_log = log.bind(arguments=abbreviate(given, _LOGGED_CHARS))
-        tool_log.info(
+            _log = log.bind(arguments=abbreviate(given, _LOGGED_CHARS))
+        _log.info(
             "tool_call",
             tool=tool,
             outcome=done.outcome,

@@ -160,7 +160,10 @@ _SearchField: TypeAlias = Annotated[
 
 
 class Arguments(BaseModel):
-    """The arguments of one query. Unknown ones are refused before a model sees them."""
+    """The arguments of one query, whose parameters have the names of the fields.
+
+    An alias is the name that clients see. `Signature` refuses unknown names before.
+    """
 
     # Few of them are needed by a program that asks one question: each is built when it is used.
     model_config = ConfigDict(frozen=True, defer_build=True)
@@ -278,7 +281,7 @@ class LastMatchArguments(Arguments):
     value: _ConditionValue
     field: _SearchField | None = None
     fields: _Fields = ()
-    before: _Before | None = None
+    before_s: _Before | None = Field(default=None, alias="before")
 
 
 class ValueWhenArguments(Arguments):
@@ -292,7 +295,7 @@ class ValueWhenArguments(Arguments):
     value: _ConditionValue
     field: _SearchField | None = None
     fields: _Fields = ()
-    before: _Before | None = None
+    before_s: _Before | None = Field(default=None, alias="before")
 
 
 class TrajectoryArguments(Arguments):
@@ -323,7 +326,7 @@ class SaveMomentArguments(Arguments):
 class TypeArguments(Arguments):
     """A message type."""
 
-    type: Annotated[_Name, Field(examples=["nav_msgs/msg/Odometry"])]
+    type_name: Annotated[_Name, Field(alias="type", examples=["nav_msgs/msg/Odometry"])]
 
 
 class VisitsArguments(Arguments):
@@ -346,9 +349,11 @@ class MatchesArguments(Arguments):
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
-    seconds: Annotated[_Positive, Field(description="Only the last so many s.")] | None = None
-    start: _UnixBound | None = None
-    end: _UnixBound | None = None
+    last_s: Annotated[_Positive, Field(description="Only the last so many s.")] | None = Field(
+        default=None, alias="seconds"
+    )
+    start_s: _UnixBound | None = Field(default=None, alias="start")
+    end_s: _UnixBound | None = Field(default=None, alias="end")
     oldest_first: Annotated[
         bool, Field(strict=True, description="Counts all; the first are told.")
     ] = False

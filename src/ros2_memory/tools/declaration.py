@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias
 
-from ros2_memory.tools.arguments import Arguments
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.schema import Signature
 
@@ -15,13 +14,13 @@ if TYPE_CHECKING:
 
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Answer
-    from ros2_memory.tools.arguments import TimeArgument
+    from ros2_memory.tools.arguments import Arguments, TimeArgument
     from ros2_memory.tools.reply_size import JsonObject
 
 Question: TypeAlias = "Callable[[Memory, Call], Answer]"
 """A query with its arguments bound."""
-
-A = TypeVar("A", bound=Arguments)
+Query: TypeAlias = "Callable[..., Answer]"  # type: ignore[explicit-any]
+"""A function of a memory, a call, and the fields of its arguments as keywords, as a test holds."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +40,12 @@ class Tool:
 
     @property
     def description(self) -> str:
-        """The text that tells planners what the tool answers."""
+        """Returns the text that tells planners what the tool answers."""
         return self._described[0]
 
     @property
     def schema(self) -> JsonObject:
-        """The JSON schema of the arguments."""
+        """Returns the JSON schema of the arguments."""
         return self._described[1]
 
     @cached_property
@@ -71,13 +70,13 @@ class ToolName:
 
 
 @dataclass(frozen=True, slots=True)
-class ToolDeclaration(Generic[A]):
+class ToolDeclaration:
     """A query and all its names."""
 
     names: tuple[ToolName, ...]
     description: str
-    arguments: type[A]
-    query: Callable[[Memory, Call, A], Answer]
+    arguments: type[Arguments]
+    query: Query
     blocking: bool = False
     writes: bool = False
 
@@ -95,7 +94,7 @@ class ToolDeclaration(Generic[A]):
             )
 
     def _describe(
-        self, name: ToolName, signature: Signature[A], defaults: Mapping[str, object]
+        self, name: ToolName, signature: Signature, defaults: Mapping[str, object]
     ) -> tuple[str, JsonObject]:
         description = self._description(name, defaults)
         text = f"{description} Example: {to_json_text(signature.example)}"
@@ -111,6 +110,6 @@ class ToolDeclaration(Generic[A]):
         extra = f" Reply: the same, {name.extra_reply}." if name.extra_reply else ""
         return f"As {first.name}, {name.when_text}.{extra}"
 
-    def _question(self, signature: Signature[A], given: Mapping[str, object]) -> Question:
-        arguments = signature.parse(given)
-        return lambda memory, call: self.query(memory, call, arguments)
+    def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
+        arguments = dict(signature.parse(given))
+        return lambda memory, call: self.query(memory, call, **arguments)

@@ -26,19 +26,7 @@ _SIGHTINGS = ToolDeclaration(
     "matches in a row are one sighting. Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, robot: where it was at last_seen, place: of the thing}}], total}}.",
     MatchesArguments,
-    lambda memory, call, given: find_matches(
-        memory,
-        call,
-        given.topic,
-        given.condition_type,
-        given.value,
-        field=given.field,
-        start_s=given.start,
-        end_s=given.end,
-        last_s=given.seconds,
-        oldest_first=given.oldest_first,
-        limit=given.limit,
-    ),
+    find_matches,
     blocking=True,
 )
 _RECAP = ToolDeclaration(
@@ -49,7 +37,7 @@ _RECAP = ToolDeclaration(
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps. Reply: "
     "{{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], counts}}.",
     WindowArguments,
-    lambda memory, call, given: recap(memory, call, given.span),
+    recap,
     blocking=True,
 )
 _STATUS = ToolDeclaration(
@@ -57,7 +45,7 @@ _STATUS = ToolDeclaration(
     "Whether the recorder is alive, how old the newest data is, which topics fell silent, what is "
     "damaged, and for how long the disk lasts.",
     NoArguments,
-    lambda memory, call, _: memory_status(memory, call),
+    memory_status,
 )
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits to a place"),),
@@ -65,41 +53,27 @@ _VISITS = ToolDeclaration(
     "transforms lead there, else in the frame of {pose_topic}. Reply: {{frame_id, there_now, "
     "visits: [{{arrived, departed, duration_s, closest_m, ago_s}}], total}}.",
     VisitsArguments,
-    lambda memory, call, given: visits(
-        memory,
-        call,
-        given.x,
-        given.y,
-        frame_id=given.frame_id,
-        radius_m=given.radius_m,
-        limit=given.limit,
-    ),
+    visits,
     blocking=True,
 )
 TYPE = ToolDeclaration(
     (ToolName("describe_type", "Fields of a message type"),),
     "The fields that replies show of a message type.",
     TypeArguments,
-    lambda memory, call, given: describe_type(memory, call, given.type),
+    describe_type,
 )
 _MOMENTS = ToolDeclaration(
     (ToolName("list_moments", "Kept moments"),),
     "Moments kept by remember_moment, newest first.",
     NoArguments,
-    lambda memory, call, _: list_moments(memory, call),
+    list_moments,
 )
 _SAVE_MOMENT = ToolDeclaration(
     (ToolName("remember_moment", "Keep a moment"),),
     "Keeps what is recorded around now from deletion. Reply: {{moment, bags, pending: the rest is "
     "being written}}.",
     SaveMomentArguments,
-    lambda memory, call, given: remember_moment(
-        memory,
-        call,
-        given.label,
-        seconds_before=given.seconds_before,
-        seconds_after=given.seconds_after,
-    ),
+    remember_moment,
     blocking=True,
     writes=True,
 )

@@ -1,30 +1,27 @@
-"""The signature of one tool: its JSON schema, an example, and the door for what a planner sends."""
+"""The signature of one tool: its JSON schema, an example, and the check of a call's arguments."""
 
 from __future__ import annotations
 
 from difflib import get_close_matches
 from functools import cached_property
 from itertools import islice
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
-from ros2_memory.tools.arguments import Arguments
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.tools.arguments import TimeArgument
+    from ros2_memory.tools.arguments import Arguments, TimeArgument
     from ros2_memory.tools.reply_size import JsonObject
 
-A = TypeVar("A", bound=Arguments)
-
-_MOST_UNKNOWN_NAMED: Final = 5
-_LONGEST_NAME: Final = 64
+_MAX_UNKNOWN_NAMED: Final = 5
+_MAX_NAME_CHARS: Final = 64
 _KINDS: Final = {
     "string": "a text",
     "number": "a number",
@@ -35,10 +32,10 @@ _KINDS: Final = {
 }
 
 
-class Signature(Generic[A]):
-    """Arguments of type `A`, with a `TimeArgument` in the place of their moment or span."""
+class Signature:
+    """The arguments of a model, with a `TimeArgument` in the place of their moment or span."""
 
-    def __init__(self, arguments: type[A], when: type[TimeArgument] | None = None) -> None:
+    def __init__(self, arguments: type[Arguments], when: type[TimeArgument] | None = None) -> None:
         self._arguments = arguments
         self._when = when
 
@@ -59,16 +56,16 @@ class Signature(Generic[A]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The arguments in the order in which they are declared."""
+        """Returns the arguments in the order in which they are declared."""
         return tuple(self._properties)
 
     @property
     def example(self) -> JsonObject:
-        """A call with the required arguments alone."""
+        """Returns a call with the required arguments alone."""
         return {name: _example(self._properties[name]) for name in self._required}
 
     def json_schema(self) -> JsonObject:
-        """The schema that `tools/list` shows: flat, closed, and without what says nothing."""
+        """Returns the schema that `tools/list` shows: flat, closed, without empty defaults."""
         properties: JsonObject = {}
         for name, schema in self._properties.items():
             properties[name] = {
@@ -81,12 +78,12 @@ class Signature(Generic[A]):
             closed["required"] = [*self._required]
         return {"type": "object", "properties": properties, **closed}
 
-    def parse(self, given: Mapping[str, object]) -> A:
-        """The arguments, checked. A null for an optional one counts as not given.
+    def parse(self, given: Mapping[str, object]) -> Arguments:
+        """Returns the checked arguments. A null for an optional one counts as not given.
 
         Raises:
-            InvalidArgumentsError: one is unknown, missing, or not what is expected; the sentence
-                names each, with what was given and an example.
+            InvalidArgumentsError: one is unknown, missing, or invalid; the message names each, with
+                the value that was given and an example.
         """
         present = {
             name: value
@@ -94,14 +91,14 @@ class Signature(Generic[A]):
             if value is not None or name in self._required
         }
         problems = [*self._unknown(given), *self._missing(present)]
-        own = dict(present)
+        values = dict(present)
         if self._when is not None:
             try:
-                own[self._when.replaces] = self._when.model_validate(present).to_query_time()
+                values[self._when.replaces] = self._when.model_validate(present).to_query_time()
             except ValidationError as error:
                 problems += self._wrong(error, given)
         try:
-            arguments = self._arguments.model_validate(own)
+            arguments = self._arguments.model_validate(values)
         except ValidationError as error:
             problems += self._wrong(error, given)
         else:
@@ -111,8 +108,8 @@ class Signature(Generic[A]):
 
     def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
         unknown = (name for name in given if name not in self._properties)
-        for name in islice(unknown, _MOST_UNKNOWN_NAMED):
-            near = get_close_matches(name[:_LONGEST_NAME], self._properties, n=1)
+        for name in islice(unknown, _MAX_UNKNOWN_NAMED):
+            near = get_close_matches(name[:_MAX_NAME_CHARS], self._properties, n=1)
             hint = f"do you mean {near[0]}?" if near else f"there are: {', '.join(self.names)}"
             hint = hint if self.names else "there are none"
             yield f"there is no argument {abbreviate(name)}; {hint}"
@@ -125,20 +122,20 @@ class Signature(Generic[A]):
                 yield f"{name} is missing: {_expected(self._properties[name])}"
 
     def _wrong(self, error: ValidationError, given: Mapping[str, object]) -> Iterator[str]:
-        told: set[str] = set()
+        reported: set[str] = set()
         for fault in error.errors(include_url=False, include_context=False, include_input=False):
             name = str(fault["loc"][0])
-            if fault["type"] == "missing" or name in told or name not in self._properties:
+            if fault["type"] == "missing" or name in reported or name not in self._properties:
                 continue
-            told.add(name)
-            own = fault["msg"].removeprefix("Value error, ")
-            why = f", which {own}" if fault["type"] == "value_error" else ""
+            reported.add(name)
+            reason = fault["msg"].removeprefix("Value error, ")
+            why = f", which {reason}" if fault["type"] == "value_error" else ""
             expected = _expected(self._properties[name])
             yield f"{name} was {abbreviate(given[name])}{why}; expected {expected}"
 
 
 def _properties(arguments: type[Arguments]) -> dict[str, JsonObject]:
-    """The JSON schema of each argument; an optional one has a default and no null."""
+    """Returns the JSON schema of each argument; an optional one has a default and no null."""
     schema: dict[str, JsonObject] = arguments.model_json_schema().get("properties", {})
     return {name: _flat(each) for name, each in schema.items()}
 
@@ -154,7 +151,7 @@ def _flat(schema: JsonObject) -> JsonObject:
 
 
 def _expected(schema: JsonObject) -> str:
-    """What an argument may be, in words."""
+    """Describes the allowed values of an argument."""
     what = _kind(schema)
     bounds = [
         f"{word} {schema[key]:.10g}"
@@ -165,10 +162,10 @@ def _expected(schema: JsonObject) -> str:
         )
         if isinstance(schema.get(key), int | float)
     ]
-    told = f"{what} of {' and '.join(bounds)}" if bounds else what
+    text = f"{what} of {' and '.join(bounds)}" if bounds else what
     if "description" in schema:
-        told += f" ({str(schema['description']).rstrip('.')})"
-    return f"{told}, e.g. {to_json_text(_example(schema))}" if "examples" in schema else told
+        text += f" ({str(schema['description']).rstrip('.')})"
+    return f"{text}, e.g. {to_json_text(_example(schema))}" if "examples" in schema else text
 
 
 def _kind(schema: JsonObject) -> str:

@@ -63,17 +63,17 @@ def build_tools(
 
 
 def _list_topics(
-    memory: Memory, call: Call, given: TopicListArguments
+    memory: Memory, call: Call, *, pattern: str | None
 ) -> tuple[results.TopicRow, ...]:
     rows = queries.list_recorded_topics(memory, call)
-    if given.pattern is None or not rows:
+    if pattern is None or not rows:
         return rows
-    matched = {*match_topics([row.topic for row in rows], given.pattern)}
+    matched = {*match_topics([row.topic for row in rows], pattern)}
     named = tuple(row for row in rows if row.topic in matched)
     if not named:
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,
-            f"none of the {len(rows)} recorded topics matches {given.pattern}; "
+            f"none of the {len(rows)} recorded topics matches {pattern}; "
             "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
         )
     return named
@@ -106,7 +106,7 @@ _RANGE = ToolDeclaration(
     "Reply: {{earliest, latest, now, bags, gaps, damaged, clock_faults, ...}}, times in Unix s and "
     "local ISO, null while the memory is empty.",
     NoArguments,
-    lambda memory, call, _: queries.data_time_range(memory, call),
+    queries.data_time_range,
 )
 _TOPIC_AT = ToolDeclaration(
     _at_and_ago("topic", "A topic's value", at="at_time"),
@@ -114,14 +114,7 @@ _TOPIC_AT = ToolDeclaration(
     "(default {tolerance}, too little for topics that speak seldom; latched topics: any age). "
     "Reply: {{topic, type, timestamp, value}}.",
     TopicAtArguments,
-    lambda memory, call, given: queries.topic_value(
-        memory,
-        call,
-        given.topic,
-        given.moment,
-        tolerance_s=given.tolerance_s,
-        fields=given.fields,
-    ),
+    queries.topic_value,
 )
 _TOPIC_RANGE = ToolDeclaration(
     (
@@ -132,14 +125,7 @@ _TOPIC_RANGE = ToolDeclaration(
     "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; with "
     "fields of numbers extremes, too: {{field: {{min, min_at, max, max_at}}}} of all messages.",
     TopicRangeArguments,
-    lambda memory, call, given: queries.topic_range(
-        memory,
-        call,
-        given.topic,
-        given.span,
-        max_samples=given.max_samples,
-        fields=given.fields,
-    ),
+    queries.topic_range,
 )
 _POSITION = ToolDeclaration(
     _at_and_ago("position", "Robot position"),
@@ -147,9 +133,7 @@ _POSITION = ToolDeclaration(
     "(counter-clockwise from x), timestamp, topic, frame_id}}; of a NavSatFix latitude, longitude "
     "and altitude instead of x, y, z, which are null.",
     MotionArguments,
-    lambda memory, call, given: queries.position(
-        memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
-    ),
+    queries.position,
 )
 _VELOCITY = ToolDeclaration(
     _at_and_ago("velocity", "Robot velocity"),
@@ -157,9 +141,7 @@ _VELOCITY = ToolDeclaration(
     "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}; in the robot's own frame "
     "x is ahead and angular z turns left.",
     MotionArguments,
-    lambda memory, call, given: queries.velocity(
-        memory, call, given.moment, topic=given.topic, tolerance_s=given.tolerance_s
-    ),
+    queries.velocity,
 )
 _TRANSFORM = ToolDeclaration(
     _at_and_ago("transform", "Transform"),
@@ -167,15 +149,13 @@ _TRANSFORM = ToolDeclaration(
     "Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, parent, child, clock"
     "}}.",
     TransformArguments,
-    lambda memory, call, given: queries.transform(
-        memory, call, given.parent, given.child, given.moment
-    ),
+    queries.transform,
 )
 _FRAMES = ToolDeclaration(
     (ToolName("list_frames", "Frames"),),
     "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, static}}]}}.",
     NoArguments,
-    lambda memory, call, _: queries.frames(memory, call),
+    queries.frames,
     blocking=True,
 )
 _CONDITIONS = (
@@ -191,16 +171,7 @@ _LAST_MATCH = ToolDeclaration(
     "age_s}}, or null if never ({{timestamp: null, value: null, notes}} where not all could be "
     "read).",
     LastMatchArguments,
-    lambda memory, call, given: queries.find_last_match(
-        memory,
-        call,
-        given.topic,
-        given.condition_type,
-        given.value,
-        field=given.field,
-        fields=given.fields,
-        before_s=given.before,
-    ),
+    queries.find_last_match,
     blocking=True,
 )
 _VALUE_WHEN = ToolDeclaration(
@@ -209,17 +180,7 @@ _VALUE_WHEN = ToolDeclaration(
     "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
     "value_timestamp, condition_topic, value_topic}}, or null as there.",
     ValueWhenArguments,
-    lambda memory, call, given: queries.value_when(
-        memory,
-        call,
-        given.value_topic,
-        given.condition_topic,
-        condition_type=given.condition_type,
-        value=given.value,
-        field=given.field,
-        fields=given.fields,
-        before_s=given.before,
-    ),
+    queries.value_when,
     blocking=True,
 )
 _TRAJECTORY = ToolDeclaration(
@@ -235,9 +196,7 @@ _TRAJECTORY = ToolDeclaration(
     "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, avg_speed, "
     "max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], ...}}.",
     TrajectoryArguments,
-    lambda memory, call, given: queries.trajectory_summary(
-        memory, call, given.span, topic=given.topic
-    ),
+    queries.trajectory_summary,
     blocking=True,
 )
 _DECLARATIONS = (

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import os
@@ -11,8 +12,9 @@ import pytest
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.history.time_arguments import AtTime
+from ros2_memory.tools import extra_tools, spec_tools
 from ros2_memory.tools.arguments import At, LastMatchArguments
-from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.declaration import Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions
 from ros2_memory.tools.schema import Signature
 from ros2_memory.tools.spec_tools import build_tools
@@ -255,9 +257,10 @@ def test_a_long_value_is_cut_in_the_refusal() -> None:
 
 
 def read(given: dict[str, Any]) -> LastMatchArguments:
-    return Signature(LastMatchArguments).parse(
-        {"topic": "/a", "condition_type": "contains"} | given
-    )
+    required = {"topic": "/a", "condition_type": "contains"}
+    arguments = Signature(LastMatchArguments).parse(required | given)
+    assert isinstance(arguments, LastMatchArguments)
+    return arguments
 
 
 @pytest.mark.parametrize("given", ["position", ["position"], '["position"]', ("position",)])
@@ -277,3 +280,13 @@ def test_a_whole_number_may_be_written_with_a_point() -> None:
 
 def test_a_time_argument_replaces_the_moment() -> None:
     assert At(timestamp=5.0).to_query_time() == AtTime(at_s=5.0)
+
+
+DECLARATIONS = (*spec_tools._DECLARATIONS, *extra_tools.DECLARATIONS, extra_tools.TYPE)
+
+
+@pytest.mark.parametrize("declaration", DECLARATIONS, ids=lambda each: each.names[0].name)
+def test_a_query_has_a_parameter_for_each_argument(declaration: ToolDeclaration) -> None:
+    memory, call, *parameters = inspect.signature(declaration.query).parameters
+    assert (memory, call) == ("memory", "call")
+    assert set(parameters) == set(declaration.arguments.model_fields)
