@@ -357,7 +357,8 @@ def test_a_parent_that_died_before_is_noticed(tmp_path: Path) -> None:
 class TestRunBounded:
     def test_it_gives_status_and_both_streams(self, tmp_path: Path) -> None:
         body = "print('out'); sys.stderr.write('err'); sys.exit(5)"
-        assert run_bounded([program(tmp_path, body)], ENV, PATIENCE_S) == (5, b"out\n", b"err")
+        finished = run_bounded([program(tmp_path, body)], ENV, PATIENCE_S)
+        assert (finished.returncode, finished.stdout, finished.stderr) == (5, b"out\n", b"err")
 
     def test_it_kills_what_takes_too_long_with_all_it_started(self, tmp_path: Path) -> None:
         body = (
@@ -378,9 +379,9 @@ class TestRunBounded:
             "p = subprocess.Popen([sys.executable, '-IS', '-c', 'import time; time.sleep(600)'])\n"
             "print(p.pid)"
         )
-        status, output, _ = run_bounded([program(tmp_path, body)], ENV, PATIENCE_S)
-        assert status == 0
-        os.kill(int(output), signal.SIGKILL)
+        finished = run_bounded([program(tmp_path, body)], ENV, PATIENCE_S)
+        assert finished.returncode == 0
+        os.kill(int(finished.stdout), signal.SIGKILL)
 
     def test_a_program_that_is_not_there_is_named(self) -> None:
         with pytest.raises(RecorderError, match="/nowhere/x cannot be started: No such file"):

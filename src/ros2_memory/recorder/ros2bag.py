@@ -48,22 +48,22 @@ class Ros2BagRecorder(Recorder):
 
     Args:
         reader: reads splits that are closed.
-        bag_dir: where recordings lie; it is made where it does not exist.
-        topics_file: `topics.yaml`, see `topics`.
+        bag_dir: where to record; it is made where it does not exist.
+        topics_file: `topics.yaml`, see `process.topics`.
         split_duration_s: length of one bag file, whole seconds.
         session_duration_s: how long one recording lasts before the next takes over.
         use_sim_time: whether log times come from `/clock`.
         min_free_gb: what must be free on the disk for recording to go on, in 10^9 bytes.
         setup_files: bash files that make the ROS environment.
-        latched_topics: topics whose publishers are transient local; of those that are recorded by
-            name every message is kept, however many there are.
-        repeat_latched: `topic` or `topic=depth`, to begin every split with, where the distribution
-            can do that. Their log times may lie long before the split.
+        latched_topics: topics whose publishers are transient local; of those that `topics_file`
+            names, all messages are recorded, however many there are.
+        repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
+            distribution can do that. Their log times may lie long before the split.
         chunk_bytes: size of an MCAP chunk before compression.
-        housekeeper: repairs and deletes; nobody where None.
+        housekeeper: repairs and deletes; nothing does where None.
         own: the list of the recordings that were made here.
         clock: the wall clock.
-        keep_open: file descriptors that the recorder's process inherits.
+        keep_open: file descriptors that `ros2 bag record` inherits.
     """
 
     def __init__(
@@ -118,12 +118,7 @@ class Ros2BagRecorder(Recorder):
         )
 
     def check(self) -> None:
-        """Makes the environment of `ros2` and asks it what it can do; touches no bag.
-
-        Raises:
-            ConfigError: the list of topics is refused.
-            RecorderError: there is no `ros2` that can record, or a setup file fails.
-        """
+        """Makes the environment of `ros2` and reads its options from its help."""
         self._topics = load_topics(self._topics_file)
         self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
         self._ros2 = find_ros2(self._env)
@@ -131,12 +126,7 @@ class Ros2BagRecorder(Recorder):
         self._checked = True
 
     def start(self) -> None:
-        """Begins to record; from then on `tick` must be called some times a second.
-
-        Raises:
-            ConfigError: the list of topics is refused.
-            RecorderError: recording cannot begin.
-        """
+        """Begins to record, after `check` if that was not called since the last start."""
         if self._started:
             return
         if not self._checked:
@@ -146,7 +136,7 @@ class Ros2BagRecorder(Recorder):
         self._started = True
 
     def tick(self) -> None:
-        """Does what supervision needs at this moment; does not wait, and raises nothing."""
+        """Does what supervision needs at this moment."""
         self._supervisor.tick()
 
     def stop(self) -> None:
@@ -155,22 +145,23 @@ class Ros2BagRecorder(Recorder):
         self._started = False
 
     def is_running(self) -> bool:
-        """Whether a recorder runs and has said that it records."""
+        """Whether a child runs and has reported that it records."""
         return self._supervisor.is_recording
 
     def _known_options(self) -> frozenset[str]:
-        # Nothing is recorded yet, or never where only somebody looks: no log goes beside the bags.
+        # Nothing is recorded yet, or never (`ros2-memory doctor`): no log goes beside the bags.
         with TemporaryDirectory() as elsewhere:
             env = {**self._env, "ROS_LOG_DIR": elsewhere}
             finished = run_bounded([self._ros2, *HELP_ARGV], env, HELP_TIMEOUT_S)
-        if finished.status != 0:
-            said = " ".join(finished.errors.decode(errors="replace").split())[-300:]
+        if finished.returncode != 0:
+            printed = " ".join(finished.stderr.decode(errors="replace").split())[-300:]
             raise RecorderError(
-                f"{self._ros2} bag record --help fails with status {finished.status} ({said}); "
+                f"{self._ros2} bag record --help fails with status {finished.returncode} "
+                f"({printed}); "
                 "install the packages ros-$ROS_DISTRO-ros2bag and -rosbag2-storage-mcap, and "
                 "correct recorder.setup_files"
             )
-        return options_in_help(finished.output.decode(errors="replace"))
+        return options_in_help(finished.stdout.decode(errors="replace"))
 
     def _start_child(self, name: str, directory: Path) -> Child:
         qos_file, storage_file = self._bag_dir / QOS_FILE, self._bag_dir / STORAGE_FILE
@@ -201,11 +192,11 @@ class Ros2BagRecorder(Recorder):
 
 
 def _prune(log_dir: Path) -> None:
-    """Keeps the newest logs: every run of `ros2` leaves one, and all it says is read here."""
+    """Deletes all but the newest logs of `ros2`, whose lines the event log has as well."""
     with suppress(OSError):
         if log_dir.is_symlink():
-            return  # what lies elsewhere is somebody else's
+            return  # the files elsewhere are not ours
         logs = sorted(log_dir.iterdir(), key=lambda path: path.lstat().st_mtime_ns)
         for path in logs[:-LOGS_KEPT]:
-            with suppress(OSError):  # a directory; the others may go all the same
+            with suppress(OSError):  # such as a directory
                 path.unlink()

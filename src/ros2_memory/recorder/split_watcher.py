@@ -1,7 +1,7 @@
-"""The bag files of one recording while it is being written: which are closed, and how it grows.
+"""Watches the bag files of one recording: which are closed, and how it grows.
 
-A file says of itself whether it is closed; its name says nothing, since distributions differ in
-how they number splits, and a new file appears some milliseconds before the old one is closed.
+Only the end of a file shows whether it is closed: distributions number splits differently, and a
+new file appears some milliseconds before the old one is closed.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 EMPTY_GRACE_S: Final = 5.0
-"""A file that is still 0 bytes so long after a newer one appeared was not written: disk full."""
+"""A file that is still 0 bytes so long after a newer one appeared was lost to a full disk."""
 
 
 @dataclass(frozen=True, slots=True)
 class SplitChanges:
-    """What one look found: splits closed since the last, splits left empty, and what is amiss.
+    """What changed since the last observation.
 
-    `gone`: the directory was there and is not any more. `faults` are sentences on what could not
-    be read.
+    `closed` and `empty` name splits. `gone`: the directory existed and does not any more. `faults`
+    are sentences about what could not be read.
     """
 
     closed: tuple[str, ...] = ()
@@ -48,7 +48,15 @@ class _Split:
 
 @dataclass(slots=True)
 class Splits:
-    """The splits of one recording, as far as it has been looked at."""
+    """The splits of one recording, as of the last observation.
+
+    Attributes:
+        directory: the recording.
+        reader: reads splits that are closed.
+        exists: whether the directory exists.
+        received: the topics of which a closed split has a message.
+        messages: how many messages all closed splits have.
+    """
 
     directory: Path
     reader: BagReader
@@ -58,11 +66,7 @@ class Splits:
     _files: dict[str, _Split] = field(default_factory=dict)
 
     def observe(self, now_s: float) -> SplitChanges:
-        """Looks at the directory again. Raises nothing.
-
-        `received` then has every topic of which a closed split holds a message, and `messages` how
-        many there are in all of them.
-        """
+        """Reads the directory again. Raises nothing."""
         try:
             sizes = self._sizes()
         except (FileNotFoundError, NotADirectoryError):
@@ -85,16 +89,16 @@ class Splits:
 
     @property
     def bytes_written(self) -> int:
-        """What the splits hold, deleted ones too; it never shrinks."""
+        """The size of all splits in bytes, deleted ones included; it never shrinks."""
         return sum(split.size for split in self._files.values())
 
     @property
     def closed_names(self) -> frozenset[str]:
-        """The splits that were closed when they were last looked at."""
+        """The splits that were closed at the last observation."""
         return frozenset(name for name, split in self._files.items() if split.closed)
 
     def names(self) -> frozenset[str]:
-        """All splits: those that were seen, and those that are there at this moment."""
+        """Returns the names of all splits, seen before or present now."""
         with suppress(OSError):
             return frozenset(self._files) | frozenset(self._sizes())
         return frozenset(self._files)
@@ -108,7 +112,7 @@ class Splits:
         return sizes
 
     def _has_closed(self, name: str, faults: list[str]) -> bool:
-        """Whether the split is closed, and was not when it was last looked at."""
+        """Whether the split has been closed since the last observation."""
         split = self._files[name]
         if split.closed or split.size == 0:
             return False
@@ -130,7 +134,7 @@ class Splits:
         return True
 
     def _is_empty(self, name: str, size: int, newest_s: float) -> bool:
-        """Whether the split is empty though a newer one was seen; said once."""
+        """Whether the split is empty though a newer one was seen; True only once."""
         split = self._files[name]
         if size > 0 or split.reported_empty or newest_s <= split.first_seen_s:
             return False

@@ -55,8 +55,8 @@ def _ask_timedated(environment: Mapping[str, str]) -> bool | None:
         finished = run_bounded(_ASK, {**env, "LC_ALL": "C"}, TIMEOUT_S)
     except (RecorderError, OSError):
         return None
-    answer = finished.output.strip()
-    return answer == b"yes" if not finished.status and answer in {b"yes", b"no"} else None
+    answer = finished.stdout.strip()
+    return answer == b"yes" if not finished.returncode and answer in {b"yes", b"no"} else None
 
 
 class _Timex(ctypes.Structure):

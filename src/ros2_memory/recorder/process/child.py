@@ -1,9 +1,10 @@
 """One child process: started without a shell, read line by line, ended within a bounded time.
 
-A child is a session and a process group of its own. It dies with the thread that started it, so
-only the main thread may start one. What it prints is read by a thread, so that it never waits for
-us; what nobody asks for is dropped in time. Nothing is ever sent to a process that was not started
-here: the exit of a child is noticed without reaping it, and until it is reaped its number is taken.
+A child is a session and a process group of its own. It dies with the thread that started it
+(PR_SET_PDEATHSIG), so only the main thread may start one. A thread reads its output, so that it
+never blocks on a full pipe; lines that are not taken are dropped in time. No signal ever reaches a
+process that was not started here: a child's exit is noticed without reaping it (WNOWAIT), and no
+other process gets its number until it is reaped.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Final, NamedTuple
+from typing import IO, TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import RecorderError
 
@@ -38,7 +39,7 @@ _POLL_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """How long an ending child is waited for after each signal, in seconds."""
+    """How long to wait for an ending child after each signal, in seconds."""
 
     interrupt_s: float = 8.0
     terminate_s: float = 4.0
@@ -46,11 +47,11 @@ class Patience:
 
     @property
     def total_s(self) -> float:
-        """After this long it is given up: not even SIGKILL ends a process that waits for a disk."""
+        """After so long it is given up: not even SIGKILL ends a process that waits for a disk."""
         return self.interrupt_s + self.terminate_s + self.kill_s
 
     def signal_due(self, since_s: float) -> signal.Signals:
-        """The strongest signal that has fallen due, `since_s` seconds after the first."""
+        """Returns the strongest signal that is due `since_s` seconds after the first."""
         if since_s < self.interrupt_s:
             return signal.SIGINT
         if since_s < self.interrupt_s + self.terminate_s:
@@ -97,7 +98,7 @@ class Child:
             argv: the program and its arguments, as they are: no shell sees them.
             env: its whole environment.
             keep_open: file descriptors that it inherits besides its output.
-            patience: how long it is waited for when it is to end.
+            patience: how long to wait for it when it is to end.
 
         Raises:
             RecorderError: it cannot be started.
@@ -117,12 +118,12 @@ class Child:
         return cls(process, output, patience or Patience())
 
     def take_lines(self) -> list[str]:
-        """What it printed since the last call, oldest first."""
+        """Returns what it printed since the last call, oldest first."""
         # As many as there are at this moment: the reading thread may add without end.
         return [self._lines.popleft() for _ in range(len(self._lines))]
 
     def exit_status(self) -> int | None:
-        """None while it runs; then its exit code, or minus the number of the signal it died by.
+        """Returns None while it runs, then its exit code, or minus a signal's number.
 
         Whatever is left of its group is killed first. All its output can then be taken.
         """
@@ -133,13 +134,13 @@ class Child:
                 return None
             self._signal_group(signal.SIGKILL)
         except ChildProcessError:
-            pass  # reaped already, where SIGCHLD is ignored: the number may be another's
+            pass  # already reaped, if SIGCHLD is ignored: the number may belong to another process
         self._status = self._process.wait()
         self._reader.join(_READER_PATIENCE_S)
         return self._status
 
     def end(self) -> int | None:
-        """Has it end, without waiting: to be called again until there is an exit status.
+        """Asks it to end, without waiting; must be called again until there is an exit status.
 
         The first call sends SIGINT, and later ones SIGTERM and SIGKILL as its patience runs out.
         """
@@ -161,7 +162,7 @@ class Child:
 
 
 def end_all(children: Collection[Child]) -> list[Child]:
-    """Ends all of them at once; returns those that not even SIGKILL ended in time, mostly none."""
+    """Ends all children at once; returns those that not even SIGKILL ended in time."""
     patience_s = max((child.patience_s for child in children), default=0.0)
     give_up = time.monotonic() + patience_s
     while True:
@@ -171,16 +172,12 @@ def end_all(children: Collection[Child]) -> list[Child]:
         time.sleep(_POLL_S)
 
 
-class Finished(NamedTuple):
-    """A program that came to its end: exit code (or minus a signal's number), and its output."""
+def run_bounded(
+    argv: Sequence[str], env: Mapping[str, str], timeout_s: float
+) -> subprocess.CompletedProcess[bytes]:
+    """Runs a program to its end, and does not wait for what it leaves running in the background.
 
-    status: int
-    output: bytes
-    errors: bytes
-
-
-def run_bounded(argv: Sequence[str], env: Mapping[str, str], timeout_s: float) -> Finished:
-    """Runs a program to its end. What it leaves running in the background is not waited for.
+    Its output goes to files for that: `subprocess.run` waits until every copy of a pipe is closed.
 
     Raises:
         RecorderError: it cannot be started, or runs for longer than `timeout_s`.
@@ -195,7 +192,9 @@ def run_bounded(argv: Sequence[str], env: Mapping[str, str], timeout_s: float) -
             raise RecorderError(
                 f"{' '.join(argv[:3])} ... did not come to an end within {timeout_s:g} s"
             ) from error
-        return Finished(status, _content(output), _content(errors))
+        output.seek(0)
+        errors.seek(0)
+        return subprocess.CompletedProcess(argv, status, output.read(), errors.read())
 
 
 def _spawn(
@@ -220,13 +219,8 @@ def _spawn(
         raise RecorderError(f"{argv[0]} cannot be started: {reason}") from error
 
 
-def _content(stream: IO[bytes]) -> bytes:
-    stream.seek(0)
-    return stream.read()
-
-
 def _read(stream: IO[bytes], lines: deque[str]) -> None:
-    """Takes everything that comes until all ends of the pipe are closed."""
+    """Reads lines until every copy of the pipe is closed."""
     with stream:
         while piece := stream.readline(MAX_LINE):
             lines.append(piece.decode("utf-8", errors="replace").rstrip("\r\n"))

@@ -1,7 +1,7 @@
-"""The command line of `ros2 bag record`, and the two files that it is given. Pure.
+"""Makes the command line of `ros2 bag record`, and its two configuration files. Pure.
 
-Distributions differ in what they take. Topics are given in the one form that all of them take, a
-regular expression; an option that only some know is used only where the help lists it.
+Distributions accept different options. Topics are passed in the one form that all of them accept, a
+regular expression; an option that only some have is used only if the help lists it.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ def record_argv(
     bag_dir_id: str | None = None,
     known_options: Collection[str] = (),
 ) -> list[str]:
-    """The argv of one recording.
+    """Returns the argv of one recording.
 
     Args:
         ros2: the program.
-        directory: where the recording is to lie, absolute; it must not exist yet.
+        directory: where to record, absolute; it must not exist yet.
         topics: what is recorded.
         split_duration_s: length of one bag file in whole seconds.
         qos_file: QoS overrides, see `qos_overrides`.
         storage_file: how MCAP is written, see `storage_config`.
-        node_name: what the recorder's node is called, where that can be said.
+        node_name: the name of the recorder's node, if the distribution can set it.
         use_sim_time: whether log times come from `/clock`, before which nothing is recorded.
-        repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, where the
+        repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that.
-        bag_dir_id: what the files carry, besides who recorded them, where that can be said.
+        bag_dir_id: the custom data that identifies the bag directory, if it can be written.
         known_options: the options that this distribution has, see `options_in_help`.
     """
     argv = [ros2, "bag", "record", "-s", "mcap", "-d", str(split_duration_s), "-o", str(directory)]
@@ -81,12 +81,12 @@ def record_argv(
 
 
 def options_in_help(text: str) -> frozenset[str]:
-    """The long options that the help of `ros2 bag record` lists.
+    """Returns the long options in the help of `ros2 bag record`.
 
-    Only its usage counts: the descriptions below mention options too, of other distributions even.
+    Only its usage counts: the descriptions below also mention options of other distributions.
 
     Raises:
-        RecorderError: the help says that MCAP cannot be written.
+        RecorderError: this installation cannot write MCAP.
     """
     usage = _usage(text)
     storages = _STORAGES.search(usage)
@@ -99,25 +99,25 @@ def options_in_help(text: str) -> frozenset[str]:
 
 
 def qos_overrides(latched: Iterable[str]) -> str:
-    """YAML for `--qos-profile-overrides-path`: every message of these topics, however many.
+    """Returns YAML for `--qos-profile-overrides-path`, to record all messages of these topics.
 
     The recorder's default depth of 10 loses messages where many broadcasters publish at once. For
-    a topic whose publishers are not latched this would record nothing: only name those that are.
+    a topic whose publishers are not latched this would record nothing.
     """
     profile = {"history": "keep_all", "reliability": "reliable", "durability": "transient_local"}
     return yaml.safe_dump({topic: dict(profile) for topic in latched}, sort_keys=True)
 
 
 def storage_config(chunk_bytes: int) -> str:
-    """YAML for `--storage-config-file`: zstd, in chunks of so many bytes before compression.
+    """Returns YAML for `--storage-config-file`: zstd, in chunks of so many uncompressed bytes.
 
-    What is in a chunk that is not full yet is lost with the process, so the size is what bounds
-    the loss (README of the ROS package rosbag2_storage_mcap).
+    A chunk that is not full yet is lost with the process, so the size bounds the loss (README of
+    the ROS package rosbag2_storage_mcap).
     """
     return yaml.safe_dump({"chunkSize": chunk_bytes, "compression": "Zstd"}, sort_keys=True)
 
 
 def _usage(text: str) -> str:
-    """The first paragraph that begins with "usage:"; nothing where there is none."""
+    """Returns the first paragraph that begins with "usage:", or an empty string."""
     begin = text.find("usage:")
     return "" if begin < 0 else text[begin:].split("\n\n", 1)[0]

@@ -1,8 +1,8 @@
-"""The environment that `ros2` runs in: the robot's, and nothing of ours.
+"""Makes the environment that `ros2` runs in: the robot's, without that of our own Python.
 
 The setup files of a distribution and of workspaces (`/opt/ros/jazzy/setup.bash`) are shell scripts
-that only a shell can read. One constant helper sources them, in order, and prints the environment
-that came of it; their paths reach it as arguments, so that no path is ever read as shell text.
+that only a shell can read. One constant script sources them, in order, and prints the resulting
+environment. Their paths reach it as arguments, so that no path is ever read as shell text.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SETUP_TIMEOUT_S: Final = 60.0
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
-# Each file is announced before it is sourced, so that one that fails, or exits, has a name. What it
-# prints goes to stderr. No file sees the arguments, which some would take for their own. An empty
-# entry ends the names and begins the environment.
+# The script prints each file's name before it sources the file, so that a file that fails or exits
+# can be named. What files print goes to stderr. They do not see the arguments, which some would
+# take for their own. An empty entry ends the names and begins the environment.
 _SOURCE_ALL: Final = (
     'files=("$@"); set --; '
     'for file in "${files[@]}"; do printf "%s\\0" "$file"; . "$file" >&2 || exit; done; '
@@ -39,7 +39,7 @@ _OURS: Final = frozenset(
         "VIRTUAL_ENV_PROMPT",
         "PYTHONHOME",
         "PYTHONEXECUTABLE",
-        "BASH_ENV",  # bash would source it, uninvited
+        "BASH_ENV",  # bash would source it
         # The service manager's channels belong to the daemon.
         "NOTIFY_SOCKET",
         "WATCHDOG_PID",
@@ -69,28 +69,28 @@ def robot_environment(
     log_dir: Path,
     inherited: Mapping[str, str] | None = None,
 ) -> dict[str, str]:
-    """The environment for `ros2`: what is inherited, less what is ours, after the setup files.
+    """Returns the environment for `ros2`: the inherited one without ours, after the setup files.
 
     `ROS_DOMAIN_ID`, the RMW's settings and everything else of the robot pass through.
 
     Args:
         setup_files: bash scripts, sourced in this order; none where `ros2` is on PATH already.
-        log_dir: where ROS leaves the log file of each run, unless the environment names a place.
+        log_dir: where ROS writes the log of each run, unless the environment has ROS_LOG_DIR.
         inherited: the environment to begin with; the process's own where None.
 
     Raises:
-        RecorderError: a setup file is missing or fails; the sentence names it.
+        RecorderError: a setup file is missing or fails; the message names it.
     """
     base = without_ours(os.environ if inherited is None else inherited)
     if setup_files:
-        # Setup files set it anew; what stands there before them is not the robot's.
+        # Setup files set it; an earlier value is not the robot's.
         base.pop("PYTHONPATH", None)
         base = _sourced(setup_files, base)
     return {"ROS_LOG_DIR": str(log_dir), **base, **_READABLE_OUTPUT}
 
 
 def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
-    """The environment less our Python's virtual environment and the service manager's channels."""
+    """Removes our virtual environment and the service manager's variables from an environment."""
     prefixes = [inherited["VIRTUAL_ENV"]] if inherited.get("VIRTUAL_ENV") else []
     if sys.prefix != sys.base_prefix:
         prefixes.append(sys.prefix)
@@ -105,7 +105,7 @@ def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
 
 
 def find_ros2(env: Mapping[str, str]) -> str:
-    """The path of the `ros2` program.
+    """Returns the path of the `ros2` program.
 
     Raises:
         RecorderError: it is not on the environment's PATH.
@@ -126,17 +126,17 @@ def _sourced(setup_files: Sequence[Path], base: Mapping[str, str]) -> dict[str, 
     bash = shutil.which("bash", path=base.get("PATH", os.defpath))
     if bash is None:
         raise RecorderError("there is no bash on PATH, which recorder.setup_files need")
-    # Absolute: a bare name would be looked for on PATH.
+    # Absolute: bash looks a bare name up on PATH.
     names = [str(file.absolute()) for file in setup_files]
     argv = [bash, "--noprofile", "--norc", "-c", _SOURCE_ALL, "ros2-memory-setup", *names]
     finished = run_bounded(argv, base, SETUP_TIMEOUT_S)
-    begun, ended, printed = os.fsdecode(finished.output).partition("\0\0")
-    said = finished.errors.decode("utf-8", errors="replace")
-    if finished.status != 0 or not ended:
-        raise RecorderError(_failure(begun, finished.status, said))
-    for line in said.splitlines():
+    begun, ended, entries = os.fsdecode(finished.stdout).partition("\0\0")
+    printed = finished.stderr.decode("utf-8", errors="replace")
+    if finished.returncode != 0 or not ended:
+        raise RecorderError(_failure(begun, finished.returncode, printed))
+    for line in printed.splitlines():
         _log.warning("setup_file_said", text=line)
-    pairs = (entry.partition("=") for entry in printed.split("\0") if entry)
+    pairs = (entry.partition("=") for entry in entries.split("\0") if entry)
     return {name: value for name, _, value in pairs if name not in _SHELLS_OWN}
 
 

@@ -1,11 +1,10 @@
-"""Becomes another program, after putting right what a child inherits. Run as a script.
+"""Replaces itself by another program, after resetting what a child inherits. Run as a script.
 
     python -I -S launch.py PARENT_PID PROGRAM [ARGUMENT ...]
 
-It is a program of its own because what it does must happen between fork and exec, where a process
-with threads must not run Python. It imports nothing of this package, so that it starts in
-milliseconds, and it ignores the environment that it hands on, which may be meant for another
-Python.
+It is a program of its own because this must happen between fork and exec, where a process with
+threads must not run Python. It imports nothing of this package, so that it starts in milliseconds,
+and ignores the environment that it passes on (-I), which may be meant for another Python.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ _CANNOT_RUN = 127
 def become(parent: int, argv: list[str]) -> None:
     """Replaces this process by `argv`, whose first element is the program's path.
 
-    The program then has every signal at its default and none blocked (a recorder started where
-    SIGINT is ignored would ignore it for good), and receives SIGINT when its parent dies.
+    Every signal gets its default handler and none is blocked (a recorder started where SIGINT is
+    ignored would always ignore it). The program receives SIGINT when its parent dies.
     """
     for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
-        # The C library keeps some real-time signals for itself.
+        # The C library reserves some real-time signals.
         with suppress(OSError, ValueError):
             signal.signal(number, signal.SIG_DFL)
     libc = ctypes.CDLL(None, use_errno=True)

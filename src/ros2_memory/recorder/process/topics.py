@@ -1,12 +1,12 @@
-"""`topics.yaml`: which topics are recorded, and the one regular expression that says so to ROS 2.
+"""Reads `topics.yaml`, and makes the regular expression that selects its topics in ROS 2.
 
     topics:
       - /odom
       - /vision/*/detections_meta
 
-An entry is a fully qualified topic name, or a glob: `*` stands for one or more characters other
-than `/`, inside one part of the name. What is commented out is not recorded. Names are those of
-the ROS 2 design article "Topic and Service name mapping to DDS".
+An entry is a fully qualified topic name, or a glob: `*` matches one or more characters other than
+`/`, inside one part of the name. Names follow the ROS 2 design article "Topic and Service name
+mapping to DDS".
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MAX_NAME: Final = 247
 """Characters in a topic name: what rmw leaves of DDS's 255 for the name itself."""
 MAX_REGEX: Final = 60_000
-"""Characters in the regular expression: the C++ library gives up on patterns not much larger."""
+"""Characters in the regular expression: the C++ library fails on patterns not much larger."""
 
 _PART = re.compile(r"[A-Za-z_*][A-Za-z0-9_*]*")
 
@@ -43,18 +43,18 @@ class TopicSelection:
 
     @property
     def hidden(self) -> bool:
-        """Whether a hidden topic is asked for by name: one with a part that begins with `_`.
+        """Whether an entry is a hidden topic: one with a part that begins with `_`.
 
-        The recorder leaves those out unless it is told to look at them.
+        The recorder leaves those out without `--include-hidden-topics`.
         """
         return any("/_" in entry for entry in self.entries)
 
     @property
     def regex(self) -> str:
-        """An anchored ECMAScript (and Python) regular expression that matches these topics alone.
+        """An anchored ECMAScript (and Python) regular expression that matches only these topics.
 
-        A regular expression is the only form in which every distribution from Humble to Rolling
-        takes topics, and the only one with which the recorder never stops discovering.
+        Only in this form does every distribution from Humble to Rolling accept topics, and only
+        with it does the recorder never stop discovering.
         """
         return f"^({'|'.join(_pattern(entry) for entry in self.entries)})$"
 
@@ -64,11 +64,11 @@ class TopicSelection:
 
 
 def load_topics(path: Path) -> TopicSelection:
-    """The topics that the file lists.
+    """Returns the topics that the file lists.
 
     Raises:
         ConfigError: the file is missing, is not such a list, lists nothing, or an entry is no
-            topic name; the sentence names the file, the entry and the reason.
+            topic name; the message names the file, the entry and the reason.
     """
     entries = _entries(path)
     for entry in entries:
@@ -105,7 +105,7 @@ def _entries(path: Path) -> list[object]:
 
 
 def _fault(entry: object) -> str | None:
-    """Why an entry is no topic name and no glob; None where it is one."""
+    """Returns why an entry is neither a topic name nor a glob; None if it is one."""
     if not isinstance(entry, str):
         return "an entry must be text, such as /odom"
     if not entry.startswith("/"):
