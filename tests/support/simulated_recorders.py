@@ -18,7 +18,8 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.process.child import Child
-from ros2_memory.recorder.supervisor import Orders, Supervisor
+from ros2_memory.recorder.sessions import Orders
+from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, write_mcap
 

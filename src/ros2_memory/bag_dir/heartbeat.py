@@ -95,6 +95,11 @@ class HeartbeatReading(NamedTuple):
     heartbeat: Heartbeat | None
     reason: str | None
 
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """The recordings that the heartbeat names, live or not; none without a heartbeat."""
+        return () if self.heartbeat is None else self.heartbeat.recordings
+
 
 def read_heartbeat(bag_dir: Path) -> HeartbeatReading:
     """Returns the last heartbeat in `recorder.json`, live or not. Raises nothing."""

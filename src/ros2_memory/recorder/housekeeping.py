@@ -423,8 +423,7 @@ class BackgroundHousekeeper(Housekeeper):
 
 def _named(bag_dir: Path) -> frozenset[Path]:
     """Returns the recordings that the last heartbeat names, live or not."""
-    heartbeat = read_heartbeat(bag_dir).heartbeat
-    return frozenset(bag_dir / name for name in heartbeat.recordings) if heartbeat else frozenset()
+    return frozenset(bag_dir / name for name in read_heartbeat(bag_dir).recordings)
 
 
 def _is_unfinished(recording: Path) -> bool:

@@ -136,8 +136,7 @@ class IndexManager:
             return Collected()
         with self._lock:
             snapshot = self._scan()
-            heartbeat = self.heartbeat()
-            named = () if heartbeat is None else heartbeat.recordings
+            named = read_heartbeat(self.bag_dir).recordings
             collected = self._collector.apply(
                 self._table.known(named, snapshot.scanned_at),
                 snapshot,
@@ -150,8 +149,7 @@ class IndexManager:
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Measures the bags that the recorder did not make; returns None if that is unknown."""
-        heartbeat = self.heartbeat()
-        return self._foreign.measured(snapshot, () if heartbeat is None else heartbeat.recordings)
+        return self._foreign.measured(snapshot, read_heartbeat(self.bag_dir).recordings)
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns the recorder's last heartbeat, live or not; None if it cannot be read."""

@@ -27,7 +27,8 @@ from ros2_memory.recorder.process.command import (
 )
 from ros2_memory.recorder.process.environment import find_ros2, robot_environment
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
-from ros2_memory.recorder.supervisor import Orders, Supervisor
+from ros2_memory.recorder.sessions import Orders
+from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:

@@ -6,12 +6,18 @@ This module does each step; `supervisor` decides when. Nothing here waits, excep
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.handover.plan import READY_TIMEOUT_S, HandoverPlan, Step
+from ros2_memory.recorder.handover.plan import (
+    READY_TIMEOUT_S,
+    SUBSCRIBE_TIMEOUT_S,
+    HandoverPlan,
+    Step,
+)
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.policies import describe_silent_topics
 from ros2_memory.recorder.process.child import end_all
@@ -34,18 +40,32 @@ WHOLE_RECORDING_S: Final = 15.0
 """A recording that lived for less says nothing about topics that brought no message."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Orders:
+    """What to record and for how long. Durations are in seconds.
+
+    `simulated`: log times come from a simulated clock. `subscribe_timeout_s` is how long a handover
+    waits for the new recorder (see `handover.plan`).
+    """
+
+    bag_dir: Path
+    split_duration_s: float
+    session_duration_s: float
+    min_free_bytes: int
+    simulated: bool = False
+    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
+
+
 class RecordingSessions:
     """The sessions of one bag directory.
 
     Args:
-        bag_dir: where recordings lie.
+        orders: what to record.
         start_child: starts the `ros2 bag record` of a recording, given its name and directory.
         announce: receives the name of a recording before anything of it exists.
         reader: reads splits that are closed.
         events: where everything is reported.
         own: the list of recordings that were made here.
-        simulated: whether log times come from a simulated clock.
-        subscribe_timeout_s: how long a handover waits for the new recorder.
 
     Attributes:
         current: the session that records; None while none does.
@@ -55,25 +75,22 @@ class RecordingSessions:
 
     def __init__(
         self,
-        bag_dir: Path,
+        orders: Orders,
         start_child: Callable[[str, Path], Child],
         announce: Callable[[str], None],
         reader: BagReader,
         events: EventLog,
         *,
         own: OwnRecordings,
-        simulated: bool,
-        subscribe_timeout_s: float,
     ) -> None:
-        self._bag_dir = bag_dir
+        self._orders = orders
+        self._bag_dir = orders.bag_dir
         self._start_child = start_child
         self._announce = announce
         self._own = own
         self._unlisted: set[str] = set()
         self._reader = reader
         self._events = events
-        self._simulated = simulated
-        self._subscribe_timeout_s = subscribe_timeout_s
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
         self._running: list[RecordingSession] = []
@@ -116,8 +133,9 @@ class RecordingSessions:
         except RecorderError:
             HandoverTransfer.withdraw(old)
             raise
-        plan = HandoverPlan(now, subscribe_timeout_s=self._subscribe_timeout_s)
-        self.handover = HandoverTransfer(old, new, plan, self._reader, simulated=self._simulated)
+        orders = self._orders
+        plan = HandoverPlan(now, subscribe_timeout_s=orders.subscribe_timeout_s)
+        self.handover = HandoverTransfer(old, new, plan, self._reader, simulated=orders.simulated)
         self._events.info("rotation_begun", recording=old.name, next=name)
 
     def observe(self, now: ClockReading) -> bool:

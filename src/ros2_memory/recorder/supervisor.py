@@ -7,18 +7,13 @@ wait. `policies` and `handover.plan` decide what to do, and `sessions` does it; 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.event_log import EventLog
-from ros2_memory.recorder.handover.plan import (
-    SUBSCRIBE_TIMEOUT_S,
-    ClockReading,
-    Step,
-)
+from ros2_memory.recorder.handover.plan import ClockReading, Step
 from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
 from ros2_memory.recorder.policies import (
     Backoff,
@@ -38,6 +33,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.recorder.process.child import Child
+    from ros2_memory.recorder.sessions import Orders
     from ros2_memory.storage.base import BagReader
 
 OBSERVE_S: Final = 0.5
@@ -53,22 +49,6 @@ RETENTION_S: Final = 10.0
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags grow old all the same."""
 HEARTBEAT_S: Final = 5.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Orders:
-    """What to record and for how long. Durations are in seconds.
-
-    `simulated`: log times come from a simulated clock. `subscribe_timeout_s` is how long a handover
-    waits for the new recorder (see `handover.plan`).
-    """
-
-    bag_dir: Path
-    split_duration_s: float
-    session_duration_s: float
-    min_free_bytes: int
-    simulated: bool = False
-    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
 
 
 class Supervisor:
@@ -119,14 +99,12 @@ class Supervisor:
             expected=expected,
         )
         self._sessions = RecordingSessions(
-            orders.bag_dir,
+            orders,
             start_child,
             self._announce,
             reader,
             self._events,
             own=own or OwnRecordings(orders.bag_dir),
-            simulated=orders.simulated,
-            subscribe_timeout_s=orders.subscribe_timeout_s,
         )
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()

@@ -68,8 +68,7 @@ def recover_unwritten(bag_dir: Path, reader: BagReader) -> None:
     Raises:
         OSError: the bag directory cannot be listed.
     """
-    heartbeat = read_heartbeat(bag_dir).heartbeat
-    recover_handovers(bag_dir, reader, heartbeat.recordings if heartbeat else ())
+    recover_handovers(bag_dir, reader, read_heartbeat(bag_dir).recordings)
 
 
 def _is_folder(path: Path) -> bool:
