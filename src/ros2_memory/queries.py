@@ -1,4 +1,4 @@
-"""One function for one question over a `Memory`: plain values in, a dataclass of `answers` out.
+"""Queries: one function for each tool of the specification, plain values in, `results` out.
 
 Times that come in are Unix seconds (see `timebase`); "ago" counts from the memory's now, which is
 the wall clock or, for replayed and simulated bags, the newest recorded moment. Every function may
@@ -64,7 +64,7 @@ from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.field_extremes import (
-    MOST_MESSAGES,
+    MAX_MESSAGES,
     TOO_MANY,
     extremes_of,
 )
@@ -84,9 +84,10 @@ if TYPE_CHECKING:
     from ros2_memory.extract import Extracted
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
 
-_ODD_BAGS: Final = 5
+_MAX_ODD_BAGS: Final = 5
 
 
 def topic_value(
@@ -98,7 +99,7 @@ def topic_value(
     tolerance_s: float | None = None,
     fields: Sequence[str] = (),
 ) -> results.TopicValue:
-    """The newest message of a topic at or before a moment, within the tolerance.
+    """Returns the newest message of a topic at or before a moment, within the tolerance (s).
 
     A latched topic has no tolerance unless one is given: its newest message holds.
     """
@@ -117,9 +118,9 @@ def topic_range(
     max_samples: int = 100,
     fields: Sequence[str] = (),
 ) -> results.TopicRange:
-    """Samples of a topic, evenly spaced over all its messages in a window.
+    """Returns samples of a topic, evenly spaced over all its messages in a window.
 
-    Of `fields` that hold numbers the extremes are told, unless the messages are too many.
+    With them the extremes of `fields` that hold numbers, unless the messages are too many.
     """
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
@@ -134,7 +135,7 @@ def topic_range(
     note_unread(view, window)
     note_edges(view, window)
     extremes: tuple[results.Extremes, ...] = ()
-    if fields and total > MOST_MESSAGES:
+    if fields and total > MAX_MESSAGES:
         view.notes.add(TOO_MANY)
     elif fields:
         extremes = extremes_of(view, name, window, fields)
@@ -149,7 +150,7 @@ def position(
     topic: str | None = None,
     tolerance_s: float | None = None,
 ) -> results.Position:
-    """Where the robot was: the newest pose at or before a moment, within the tolerance.
+    """Returns where the robot was: its newest pose at or before a moment, within the tolerance (s).
 
     A topic of a satellite receiver gives degrees.
     """
@@ -184,7 +185,7 @@ def velocity(
     topic: str | None = None,
     tolerance_s: float | None = None,
 ) -> results.Velocity:
-    """How fast the robot moved: the newest twist at or before a moment, within the tolerance."""
+    """Returns the robot's newest twist at or before a moment, within the tolerance (s)."""
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic, "velocity")
     found = _found_at(view, name, at, tolerance_s)
@@ -198,7 +199,7 @@ def velocity(
 def transform(
     memory: Memory, call: Call, parent: str, child: str, moment: AtTime
 ) -> results.TransformAt:
-    """The pose of `child` in `parent` at a moment, interpolated by tf2's rules."""
+    """Returns the pose of `child` in `parent` at a moment, interpolated by tf2's rules."""
     view, at, now = open_moment(memory, call, moment)
     try:
         found = frame_history.transform_at(view, parent, child, at)
@@ -213,7 +214,7 @@ def transform(
 
 
 def frames(memory: Memory, call: Call) -> results.Frames:
-    """Every frame and parent-child pair that was recorded."""
+    """Returns every frame and parent-child pair that was recorded."""
     view = View(memory, call, memory.clock.now())
     require_bags(view)
     edges = frame_history.edges(view)
@@ -232,7 +233,7 @@ def find_last_match(
     fields: Sequence[str] = (),
     before_s: float | None = None,
 ) -> results.Match:
-    """The newest message of a topic, or of all topics of a glob, that meets a condition.
+    """Returns the newest message of a topic, or of all topics of a glob, that meets a condition.
 
     With `before_s` (Unix seconds) only messages up to and including then are searched.
     """
@@ -265,7 +266,7 @@ def value_when(
     fields: Sequence[str] = (),
     before_s: float | None = None,
 ) -> results.ValueWhen:
-    """What one topic held when another last met a condition: its value at or before the match.
+    """Returns a topic's value at or before the last time that another topic met a condition.
 
     With `before_s` (Unix seconds) the condition is looked for up to and including then.
     """
@@ -289,17 +290,17 @@ def value_when(
     latched = memory.limits.latching.holds(view.snapshot, held)
     if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
         view.notes.add(f"the value is {seconds(distance)} older than the match")
-    told = _held(view, _value(view, held, fields, None), held, found.time)
-    return results.ValueWhen(matched, told, view.notes.sentences())
+    held_value = _held(view, _value(view, held, fields, None), held, found.time)
+    return results.ValueWhen(matched, held_value, view.notes.sentences())
 
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
-    """Every topic that was heard, under each of its types; empty for an empty memory.
+    """Returns every topic that has messages, under each of its types; none for an empty memory.
 
     A row has notes where its numbers are of bags that are not whole, or that a wrong clock dated.
 
     Raises:
-        NoDataError: the bag directory is not there, or its disk: what was heard is not known.
+        NoDataError: the bag directory or its disk is missing: what was recorded is not known.
     """
     view = View(memory, call, memory.clock.now())
     if view.snapshot.problem is not None:
@@ -324,9 +325,9 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
 
 
 def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
-    """What the memory spans, where it has holes, and which files do not answer.
+    """Returns what the memory spans, where it has gaps, and which files do not answer.
 
-    Bags that a wrong clock dated are listed, and neither begin nor end the span or a hole in it.
+    Bags that a wrong clock dated are listed, and neither begin nor end the span or a gap in it.
     """
     now = memory.clock.now()
     view = View(memory, call, now if memory.limits.now == "wall" else None)
@@ -362,7 +363,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
 def _newest_beside(
     view: View, topic: str, window: TimeWindow, match: StoredMessage
 ) -> StoredMessage | None:
-    """The newest message of a topic in a window: of the match's recording, where it has one there.
+    """Returns the newest message of a topic in a window, from the match's recording if it has one.
 
     A note says where recordings of several robots may be mixed.
     """
@@ -384,37 +385,37 @@ def _newest_beside(
 def trajectory_summary(
     memory: Memory, call: Call, span: TimeRange, *, topic: str | None = None
 ) -> results.TrajectorySummary:
-    """The way driven in a window, from one pose topic in log-time order."""
+    """Returns the driven path in a window, from one pose topic in log-time order."""
     view, window = open_span(memory, call, span)
     name = resolve_pose_topic(view, topic)
-    way = driven_path(view, name, window)
-    if way is None:
+    path = driven_path(view, name, window)
+    if path is None:
         raise no_data_between(view, (name,), window)
-    if len(way.frames) > 1:
-        view.notes.add(f"poses in several frames were joined: {', '.join(way.frames)}")
+    if len(path.frames) > 1:
+        view.notes.add(f"poses in several frames were joined: {', '.join(path.frames)}")
     note_robots(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
     return results.TrajectorySummary(
-        name, way.frames[0], way.first, way.last, way.trajectory, view.notes.sentences()
+        name, path.frames[0], path.first, path.last, path.trajectory, view.notes.sentences()
     )
 
 
 def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
-    """What a search went through to its match, as far as there has been anything."""
+    """Returns what a search went through to reach its match, as far as there can be messages."""
     stop = until if view.memory.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(found.time, max(stop, found.time + 1))
 
 
 def _before(before_s: float | None) -> Ns:
-    """Where a search begins: just after a moment, with the slack of its float of seconds."""
+    """Returns the end of a search: just after a moment, with the slack of a float of seconds."""
     if before_s is None:
         return MAX_NS
     return min(ns_argument("before", before_s) + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
 
 
 def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> StoredMessage:
-    """The newest message of a topic at or before a moment: of any age where it is latched.
+    """Returns the newest message of a topic at or before a moment: of any age where it is latched.
 
     Raises:
         NoDataError: there is none within the tolerance.
@@ -443,7 +444,7 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Stor
 def _held(
     view: View, value: results.TopicValue, found: StoredMessage, at: Ns
 ) -> results.TopicValue:
-    """A value with whether it is latched, and then how old it is."""
+    """Returns a value with whether it is latched, and then how old it is."""
     if not view.memory.limits.latching.holds(view.snapshot, found):
         return value
     age = max(at - found.time, 0) if value.age is None else value.age
@@ -451,7 +452,7 @@ def _held(
 
 
 def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
-    """Says of a value that is not shown with its age that it is latched, and how old."""
+    """Notes of an answer that does not show its age that it is latched, and how old it is."""
     if view.memory.limits.latching.holds(view.snapshot, found):
         topic = found.record.channel.topic
         view.notes.add(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
@@ -464,7 +465,7 @@ def _note_robots(view: View, found: StoredMessage) -> None:
 
 
 def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:
-    """A message as a reply shows it, with the notes on that message alone."""
+    """Returns a message as a reply shows it, with the notes on that message alone."""
     begin = time.perf_counter_ns()
     message = decode(view, found)
     shown = view.memory.extractor.shown(message, found.record.channel.type, fields)
@@ -475,7 +476,7 @@ def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extra
 def _value(
     view: View, found: StoredMessage, fields: Sequence[str], now: Ns | None
 ) -> results.TopicValue:
-    """A message as a reply shows it, with the notes of the whole view so far."""
+    """Returns a message as a reply shows it, with all notes of the view so far."""
     shown = _extracted(view, found, fields)
     channel = found.record.channel
     return results.TopicValue(
@@ -490,10 +491,10 @@ def _value(
 def _samples(
     view: View, chosen: Sequence[StoredMessage], window: TimeWindow, fields: Sequence[str]
 ) -> tuple[tuple[Sample, ...], list[str]]:
-    """The samples that can be decoded, and their types in order of appearance.
+    """Returns the samples that can be decoded, and their types in order of appearance.
 
     Raises:
-        NoDataError: none can.
+        NoDataError: none can be decoded.
     """
     samples: list[Sample] = []
     types: dict[str, None] = {}
@@ -521,26 +522,28 @@ def _age(found: StoredMessage, now: Ns | None) -> Ns | None:
 
 
 def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
-    """What is amiss in the bags that hold a topic, for the topics of which something is."""
+    """Returns, for topics with odd or misdated bags, the sentences on these."""
     odd: dict[str, list[BagFile]] = {}
     for bag in snapshot.faulty(TimeWindow.everything()):
-        for heading in bag.summary.schema.topics:
-            odd.setdefault(heading.topic, []).append(bag)
-    notes = {topic: list(describe_odd(bags)) for topic, bags in odd.items()}
-    if snapshot.misdated:
-        named = {fault.bag.file: fault for fault in snapshot.misdated}
-        held: dict[str, list[str]] = {}
-        for fault in snapshot.misdated:
-            for heading in fault.bag.summary.schema.topics:
-                held.setdefault(heading.topic, []).append(fault.bag.file)
-        for topic, files in held.items():
-            faults = [named[file] for file in dict.fromkeys(files)]
-            notes.setdefault(topic, []).append(describe_misdated(faults))
-    return {topic: tuple(sentences) for topic, sentences in notes.items()}
+        for topic in _topics_of(bag):
+            odd.setdefault(topic, []).append(bag)
+    misdated: dict[str, list[ClockFault]] = {}
+    for fault in snapshot.misdated:
+        for topic in _topics_of(fault.bag):
+            misdated.setdefault(topic, []).append(fault)
+    notes = {topic: tuple(describe_odd(bags)) for topic, bags in odd.items()}
+    for topic, faults in misdated.items():
+        notes[topic] = (*notes.get(topic, ()), describe_misdated(faults))
+    return notes
+
+
+def _topics_of(bag: BagFile) -> frozenset[str]:
+    """Returns the topics that a bag declares; one may be declared under several types."""
+    return frozenset(each.topic for each in bag.summary.schema.topics)
 
 
 def _note_odd_bags(view: View) -> None:
-    """Says of the newest bags that are odd, not left open, and no fault of a clock, in what way."""
+    """Notes what is odd about the newest odd bags, but for crashes and wrong clocks."""
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in odd_bags(view.snapshot)]
-    for sentence in by_remark(odd, _ODD_BAGS):
+    for sentence in by_remark(odd, _MAX_ODD_BAGS):
         view.notes.add(sentence)

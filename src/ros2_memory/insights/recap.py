@@ -1,8 +1,8 @@
-"""What happened in a window, from the data alone: a few sentences, each with its time.
+"""A recap of a window, from the data alone: a few sentences, each with its time.
 
-The robot stood, things came into view and left it, booleans flipped, errors were reported, and
-nothing was recorded. Where that is more than a planner wants to read, what matters least is left
-out, and counted.
+The robot stood, things came into view and left it, booleans toggled, errors were reported, and
+nothing was recorded. Where there are more events than a planner wants to read, the least important
+are left out, and counted.
 """
 
 from __future__ import annotations
@@ -56,9 +56,10 @@ from ros2_memory.results import Event, Recap
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.intervals import IntervalTable, VisibleInterval
+    from ros2_memory.analysis.intervals import IntervalTable
     from ros2_memory.analysis.standstills import Standstill
     from ros2_memory.analysis.topic_events import ReportedError
+    from ros2_memory.analysis.trajectory import Trajectory
     from ros2_memory.core.model import Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Span
@@ -71,11 +72,11 @@ if TYPE_CHECKING:
 MOST_EVENTS: Final = 25
 
 _UNDECODED: Final = Reason("could not be decoded: what they say is not told", "topic")
-_UNTOLD: Final = (
+_STANDSTILLS_UNKNOWN: Final = (
     "the positions are too noisy, or too few, to tell when the robot stood: stood_s is null"
 )
 _KINDS: Final = ("gap", "error", "stop", "flip", "thing")
-"""Kinds of events, the one that matters most first."""
+"""Kinds of events, the most important first."""
 _PLURALS: Final = {
     "gap": "gaps",
     "error": "errors",
@@ -87,31 +88,38 @@ _PLURALS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Drive:
-    """How the robot moved: its way, where there are poses, and its stops, and which go on."""
+    """How the robot moved: its path, and its standstills with whether each goes on afterwards."""
 
-    way: DrivenPath | None
-    stops: tuple[tuple[Standstill, bool], ...]
+    path: DrivenPath | None = None
+    standstills: tuple[tuple[Standstill, bool], ...] = ()
+
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """The path's trajectory, if there are poses; `is_known` says whether any was valid."""
+        return None if self.path is None else self.path.trajectory
 
     def stood(self, length: Ns) -> Ns | None:
-        """How long the robot stood in all, in a window of a length; None where nothing tells.
+        """Returns how long the robot stood in all, in a window of a length; None if not known.
 
-        So it is where no pose is a place, and where the robot neither moved nor stood for most of
-        the time: noise hides where it stood.
+        It is not known where no pose has a valid position, nor where the robot neither moved nor
+        stood for most of the time: noise hides where it stood.
         """
-        stood = sum(stop.end - stop.start for stop, _ in self.stops)
-        way = None if self.way is None else self.way.trajectory
-        if way is None or not way.is_known:
+        stood = sum(each.end - each.start for each, _ in self.standstills)
+        known = self.trajectory
+        if known is None or not known.is_known:
             return stood or None
         if not stood:
-            is_hidden = length >= SHORTEST_NS and way.distance_m <= CREEP_MPS * way.duration_s
+            is_hidden = length >= SHORTEST_NS and known.distance_m <= CREEP_MPS * known.duration_s
             return None if is_hidden else 0
-        else_s = way.duration_s - unix_from_ns(stood)
-        is_hidden = else_s > way.duration_s / 2 and way.distance_m < CREEP_MPS * else_s
-        return None if is_hidden and not way.gaps and ns_from_unix(else_s) > SHORTEST_NS else stood
+        else_s = known.duration_s - unix_from_ns(stood)
+        is_hidden = else_s > known.duration_s / 2 and known.distance_m < CREEP_MPS * else_s
+        if is_hidden and not known.gaps and ns_from_unix(else_s) > SHORTEST_NS:
+            return None
+        return stood
 
 
 def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
-    """What happened in a window.
+    """Returns what happened in a window.
 
     Raises:
         InvalidArgumentsError: the bounds are missing, reversed, not finite or of no length.
@@ -121,32 +129,8 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     view, window = open_span(memory, call, span)
     start, end = window.asked()
     drive = _drive(view, window)
-    events = [] if drive is None else [*_stops(drive)]
-    seen: list[IntervalTable] = []
-    throughout: set[str] = set()
-    there_still: dict[str, Ns] = {}
-    newest = view.snapshot.latest
-    known_to = window.stop if newest is None else min(window.stop, newest)
-    for topic, story in _stories(view, window):
-        events += [*_flips(topic, story), *map(_error, story.errors)]
-        seen.append(story.visible)
-        throughout.update(story.visible.throughout(start, end))
-        there_still |= dict.fromkeys(story.visible.at_end(story.last, known_to), story.last)
-        if story.undecodable:
-            messages = counted(story.undecodable, "message")
-            view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
-        if story.left_out:
-            view.notes.add(f"{topic} changes too often to tell each: {story.left_out} more")
-        if story.beyond:
-            view.notes.add(
-                f"{topic} has too many booleans or things in one message: {story.beyond} more are "
-                "not followed"
-            )
-    things = united(seen).without(throughout)
-    events += [
-        _thing(each, goes_on=each.last == there_still.get(each.label))
-        for each in things.longest(MOST_EVENTS)
-    ]
+    reported, things, throughout = _topic_events(view, window)
+    events = [*_stops(drive), *reported]
     events += [
         Event("gap", begin, until, "nothing was recorded")
         for begin, until in recording_gaps(view, window)
@@ -154,93 +138,127 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
     note_unread(view, window)
     note_edges(view, window)
     counts = Counter(each.kind for each in events)
-    if things.size:
-        counts["thing"] = things.size
-    told = _most_important(view, events, counts)
-    latest = view.snapshot.latest
-    way = None if drive is None else drive.way
-    trajectory = None if way is None else way.trajectory
+    if things:
+        counts["thing"] = things
+    shown = _most_important(view, events, counts)
+    trajectory = drive.trajectory
     for note in () if trajectory is None else length_notes(trajectory):
         view.notes.add(note)
-    stood = None if drive is None else drive.stood(end - start)
-    if stood is None and trajectory is not None and trajectory.is_known:
-        view.notes.add(_UNTOLD)
+    stood = drive.stood(end - start)
     known = trajectory if trajectory is not None and trajectory.is_known else None
+    if stood is None and known is not None:
+        view.notes.add(_STANDSTILLS_UNKNOWN)
     return Recap(
         start=start,
         end=end,
-        now=memory.now(memory.clock.now(), latest),
+        now=memory.now(memory.clock.now(), view.snapshot.latest),
         distance_m=None if known is None else known.distance_m,
         max_speed=None if known is None else known.max_speed,
         stood=stood,
         shortest_stop=SHORTEST_NS,
-        frame_id=None if way is None else way.frames[0],
-        events=tuple(told),
+        frame_id=None if drive.path is None else drive.path.frames[0],
+        events=tuple(shown),
         throughout=tuple(sorted(throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
         notes=view.notes.sentences(),
-        path_sum_m=trajectory.path_sum_m
-        if trajectory is not None and trajectory.is_noisy
-        else None,
-        gap_m=trajectory.gap_m if trajectory is not None and trajectory.gaps else None,
+        path_sum_m=None if trajectory is None or not trajectory.is_noisy else trajectory.path_sum_m,
+        gap_m=None if trajectory is None or not trajectory.gaps else trajectory.gap_m,
     )
 
 
-def _drive(view: View, window: TimeWindow) -> _Drive | None:
-    """How the robot moved; None, with a note, where that is not known."""
+def _drive(view: View, window: TimeWindow) -> _Drive:
+    """Returns how the robot moved; nothing, with a note, where that is not known."""
     try:
         topic = resolve_pose_topic(view)
-        way = driven_path(view, topic, window)
+        path = driven_path(view, topic, window)
         note_robots(view, topic, window)
-        stops = _standstills_in(view, topic, window)
-        if way is None:
-            view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
+        standstills = _standstills_in(view, topic, window)
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"nothing is known of the way: {error}")
-        return None
-    return None if way is None and not stops else _Drive(way, stops)
+        return _Drive()
+    if path is None:
+        view.notes.add(f"{topic} has no poses in this time: nothing is known of the way")
+    return _Drive(path, standstills)
 
 
-def _stories(view: View, window: TimeWindow) -> Iterator[tuple[str, TopicEvents]]:
+def _topic_events(view: View, window: TimeWindow) -> tuple[list[Event], int, set[str]]:
+    """Returns events that messages report, the number of things seen, and those seen throughout.
+
+    Of things that came or went, only the `MOST_EVENTS` that were seen longest are among the events.
+    """
+    start, end = window.asked()
+    newest = view.snapshot.latest
+    known_to = window.stop if newest is None else min(window.stop, newest)
+    events: list[Event] = []
+    visible: list[IntervalTable] = []
+    throughout: set[str] = set()
+    last_seen: dict[str, Ns] = {}
     for topic in view.snapshot.topics():
-        if any(map(has_events, view.snapshot.types_of(topic))):
-            story = _events_in(view, topic, window)
-            if story is not None and not story.is_empty:
-                yield topic, story
+        if not any(map(has_events, view.snapshot.types_of(topic))):
+            continue
+        found = _events_in(view, topic, window)
+        if found is None or found.is_empty:
+            continue
+        events += [*_flips(topic, found), *map(_error, found.errors)]
+        visible.append(found.visible)
+        throughout.update(found.visible.throughout(start, end))
+        last_seen |= dict.fromkeys(found.visible.at_end(found.last, known_to), found.last)
+        _note_limits(view, topic, found)
+    things = united(visible).without(throughout)
+    events += [
+        Event(
+            "thing",
+            each.first,
+            each.last,
+            f"{each.label} in view",
+            goes_on=each.last == last_seen.get(each.label),
+        )
+        for each in things.longest(MOST_EVENTS)
+    ]
+    return events, things.size, throughout
+
+
+def _note_limits(view: View, topic: str, events: TopicEvents) -> None:
+    if events.undecodable:
+        messages = counted(events.undecodable, "message")
+        view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
+    if events.left_out:
+        view.notes.add(f"{topic} changes too often to tell each: {events.left_out} more")
+    if events.beyond:
+        view.notes.add(
+            f"{topic} has too many booleans or things in one message: {events.beyond} more are "
+            "not followed"
+        )
 
 
 def _stops(drive: _Drive) -> Iterator[Event]:
-    for (start, end, box), goes_on in drive.stops:
+    for (start, end, box), goes_on in drive.standstills:
         x, y, _ = box.centre
+        # z: a rounded -0.00 reads as 0.00.
         yield Event("stop", start, end, f"stood at x {x:z.2f}, y {y:z.2f}", goes_on)
 
 
-def _flips(topic: str, story: TopicEvents) -> Iterator[Event]:
-    """Each flip, and how long it held; up to the end where it still did."""
+def _flips(topic: str, events: TopicEvents) -> Iterator[Event]:
+    """Yields each toggle with how long its value held: until the next, or beyond the window."""
     until: dict[str, Ns] = {}
-    for flip in reversed(story.toggles):
-        name = topic if flip.path == "value" else f"{topic} {flip.path}"
-        text = f"{name} became {'true' if flip.value else 'false'}"
-        held = until.get(flip.path)
-        yield Event("flip", flip.time, held, text, goes_on=held is None)
-        until[flip.path] = flip.time
+    for toggle in reversed(events.toggles):
+        name = topic if toggle.path == "value" else f"{topic} {toggle.path}"
+        text = f"{name} became {'true' if toggle.value else 'false'}"
+        end = until.get(toggle.path)
+        yield Event("flip", toggle.time, end, text, goes_on=end is None)
+        until[toggle.path] = toggle.time
 
 
-def _error(fault: ReportedError) -> Event:
-    again = f" ({fault.reports} times)" if fault.reports > 1 else ""
-    end = fault.last if fault.reports > 1 else None
-    return Event("error", fault.first, end, f"error: {fault.text}{again}")
-
-
-def _thing(presence: VisibleInterval, *, goes_on: bool) -> Event:
-    text = f"{presence.label} in view"
-    return Event("thing", presence.first, presence.last, text, goes_on)
+def _error(error: ReportedError) -> Event:
+    again = f" ({error.reports} times)" if error.reports > 1 else ""
+    end = error.last if error.reports > 1 else None
+    return Event("error", error.first, end, f"error: {error.text}{again}")
 
 
 def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -> list[Event]:
-    """At most `MOST_EVENTS`, in order of time: of a kind those that lasted longest.
+    """Returns at most `MOST_EVENTS`, in order of time: of a kind those that lasted longest.
 
-    `counts` is how many there are of each kind; all of those that may be told are among `events`.
+    `counts` has how many there are of each kind, also of those that are not among `events`.
     """
     ranked = sorted(
         events,
@@ -249,8 +267,8 @@ def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -
             0 if each.end is None else each.start - each.end,
         ),
     )
-    told = ranked[:MOST_EVENTS]
-    left_out = counts - Counter(each.kind for each in told)
+    shown = ranked[:MOST_EVENTS]
+    left_out = counts - Counter(each.kind for each in shown)
     if left_out:
         named = ", ".join(
             counted(left_out[kind], kind if kind != "thing" else "sight of a thing", _PLURALS[kind])
@@ -258,7 +276,7 @@ def _most_important(view: View, events: Sequence[Event], counts: Counter[str]) -
             if left_out[kind]
         )
         view.notes.add(f"left out, since they are too many: {named}; ask for a shorter time")
-    return sorted(told, key=lambda each: (each.start, _KINDS.index(each.kind)))
+    return sorted(shown, key=lambda each: (each.start, _KINDS.index(each.kind)))
 
 
 _STANDSTILLS: Final = DigestKind(

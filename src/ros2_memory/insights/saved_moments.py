@@ -1,4 +1,4 @@
-"""Moments: asks the recorder to keep some, which alone writes there, and lists those it keeps."""
+"""Saved moments: asks the recorder, which alone writes there, to save some, and lists them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
 
-PATIENCE_S: Final = 5.0
-"""The recorder looks once a second, and may be deleting."""
-MOST_LISTED: Final = 20
+ANSWER_TIMEOUT_S: Final = 5.0
+"""The recorder looks for requests once a second, and may be deleting bags."""
+MAX_LISTED: Final = 20
 _POLL_S: Final = 0.05
 _ENDED: Final = frozenset({RecorderState.STOPPING, RecorderState.STOPPED})
 
@@ -28,10 +28,10 @@ _ENDED: Final = frozenset({RecorderState.STOPPING, RecorderState.STOPPED})
 def remember_moment(
     memory: Memory, call: Call, label: str, *, seconds_before: float, seconds_after: float
 ) -> Remembered:
-    """Has the recorder keep what was and will be recorded around now.
+    """Asks the recorder to save what was and will be recorded around now.
 
     Raises:
-        RefusedError: nothing records here, or the recorder does not keep it.
+        RefusedError: nothing records here, or the recorder does not save it.
         QueryTimeoutError: there is no time to wait for the recorder.
     """
     now = _now(memory, call)
@@ -56,8 +56,8 @@ def remember_moment(
         slot.close()
     if outcome is None:
         raise RefusedError(
-            f"the recorder did not answer within {PATIENCE_S:g} s; list_moments tells whether it "
-            "keeps the moment all the same, else ask again"
+            f"the recorder did not answer within {ANSWER_TIMEOUT_S:g} s; list_moments tells "
+            "whether it keeps the moment all the same, else ask again"
         )
     if outcome.moment is None:
         raise RefusedError(outcome.refused or "the recorder does not say why")
@@ -65,19 +65,19 @@ def remember_moment(
 
 
 def list_moments(memory: Memory, call: Call) -> KeptMoments:
-    """The moments that are kept, the newest first.
+    """Returns the saved moments, newest first.
 
     Raises:
         RefusedError: they cannot be listed.
     """
     try:
-        held = [*stored_moments_in(memory.index.bag_dir)]
+        stored = [*stored_moments_in(memory.index.bag_dir)]
     except OSError as error:
         raise RefusedError(
             f"the moments cannot be listed: {error.strerror or error}; this server must be allowed "
             "to read moments/ of the bag directory"
         ) from error
-    held.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
+    stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
     listed = (
         KeptMoment(
             each.folder.name,
@@ -89,22 +89,20 @@ def list_moments(memory: Memory, call: Call) -> KeptMoments:
             each.moment.pending,
             each.moment.missing,
         )
-        for each in held[:MOST_LISTED]
+        for each in stored[:MAX_LISTED]
     )
-    return KeptMoments(tuple(listed), len(held[MOST_LISTED:]), _now(memory, call))
+    return KeptMoments(tuple(listed), len(stored[MAX_LISTED:]), _now(memory, call))
 
 
 def _now(memory: Memory, call: Call) -> Ns:
-    """What "ago" counts from."""
+    """Returns what "ago" counts from."""
     wall = memory.clock.now()
-    if memory.limits.now == "wall":
-        return wall
-    latest = View(memory, call, wall).snapshot.latest
-    return wall if latest is None else latest
+    relative = memory.limits.now == "latest"
+    return memory.now(wall, View(memory, call, wall).snapshot.latest if relative else None)
 
 
 def _require_recorder(memory: Memory) -> None:
-    """Refuses where nobody would hear of a wish.
+    """Checks that a recorder is running, which would read a request.
 
     Raises:
         RefusedError: nothing records here, or not just now.
@@ -123,15 +121,15 @@ def _require_recorder(memory: Memory) -> None:
 
 
 def _awaited(slot: PendingRequest, call: Call) -> Outcome | None:
-    """What the recorder answers; None where it has not begun in time, and so never will."""
+    """Returns what the recorder answers; None where it has not begun in time, and never will."""
     for _ in range(2):
-        patience = Deadline.after(PATIENCE_S)
-        while not patience.expired() and not call.deadline.expired():
+        timeout = Deadline.after(ANSWER_TIMEOUT_S)
+        while not timeout.expired() and not call.deadline.expired():
             outcome = slot.outcome()
             if outcome is not None:
                 return outcome
             time.sleep(_POLL_S)
-        # What cannot be withdrawn has been begun, and is waited for once more.
+        # A request that cannot be withdrawn has been begun: wait for it once more.
         if slot.withdraw():
             return None
     return slot.outcome()

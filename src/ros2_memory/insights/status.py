@@ -1,4 +1,4 @@
-"""How far the memory can be trusted just now: what records, how fresh and how whole it is."""
+"""The memory's status: what records, how fresh and how complete the memory is."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
 _SILENT_PERIODS: Final = 10
-"""A topic is silent after so many times the spacing that its messages had."""
-_FEW: Final = 5
-"""A topic with fewer messages has no usual spacing."""
+"""A topic is silent after so many of its usual periods without a message."""
+_MIN_MESSAGES: Final = 5
+"""A topic with fewer messages has no usual period."""
 _GROWTH_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """Growth is measured over the newest data of this length."""
 
 
 def memory_status(memory: Memory, call: Call) -> Status:
-    """What the recorder does, how old the newest data is, what fell silent, what is amiss."""
+    """Returns what the recorder does, how old the newest data is, and what is silent or faulty."""
     wall = memory.clock.now()
     view = View(memory, call, wall)
     view.bags.track_all_sources()
@@ -57,9 +57,10 @@ def memory_status(memory: Memory, call: Call) -> Status:
 
 
 def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
-    """Why answers may be missing something, in sentences.
+    """Yields why answers may be missing something.
 
-    A recorder that should be recording is a problem where it does not; a stopped one was stopped.
+    A recorder that should be recording is a problem where it does not; one that was stopped is
+    none.
     """
     if snapshot.problem:
         yield snapshot.problem
@@ -77,7 +78,7 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
 
 
 def lacking_in(view: View) -> Iterator[str]:
-    """What is known to be missing from the answers, in sentences, each with its count.
+    """Yields what is known to be missing from answers, each with its count.
 
     Damaged files and a directory that cannot be read are among `problems_of`.
     """
@@ -100,13 +101,13 @@ def lacking_in(view: View) -> Iterator[str]:
 
 
 def _age_held(heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
-    """What a live recorder keeps longer than it should, for want of a clock that is right."""
+    """Yields the note on what a live recorder keeps too long while its clock may be wrong."""
     if heartbeat is not None and heartbeat.age_held is not None and heartbeat.is_live(wall):
         yield heartbeat.age_held
 
 
 def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[Stillness]:
-    """Topics that were heard often, and not any more when the newest data was recorded."""
+    """Yields topics that had messages often, and none when the newest data was recorded."""
     latest = snapshot.dating.latest
     if latest is None:
         return
@@ -116,7 +117,7 @@ def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[Stillness
         stated = [*snapshot.totals(topic).values()]
         messages = sum(each.messages for each in stated)
         first, last = min(each.first for each in stated), max(each.last for each in stated)
-        if messages < _FEW:
+        if messages < _MIN_MESSAGES:
             continue
         usual = (last - first) // (messages - 1)
         if latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual):
@@ -124,7 +125,7 @@ def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[Stillness
 
 
 def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:
-    """What the bags take, how fast that grows, and for how long the budget lasts.
+    """Returns what the bags take, how fast that grows, and how much may be kept.
 
     Growth is only predicted while a live recorder records. Where none is configured there is no
     budget either.
@@ -158,7 +159,7 @@ def _is_recording(heartbeat: Heartbeat, wall: Ns) -> bool:
 
 
 def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
-    """The bags that a crash left open, each with what is lost of it."""
+    """Returns the bags that a crash left open, each with what is lost of it."""
     return tuple(
         SetAside(bag.path, "; ".join(bag.summary.remarks) or "left open by a crash")
         for bag in snapshot.faulty(TimeWindow.everything())
@@ -167,13 +168,13 @@ def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
 
 
 def odd_bags(snapshot: Snapshot) -> list[BagFile]:
-    """The bags of which something is amiss, be it no crash and no clock, in bag order."""
+    """Returns the bags with remarks other than on a crash or a clock, in bag order."""
     bags = snapshot.faulty(TimeWindow.everything())
     return [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
 
 
 def nothing_here(snapshot: Snapshot) -> str:
-    """The sentence on a bag directory of which no bag answers."""
+    """Returns the sentence on a bag directory in which no bag answers."""
     if snapshot.active:
         return "no bag answers yet: the first one is still being written"
     if snapshot.empty:
@@ -186,12 +187,12 @@ def nothing_here(snapshot: Snapshot) -> str:
 
 
 def clock_faults(snapshot: Snapshot) -> tuple[SetAside, ...]:
-    """The bags that a wrong clock dated, each with how that is known."""
+    """Returns the bags that a wrong clock dated, each with how that is known."""
     return tuple(SetAside(fault.bag.path, fault.reason) for fault in snapshot.dating.faults)
 
 
 def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
-    """The topics of which messages are recorded that cannot be decoded, under which types."""
+    """Returns the topics with messages that cannot be decoded, with type and reason."""
     return tuple(
         Undecodable(topic, type_name, reason)
         for topic in view.snapshot.topics()
@@ -200,7 +201,7 @@ def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
 
 
 def undecodable_types(view: View, topic: str) -> dict[str, str]:
-    """Why messages of the topic cannot be decoded, by type; from one bag for each type."""
+    """Returns why messages of a topic cannot be decoded, by type; from one bag for each type."""
     reasons: dict[str, str] = {}
     for type_name in view.snapshot.types_of(topic):
         reason = _why_undecodable(view, topic, type_name)

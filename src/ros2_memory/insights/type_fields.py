@@ -1,4 +1,4 @@
-"""What the replies show of a message type: its fields, as the dot-paths that tools take."""
+"""The fields that replies show of a message type, as the dot-paths that tools take."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
 
-MOST_FIELDS: Final = 100
+MAX_FIELDS: Final = 100
 
 
 def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
-    """The fields of a recorded message type, from the newest message of it.
+    """Returns the fields of a recorded message type, from the newest message of it.
 
     Raises:
         NoDataError: no topic was recorded under the type, or none of its messages can be decoded.
@@ -31,8 +31,8 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     topics = [topic for topic in snapshot.topics() if type_name in snapshot.types_of(topic)]
     if not topics:
         known = sorted({each for topic in snapshot.topics() for each in snapshot.types_of(topic)})
-        more = f" and {len(known) - MOST_FIELDS} more" if len(known) > MOST_FIELDS else ""
-        names = ", ".join(known[:MOST_FIELDS]) + more
+        more = f" and {len(known) - MAX_FIELDS} more" if len(known) > MAX_FIELDS else ""
+        names = ", ".join(known[:MAX_FIELDS]) + more
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,
             f"no topic was recorded under this type; there are {names}",
@@ -49,10 +49,10 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
             continue
         value = memory.extractor.exact(message, type_name)
         fields = dict(_fields(value, ""))
-        if len(fields) > MOST_FIELDS:
-            view.notes.add(f"{MOST_FIELDS} of {len(fields)} fields")
-        told = tuple(fields.items())[:MOST_FIELDS]
-        return TypeFields(type_name, tuple(topics), told, view.notes.sentences())
+        if len(fields) > MAX_FIELDS:
+            view.notes.add(f"{MAX_FIELDS} of {len(fields)} fields")
+        shown = tuple(fields.items())[:MAX_FIELDS]
+        return TypeFields(type_name, tuple(topics), shown, view.notes.sentences())
     raise NoDataError(
         NoDataReason.UNDECODABLE,
         f"no newest message of this type can be read: {failure or 'others came after it'}",
@@ -60,7 +60,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
 
 
 def _fields(value: JsonValue, path: str) -> Iterator[tuple[str, str]]:
-    """Dot-paths and the kinds of what stands there; a list is told by its first element."""
+    """Yields dot-paths and the kinds of their values; a list is described by its first element."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from _fields(inner, f"{path}.{name}" if path else name)

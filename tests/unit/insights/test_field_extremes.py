@@ -81,12 +81,12 @@ def test_a_field_that_leads_into_a_list_means_all_of_it(tmp_path: Path) -> None:
     assert score.least_at == score.most_at == BEGIN
 
 
-@pytest.mark.parametrize("bound", ["MOST_MESSAGES", "MOST_NUMBERS"])
+@pytest.mark.parametrize("bound", ["MAX_MESSAGES", "MAX_NUMBERS"])
 def test_a_window_that_holds_too_much_says_so(
     tmp_path: Path, bound: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(field_extremes, bound, 3)
-    monkeypatch.setattr(queries, "MOST_MESSAGES", field_extremes.MOST_MESSAGES)
+    monkeypatch.setattr(queries, "MAX_MESSAGES", field_extremes.MAX_MESSAGES)
     answer = asked(tmp_path, [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)], "position.x")
     assert answer.extremes == ()
     assert field_extremes.TOO_MANY in answer.notes
@@ -104,7 +104,7 @@ def test_extremes_are_the_least_and_the_greatest_finite_numbers(rows: list[list[
     finite = [[*field_extremes._numbers([*row, True, None, "9"])] for row in rows]
     for time, numbers in enumerate(finite):
         if numbers:
-            field_extremes._take(found, "a", time, numbers)
+            field_extremes._update(found, "a", time, numbers)
     flat = [number for numbers in finite for number in numbers]
     assert sorted(map(abs, flat), reverse=True)[:1] <= [field_extremes._LARGEST]
     if not flat:

@@ -24,7 +24,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights import saved_moments
 from ros2_memory.insights.saved_moments import (
-    MOST_LISTED,
+    MAX_LISTED,
     list_moments,
     remember_moment,
 )
@@ -48,7 +48,7 @@ RECORDS = QuerySettings(kept=RetentionLimits(10**12, 10**18))
 @pytest.fixture(autouse=True)
 def _much_patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine does not fail a test."""
-    monkeypatch.setattr(saved_moments, "PATIENCE_S", 60.0)
+    monkeypatch.setattr(saved_moments, "ANSWER_TIMEOUT_S", 60.0)
 
 
 def remembering(bag_dir: Path, limits: QuerySettings = RECORDS) -> Memory:
@@ -150,7 +150,7 @@ def test_a_recorder_that_does_not_answer_is_not_waited_for_for_ever(
 ) -> None:
     memory = remembering(tmp_path)
     beating(tmp_path)
-    monkeypatch.setattr(saved_moments, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(saved_moments, "ANSWER_TIMEOUT_S", 0.0)
     assert "did not answer" in refusal(memory)
     assert requests(tmp_path) == []
 
@@ -174,7 +174,7 @@ def test_a_wish_that_was_begun_just_in_time_is_waited_for(
         house.keep_moments()
         return withdraw(slot)
 
-    monkeypatch.setattr(saved_moments, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(saved_moments, "ANSWER_TIMEOUT_S", 0.0)
     monkeypatch.setattr(PendingRequest, "withdraw", too_late)
     assert remember(memory).bags == 3
 
@@ -202,11 +202,11 @@ class TestTheList:
         write_saved_moment(make_moment_folder(bag_dir, wish), replace(SavedMoment(wish), **more))
 
     def test_it_has_the_newest_first_and_counts_the_others(self, tmp_path: Path) -> None:
-        for number in range(MOST_LISTED + 3):
+        for number in range(MAX_LISTED + 3):
             self.keep(tmp_path, number, pending=False)
         told = shown(memory_of(tmp_path, clock=SettableClock(NOW)), tmp_path)
         assert [each["label"] for each in told["moments"]][:2] == ["number 22", "number 21"]
-        assert len(told["moments"]) == MOST_LISTED
+        assert len(told["moments"]) == MAX_LISTED
         assert told["more"] == 3
 
     def test_a_moment_says_what_of_it_is_not_kept(self, tmp_path: Path) -> None:
