@@ -252,7 +252,7 @@ class SqliteBags:
             if path.lstat().st_ino != key.inode:
                 raise UnreadableError("it was replaced while it was being opened")
             # One name that is not UTF-8 must not hide the others.
-            base.text_factory = _text
+            base.text_factory = partial(str, encoding="utf-8", errors="replace")
             guard(base, self._max_message_bytes, size)
             topics = self._known.get(key)
             if topics is None:
@@ -291,10 +291,6 @@ class SqliteBags:
         if sum(len(c.topic) + len(c.type) for c in channels.values()) > MAX_NAMES_CHARS:
             raise UnreadableError("its topics and types have longer names than any can have")
         return channels
-
-
-def _text(raw: bytes) -> str:
-    return raw.decode("utf-8", errors="replace")
 
 
 def _placed(

@@ -49,7 +49,7 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
             raise UnreadableError("not a zstd file: it does not begin as one")
         whole = ends_whole(file)
     target = folder / path.stem
-    damage = _unpack(path, target, _harmless(reserve, path.stat().st_size))
+    damage = _unpack(path, target, reserve)
     if not target.stat().st_size:
         raise UnreadableError(f"nothing of it can be decompressed ({damage or 'it ends early'})")
     if damage:
@@ -57,27 +57,11 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
     return target, "" if whole else "its compressed file ends early"
 
 
-def _harmless(reserve: Callable[[int], None], packed: int) -> Callable[[int], None]:
-    """`reserve`, up to what a file of this size may unpack to.
-
-    Its caller raises `UnreadableError` for more.
-    """
-    left = most_unpacked(packed)
-
-    def reserve_some(size: int) -> None:
-        nonlocal left
-        left -= size
-        if left < 0:
-            raise UnreadableError(f"it unpacks to more than {MAX_TIMES_PACKED} times its size")
-        reserve(size)
-
-    return reserve_some
-
-
 def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
     """Writes what can be decompressed; what is wrong with the rest, or nothing."""
     with os.fdopen(open_regular(path), "rb") as packed, target.open("wb") as out:
         reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+        left = most_unpacked(path.stat().st_size)
         while True:
             try:
                 piece = reader.read(_PIECE)
@@ -85,6 +69,9 @@ def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
                 return str(error)
             if not piece:
                 return ""
+            left -= len(piece)
+            if left < 0:
+                raise UnreadableError(f"it unpacks to more than {MAX_TIMES_PACKED} times its size")
             reserve(len(piece))
             out.write(piece)
 

@@ -214,7 +214,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
 
 
 def _index_from_summary(file: OpenFile) -> McapIndex:
-    start, channels, channel_bytes, declared, chunks, stated = read_summary(file)
+    start, (channels, channel_bytes, declared), chunks, stated = read_summary(file)
     if stated is None or not declared.resolved or stated.channel_count > len(channels):
         raise DoubtError
     counts = stated.channel_message_counts

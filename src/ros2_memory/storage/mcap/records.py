@@ -77,13 +77,13 @@ def offered_as_latched(qos_profiles: str) -> bool:
     return _TRANSIENT_LOCAL.search(qos_profiles) is not None
 
 
-def framed(section: bytes, position: int = 0) -> Iterator[tuple[int, int, int]]:
-    """Yields the opcode of each record from `position` on, and where its body begins and ends.
+def framed(section: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yields the opcode of each record of a section, and where its body begins and ends.
 
     Raises:
         UnreadableError: the section does not end where a record does.
     """
-    end = len(section)
+    position, end = 0, len(section)
     while position < end:
         if position + RECORD.size > end:
             raise UnreadableError("damaged: a section ends inside a record")

@@ -79,11 +79,11 @@ def test_what_other_bags_declare_is_not_taken_for_what_a_bag_declares(tmp_path: 
         path = write_mcap(tmp_path / f"{n}.mcap", messages[:n])
         with OpenFile(path) as file:
             summary = read_summary(file)
-        assert {channel.topic for channel in summary.channels.values()} == declared[n - 1]
-        assert {channel.schema.name for channel in summary.channels.values()} == {
+        assert {channel.topic for channel in summary.declared.channels.values()} == declared[n - 1]
+        assert {channel.schema.name for channel in summary.declared.channels.values()} == {
             each.type for each in messages[:n]
         }
-        assert summary.declarations.resolved
+        assert summary.declared.declarations.resolved
 
 
 def test_a_bag_that_repeats_another_ones_beginning_is_read_to_its_own_end(tmp_path: Path) -> None:
@@ -91,5 +91,5 @@ def test_a_bag_that_repeats_another_ones_beginning_is_read_to_its_own_end(tmp_pa
     for messages in (short, long, short, long):
         with OpenFile(write_mcap(tmp_path / "a.mcap", messages, SMALL)) as file:
             summary = read_summary(file)
-        assert len(summary.channels) == len(messages)
+        assert len(summary.declared.channels) == len(messages)
         assert sum(len(chunk.channels) for chunk in summary.chunks) == len(messages)
