@@ -1,8 +1,9 @@
-"""What each question is answered with, before it becomes JSON.
+"""Results: what queries and insights return, before it becomes JSON.
 
 Times are `Ns` of log time, lengths metres, angles radians, velocities m/s and rad/s. `age` is how
 long before "now" the answer's own moment lies, in nanoseconds; it is set for relative questions
-only. `notes` are sentences on what was downsampled, skipped, clamped or could not be read.
+only. `now` is what ages count from. `notes` are sentences on what was downsampled, left out,
+clamped or could not be read.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TopicRow:
-    """One topic under one type over all bags; a message that stands twice counts once."""
+    """One topic under one type over all bags; each message counts once."""
 
     topic: str
     type: str
@@ -32,7 +33,7 @@ class TopicRow:
 
 @dataclass(frozen=True, slots=True)
 class Undecodable:
-    """A topic of which messages are recorded under a type that cannot be decoded, and why."""
+    """A topic with messages under a type that cannot be decoded, and why."""
 
     topic: str
     type: str
@@ -41,7 +42,7 @@ class Undecodable:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A hole in the memory between two bags: `end` is where data begins again."""
+    """A time without a bag; `end` is where data begins again."""
 
     start: Ns
     end: Ns
@@ -49,7 +50,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class DataTimeRange:
-    """What the memory spans and what is wrong with it; `earliest` and `latest` None when empty."""
+    """What the memory spans, and the files that do not answer; no times where it is empty."""
 
     earliest: Ns | None
     latest: Ns | None
@@ -70,7 +71,7 @@ class DataTimeRange:
 class TopicValue:
     """One message of one topic; with `latched` it holds, however old it is.
 
-    `age` counts back from now, where the question did, or else from the moment asked about.
+    `age` counts back from now for a relative question, else from the moment asked about.
     """
 
     topic: str
@@ -94,9 +95,9 @@ class Extremes:
 
 @dataclass(frozen=True, slots=True)
 class TopicRange:
-    """Samples of a window, evenly spaced over all `total` messages in it, first and last kept.
+    """Samples of a window, evenly spaced over all `total` messages in it, with the first and last.
 
-    `extremes` are those of all messages, for the fields that were asked for and hold numbers.
+    `extremes` are those of all messages, for the requested fields that hold numbers.
     """
 
     topic: str
@@ -111,7 +112,7 @@ class TopicRange:
 class Position:
     """Where the robot was, in the pose's own frame.
 
-    `geodetic` is set for a satellite receiver, and the pose's coordinates are NaN then.
+    `geodetic` is set for a satellite receiver; the pose's coordinates are NaN then.
     """
 
     topic: str
@@ -135,9 +136,9 @@ class Velocity:
 
 @dataclass(frozen=True, slots=True)
 class TransformAt:
-    """The pose of `child` in `parent` at `time`; `clock` says what that time is of.
+    """The pose of `child` in `parent` at `time`.
 
-    `clock` is `stamp` (header stamps) or `log` (log time).
+    `clock` is what `time` is in: `stamp` (header stamps) or `log` (log time).
     """
 
     parent: str
@@ -170,7 +171,7 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class ValueWhen:
-    """A match on one topic and what another topic held then; None where it held nothing yet."""
+    """A match on one topic and the value of another then; None where it had none yet."""
 
     matched: TopicValue | None
     value: TopicValue | None = None
@@ -179,7 +180,7 @@ class ValueWhen:
 
 @dataclass(frozen=True, slots=True)
 class TrajectorySummary:
-    """The way driven in a window, from one pose topic in log-time order."""
+    """The driven path in a window, from one pose topic in log-time order."""
 
     topic: str
     frame_id: str
@@ -190,7 +191,7 @@ class TrajectorySummary:
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
+class LabelledPlace:
     """A place (m) in a frame; `label` names what is there."""
 
     label: str
@@ -200,16 +201,16 @@ class Spot:
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """Message after message of one topic that met a condition.
+    """Consecutive messages of one topic that met a condition.
 
     Attributes:
-        topic: where.
+        topic: of the messages.
         first: log time of the first of them; of the earliest one read where `begun` is False.
         last: of the last.
         messages: how many there are.
-        begun: whether the search went on to before the first.
+        begun: whether the message before the first is known not to belong.
         robot: where the robot was at the last.
-        thing: where the thing itself was then, if the message says so.
+        thing: where the thing itself was then, if the message has that.
     """
 
     topic: str
@@ -218,14 +219,14 @@ class Sighting:
     messages: int
     begun: bool
     robot: Pose | None
-    thing: Spot | None
+    thing: LabelledPlace | None
 
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
     """Sightings in the order asked for; `more`: there are others. `start` and `end` were searched.
 
-    `total` is how many there are; None where the search did not go through all.
+    `total` is how many there are; None where the search ended before it had counted all.
     """
 
     sightings: tuple[Sighting, ...]
@@ -241,7 +242,7 @@ class Sightings:
 class Event:
     """Something that happened at `start`, and went on until `end` where it took time.
 
-    `goes_on`: `end` is only that of what is known.
+    With `goes_on`, `end` is only as far as is known.
     """
 
     kind: str
@@ -259,19 +260,19 @@ class Recap:
         start: of the window, inclusive.
         end: of the window, inclusive.
         now: what ages count from.
-        distance_m: the way driven; None, as what follows, where no pose tells.
+        distance_m: length of the driven path; None, as what follows, where no pose gives it.
         max_speed: in m/s.
-        stood: how long the robot stood in all, in standstills that last `shortest_stop` or longer.
-            One that goes on outside of the window counts as far as it is inside, so the times of
+        stood: how long the robot stood in all, in standstills of `shortest_stop` or longer. One
+            that goes on outside of the window counts as far as it is inside, so the times of
             windows that follow each other add up. None where poses are there, but too noisy or too
-            few to tell.
-        shortest_stop: what stands for less is no standstill.
+            few to know.
+        shortest_stop: what is shorter is no standstill.
         frame_id: of the places in texts.
         events: what happened, in order of time.
         throughout: things that a detector saw all the time of the window at its usual rate.
-        counts: how many events of which kind there were, those that are left out too.
-        path_sum_m: the way with what the noise of positions adds, where that is much.
-        gap_m: the way across gaps in the recording, in straight lines; None without a gap.
+        counts: how many events of each kind there were, also of those that are left out.
+        path_sum_m: the length with what the noise of positions adds, where that is much.
+        gap_m: the path across gaps in the recording, in straight lines; None without a gap.
     """
 
     start: Ns
@@ -291,8 +292,8 @@ class Recap:
 
 
 @dataclass(frozen=True, slots=True)
-class Stillness:
-    """A topic that fell silent: its last message, and how far apart they usually are."""
+class SilentTopic:
+    """A topic without recent messages: its last one, and the usual time between two."""
 
     topic: str
     last: Ns
@@ -315,15 +316,15 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """How far the memory can be trusted.
+    """How complete and how current the memory is.
 
     Attributes:
         now: what ages count from.
         earliest: the oldest moment that can be asked about; None where the memory is empty.
         latest: the newest one.
         recorder: its state; None where no recorder has written here.
-        live: whether it is there still.
-        restarts: how often it had to start `ros2 bag record` anew; 0 where there is none.
+        live: whether it is running.
+        restarts: how often it had to restart `ros2 bag record`; 0 where there is none.
         missing: topics that it is to record by name, and that no publisher has offered to it.
         never_heard: topics it subscribed to that brought no message.
         fell_silent: topics that brought some, and none lately.
@@ -342,7 +343,7 @@ class Status:
     restarts: int
     missing: tuple[str, ...]
     never_heard: tuple[str, ...]
-    fell_silent: tuple[Stillness, ...]
+    fell_silent: tuple[SilentTopic, ...]
     damaged: int
     incomplete: int
     unread: int
@@ -359,10 +360,10 @@ class Visit:
         arrived: log time of its first pose there; None where it was there before what was searched.
         departed: of its last one; None where it is there still, by a pose recent enough to know.
         duration: between the first and the last that are known.
-        closest_m: distance (m, in the plane) of the recorded pose that is nearest; the robot may
-            have been nearer between two messages.
+        closest_m: distance (m, in the plane) of the nearest recorded pose; the robot may have been
+            nearer between two messages.
         closest_at: log time of that pose.
-        restarts: how often odometry began anew since.
+        restarts: how often odometry was reset since.
     """
 
     arrived: Ns | None
@@ -402,10 +403,10 @@ class TypeFields:
 
 
 @dataclass(frozen=True, slots=True)
-class Remembered:
-    """A moment that the recorder keeps: its name, and the bags that it has so far.
+class RememberedMoment:
+    """A moment that the recorder saves: its name, and how many bags it has so far.
 
-    `start` and `end` (inclusive) are those asked for. `pending`: the rest is still being written.
+    `start` and `end` (inclusive) are as asked. `pending`: the rest is still being written.
     """
 
     moment: str
@@ -417,8 +418,8 @@ class Remembered:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptMoment:
-    """A moment that is kept; `size` in bytes, `missing` says what of it is not kept."""
+class ListedMoment:
+    """A saved moment; `size` in bytes, `missing` names what of it could not be saved."""
 
     moment: str
     label: str
@@ -431,10 +432,10 @@ class KeptMoment:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptMoments:
-    """The moments that are kept, newest first; `more` is how many there are besides."""
+class MomentList:
+    """The saved moments, newest first; `more` is how many there are besides."""
 
-    moments: tuple[KeptMoment, ...]
+    moments: tuple[ListedMoment, ...]
     more: int
     now: Ns
 
@@ -456,6 +457,6 @@ Answer: TypeAlias = (
     | Status
     | Visits
     | TypeFields
-    | Remembered
-    | KeptMoments
+    | RememberedMoment
+    | MomentList
 )

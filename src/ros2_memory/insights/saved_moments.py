@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
 from ros2_memory.history.view import View
-from ros2_memory.results import KeptMoment, KeptMoments, Remembered
+from ros2_memory.results import ListedMoment, MomentList, RememberedMoment
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.request_queue import Outcome
@@ -27,7 +27,7 @@ _ENDED: Final = frozenset({RecorderState.STOPPING, RecorderState.STOPPED})
 
 def remember_moment(
     memory: Memory, call: Call, label: str, *, seconds_before: float, seconds_after: float
-) -> Remembered:
+) -> RememberedMoment:
     """Asks the recorder to save what was and will be recorded around now.
 
     Raises:
@@ -61,10 +61,10 @@ def remember_moment(
         )
     if outcome.moment is None:
         raise RefusedError(outcome.refused or "the recorder does not say why")
-    return Remembered(outcome.moment, label, start, end, outcome.bags, outcome.pending)
+    return RememberedMoment(outcome.moment, label, start, end, outcome.bags, outcome.pending)
 
 
-def list_moments(memory: Memory, call: Call) -> KeptMoments:
+def list_moments(memory: Memory, call: Call) -> MomentList:
     """Returns the saved moments, newest first.
 
     Raises:
@@ -79,7 +79,7 @@ def list_moments(memory: Memory, call: Call) -> KeptMoments:
         ) from error
     stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
     listed = (
-        KeptMoment(
+        ListedMoment(
             each.folder.name,
             each.moment.request.label,
             each.moment.request.start,
@@ -91,7 +91,7 @@ def list_moments(memory: Memory, call: Call) -> KeptMoments:
         )
         for each in stored[:MAX_LISTED]
     )
-    return KeptMoments(tuple(listed), len(stored[MAX_LISTED:]), _now(memory, call))
+    return MomentList(tuple(listed), len(stored[MAX_LISTED:]), _now(memory, call))
 
 
 def _now(memory: Memory, call: Call) -> Ns:

@@ -36,7 +36,7 @@ from ros2_memory.history.time_arguments import TimeRange, clamped, last_window, 
 from ros2_memory.history.transforms import session_bags, transform_at
 from ros2_memory.history.view import View
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.results import Sighting, Sightings, Spot
+from ros2_memory.results import LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -344,7 +344,7 @@ def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
 
 def _spot(
     view: View, condition: Condition, found: StoredMessage, robot: Pose | None
-) -> Spot | None:
+) -> LabelledPlace | None:
     """Returns where the thing that matched was: in the map, the robot's frame, or its message's."""
     message = view.memory.reader.decode(found.record)
     value = view.memory.extractor.exact(message, found.record.channel.type)
@@ -355,7 +355,7 @@ def _spot(
     frames = (view.memory.limits.map_frame, "" if robot is None else robot.frame_id)
     for target in filter(None, frames):
         if target == thing.frame_id:
-            return Spot(thing.label, thing.place, target)
+            return LabelledPlace(thing.label, thing.place, target)
         try:
             found_transform = transform_at(
                 view, target, thing.frame_id, found.time, found.bag.recording
@@ -363,8 +363,8 @@ def _spot(
         except NoDataError:
             continue
         place = transform_point(found_transform.transform, thing.place)
-        return Spot(thing.label, place, target)
-    return Spot(thing.label, thing.place, thing.frame_id)
+        return LabelledPlace(thing.label, place, target)
+    return LabelledPlace(thing.label, thing.place, thing.frame_id)
 
 
 def _matching(detections: Sequence[Detection], condition: Condition) -> Detection | None:

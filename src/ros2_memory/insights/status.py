@@ -10,7 +10,7 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.view import View
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
-from ros2_memory.results import Budget, Status, Stillness, Undecodable
+from ros2_memory.results import Budget, SilentTopic, Status, Undecodable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -106,7 +106,7 @@ def _age_held(heartbeat: Heartbeat | None, wall: Ns) -> Iterator[str]:
         yield heartbeat.age_held
 
 
-def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[Stillness]:
+def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[SilentTopic]:
     """Yields topics that had messages often, and none when the newest data was recorded."""
     latest = snapshot.dating.latest
     if latest is None:
@@ -121,7 +121,7 @@ def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[Stillness
             continue
         usual = (last - first) // (messages - 1)
         if latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual):
-            yield Stillness(topic, last, usual)
+            yield SilentTopic(topic, last, usual)
 
 
 def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:

@@ -136,8 +136,8 @@ def _gigabytes(size: float | None) -> float | None:
     return None if size is None else round(size / GB, 3)
 
 
-@render.register(results.Remembered)
-def _saved_moment(answer: results.Remembered) -> JsonObject:
+@render.register(results.RememberedMoment)
+def _saved_moment(answer: results.RememberedMoment) -> JsonObject:
     return {
         "moment": answer.moment,
         "label": answer.label,
@@ -148,15 +148,15 @@ def _saved_moment(answer: results.Remembered) -> JsonObject:
     }
 
 
-@render.register(results.KeptMoments)
-def _stored_moments(answer: results.KeptMoments) -> JsonObject:
+@render.register(results.MomentList)
+def _stored_moments(answer: results.MomentList) -> JsonObject:
     reply: JsonObject = {"moments": [_stored(each, answer.now) for each in answer.moments]}
     if answer.more:
         reply["more"] = answer.more
     return reply
 
 
-def _stored(stored: results.KeptMoment, now: Ns) -> JsonObject:
+def _stored(stored: results.ListedMoment, now: Ns) -> JsonObject:
     reply: JsonObject = {
         "moment": stored.moment,
         "label": stored.label,

@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartb
 from ros2_memory.history.context import Call
 from ros2_memory.index.listed_splits import absent_splits
 from ros2_memory.insights.status import memory_status
-from ros2_memory.results import Stillness
+from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
@@ -126,7 +126,7 @@ def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Pat
         tf(BEGIN, transform(BEGIN, "a", "b", (0, 0, 0)), topic="/tf_static"),
     ]
     answer = memory_status(remembering(tmp_path, messages), Call())
-    assert answer.fell_silent == (Stillness("/bumper", BEGIN + 79 * S, S),)
+    assert answer.fell_silent == (SilentTopic("/bumper", BEGIN + 79 * S, S),)
 
 
 def test_damaged_files_are_counted_and_told(tmp_path: Path) -> None:
