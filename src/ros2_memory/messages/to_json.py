@@ -9,7 +9,7 @@ numbers) is a summary there too.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from ros2_memory.messages.downsample import array_note, evenly
 from ros2_memory.messages.fields import ABSENT, field_table_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
@@ -50,221 +50,6 @@ _LEAST_DECIMALS: Final = 6
 """Of a number of unknown unit: a time in Unix seconds keeps its microseconds."""
 _LARGEST_WHOLE: Final = 10**15
 _LARGEST_SINGLE: Final = float(np.finfo(np.float32).max)
-
-
-class ExactJson:
-    """One walk over one message, which keeps all of it. Never raises because of its content.
-
-    Args:
-        limit: bytes of a byte array that is rendered as numbers.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-
-    def value(self, node: object, path: str, depth: int = 0) -> JsonValue:
-        """Renders a node; `path` is its name in notes."""
-        if isinstance(node, str):
-            return self._text(node, path)
-        if node is None or node is ABSENT or isinstance(node, bool):
-            return node if isinstance(node, bool) else None
-        if isinstance(node, int):
-            return self._integer(int(node))
-        if isinstance(node, float):
-            return self._float(node)
-        if depth >= MAX_DEPTH:
-            note = f"{_named(path)}: what lies deeper than {MAX_DEPTH} levels is left out"
-            self.note("depth", path, note)
-            return None
-        return self._container(node, path, depth + 1)
-
-    def _float(self, number: float) -> JsonValue:
-        if isinstance(number, Metric):
-            return self._metric(number)
-        return self._degrees(number) if isinstance(number, Degrees) else self._real(number)
-
-    def _container(self, node: object, path: str, depth: int) -> JsonValue:
-        if isinstance(node, list | tuple):
-            return [self.value(one, path, depth) for one in self._elements(node, path)]
-        if isinstance(node, np.ndarray):
-            return self._array(node, path, depth)
-        if isinstance(node, np.generic):
-            return self._scalar(node, path)
-        if isinstance(node, dict):
-            entries = self._entries(node, path)
-            return {name: self.value(node, _join(path, name), depth) for name, node in entries}
-        if isinstance(node, bytes | bytearray):
-            return self._array(np.frombuffer(node, dtype=np.uint8), path, depth)
-        return self._message(node, path, depth)
-
-    def _message(self, node: object, path: str, depth: int) -> JsonValue:
-        kind = kind_of(node)
-        if kind is ValueKind.QUATERNION:
-            return self._rotation(node, path)
-        if kind is ValueKind.TIME:
-            time = nanoseconds(node)
-            return None if time is None else self._seconds(time)
-        vector = xyz(node) if kind is ValueKind.VECTOR else None
-        if vector is not None:
-            x, y, z = vector
-            return {"x": self._metric(x), "y": self._metric(y), "z": self._metric(z)}
-        table = field_table_of(node)
-        if table is None:
-            return self._text(f"<{type(node).__name__}>", path)
-        summaries = summaries_of(table)
-        fields: dict[str, JsonValue] = {}
-        for name, attribute in table.attributes.items():
-            found: object = getattr(node, attribute, ABSENT)
-            if name in summaries:
-                found = summaries[name](node, found)
-            fields[name] = self.value(found, _join(path, name), depth)
-        return fields
-
-    def _rotation(self, node: object, path: str) -> JsonValue:
-        angles = euler(node)
-        if angles is None:
-            note = f"{_named(path)}: no rotation (a zero or NaN quaternion)"
-            self.note("rotation", path, note)
-            return None
-        return {name: self._degrees(angle) for name, angle in angles.items()}
-
-    def _array(self, array: Array, path: str, depth: int) -> JsonValue:
-        if array.ndim == 0:
-            return self.value(array[()], path, MAX_DEPTH - 1)
-        if array.dtype == np.uint8 and array.size > self._limit:
-            return {"bytes": int(array.size)}
-        if array.ndim > 1 or array.dtype.kind not in "biuf":
-            return [self.value(row, path, depth) for row in self._elements(list(array), path)]
-        return self._numbers(array, path)
-
-    def _scalar(self, scalar: np.generic[object], path: str) -> JsonValue:
-        if isinstance(scalar, np.float32):
-            return self._single(scalar)
-        if isinstance(scalar, np.floating):
-            return self._real(float(scalar))
-        plain = scalar.item()
-        known = isinstance(plain, bool | int | bytes)
-        return self.value(plain if known else str(plain), path, MAX_DEPTH - 1)
-
-    # What a reply shortens or rounds, and what is noted of that.
-
-    def _text(self, text: str, _path: str, /) -> JsonValue:
-        return str(text)
-
-    def _integer(self, number: int) -> JsonValue:
-        return number
-
-    def _real(self, number: float) -> JsonValue:
-        return float(number)
-
-    def _metric(self, number: float) -> JsonValue:
-        return float(number)
-
-    def _degrees(self, number: float) -> JsonValue:
-        return float(number)
-
-    def _single(self, number: np.float32) -> JsonValue:
-        return float(number)
-
-    def _seconds(self, time: Ns) -> JsonValue:
-        return unix_from_ns(time)
-
-    def _numbers(self, array: Array, _path: str, /) -> JsonValue:
-        if array.size > MAX_EXACT_NUMBERS:
-            return {"numbers": int(array.size)}
-        numbers: JsonValue = _at_most_64_bits(array).tolist()
-        return numbers
-
-    def _elements(self, nodes: Sequence[object], _path: str, /) -> Sequence[object]:
-        return nodes
-
-    def _entries(self, node: Mapping[object, object], _path: str, /) -> list[tuple[str, object]]:
-        return [(str(name), value) for name, value in node.items()]
-
-    def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
-        """Notes a loss at a path; here none is noted, since `exact` documents what is left out."""
-
-
-class ReplyJson(ExactJson):
-    """One walk over one message for a reply.
-
-    `squeeze` divides the length of strings and bounds JSON objects too, for messages that would
-    fill a reply alone. `notes` is complete when the walk is.
-    """
-
-    def __init__(self, limit: int, squeeze: int = 1) -> None:
-        super().__init__(limit)
-        self._max_text = max(MAX_TEXT // squeeze, MAX_TEXT // MAX_SQUEEZE)
-        self._max_entries = limit if squeeze > 1 else None
-        self._notes: dict[tuple[str, str], tuple[int, str]] = {}
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """One sentence for each path and kind of loss."""
-        notes = [note for _, note in self._notes.values()]
-        more = len(notes) - MAX_NOTES
-        return (
-            (*notes[:MAX_NOTES], f"and {more} more notes of this kind") if more > 0 else (*notes,)
-        )
-
-    def _text(self, text: str, path: str, /) -> JsonValue:
-        if len(text) > self._max_text:
-            note = f"{_named(path)}: the first {self._max_text} of {len(text)} characters"
-            self.note("text", path, note, len(text))
-            text = text[: self._max_text]
-        return str(text) if text.isascii() else _encodable(text)
-
-    def _integer(self, number: int) -> JsonValue:
-        return round_integer(number)
-
-    def _real(self, number: float) -> JsonValue:
-        return round_real(number)
-
-    def _metric(self, number: float) -> JsonValue:
-        return round_metric(number)
-
-    def _degrees(self, number: float) -> JsonValue:
-        return round_degrees(number)
-
-    def _single(self, number: np.float32) -> JsonValue:
-        return round_single(number)
-
-    def _seconds(self, time: Ns) -> JsonValue:
-        return _whole_or_null(unix_rounded_up(time))
-
-    def _numbers(self, array: Array, path: str, /) -> JsonValue:
-        if array.size > self._limit:
-            self._note_thinned(array.size, path)
-            array = array[evenly(array.size, self._limit)]
-        if array.dtype == np.float32:
-            return [round_single(number) for number in array]
-        if array.dtype.kind == "f":
-            return [round_real(number) for number in _at_most_64_bits(array).tolist()]
-        numbers: JsonValue = array.tolist()
-        return numbers
-
-    def _elements(self, nodes: Sequence[object], path: str, /) -> Sequence[object]:
-        if len(nodes) <= self._limit:
-            return nodes
-        self._note_thinned(len(nodes), path)
-        return [nodes[at] for at in evenly(len(nodes), self._limit)]
-
-    def _note_thinned(self, total: int, path: str) -> None:
-        self.note("array", path, array_note(_named(path), self._limit, total), total)
-
-    def _entries(self, node: Mapping[object, object], path: str, /) -> list[tuple[str, object]]:
-        entries = [(_encodable(str(name)), value) for name, value in node.items()]
-        if self._max_entries is None or len(entries) <= self._max_entries:
-            return entries
-        note = f"{_named(path)}: the first {self._max_entries} of {len(entries)} entries"
-        self.note("entries", path, note, len(entries))
-        return entries[: self._max_entries]
-
-    def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
-        """Notes a loss at a path; of several of one kind there, the one of most weight is kept."""
-        known = self._notes.get((kind, path))
-        if known is None or known[0] < weight:
-            self._notes[kind, path] = (weight, note)
 
 
 def round_metric(number: float) -> JsonValue:
@@ -316,6 +101,214 @@ def _whole_or_null(number: float) -> JsonValue:
         return None
     whole = int(number)
     return whole if whole == number and abs(whole) < _LARGEST_WHOLE else float(number)
+
+
+class NumberWriter(NamedTuple):
+    """How a rendering writes numbers, by what they measure; times in ns become Unix seconds."""
+
+    integer: Callable[[int], JsonValue]
+    real: Callable[[float], JsonValue]
+    metric: Callable[[float], JsonValue]
+    degrees: Callable[[float], JsonValue]
+    single: Callable[[np.float32], JsonValue]
+    seconds: Callable[[Ns], JsonValue]
+
+
+_EXACT: Final = NumberWriter(int, float, float, float, float, unix_from_ns)
+_ROUNDED: Final = NumberWriter(
+    round_integer,
+    round_real,
+    round_metric,
+    round_degrees,
+    round_single,
+    lambda time: _whole_or_null(unix_rounded_up(time)),
+)
+
+
+class ExactJson:
+    """One walk over one message, which keeps all of it. Never raises because of its content.
+
+    Args:
+        limit: bytes of a byte array that is rendered as numbers.
+    """
+
+    _write = _EXACT
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+
+    def value(self, node: object, path: str, depth: int = 0) -> JsonValue:
+        """Renders a node; `path` is its name in notes."""
+        if isinstance(node, str):
+            return self._text(node, path)
+        if node is None or node is ABSENT or isinstance(node, bool):
+            return node if isinstance(node, bool) else None
+        if isinstance(node, int):
+            return self._write.integer(int(node))
+        if isinstance(node, float):
+            return self._float(node)
+        if depth >= MAX_DEPTH:
+            note = f"{_named(path)}: what lies deeper than {MAX_DEPTH} levels is left out"
+            self.note("depth", path, note)
+            return None
+        return self._container(node, path, depth + 1)
+
+    def _float(self, number: float) -> JsonValue:
+        if isinstance(number, Metric):
+            return self._write.metric(number)
+        if isinstance(number, Degrees):
+            return self._write.degrees(number)
+        return self._write.real(number)
+
+    def _container(self, node: object, path: str, depth: int) -> JsonValue:
+        if isinstance(node, list | tuple):
+            return [self.value(one, path, depth) for one in self._elements(node, path)]
+        if isinstance(node, np.ndarray):
+            return self._array(node, path, depth)
+        if isinstance(node, np.generic):
+            return self._scalar(node, path)
+        if isinstance(node, dict):
+            entries = self._entries(node, path)
+            return {name: self.value(node, _join(path, name), depth) for name, node in entries}
+        if isinstance(node, bytes | bytearray):
+            return self._array(np.frombuffer(node, dtype=np.uint8), path, depth)
+        return self._message(node, path, depth)
+
+    def _message(self, node: object, path: str, depth: int) -> JsonValue:
+        kind = kind_of(node)
+        if kind is ValueKind.QUATERNION:
+            return self._rotation(node, path)
+        if kind is ValueKind.TIME:
+            time = nanoseconds(node)
+            return None if time is None else self._write.seconds(time)
+        vector = xyz(node) if kind is ValueKind.VECTOR else None
+        if vector is not None:
+            x, y, z = vector
+            metric = self._write.metric
+            return {"x": metric(x), "y": metric(y), "z": metric(z)}
+        table = field_table_of(node)
+        if table is None:
+            return self._text(f"<{type(node).__name__}>", path)
+        summaries = summaries_of(table)
+        fields: dict[str, JsonValue] = {}
+        for name, attribute in table.attributes.items():
+            found: object = getattr(node, attribute, ABSENT)
+            if name in summaries:
+                found = summaries[name](node, found)
+            fields[name] = self.value(found, _join(path, name), depth)
+        return fields
+
+    def _rotation(self, node: object, path: str) -> JsonValue:
+        angles = euler(node)
+        if angles is None:
+            note = f"{_named(path)}: no rotation (a zero or NaN quaternion)"
+            self.note("rotation", path, note)
+            return None
+        return {name: self._write.degrees(angle) for name, angle in angles.items()}
+
+    def _array(self, array: Array, path: str, depth: int) -> JsonValue:
+        if array.ndim == 0:
+            return self.value(array[()], path, MAX_DEPTH - 1)
+        if array.dtype == np.uint8 and array.size > self._limit:
+            return {"bytes": int(array.size)}
+        if array.ndim > 1 or array.dtype.kind not in "biuf":
+            return [self.value(row, path, depth) for row in self._elements(list(array), path)]
+        return self._numbers(array, path)
+
+    def _scalar(self, scalar: np.generic[object], path: str) -> JsonValue:
+        if isinstance(scalar, np.float32):
+            return self._write.single(scalar)
+        if isinstance(scalar, np.floating):
+            return self._write.real(float(scalar))
+        plain = scalar.item()
+        known = isinstance(plain, bool | int | bytes)
+        return self.value(plain if known else str(plain), path, MAX_DEPTH - 1)
+
+    # What a reply shortens, and notes.
+
+    def _text(self, text: str, _path: str, /) -> JsonValue:
+        return str(text)
+
+    def _numbers(self, array: Array, _path: str, /) -> JsonValue:
+        if array.size > MAX_EXACT_NUMBERS:
+            return {"numbers": int(array.size)}
+        numbers: JsonValue = _at_most_64_bits(array).tolist()
+        return numbers
+
+    def _elements(self, nodes: Sequence[object], _path: str, /) -> Sequence[object]:
+        return nodes
+
+    def _entries(self, node: Mapping[object, object], _path: str, /) -> list[tuple[str, object]]:
+        return [(str(name), value) for name, value in node.items()]
+
+    def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
+        """Notes a loss at a path; here none is noted, since `exact` documents what is left out."""
+
+
+class ReplyJson(ExactJson):
+    """One walk over one message for a reply.
+
+    `squeeze` divides the length of strings and bounds JSON objects too, for messages that would
+    fill a reply alone. `notes` is complete when the walk is.
+    """
+
+    _write = _ROUNDED
+
+    def __init__(self, limit: int, squeeze: int = 1) -> None:
+        super().__init__(limit)
+        self._max_text = max(MAX_TEXT // squeeze, MAX_TEXT // MAX_SQUEEZE)
+        self._max_entries = limit if squeeze > 1 else None
+        self._notes: dict[tuple[str, str], tuple[int, str]] = {}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """One sentence for each path and kind of loss."""
+        notes = [note for _, note in self._notes.values()]
+        more = len(notes) - MAX_NOTES
+        return (
+            (*notes[:MAX_NOTES], f"and {more} more notes of this kind") if more > 0 else (*notes,)
+        )
+
+    def _text(self, text: str, path: str, /) -> JsonValue:
+        if len(text) > self._max_text:
+            note = f"{_named(path)}: the first {self._max_text} of {len(text)} characters"
+            self.note("text", path, note, len(text))
+            text = text[: self._max_text]
+        return str(text) if text.isascii() else _encodable(text)
+
+    def _numbers(self, array: Array, path: str, /) -> JsonValue:
+        if array.size > self._limit:
+            self._note_thinned(array.size, path)
+            array = array[evenly(array.size, self._limit)]
+        if array.dtype == np.float32:
+            return [round_single(number) for number in array]
+        if array.dtype.kind == "f":
+            return [round_real(number) for number in _at_most_64_bits(array).tolist()]
+        numbers: JsonValue = array.tolist()
+        return numbers
+
+    def _elements(self, nodes: Sequence[object], path: str, /) -> Sequence[object]:
+        if len(nodes) <= self._limit:
+            return nodes
+        self._note_thinned(len(nodes), path)
+        return [nodes[at] for at in evenly(len(nodes), self._limit)]
+
+    def _note_thinned(self, total: int, path: str) -> None:
+        self.note("array", path, array_note(_named(path), self._limit, total), total)
+
+    def _entries(self, node: Mapping[object, object], path: str, /) -> list[tuple[str, object]]:
+        entries = [(_encodable(str(name)), value) for name, value in node.items()]
+        if self._max_entries is None or len(entries) <= self._max_entries:
+            return entries
+        note = f"{_named(path)}: the first {self._max_entries} of {len(entries)} entries"
+        self.note("entries", path, note, len(entries))
+        return entries[: self._max_entries]
+
+    def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
+        """Notes a loss at a path; of several of one kind there, the one of most weight is kept."""
+        known = self._notes.get((kind, path))
+        if known is None or known[0] < weight:
+            self._notes[kind, path] = (weight, note)
 
 
 def _at_most_64_bits(array: Array) -> Array:
