@@ -148,7 +148,7 @@ def test_a_type_named_as_before_2019_is_found_in_the_map() -> None:
 
 
 @pytest.mark.parametrize("message", [{"level": 2, "q": {"x": 0, "w": 1}}, [1, "a"], "text", None])
-def test_json_says_what_it_says(message: object) -> None:
+def test_json_is_extracted_unchanged(message: object) -> None:
     assert shown(message, "foxglove.Log") == message
     assert EXTRACTOR.exact(message, "foxglove.Log") == message
 

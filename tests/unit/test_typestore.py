@@ -202,7 +202,7 @@ module a_msgs {{ module msg {{ struct B {{ octet value; string name; }}; }}; }};
     def test_services_and_actions_are_refused_as_what_they_are(self, whole: str, kind: str) -> None:
         assert kind in reason(lookup("a_msgs/srv/A_Event", whole))
 
-    def test_a_type_without_fields_is_told_from_one_whose_text_was_not_found(self) -> None:
+    def test_a_type_without_fields_differs_from_one_whose_text_was_not_found(self) -> None:
         empty = lookup("a_msgs/msg/Nothing", "")
         assert empty.fieldless
         assert decoded(empty, CDR + b"\0") is not None
@@ -249,7 +249,7 @@ class TestHostileDefinitions:
         whole = f"{field}\n{RULE}\nMSG: a_msgs/Point\nfloat64 x\n"
         assert "fixed arrays" in reason(lookup("a_msgs/msg/A", whole))
 
-    def test_a_large_array_of_numbers_costs_nothing_until_a_payload_holds_it(self) -> None:
+    def test_a_large_array_of_numbers_costs_nothing_until_a_payload_contains_it(self) -> None:
         found = lookup("a_msgs/msg/A", "float64[2000000000] x\n")
         assert found.deserialize is not None
         with pytest.raises(Exception, match="deserialize"):
@@ -343,7 +343,7 @@ def test_threads_that_look_up_at_once_get_one_type() -> None:
     assert sorted(answers) == sorted((m.type, oracle(m)) for m in messages * 8)
 
 
-def test_what_is_kept_of_definitions_is_bounded_by_their_length() -> None:
+def test_the_cache_of_definitions_is_bounded_by_their_length() -> None:
     stores = Typestores()
     long = (f"# {n} {'x' * (MAX_TEXT_BYTES - 100)}\nuint8 x\n" for n in range(20))
     for each in long:
@@ -352,7 +352,7 @@ def test_what_is_kept_of_definitions_is_bounded_by_their_length() -> None:
     assert stores._types
 
 
-def test_a_definition_longer_than_all_that_is_kept_is_refused_and_not_kept() -> None:
+def test_a_definition_longer_than_the_cache_is_refused_and_not_cached() -> None:
     stores = Typestores()
     stores.lookup("a_msgs/msg/A", "ros2msg", b"uint8 x\n")
     found = stores.lookup("a_msgs/msg/A", "ros2msg", b"#" * (MAX_CACHED_BYTES + 1))

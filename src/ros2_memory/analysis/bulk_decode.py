@@ -223,7 +223,7 @@ def template_for(
     )
     try:
         return _template(layout, one, other)
-    # Two values of different shape have leaves that do not pair, which zip reports.
+    # Two values of different structure have leaves that do not pair, which zip reports.
     except (_NoTemplateError, ValueError):
         return None
 

@@ -276,7 +276,7 @@ def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
     """
     found: list[JsonValue] = [value]
     for segment in dot_path.split("."):
-        found = [target for held in found for target in _step(held, segment)]
+        found = [target for node in found for target in _step(node, segment)]
     return found
 
 
@@ -292,15 +292,15 @@ def positions(value: JsonValue) -> Iterator[Vector3]:
         return
     waiting: list[JsonValue] = [value]
     while waiting:
-        held = waiting.pop()
-        if isinstance(held, list):
-            waiting.extend(reversed(held))
-        elif isinstance(held, dict):
+        node = waiting.pop()
+        if isinstance(node, list):
+            waiting.extend(reversed(node))
+        elif isinstance(node, dict):
             for key in POSITION_KEYS:
-                inner = held.get(key)
+                inner = node.get(key)
                 if isinstance(inner, dict | list):
                     yield from _own_positions(inner)
-            waiting.extend(reversed(held.values()))
+            waiting.extend(reversed(node.values()))
 
 
 def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Test:
@@ -367,17 +367,17 @@ def _kind(value: JsonValue) -> str:
     return "an object" if isinstance(value, dict) else abbreviate(value)
 
 
-def _step(held: JsonValue, segment: str) -> Iterator[JsonValue]:
-    if isinstance(held, dict):
-        if segment in held:
-            yield held[segment]
-    elif isinstance(held, list):
+def _step(node: JsonValue, segment: str) -> Iterator[JsonValue]:
+    if isinstance(node, dict):
+        if segment in node:
+            yield node[segment]
+    elif isinstance(node, list):
         if _INDEX.fullmatch(segment):
             index = int(segment)
-            if -len(held) <= index < len(held):
-                yield held[index]
+            if -len(node) <= index < len(node):
+                yield node[index]
         else:
-            for element in held:
+            for element in node:
                 yield from _step(element, segment)
 
 
@@ -385,34 +385,34 @@ def leaves(value: JsonValue) -> Iterator[JsonValue]:
     """Yields everything at any depth that is neither a list nor an object."""
     waiting = [value]
     while waiting:
-        held = waiting.pop()
-        if isinstance(held, dict):
-            waiting.extend(held.values())
-        elif isinstance(held, list):
-            waiting.extend(held)
+        node = waiting.pop()
+        if isinstance(node, dict):
+            waiting.extend(node.values())
+        elif isinstance(node, list):
+            waiting.extend(node)
         else:
-            yield held
+            yield node
 
 
 def elements(value: JsonValue) -> Iterator[JsonValue]:
     """Yields the value itself or, where it is a list, its elements and those of the lists in it."""
     waiting = [value]
     while waiting:
-        held = waiting.pop()
-        if isinstance(held, list):
-            waiting.extend(held)
-        elif not isinstance(held, dict):
-            yield held
+        node = waiting.pop()
+        if isinstance(node, list):
+            waiting.extend(node)
+        elif not isinstance(node, dict):
+            yield node
 
 
 def _own_positions(value: JsonValue) -> Iterator[Vector3]:
-    for held in value if isinstance(value, list) else (value,):
+    for node in value if isinstance(value, list) else (value,):
         # Null is a coordinate that was NaN; texts and lists are not coordinates at all.
-        if isinstance(held, dict) and all(
-            axis in held and isinstance(held[axis], int | float | None) for axis in ("x", "y")
+        if isinstance(node, dict) and all(
+            axis in node and isinstance(node[axis], int | float | None) for axis in ("x", "y")
         ):
-            x, y = _coordinate(held["x"]), _coordinate(held["y"])
-            yield (x, y, _coordinate(held.get("z")))
+            x, y = _coordinate(node["x"]), _coordinate(node["y"])
+            yield (x, y, _coordinate(node.get("z")))
 
 
 def _coordinate(value: JsonValue) -> float:

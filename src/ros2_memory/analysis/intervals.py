@@ -95,8 +95,8 @@ class IntervalTable(NamedTuple):
             return self
         rows = _rows(self.rows)
         rows = rows[np.sort(_by_length(rows)[:at_most])]
-        kept, rows["label"] = np.unique(rows["label"], return_inverse=True)
-        return IntervalTable(tuple(self.labels[place] for place in kept.tolist()), rows.tobytes())
+        used, rows["label"] = np.unique(rows["label"], return_inverse=True)
+        return IntervalTable(tuple(self.labels[place] for place in used.tolist()), rows.tobytes())
 
     def throughout(self, start: Ns, end: Ns) -> list[str]:
         """Returns the labels seen at their usual rate all the time from `start` to `end`."""
@@ -231,18 +231,18 @@ def joined(parts: Sequence[IntervalPart]) -> IntervalPart:
     return IntervalPart(parts[0].first, parts[-1].last, seen)
 
 
-def united(seen: Sequence[IntervalTable]) -> IntervalTable:
+def united(tables: Sequence[IntervalTable]) -> IntervalTable:
     """Merges the tables of several topics of one time: visible on one of them is visible."""
-    return _merged(seen, np.zeros(len(seen), np.bool_))
+    return _merged(tables, np.zeros(len(tables), np.bool_))
 
 
-def _merged(seen: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> IntervalTable:
+def _merged(tables: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> IntervalTable:
     """Merges tables: joins intervals of one label that overlap, or that go on in the next part."""
-    rows = _rows(b"".join([each.rows for each in seen]))
+    rows = _rows(b"".join([each.rows for each in tables]))
     if not rows.size:
         return IntervalTable()
-    part = np.repeat(np.arange(len(seen)), [each.size for each in seen])
-    labels, label = _shared_labels(seen, part, rows["label"])
+    part = np.repeat(np.arange(len(tables)), [each.size for each in tables])
+    labels, label = _shared_labels(tables, part, rows["label"])
     order = np.lexsort((part, rows["first"], label))
     rows, part, label = rows[order], part[order], label[order]
     first, ends, reach = rows["first"], rows["ends"], _reach(label, rows["last"])
@@ -259,23 +259,23 @@ def _merged(seen: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> Interva
     pauses = np.append(0, np.where(goes_on, np.maximum(first[1:] - reach[:-1], 0), 0))
     found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
     found["ends"] = (ends[begins] & _FROM_START) * (part[begins] == 0)
-    found["ends"] |= (ends[stops] & _TO_END) * (part[stops] == len(seen) - 1)
+    found["ends"] |= (ends[stops] & _TO_END) * (part[stops] == len(tables) - 1)
     return IntervalTable(labels, found[np.lexsort((found["label"], found["first"]))].tobytes())
 
 
 def _shared_labels(
-    seen: Sequence[IntervalTable], part: NDArray[np.intp], label: NDArray[np.uint32]
+    tables: Sequence[IntervalTable], part: NDArray[np.intp], label: NDArray[np.uint32]
 ) -> tuple[tuple[str, ...], NDArray[np.intp]]:
     """Returns the labels of all tables, sorted, and for each row the index of its label in them."""
-    labels = tuple(sorted({label for each in seen for label in each.labels}))
+    labels = tuple(sorted({label for each in tables for label in each.labels}))
     place = {label: at for at, label in enumerate(labels)}
     places: list[int] = []
     begins: dict[tuple[str, ...], int] = {}
-    for each in seen:
+    for each in tables:
         if each.labels not in begins:
             begins[each.labels] = len(places)
             places += [place[label] for label in each.labels]
-    begin = np.array([begins[each.labels] for each in seen], np.intp)
+    begin = np.array([begins[each.labels] for each in tables], np.intp)
     return labels, np.array(places, np.intp)[begin[part] + label]
 
 

@@ -148,17 +148,17 @@ def _is_restart(
     return step_m > max(_FASTER * near.speed_mps * elapsed_s, hard_mps2 * elapsed_s * elapsed_s / 4)
 
 
-def _motion_of(stops: Sequence[TimedPosition]) -> NearbyMotion:
+def _motion_of(path: Sequence[TimedPosition]) -> NearbyMotion:
     """Returns the longest step of consecutive poses, and the highest speed over half of them."""
-    if len(stops) < 2:
+    if len(path) < 2:
         return _STATIONARY
-    half = max(len(stops) // 2, 1)
+    half = max(len(path) // 2, 1)
     speed_mps = max(
         distance(here.position, there.position)
         / unix_from_ns(max(there.time - here.time, ARRIVAL_JITTER_NS))
-        for here, there in zip(stops[:-half], stops[half:], strict=True)
+        for here, there in zip(path[:-half], path[half:], strict=True)
     )
-    steps = (distance(here.position, there.position) for here, there in pairwise(stops))
+    steps = (distance(here.position, there.position) for here, there in pairwise(path))
     return NearbyMotion(max(steps), speed_mps)
 
 
@@ -382,13 +382,13 @@ class Motion:
             return 0.0
         return unix_from_ns(self.last.time - self.first.time)
 
-    def add(self, stops: Sequence[TimedPosition]) -> list[int]:
+    def add(self, path: Sequence[TimedPosition]) -> list[int]:
         """Takes the poses that come next; returns the indices of those that a jump or reset led to.
 
         The more at a time, the better noise is distinguished from driving.
         """
-        times = np.array([stop.time for stop in stops], dtype=np.int64)
-        positions = np.array([stop.position for stop in stops], dtype=np.float64)
+        times = np.array([pose.time for pose in path], dtype=np.int64)
+        positions = np.array([pose.position for pose in path], dtype=np.float64)
         apart = np.diff(times)
         steps_m = np.sqrt((np.diff(positions, axis=0) ** 2).sum(axis=1))
         plausible_m = self._fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
@@ -399,11 +399,11 @@ class Motion:
         )
         odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
         for index in np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist():
-            here, there = stops[index], stops[index + 1]
+            here, there = path[index], path[index + 1]
             usual_ns = _usual_ns(apart, index, self._period_ns)
             sides = (
-                stops[max(begin, index - _NEARBY) : index + 1],
-                stops[index + 1 : index + 2 + _NEARBY],
+                path[max(begin, index - _NEARBY) : index + 1],
+                path[index + 1 : index + 2 + _NEARBY],
             )
             known = sum(map(len, sides))
             near = _motion_of(sides[0]).or_more(_motion_of(sides[1]))
@@ -416,13 +416,13 @@ class Motion:
             kind = link(here, there, usual_ns, self._fastest_mps, usual)
             if kind == "driven":
                 continue
-            if self._go_on(before, _leg(stops[begin : index + 1])):
+            if self._go_on(before, _leg(path[begin : index + 1])):
                 parted.append(begin)
             self._break(kind, here, there)
             begin, before = index + 1, None
             if kind != "gap":
                 parted.append(begin)
-        if self._go_on(before, _leg(stops[begin:])):
+        if self._go_on(before, _leg(path[begin:])):
             parted.append(begin)
         return parted
 
@@ -503,33 +503,33 @@ class Motion:
 _MeasuredLeg: TypeAlias = "tuple[Leg, float | None, float]"
 
 
-def _leg(stops: Sequence[TimedPosition]) -> _MeasuredLeg:
+def _leg(path: Sequence[TimedPosition]) -> _MeasuredLeg:
     """Measures a leg; returns the highest speed on it or, of few poses, from one to the next."""
-    times = np.array([stop.time for stop in stops], dtype=np.int64)
+    times = np.array([pose.time for pose in path], dtype=np.int64)
     apart = np.diff(times)
     seconds = (times - times[0]) / NS_PER_S
-    positions = [stop.position for stop in stops]
+    positions = [pose.position for pose in path]
     length_m, sum_m, head, tail, still, speed_mps = measured(seconds, positions)
     period_ns = int(np.median(apart)) if len(apart) else None
     leg = Leg(
-        stops[0],
-        stops[-1],
-        len(stops),
+        path[0],
+        path[-1],
+        len(path),
         period_ns,
         length_m,
         sum_m,
         head,
         tail,
         still,
-        near_first=_motion_of(stops[: _NEARBY + 1]),
-        near_last=_motion_of(stops[-_NEARBY - 1 :]),
+        near_first=_motion_of(path[: _NEARBY + 1]),
+        near_last=_motion_of(path[-_NEARBY - 1 :]),
     )
     step_mps = 0.0
-    if len(stops) <= SPEED_STEPS:
+    if len(path) <= SPEED_STEPS:
         step_mps = max(
             (
                 distance(here.position, there.position) / unix_from_ns(there.time - here.time)
-                for here, there in pairwise(stops)
+                for here, there in pairwise(path)
                 if there.time - here.time >= ARRIVAL_JITTER_NS
             ),
             default=0.0,

@@ -309,19 +309,21 @@ def _highest_speed(seconds: Numbers, lengths: Numbers) -> float:
     """Returns the highest speed over windows of a second, and of eight steps at least."""
     # A single step far longer than those around it is a correction of the position, not speed.
     usual = _moving_mean(np.sqrt(lengths)[:, None], SPEED_STEPS)[:, 0] ** 2
-    gone = np.concatenate(([0.0], np.cumsum(np.minimum(lengths, 2 * usual))))
+    travelled = np.concatenate(([0.0], np.cumsum(np.minimum(lengths, 2 * usual))))
     begin = np.arange(len(lengths) - SPEED_STEPS + 1)
     end = np.searchsorted(seconds, seconds[begin] + SPEED_WINDOW_S - _SLACK_S)
     dense = (end > begin + SPEED_STEPS) & (end < len(seconds))
     begin, end = begin[dense], end[dense]
     sparse_mps = _sparse_speed(lengths, np.diff(seconds))
     if len(begin):
-        highest = float(((gone[end] - gone[begin]) / (seconds[end] - seconds[begin])).max())
+        highest = float(
+            ((travelled[end] - travelled[begin]) / (seconds[end] - seconds[begin])).max()
+        )
         return max(highest, sparse_mps or 0.0)
     if sparse_mps is not None:
         return sparse_mps
     # The path takes less than a second.
-    return float(gone[-1] / max(seconds[-1] - seconds[0], _JITTER_S))
+    return float(travelled[-1] / max(seconds[-1] - seconds[0], _JITTER_S))
 
 
 def _sparse_speed(lengths: Numbers, apart: Numbers) -> float | None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.intervals import IntervalBuilder, IntervalPart, IntervalTable, joined
+from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
@@ -300,4 +301,4 @@ def _errors_in(value: JsonValue, least: int | None) -> Iterator[str]:
             and not (level == _STALE_LEVEL and least == _ERROR_LEVEL)
         ):
             text = ": ".join(part for part in (name, message) if isinstance(part, str) and part)
-            yield text if len(text) <= _MAX_TEXT_CHARS else text[: _MAX_TEXT_CHARS - 1] + "…"
+            yield shortened(text, _MAX_TEXT_CHARS)

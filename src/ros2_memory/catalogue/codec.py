@@ -39,7 +39,7 @@ _NOWHERE: Final = TimedPosition(0, (math.nan, math.nan, math.nan))
 def encode_poses(poses: PoseDigest) -> bytes:
     """Encodes a digest of poses."""
     legs = [leg for leg in (poses.head, poses.tail) if leg is not None]
-    first, last = (_NOWHERE if stop is None else stop for stop in (poses.first, poses.last))
+    first, last = (_NOWHERE if each is None else each for each in (poses.first, poses.last))
     head = _HEAD.pack(
         poses.poses,
         poses.invalid,
@@ -186,10 +186,10 @@ def decode_topic_events(packed: bytes) -> TopicEvents:
             for path, at, value in zip(paths, after, values, strict=True)
         )
     except (TypeError, struct.error, zlib.error) as error:
-        raise ValueError(f"not a events: {error}") from error
+        raise ValueError(f"not the events of a topic: {error}") from error
     seen = IntervalTable(labels, packed[_EVENTS.size : end])
     if not seen.is_sound:
-        raise ValueError("not a events: it tells of things without a name")
+        raise ValueError("not the events of a topic: a label is missing")
     return TopicEvents(first, last, seen, known, flips, faults, left_out, undecodable, beyond)
 
 

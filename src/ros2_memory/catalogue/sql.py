@@ -31,14 +31,13 @@ if TYPE_CHECKING:
 _UNBOUNDED, _TEXTS, _FALSE, _TRUE = 1, 2, 4, 8
 QUIET: Final = 0
 """Stands in `EVENTS` for messages without an event: `tales` has no row of these."""
-_TALES: Final = "FROM tales WHERE tales.topic = held.topic AND tales.bag = held.bag"
 _TOPIC: Final = "(SELECT id FROM topics WHERE name = ?)"
 _AMONG: Final = "IN (SELECT value FROM json_each(?))"
 
 # Columns for `topic_rows`.
 ZONE_MAP: Final = "flags, words, low, high, numbers, min_x, max_x, min_y, max_y, min_z, max_z"
-STANDSTILLS: Final = f"(SELECT rests {_TALES})"
-EVENTS: Final = f"coalesce((SELECT story {_TALES}), {QUIET})"
+EVENTS: Final = f"""coalesce((
+  SELECT story FROM tales WHERE tales.topic = held.topic AND tales.bag = held.bag), {QUIET})"""
 EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 
@@ -59,6 +58,16 @@ def topic_rows(
     """Returns the row id and these columns of what entries hold of a topic."""
     return connection.execute(
         f"SELECT bag, {columns} FROM held WHERE topic = {_TOPIC} AND bag {_AMONG}",
+        (topic, json.dumps(row_ids)),
+    ).fetchall()
+
+
+def standstill_rows(
+    connection: sqlite3.Connection, topic: str, row_ids: Sequence[int]
+) -> list[sqlite3.Row]:
+    """Returns the row id and the encoded standstills of entries that have any."""
+    return connection.execute(
+        f"SELECT bag, rests FROM tales WHERE topic = {_TOPIC} AND bag {_AMONG}",
         (topic, json.dumps(row_ids)),
     ).fetchall()
 

@@ -28,13 +28,13 @@ from ros2_memory.catalogue.sql import (
     EDGES,
     EVENTS,
     QUIET,
-    STANDSTILLS,
     UNDECODABLE,
     ZONE_MAP,
     delete_entries,
     entry_rows,
     insert_entry,
     message_rows,
+    standstill_rows,
     topic_rows,
     zone_map,
 )
@@ -121,6 +121,7 @@ class Catalogue(CatalogueDatabase):
         A start reads this for a week of bags, so the files of one summary schema, which are many,
         are read together.
         """
+        root = f"{bag_dir}{os.sep}"
 
         def ask(connection: sqlite3.Connection) -> dict[str, KnownFile]:
             found: dict[str, KnownFile] = {}
@@ -137,7 +138,7 @@ class Catalogue(CatalogueDatabase):
                         path, size, mtime, sidecar, counts = row
                         summary = BagSummary.decoded(schema, counts)
                         file = KnownFile(size, mtime, sidecar, summary, start, end)
-                        found[f"{bag_dir}{os.sep}{path}"] = file
+                        found[root + path] = file
             return found
 
         return self.read(ask, {})
@@ -174,7 +175,13 @@ class Catalogue(CatalogueDatabase):
 
     def standstills(self, topic: str, numbers: Sequence[int]) -> dict[int, StandstillDigest]:
         """Returns the standstills among the topic's poses; not where some message has no pose."""
-        return self._of_topic(topic, numbers, STANDSTILLS, lambda row: decode_standstills(row[1]))
+
+        def ask(connection: sqlite3.Connection) -> dict[int, StandstillDigest]:
+            offset = self.offset
+            rows = standstill_rows(connection, topic, self.row_ids(numbers))
+            return {offset + row[0]: decode_standstills(row[1]) for row in rows if row[1]}
+
+        return self.read(ask, {})
 
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic: `NO_EVENTS`, or None where none can be decoded."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.bulk_decode import BulkDecoder, MotionSample, motion_sample, template_for
+from ros2_memory.analysis.bulk_decode import BulkDecoder, motion_sample, template_for
 from ros2_memory.analysis.odometry import is_place
 from ros2_memory.analysis.standstills import StandstillCollector
 from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEventsBuilder, state_of
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.standstills import StandstillDigest
     from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.analysis.zone_map import ZoneMap
-    from ros2_memory.core.model import StampedTransform
+    from ros2_memory.core.model import Pose, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, Record
@@ -74,7 +75,8 @@ class TopicDigest:
 class _Sample(NamedTuple):
     """What one message contributes to the digest besides its numbers and edges."""
 
-    motion: MotionSample
+    pose: Pose | None
+    speed_mps: float | None
     state: State
 
 
@@ -173,11 +175,11 @@ class TopicCollector:
                 self._events.add_undecodable()
                 continue
             self._events.add(record.log_time, sample.state)
-            pose, speed_mps = sample.motion
+            pose = sample.pose
             if pose is None:
                 self._poses = None
             elif self._poses is not None:
-                self._poses.add(record.log_time, pose, speed_mps)
+                self._poses.add(record.log_time, pose, sample.speed_mps)
                 if is_place(pose.position):
                     self._standstills.add(record.log_time, pose.position)
 
@@ -194,7 +196,7 @@ class TopicCollector:
             if len(self._pairs) > _MAX_EDGES:
                 self._pairs = None
         motion = motion_sample(self._extractor, message, type_name)
-        return _Sample(motion, state_of(value, type_name))
+        return _Sample(*motion, state_of(value, type_name))
 
     def _template(self, record: Record) -> PayloadTemplate | None:
         template = template_for(self._reader, self._extractor, record)
@@ -206,5 +208,4 @@ class TopicCollector:
 
     def _apply(self, template: PayloadTemplate, first: _Sample, rows: Bytes) -> Iterable[_Sample]:
         self._zone_map.add_rows(template, rows)
-        motions = zip(template.poses(rows), template.speeds(rows), strict=True)
-        return (_Sample(MotionSample(*motion), first.state) for motion in motions)
+        return map(_Sample, template.poses(rows), template.speeds(rows), repeat(first.state))

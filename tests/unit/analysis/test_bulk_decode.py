@@ -1,4 +1,4 @@
-"""Messages of one mould say together what they say one by one."""
+"""Messages decoded by a template give what they give one by one."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_whole_numbers_that_change_are_seen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_what_a_message_of_a_mould_holds_is_never_ruled_out(tmp_path: Path, seed: int) -> None:
+def test_a_message_of_a_template_is_never_ruled_out(tmp_path: Path, seed: int) -> None:
     draw = random.Random(seed)
     places = [
         (draw.choice([draw.uniform(-5, 5), *ODD]), draw.choice([draw.uniform(-5, 5), *ODD]))
@@ -166,7 +166,7 @@ def test_the_numbers_of_an_odometry_are_found_where_they_lie(tmp_path: Path) -> 
     assert template.speeds(rows) == [0.25]
 
 
-def test_messages_that_differ_in_more_than_numbers_are_not_of_one_mould(tmp_path: Path) -> None:
+def test_messages_that_differ_in_more_than_numbers_do_not_match_a_template(tmp_path: Path) -> None:
     reader, record = first_record(tmp_path, odom(T0, 1.0, 0.0))
     template = template_for(reader, extractor(), record)
     assert template is not None
@@ -176,7 +176,7 @@ def test_messages_that_differ_in_more_than_numbers_are_not_of_one_mould(tmp_path
     assert (chosen, len(rows)) == ([0], 1)
 
 
-def test_what_cannot_be_walked_has_no_mould(tmp_path: Path) -> None:
+def test_a_message_without_a_layout_has_no_template(tmp_path: Path) -> None:
     reader, record = first_record(tmp_path, text(T0, "no numbers in it"))
     assert (
         template_for(reader, extractor(), record._replace(payload=record.payload + b"12345678"))
@@ -206,7 +206,7 @@ def test_a_pose_array_has_every_place_in_its_box(tmp_path: Path) -> None:
     assert topic.zone_map.box[:4] == (0.0, 59.0, 0.0, 2.0)
 
 
-def test_a_message_without_numbers_is_a_mould_too(tmp_path: Path) -> None:
+def test_a_message_without_numbers_has_a_template_too(tmp_path: Path) -> None:
     same = [replace(text(T0 + n, "same")) for n in range(60)]
     path = write_mcap(tmp_path / "bag.mcap", same)
     assert_alike(path)

@@ -170,7 +170,7 @@ def test_a_boolean_equals_no_other_number(asked: bool, number: float) -> None:
 
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False), st.floats(-1e-9, 1e-9))
-def test_a_number_equals_what_a_float32_field_holds_of_it(held: float, nudge: float) -> None:
+def test_a_number_equals_what_a_float32_field_stores_of_it(held: float, nudge: float) -> None:
     asked = held * (1 + nudge)
     assert Equals(asked).matches(float(np.float32(asked)))
 
@@ -362,7 +362,7 @@ def test_a_field_that_names_a_velocity_is_taken_at_its_word() -> None:
     assert not Condition(NearPosition(0.0, 0.0, None, 0.1), "linear").matches(value)
 
 
-def test_a_field_that_holds_places_deeper_down_is_searched() -> None:
+def test_a_field_with_positions_deeper_down_is_searched() -> None:
     assert Condition(NearPosition(4.0, -1.0, None, 0.1), "detections").matches(SCENE)
     assert not Condition(NearPosition(4.0, -1.0, None, 0.1), "detections.0").matches(SCENE)
 

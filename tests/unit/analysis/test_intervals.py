@@ -51,10 +51,10 @@ def watched(messages: Messages, at_most: int = 1000) -> IntervalPart:
 
 
 def by_hand(messages: Messages) -> list[VisibleInterval]:
-    """From the sentence that says what a presence is."""
+    """By the definition of an interval."""
     found: list[VisibleInterval] = []
     for label in "abc":
-        row: list[int] = []  # places of the messages of one presence
+        row: list[int] = []  # places of the messages of one interval
         for nth, (time, labels) in enumerate(messages):
             if label not in labels:
                 continue
@@ -101,15 +101,15 @@ def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
     each = [watched(messages).visible for messages in topics]
     together = united(each)
     spans = [one for seen in each for one in seen.intervals()]
-    for presence in together.intervals():
+    for interval in together.intervals():
         mine = [
             one
             for one in spans
-            if one.label == presence.label
-            and presence.first <= one.first
-            and one.last <= presence.last
+            if one.label == interval.label
+            and interval.first <= one.first
+            and one.last <= interval.last
         ]
-        assert (min(one.first for one in mine), max(one.last for one in mine)) == presence[1:]
+        assert (min(one.first for one in mine), max(one.last for one in mine)) == interval[1:]
         mine.sort(key=lambda one: one.first)
         for nth in range(1, len(mine)):
             assert mine[nth].first - max(one.last for one in mine[:nth]) <= FLICKER_NS
@@ -128,7 +128,7 @@ def test_what_lasted_longest_comes_first_and_of_equals_the_earliest() -> None:
     assert [each.label for each in seen.longest(1)] == ["a"]
 
 
-def test_the_most_lasting_are_kept_in_order_with_the_names_that_they_need() -> None:
+def test_the_longest_intervals_remain_in_order_with_the_labels_that_they_need() -> None:
     late = 40 * NS_PER_S
     seen = watched(
         [(0, ("b",)), (1, ("b",)), (20 * NS_PER_S, ("a",)), (late, ("c",)), (late + 1, ("c",))]
@@ -144,7 +144,7 @@ def test_the_most_lasting_are_kept_in_order_with_the_names_that_they_need() -> N
     assert seen.most_lasting(3) is seen
 
 
-def test_presences_without_some_things_are_those_of_the_others() -> None:
+def test_intervals_without_some_labels_are_those_of_the_others() -> None:
     seen = watched([(0, ("a", "b")), (20 * NS_PER_S, ("a",))]).visible
     assert seen.without({"a", "x"}).intervals() == (VisibleInterval("b", 0, 0),)
     assert seen.without({"x"}) is seen
@@ -211,13 +211,13 @@ def test_nothing_seen_is_joined_to_nothing_seen() -> None:
     assert IntervalTable().longest(3) == ()
 
 
-def test_times_at_either_end_of_what_can_be_said_are_far_apart() -> None:
+def test_times_at_either_end_of_the_range_are_far_apart() -> None:
     ends = [watched([(time, ("a",))]) for time in (MIN_NS, MAX_NS)]
     assert joined(ends).visible.size == 2
     assert united([each.visible for each in ends]).size == 2
 
 
-def test_presences_are_counted_beyond_what_may_be_held() -> None:
+def test_intervals_beyond_the_limit_are_counted() -> None:
     watcher = IntervalBuilder(2)
     for nth in range(6):
         watcher.add(nth * 20 * NS_PER_S, ["a"])
@@ -235,6 +235,6 @@ def test_presences_are_counted_beyond_what_may_be_held() -> None:
         IntervalTable(("a",), b"rows"),
     ],
 )
-def test_rows_without_a_name_are_told_from_sound_ones(seen: IntervalTable) -> None:
+def test_rows_without_a_label_are_recognised(seen: IntervalTable) -> None:
     assert not seen.is_sound
     assert watched([(0, ("a", "b"))]).visible.is_sound

@@ -1,4 +1,4 @@
-"""What is seen of many messages together is what each of them says alone."""
+"""Motion decoded from many messages at once is that of each of them alone."""
 
 from __future__ import annotations
 

@@ -343,7 +343,7 @@ def replies(folder: Path, *, recalls: bool) -> tuple[dict[str, Any], dict[str, A
 
 
 @each_way
-def test_the_noise_of_a_standing_robot_is_said_and_not_driven(
+def test_the_noise_of_a_stationary_robot_is_noted_and_not_driven(
     tmp_path: Path, recalls: bool
 ) -> None:
     off = np.random.default_rng(4).normal(0, 0.001, (3000, 2))
@@ -566,7 +566,7 @@ def test_of_very_many_turns_as_many_as_may_be_are_drawn() -> None:
 
 
 @given(st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=80), st.integers(2, 50))
-def test_no_way_back_is_dropped_that_is_longer_than_twice_what_is_said(
+def test_no_way_back_is_dropped_that_is_longer_than_twice_the_stated_limit(
     xs: list[float], at_most: int
 ) -> None:
     times = [float(nth) for nth in range(len(xs))]

@@ -23,7 +23,7 @@ from ros2_memory.core.timebase import NS_PER_S
 Messages = list[tuple[int, State]]
 
 
-def told(messages: Messages, at_most: int | None = None) -> TopicEvents | None:
+def events_of(messages: Messages, at_most: int | None = None) -> TopicEvents | None:
     builder = TopicEventsBuilder()
     for time, state in messages:
         builder.add(time, state)
@@ -63,13 +63,13 @@ def histories(draw: st.DrawFn) -> tuple[Messages, list[int]]:
     return messages, sorted(draw(st.sets(st.integers(1, len(messages)), max_size=6)))
 
 
-def _comparable(story: TopicEvents | None) -> object:
+def _comparable(events: TopicEvents | None) -> object:
     """Flips of several booleans at one time stand in no order."""
-    assert story is not None
-    flips = sorted(story.toggles, key=lambda flip: (flip.time, flip.path))
-    known = sorted(story.known)
-    seen = story.visible.intervals()
-    return (story.first, story.last, seen, known, flips, story.errors, story.left_out)
+    assert events is not None
+    flips = sorted(events.toggles, key=lambda flip: (flip.time, flip.path))
+    known = sorted(events.known)
+    seen = events.visible.intervals()
+    return (events.first, events.last, seen, known, flips, events.errors, events.left_out)
 
 
 def _glimpse(label: str, at: int) -> IntervalTable:
@@ -87,35 +87,35 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
     messages, cuts = history
     builder = TopicEventsBuilder()
     for begin, end in zip([0, *cuts], [*cuts, len(messages)], strict=True):
-        part = told(messages[begin:end])
+        part = events_of(messages[begin:end])
         if part is not None:
             builder.join(part)
-    assert _comparable(builder.events()) == _comparable(told(messages))
+    assert _comparable(builder.events()) == _comparable(events_of(messages))
 
 
-def test_a_boolean_that_flips_is_told_with_its_new_value() -> None:
+def test_a_boolean_that_toggles_is_reported_with_its_new_value() -> None:
     flags = [State(flags=(("value", value),)) for value in (False, False, True, False)]
-    story = told(each_second(*flags))
-    assert story is not None
-    assert story.toggles == (
+    events = events_of(each_second(*flags))
+    assert events is not None
+    assert events.toggles == (
         Toggle("value", 2 * NS_PER_S, True),
         Toggle("value", 3 * NS_PER_S, False),
     )
 
 
-def test_an_error_that_is_reported_again_is_told_once_with_its_count() -> None:
+def test_an_error_that_is_reported_again_is_listed_once_with_its_count() -> None:
     hot = State(errors=("motor: hot",))
-    story = told(each_second(hot, EMPTY_STATE, hot, hot))
-    assert story is not None
-    assert story.errors == (ReportedError("motor: hot", 0, 3 * NS_PER_S, 3),)
+    events = events_of(each_second(hot, EMPTY_STATE, hot, hot))
+    assert events is not None
+    assert events.errors == (ReportedError("motor: hot", 0, 3 * NS_PER_S, 3),)
 
 
 def test_what_is_beyond_the_limit_is_counted() -> None:
     blinking = [seeing("cup") if nth % 4 == 0 else seeing() for nth in range(40)]
-    story = told(each_second(*blinking), at_most=3)
-    assert story is not None
-    assert [each.first for each in story.visible.intervals()] == [0, 4 * NS_PER_S, 8 * NS_PER_S]
-    assert story.left_out == 7
+    events = events_of(each_second(*blinking), at_most=3)
+    assert events is not None
+    assert [each.first for each in events.visible.intervals()] == [0, 4 * NS_PER_S, 8 * NS_PER_S]
+    assert events.left_out == 7
 
 
 def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
@@ -137,19 +137,19 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
                 errors=(ReportedError(f"error {nth}", at, at, 1),),
             )
         )
-    story = builder.events()
-    assert story is not None
-    assert story.visible.size == len(story.toggles) == len(story.errors) == 10
-    assert story.visible.intervals()[0].label == "cup 0"
+    events = builder.events()
+    assert events is not None
+    assert events.visible.size == len(events.toggles) == len(events.errors) == 10
+    assert events.visible.intervals()[0].label == "cup 0"
     flips = 2 * 15 + 2 * 14
-    assert story.left_out == (15 - 10) + (flips - 10) + (15 - 10)
+    assert events.left_out == (15 - 10) + (flips - 10) + (15 - 10)
 
 
-def test_messages_that_say_nothing_make_a_story_that_says_nothing() -> None:
-    story = told(each_second(EMPTY_STATE, EMPTY_STATE))
-    assert story is not None
-    assert story.is_empty
-    assert told([]) is None
+def test_messages_without_events_make_empty_events() -> None:
+    events = events_of(each_second(EMPTY_STATE, EMPTY_STATE))
+    assert events is not None
+    assert events.is_empty
+    assert events_of([]) is None
 
 
 def test_labels_booleans_and_errors_are_found_in_values() -> None:
@@ -172,12 +172,12 @@ def test_labels_booleans_and_errors_are_found_in_values() -> None:
 
 
 @given(histories(), st.integers(0, 700))
-def test_a_story_comes_back_from_its_bytes_as_it_was(
+def test_events_are_equal_after_encoding_and_decoding(
     history: tuple[Messages, list[int]], booleans: int
 ) -> None:
     messages, _ = history
     at = messages[-1][0]
     many = State(flags=tuple((f"flag_{nth}", nth % 3 == 0) for nth in range(booleans)), beyond=3)
-    story = told([*messages, (at, many), (at + 1, EMPTY_STATE)])
-    assert story is not None
-    assert decode_topic_events(encode_topic_events(story)) == story
+    events = events_of([*messages, (at, many), (at + 1, EMPTY_STATE)])
+    assert events is not None
+    assert decode_topic_events(encode_topic_events(events)) == events

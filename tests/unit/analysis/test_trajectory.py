@@ -146,7 +146,7 @@ def test_a_speed_that_is_no_number_is_not_the_highest() -> None:
     assert found.max_speed == 1.25
 
 
-def test_a_twist_that_nobody_fills_in_does_not_say_that_a_moving_robot_stood() -> None:
+def test_a_twist_that_is_never_set_does_not_make_a_moving_robot_stand() -> None:
     moved = summarise(driven(along_x(0, 1, 3), speeds=[0.0, 0.0, 0.0]), LIMIT_MPS)
     assert (moved.max_speed, moved.max_speed_from) == (2.0, "positions")
     stood = summarise(driven(along_x(1, 1, 1), speeds=[0.0, 0.0, 0.0]), LIMIT_MPS)
@@ -276,7 +276,7 @@ def test_only_invalid_poses_make_an_empty_trajectory() -> None:
 
 
 @given(st.lists(points, min_size=1, max_size=60), st.integers(2, 60))
-def test_no_pose_lies_farther_from_the_waypoints_than_is_told(
+def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     positions: list[Vector3], at_most: int
 ) -> None:
     found = summarise(driven(positions), LIMIT_MPS, at_most)

@@ -152,19 +152,19 @@ def test_messages_may_come_in_any_order(shuffled: list[StampedTransform], time: 
     assert shift(FrameGraph(shuffled), "odom", "base", time) == pytest.approx(time / S - 100)
 
 
-def test_at_a_messages_own_time_its_transform_holds_exactly() -> None:
+def test_at_a_messages_own_time_its_transform_is_returned_exactly() -> None:
     odd = Transform((0.1, 0.2, 0.3), (0.5, 0.5, 0.5, 0.5))
     graph = FrameGraph([edge("a", "b", 1, 1.0), edge("a", "b", 2, odd), edge("a", "b", 3, 1.0)])
     assert graph.lookup("a", "b", 2) == odd
 
 
-def test_of_two_messages_for_one_time_the_later_received_holds() -> None:
+def test_of_two_messages_for_one_time_the_later_received_is_used() -> None:
     first, second = edge("a", "b", 5, 1.0, log_time=10), edge("a", "b", 5, 2.0, log_time=11)
     for order in ([first, second], [second, first]):
         assert shift(FrameGraph(order), "a", "b", 5) == 2.0
 
 
-def test_of_two_transforms_in_one_message_the_last_holds() -> None:
+def test_of_two_transforms_in_one_message_the_last_is_used() -> None:
     assert shift(FrameGraph([edge("a", "b", 5, 1.0), edge("a", "b", 5, 2.0)]), "a", "b", 5) == 2.0
 
 
@@ -193,7 +193,7 @@ def picked_up() -> FrameGraph:
 @pytest.mark.parametrize(
     ("second", "place"), [(11, 1.1), (12, 1.2), (13, 1.2), (14, 5.0), (15, 5.1)]
 )
-def test_between_two_parents_the_earlier_message_holds_as_it_is(second: int, place: float) -> None:
+def test_between_two_parents_the_earlier_message_is_used(second: int, place: float) -> None:
     assert shift(picked_up(), "map", "cup", second * S) == pytest.approx(place)
 
 
@@ -229,12 +229,12 @@ def test_a_loop_is_an_answer_and_not_an_endless_walk(static: bool) -> None:
 
 
 @pytest.mark.parametrize("time", [0, 10**18, 2**62])
-def test_a_static_transform_holds_at_all_times(time: int) -> None:
+def test_a_static_transform_is_valid_at_all_times(time: int) -> None:
     graph = FrameGraph([edge("base", "laser", 500 * S, 0.3, static=True)])
     assert shift(graph, "base", "laser", time) == 0.3
 
 
-def test_of_several_static_transforms_the_newest_received_holds() -> None:
+def test_of_several_static_transforms_the_newest_received_is_used() -> None:
     older = edge("base", "laser", 900, 1.0, log_time=10, static=True)
     again = edge("base", "laser", 900, 3.0, log_time=10, static=True)
     assert shift(FrameGraph([older, again]), "base", "laser", 0) == 3.0
@@ -265,7 +265,7 @@ def test_a_child_published_both_ways_is_dynamic_where_its_messages_reach() -> No
         edge("odom", "/", 103 * S + 1),
     ],
 )
-def test_a_transform_that_says_nothing_is_left_out(bad: StampedTransform) -> None:
+def test_an_invalid_transform_is_left_out(bad: StampedTransform) -> None:
     graph = FrameGraph([*moving(), bad])
     assert graph.names() == ["base", "odom"]
     assert shift(graph, "odom", "base", 103 * S + 1) == pytest.approx(3.0)
@@ -289,7 +289,7 @@ def test_an_unknown_frame_is_named_with_those_spelled_alike() -> None:
     assert "robot1/camera" in refusal(graph, "Camera", "odom", 5).detail
 
 
-def test_an_unknown_frame_that_is_like_none_is_told_which_there_are() -> None:
+def test_an_unknown_frame_that_is_like_none_lists_those_there_are() -> None:
     refused = refusal(FrameGraph(moving()), "odom", "zzz", 5)
     assert "there are: base, odom" in refused.detail
     many = FrameGraph([edge("odom", f"wheel_{i:02}", 5) for i in range(30)])
@@ -306,7 +306,7 @@ def test_without_any_transform_every_frame_is_unknown() -> None:
     assert "no transform at all" in refused.detail
 
 
-def test_frames_of_two_trees_are_told_their_roots() -> None:
+def test_frames_of_two_trees_are_refused_with_their_roots() -> None:
     graph = FrameGraph([*moving(), edge("map", "goal", 5), edge("goal", "tip", 5)])
     refused = refusal(graph, "tip", "base", 102 * S)
     assert refused.reason is NoDataReason.FRAMES_NOT_CONNECTED
@@ -315,7 +315,7 @@ def test_frames_of_two_trees_are_told_their_roots() -> None:
 
 
 @pytest.mark.parametrize(("time", "off"), [(90 * S, "10.000 s after"), (107 * S, "2.000 s before")])
-def test_nothing_is_extrapolated_and_the_range_of_the_edge_is_told(time: int, off: str) -> None:
+def test_nothing_is_extrapolated_and_the_range_of_the_edge_is_named(time: int, off: str) -> None:
     graph = FrameGraph([*moving(), edge("map", "odom", 0, static=True)])
     refused = refusal(graph, "map", "base", time)
     assert refused.reason is NoDataReason.OUTSIDE_RANGE
@@ -330,7 +330,7 @@ def test_a_single_message_answers_at_its_own_time_only() -> None:
     assert "only at 5.000000" in refusal(graph, "odom", "base", 6 * S).detail
 
 
-def test_a_gap_wider_than_the_cache_is_told_with_both_its_edges() -> None:
+def test_a_gap_wider_than_the_cache_is_refused_with_both_its_edges() -> None:
     graph = FrameGraph([edge("odom", "base", 100 * S, 1.0), edge("odom", "base", 111 * S, 2.0)])
     refused = refusal(graph, "odom", "base", 104 * S)
     assert refused.reason is NoDataReason.GAP

@@ -23,7 +23,7 @@ _evidence = st.just(UNBOUNDED) | st.just(ZoneMap()) | _boxes.map(lambda box: Zon
     st.none() | st.floats(-80, 80),
     st.floats(0, 30),
 )
-def test_all_boxes_at_once_say_what_each_says_alone(
+def test_all_boxes_at_once_agree_with_each_alone(
     pieces: list[ZoneMap], x: float, y: float, z: float | None, reach: float
 ) -> None:
     numbered = dict(enumerate(pieces, start=100))

@@ -1,4 +1,4 @@
-"""Whatever values are collected, their evidence rules out nothing that is among them."""
+"""Whatever values are collected, their zone map rules out nothing that is among them."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ conditions = st.builds(
 @example([], {"x": [True, 2]}, Condition(Contains("2"), "x"))
 @example([], {"x": False}, Condition(Equals(0)))
 @example([], {"x": 1.0}, Condition(Equals("true")))
-def test_evidence_never_rules_out_what_matches(
+def test_a_zone_map_never_rules_out_what_matches(
     others: list[JsonValue], value: JsonValue, condition: Condition
 ) -> None:
     collector = ZoneMapBuilder()

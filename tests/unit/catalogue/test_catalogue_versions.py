@@ -167,7 +167,7 @@ def test_the_file_of_another_version_is_never_misread(
 
 
 @pytest.mark.parametrize("change", [older, newer, with_another_column])
-def test_what_another_version_holds_open_is_left_to_it(
+def test_a_file_that_another_version_has_open_is_left_to_it(
     bag_dir: Path, tmp_path: Path, change: Callable[[Path], None]
 ) -> None:
     file = bag_dir / FOLDER / FILE

@@ -69,12 +69,12 @@ def topic_of(messages: list[Msg]) -> TopicDigest:
         ("near_position", {"x": 1.0, "y": 0.0, "z": 3.0}),
     ],
 )
-def test_evidence_rules_out_what_was_never_there(condition_type: str, value: JsonValue) -> None:
+def test_a_zone_map_rules_out_what_was_never_there(condition_type: str, value: JsonValue) -> None:
     seen = topic_of([detections(T0, ["cup", "Person 2"]), detections(T0 + S, ["chair"])])
     assert not parse_condition(condition_type, value, 0.5).can_match(seen.zone_map)
 
 
-def test_evidence_rules_out_a_number_beyond_all_that_were_there() -> None:
+def test_a_zone_map_rules_out_a_number_beyond_all_that_were_there() -> None:
     seen = topic_of([detections(T0, ["cup"])])
     for limit, above in ((1e6, True), (-1e6, False)):
         assert not Beyond(limit, above=above).can_match(seen.zone_map)
@@ -85,7 +85,7 @@ def test_evidence_rules_out_a_number_beyond_all_that_were_there() -> None:
     ("condition_type", "value"),
     [("contains", "person"), ("contains", "PERSON 2"), ("equals", "cup"), ("equals", 120)],
 )
-def test_evidence_lets_through_what_was_there(condition_type: str, value: JsonValue) -> None:
+def test_a_zone_map_lets_through_what_was_there(condition_type: str, value: JsonValue) -> None:
     seen = topic_of([detections(T0, ["cup", "Person 2"])])
     assert parse_condition(condition_type, value, 0.5).can_match(seen.zone_map)
 
@@ -150,7 +150,7 @@ def test_digests_of_bags_joined_give_what_all_their_poses_give(
     assert told.waypoint_error_m <= 0.05 or len(told.waypoints) == 50
 
 
-def test_the_path_of_joined_bags_lies_as_near_as_is_told() -> None:
+def test_the_path_of_joined_bags_is_within_the_stated_error() -> None:
     joined = TrajectoryBuilder(10.0, 2000)
     driven = []
     for bag in range(40):
@@ -197,7 +197,7 @@ def test_edges_are_all_pairs_and_the_stamps_of_the_ends() -> None:
     assert (seen.edges.first_stamp, seen.edges.last_stamp) == (T0 + 2 * S, T0 + 4 * S)
 
 
-def test_few_latched_messages_are_kept_whole_and_many_are_not() -> None:
+def test_few_latched_messages_are_stored_whole_and_many_are_not() -> None:
     fixed = transform(T0, "base_link", "laser", (0.1, 0, 0))
     sent = [tf(T0 + n, fixed, topic="/tf_static") for n in range(MAX_STORED + 1)]
     few = topic_of(sent[:MAX_STORED])

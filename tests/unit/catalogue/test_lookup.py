@@ -1,4 +1,4 @@
-"""What is settled of a run is not asked for again; what is not, is."""
+"""Complete digests of a segment are not looked up again; incomplete ones are."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def recorded(bag_dir: Path, bags: int = 2) -> tuple[Memory, Segment]:
     return memory, run
 
 
-def test_a_run_of_which_every_bag_has_an_entry_is_settled_once_it_was_looked_at(
+def test_a_segment_whose_bags_all_have_an_entry_is_complete_after_the_first_look(
     tmp_path: Path,
 ) -> None:
     memory, run = recorded(tmp_path)
@@ -44,7 +44,7 @@ def test_a_run_of_which_every_bag_has_an_entry_is_settled_once_it_was_looked_at(
     assert recall.complete_digests(run) is notes
 
 
-def test_a_run_with_a_bag_without_an_entry_is_not_settled(tmp_path: Path) -> None:
+def test_a_segment_with_a_bag_without_an_entry_is_not_complete(tmp_path: Path) -> None:
     memory, run = recorded(tmp_path)
     recall = recalling(memory, tmp_path, part=0.5).recall
     assert recall is not None
@@ -52,7 +52,7 @@ def test_a_run_with_a_bag_without_an_entry_is_not_settled(tmp_path: Path) -> Non
     assert recall.complete_digests(run) is None
 
 
-def test_what_a_catalogue_said_that_is_no_more_does_not_settle_anything(tmp_path: Path) -> None:
+def test_digests_of_a_catalogue_that_was_lost_are_not_complete(tmp_path: Path) -> None:
     memory, run = recorded(tmp_path)
     recall = recalling(memory, tmp_path).recall
     assert recall is not None
@@ -65,7 +65,7 @@ def test_what_a_catalogue_said_that_is_no_more_does_not_settle_anything(tmp_path
 
 
 @pytest.mark.parametrize("answer", ["", "x", "7", "[]", '["zz", 1, 2]', '{"a": [[1], 2]}'])
-def test_what_cannot_be_read_of_what_was_worked_out_is_worked_out_again(
+def test_a_cached_answer_that_cannot_be_parsed_is_computed_again(
     tmp_path: Path, answer: str
 ) -> None:
     for recording in ("a", "b"):
@@ -73,13 +73,13 @@ def test_what_cannot_be_read_of_what_was_worked_out_is_worked_out_again(
         write_mcap(tmp_path / recording / f"{recording}_0.mcap", messages)
     memory = recalling(memory_of(tmp_path), tmp_path)
 
-    def told() -> object:
+    def answers() -> object:
         way = trajectory_summary(memory, Call(), TimeRange(start_s=0.0, end_s=9e9))
         return list_recorded_topics(memory, Call()), way
 
-    before = told()
+    before = answers()
     with closing(sqlite3.connect(tmp_path / FOLDER / FILE)) as base:
         changed = base.execute("UPDATE remembered SET answer = ?", (answer,)).rowcount
         base.commit()
     assert changed == 2
-    assert told() == before
+    assert answers() == before

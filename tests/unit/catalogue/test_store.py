@@ -96,14 +96,14 @@ def test_what_was_put_comes_back_as_it_was_also_from_another_process_later(tmp_p
         assert again.messages(held.topic, [number]).get(number) == held.kept
     assert topic(DIGEST, "/odom").poses is not None
     assert topic(DIGEST, "/tf_static").kept is not None
-    standstills, story = topic(DIGEST, "/odom").standstills, topic(DIGEST, "/bumper").events
+    standstills, events = topic(DIGEST, "/odom").standstills, topic(DIGEST, "/bumper").events
     assert standstills is not None
     assert standstills.head
-    assert story is not None
-    assert len(story.toggles) == 1
+    assert events is not None
+    assert len(events.toggles) == 1
 
 
-def test_a_topic_that_cannot_be_decoded_has_no_story_and_is_not_taken_for_a_quiet_one(
+def test_a_topic_that_cannot_be_decoded_has_no_events_and_is_not_taken_for_a_quiet_one(
     tmp_path: Path,
 ) -> None:
     catalogue = catalogue_in(tmp_path)
@@ -117,7 +117,7 @@ def test_a_topic_that_cannot_be_decoded_has_no_story_and_is_not_taken_for_a_quie
     assert catalogue.topic_events("/tf_static", [number]) == {}
 
 
-def test_what_is_told_of_topics_comes_back_from_a_file_that_took_another_ones_place(
+def test_events_are_read_from_a_file_that_replaced_another(
     tmp_path: Path,
 ) -> None:
     catalogue = catalogue_in(tmp_path)
@@ -133,8 +133,8 @@ def test_what_is_told_of_topics_comes_back_from_a_file_that_took_another_ones_pl
     assert catalogue.standstills("/odom", [former, number]) == {
         number: topic(DIGEST, "/odom").standstills
     }
-    story = topic(DIGEST, "/bumper").events
-    assert catalogue.topic_events("/bumper", [former, number]) == {number: story}
+    events = topic(DIGEST, "/bumper").events
+    assert catalogue.topic_events("/bumper", [former, number]) == {number: events}
 
 
 def test_an_entry_that_was_dropped_is_not_taken_for_one_of_a_quiet_topic(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_an_entry_of_another_configuration_is_not_seen(tmp_path: Path) -> None:
     assert holds(catalogue_in(tmp_path, "one"))
 
 
-def test_of_other_configurations_the_last_to_write_is_kept(tmp_path: Path) -> None:
+def test_of_other_configurations_the_last_to_write_remains(tmp_path: Path) -> None:
     one, two, three = (catalogue_in(tmp_path, name) for name in ("one", "two", "three"))
     for catalogue in (one, two, three):
         catalogue.put(KEY, DIGEST)
@@ -348,7 +348,7 @@ class TestAPlaceThatComesUp:
     def catalogue(self, places: list[Path], monotonic: list[float]) -> Catalogue:
         return Catalogue(lambda: places, "config", monotonic=lambda: monotonic[0])
 
-    def test_what_the_former_place_holds_goes_along(self, tmp_path: Path) -> None:
+    def test_the_content_at_the_previous_path_is_copied(self, tmp_path: Path) -> None:
         beside, cache = tmp_path / "bags" / FILE, tmp_path / "cache" / FILE
         places, now = [cache], [0.0]
         catalogue = self.catalogue(places, now)

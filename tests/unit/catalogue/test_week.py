@@ -102,7 +102,7 @@ def week() -> tuple[Memory, FakeReader]:
     return Memory(index, reader, extractor(), clock, QuerySettings(), recall), reader
 
 
-def test_what_was_never_seen_is_told_of_a_week_without_reading_a_bag(
+def test_what_was_never_seen_is_answered_over_a_week_without_reading_a_bag(
     week: tuple[Memory, FakeReader],
 ) -> None:
     memory, reader = week

@@ -13,7 +13,7 @@ limits = st.integers(1, 600)
 
 
 @given(counts, limits)
-def test_no_more_are_kept_than_asked_and_no_fewer_than_there_are(count: int, at_most: int) -> None:
+def test_as_many_are_kept_as_asked_or_as_there_are(count: int, at_most: int) -> None:
     assert len(evenly(count, at_most)) == min(count, at_most)
 
 

@@ -173,7 +173,7 @@ def test_an_object_that_is_no_message_leaves_as_its_kind() -> None:
     assert shown(3 + 4j)[0] == "<complex>"
 
 
-def test_many_notes_are_counted_rather_than_told() -> None:
+def test_many_notes_are_counted_rather_than_listed() -> None:
     _, notes = shown({f"k{n}": list(range(60)) for n in range(MAX_NOTES + 5)})
     assert len(notes) == MAX_NOTES + 1
     assert notes[-1] == "and 5 more notes of this kind"
@@ -233,9 +233,7 @@ def longest_list(value: JsonValue) -> int:
 
 
 @given(values, st.integers(1, 8))
-def test_whatever_a_message_holds_what_leaves_is_strict_json_within_the_limit(
-    node: object, limit: int
-) -> None:
+def test_any_message_becomes_strict_json_within_the_limit(node: object, limit: int) -> None:
     value, notes = shown(node, limit)
     text = json.dumps(value, allow_nan=False, ensure_ascii=False)
     assert json.loads(text.encode("utf-8")) == value
@@ -244,9 +242,7 @@ def test_whatever_a_message_holds_what_leaves_is_strict_json_within_the_limit(
 
 
 @given(values, st.integers(1, 8))
-def test_whatever_a_message_holds_the_exact_value_is_made_of_json_values(
-    node: object, limit: int
-) -> None:
+def test_the_exact_value_of_any_message_is_made_of_json_values(node: object, limit: int) -> None:
     pending = [exact(node, limit)]
     while pending:
         value = pending.pop()
