@@ -327,9 +327,9 @@ class TestDeletions:
         (bags / ".episodic").symlink_to(outside)
         with pytest.raises(OSError, match="symbolic link"):
             PendingRequest(bags, "label", 0, 1, 2).post()
-        mailbox = RequestQueue(bags)
-        mailbox.open()
-        assert not mailbox.has_requests()
+        queue = RequestQueue(bags)
+        queue.open()
+        assert not queue.has_requests()
         assert contents(outside) == before
 
     def test_no_bag_of_a_moment_is_linked_behind_a_link(self, bags: Path, outside: Path) -> None:

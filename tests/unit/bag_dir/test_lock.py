@@ -53,10 +53,10 @@ def test_a_longer_text_of_the_holder_before_is_replaced_whole(tmp_path: Path) ->
 def test_a_second_recorder_is_refused_at_once_and_told_who_holds_it(tmp_path: Path) -> None:
     holder = {"pid": os.getppid(), "host": socket.gethostname()}
     descriptor = held_by(tmp_path, json.dumps(holder))
-    said = refusal(tmp_path, patience_s=3600)
+    sentence = refusal(tmp_path, patience_s=3600)
     os.close(descriptor)
-    assert f"process {os.getppid()} on {socket.gethostname()}" in said
-    assert str(tmp_path) in said
+    assert f"process {os.getppid()} on {socket.gethostname()}" in sentence
+    assert str(tmp_path) in sentence
 
 
 def test_two_cannot_hold_it(tmp_path: Path) -> None:

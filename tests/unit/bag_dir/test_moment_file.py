@@ -28,7 +28,7 @@ T0 = 1_795_150_800 * S  # 2026-11-20T05:00:00Z
 NUMBER = "0123456789abcdef" * 2
 
 
-def wish(label: str = "charger found", number: str = NUMBER) -> SaveRequest:
+def request(label: str = "charger found", number: str = NUMBER) -> SaveRequest:
     return SaveRequest(number, label, T0 - 30 * S, T0, T0)
 
 
@@ -48,19 +48,19 @@ class TestLabels:
 
     @given(st.text(max_size=130))
     def test_any_of_them_names_a_folder_that_is_safe(self, label: str) -> None:
-        name = folder_name(wish(label))
+        name = folder_name(request(label))
         assert re.fullmatch(r"20261120T050000Z-[a-z0-9]+(-[a-z0-9]+)*", name)
         assert bag_kind(name) is None
         assert len(name) < 64
 
     def test_a_folder_is_called_by_time_and_label(self) -> None:
-        assert folder_name(wish("Küche, 2. Stock")) == "20261120T050000Z-kuche-2-stock"
-        assert folder_name(wish("充電")) == "20261120T050000Z-moment"
+        assert folder_name(request("Küche, 2. Stock")) == "20261120T050000Z-kuche-2-stock"
+        assert folder_name(request("充電")) == "20261120T050000Z-moment"
 
 
 class TestFolders:
     def test_two_of_one_label_and_second_have_their_own(self, tmp_path: Path) -> None:
-        names = [make_moment_folder(tmp_path, wish()).name for _ in range(3)]
+        names = [make_moment_folder(tmp_path, request()).name for _ in range(3)]
         assert names == [f"20261120T050000Z-charger-found{end}" for end in ("", "_2", "_3")]
 
     def test_none_is_made_through_a_link(self, tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ class TestFolders:
         elsewhere.mkdir()
         (tmp_path / "moments").symlink_to(elsewhere)
         with pytest.raises(OSError, match="symbolic link"):
-            make_moment_folder(tmp_path, wish())
+            make_moment_folder(tmp_path, request())
         assert list(stored_moments_in(tmp_path)) == []
 
 
@@ -79,14 +79,18 @@ class TestMomentFiles:
         st.lists(st.text(st.characters(exclude_categories=["Cs"])), max_size=3),
     )
     def test_what_is_written_is_read(
-        self, tmp_path_factory: pytest.TempPathFactory, label: str, pending: bool, said: list[str]
+        self,
+        tmp_path_factory: pytest.TempPathFactory,
+        label: str,
+        pending: bool,
+        missing: list[str],
     ) -> None:
         folder = tmp_path_factory.mktemp("moment")
-        keepsake = SavedMoment(wish(label), pending, tuple(said))
-        write_saved_moment(folder, keepsake)
-        assert read_saved_moment(folder) == keepsake
+        moment = SavedMoment(request(label), pending, tuple(missing))
+        write_saved_moment(folder, moment)
+        assert read_saved_moment(folder) == moment
         complete = json.loads((folder / MOMENT_FILE).read_text())["complete"]
-        assert complete == (not pending and not said)
+        assert complete == (not pending and not missing)
 
     @pytest.mark.parametrize(
         "text",
@@ -111,7 +115,7 @@ class TestMomentFiles:
         ],
     )
     def test_what_says_something_else_is_no_moment(self, tmp_path: Path, text: str) -> None:
-        folder = make_moment_folder(tmp_path, wish())
+        folder = make_moment_folder(tmp_path, request())
         (folder / MOMENT_FILE).write_text(text)
         assert read_saved_moment(folder) is None
         assert list(stored_moments_in(tmp_path)) == []

@@ -74,7 +74,9 @@ def spoil(path: Path, fault: str) -> None:
         path.unlink()
 
 
-def told(logs: list[MutableMapping[str, Any]], event: str) -> list[MutableMapping[str, Any]]:
+def events_named(
+    logs: list[MutableMapping[str, Any]], event: str
+) -> list[MutableMapping[str, Any]]:
     return [each for each in logs if each["event"] == event]
 
 
@@ -240,9 +242,9 @@ class TestWhatAKillLeaves:
         embedding(tmp_path / A / f"{A}_1.mcap", embedded)
         with structlog.testing.capture_logs() as logs:
             assert not claimed(tmp_path).owns(tmp_path / A)
-        [warned] = told(logs, "recording_not_claimed")
-        assert warned["recording"] == A
-        assert "ros2-memory adopt" in warned["reason"]
+        [event] = events_named(logs, "recording_not_claimed")
+        assert event["recording"] == A
+        assert "ros2-memory adopt" in event["reason"]
 
     def test_a_directory_without_a_byte_is_not_claimed(self, tmp_path: Path) -> None:
         claimed(tmp_path).begin(A)
@@ -310,7 +312,7 @@ class TestWhatAKillLeaves:
             stream.write(json.dumps(line) + "\n")
         with structlog.testing.capture_logs() as logs:
             assert not OwnRecordings(tmp_path).names()
-        assert told(logs, "recordings_list_damaged")
+        assert events_named(logs, "recordings_list_damaged")
 
     def test_a_list_that_cannot_be_written_is_known_all_the_same(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -324,7 +326,7 @@ class TestWhatAKillLeaves:
         with monkeypatch.context() as patch, structlog.testing.capture_logs() as logs:
             patch.setattr(own_recordings, "write_durably", full)
             own.claim(custom_data)
-            assert told(logs, "recordings_not_listed")
+            assert events_named(logs, "recordings_not_listed")
             assert own.owns(tmp_path / A)
             with pytest.raises(RecorderError, match="No space left"):
                 own.begin(B)
@@ -410,7 +412,7 @@ class TestVersionsBeforeTheList:
         (tmp_path / A / f"{A}_3.mcap").touch()
         with structlog.testing.capture_logs() as logs:
             assert claimed(tmp_path).owns(tmp_path / A)
-        [event] = told(logs, "recordings_adopted")
+        [event] = events_named(logs, "recordings_adopted")
         assert (event["recordings"], event["names"]) == (1, [A])
         assert lines(tmp_path)[1]["adopted"] is True
 
@@ -486,12 +488,12 @@ class TestVersionsBeforeTheList:
         with structlog.testing.capture_logs() as logs:
             own = claimed(tmp_path)
         assert [*own.names()] == [B]
-        [warned] = told(logs, "recordings_not_adopted")
-        assert (warned["recordings"], warned["log_level"]) == (1, "warning")
-        [reason] = warned["reasons"]
+        [event] = events_named(logs, "recordings_not_adopted")
+        assert (event["recordings"], event["log_level"]) == (1, "warning")
+        [reason] = event["reasons"]
         assert reason.startswith(f"{A}: {A}_1.")
         assert "cannot be read as far as" in reason
-        assert "ros2-memory adopt" in warned["advice"]
+        assert "ros2-memory adopt" in event["advice"]
 
     @pytest.mark.parametrize("embedded", [None, OURS])
     def test_one_that_ends_in_a_torn_split_is_adopted_as_far_as_it_can_be_read(

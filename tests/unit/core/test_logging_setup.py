@@ -85,18 +85,18 @@ def test_what_libraries_log_has_the_same_shape(capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize(
-    ("level", "told"),
+    ("level", "logged"),
     [("debug", ["info", "warning"]), ("info", ["warning"]), ("error", [])],
 )
 def test_the_end_of_a_request_is_no_event_and_a_warning_of_its_library_is(
-    level: Literal["debug", "info", "error"], told: list[str], capsys: pytest.CaptureFixture[str]
+    level: Literal["debug", "info", "error"], logged: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     theirs = logging.getLogger(transport.__name__)
     assert transport.logger is theirs
     configure_logging(level, "json")
     theirs.info("Terminating session: None")
     theirs.warning("a stream was closed")
-    assert [event["level"] for event in events(capsys)] == told
+    assert [event["level"] for event in events(capsys)] == logged
 
 
 def test_warnings_have_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
@@ -196,11 +196,11 @@ def test_what_a_library_repeats_is_logged_now_and_then(
             logging.getLogger(logger).warning("Invalid HTTP request received.")
         logging.getLogger("asyncio").error("Fatal error: protocol.data_received() call %d", second)
         get_logger("ros2_memory.test").warning("ours")
-    told = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-    counts = Counter(each["logger"] for each in told)
+    logged = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    counts = Counter(each["logger"] for each in logged)
     ours = {"ros2_memory.test": 25}
     assert counts == {"uvicorn.error": 3, "asyncio": 6, "mcp.server.sse": 3, **ours}
-    seen = [each.get("suppressed") for each in told if each["logger"] == "uvicorn.error"]
+    seen = [each.get("suppressed") for each in logged if each["logger"] == "uvicorn.error"]
     assert seen == [None, 9, 9]
 
 
@@ -222,10 +222,10 @@ def test_nothing_that_is_logged_is_endless(capsys: pytest.CaptureFixture[str]) -
     get_logger("ros2_memory.test").info("ours", reason=long)
     fault = ValueError(f"{long}the end")
     get_logger("ros2_memory.test").error("failed", exc_info=fault)
-    told = events(capsys)
-    assert len(told) == 3
-    assert all(len(json.dumps(each)) < 2 * logging_setup.MAX_CHARS for each in told)
-    assert told[2]["exception"].endswith("the end")
+    logged = events(capsys)
+    assert len(logged) == 3
+    assert all(len(json.dumps(each)) < 2 * logging_setup.MAX_CHARS for each in logged)
+    assert logged[2]["exception"].endswith("the end")
 
 
 @pytest.mark.parametrize("level", ["debug", "info"])
@@ -237,6 +237,6 @@ def test_without_arguments_the_library_shows_nothing_of_a_message(
     theirs.debug("Received JSON: %s", "s3cret")
     theirs.warning("Rejecting message for session %s: credential does not match", "s3cret")
     theirs.error("Failed to parse message", exc_info=ValueError("s3cret"))
-    told = events(capsys)
-    assert [each["level"] for each in told] == ["warning", "error"]
-    assert "s3cret" not in str(told)
+    logged = events(capsys)
+    assert [each["level"] for each in logged] == ["warning", "error"]
+    assert "s3cret" not in str(logged)

@@ -39,18 +39,18 @@ rosbag2_bagfile_information:
 """
 
 
-class Eye:
-    """Looks at one file again and again, as scans do."""
+class RepeatedScan:
+    """Scans one file again and again."""
 
     def __init__(self, root: Path, *kinds: str) -> None:
         self.root = root
         self.reader = PlainReader(*(kinds or (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")))
         self.notes: FileNotes | None = None
-        self.verdict: Classification | None = None
+        self.classification: Classification | None = None
         self.trusts_mtime = True
-        self.scene = ScanContext(root, NOW, THREE_SPLITS)
+        self.context = ScanContext(root, NOW, THREE_SPLITS)
 
-    def look(
+    def run(
         self,
         path: Path,
         *,
@@ -58,7 +58,7 @@ class Eye:
         now: int = NOW,
         names: set[str] | None = None,
     ) -> FileState:
-        """The standing at `now`, first giving the file an mtime; `names`: a live heartbeat."""
+        """The state at `now`, first giving the file an mtime; `names`: a live heartbeat."""
         if age_s is not None:
             mtime_ns = now - round(age_s * S)
             os.utime(path, ns=(mtime_ns, mtime_ns))
@@ -68,41 +68,43 @@ class Eye:
         else:
             self.notes.update(stamp, now)
         recordings = None if names is None else frozenset(names)
-        self.scene = ScanContext(
+        self.context = ScanContext(
             self.root, now, THREE_SPLITS, recordings, trusts_mtime=self.trusts_mtime
         )
-        self.verdict = classify(self.notes, self.reader, self.scene)
-        return self.verdict.state
+        self.classification = classify(self.notes, self.reader, self.context)
+        return self.classification.state
 
     def reason(self) -> str:
-        assert self.verdict is not None
-        assert self.verdict.aside is not None
-        return self.verdict.aside.reason
+        assert self.classification is not None
+        assert self.classification.aside is not None
+        return self.classification.aside.reason
 
     def is_watched(self) -> bool:
         assert self.notes is not None
-        assert self.verdict is not None
-        return self.notes.must_be_watched(self.verdict, self.scene)
+        assert self.classification is not None
+        return self.notes.must_be_watched(self.classification, self.context)
 
 
 @pytest.fixture
-def eye(tmp_path: Path) -> Eye:
-    return Eye(tmp_path)
+def scan(tmp_path: Path) -> RepeatedScan:
+    return RepeatedScan(tmp_path)
 
 
-def test_a_closed_bag_is_described_from_inside_and_outside(eye: Eye, tmp_path: Path) -> None:
+def test_a_closed_bag_is_described_from_inside_and_outside(
+    scan: RepeatedScan, tmp_path: Path
+) -> None:
     path = plain(tmp_path / "rec" / "rec_0.mcap", [30, 10, 20])
-    assert eye.look(path, age_s=100) is FileState.CLOSED
-    assert eye.verdict is not None
-    bag = eye.verdict.bag
+    assert scan.run(path, age_s=100) is FileState.CLOSED
+    assert scan.classification is not None
+    bag = scan.classification.bag
     assert bag is not None
     assert (bag.path, bag.state, bag.start, bag.end) == (path, BagState.CLOSED, 10, 30)
     assert (bag.size, bag.mtime_ns) == (path.stat().st_size, NOW - 100 * S)
-    assert not eye.is_watched()
+    assert not scan.is_watched()
 
 
 @pytest.mark.parametrize(
-    ("age_s", "standing"),
+    ("age_s", "state"),
     [
         (0, FileState.ACTIVE),
         (30, FileState.ACTIVE),
@@ -114,272 +116,288 @@ def test_a_closed_bag_is_described_from_inside_and_outside(eye: Eye, tmp_path: P
     ],
 )
 def test_without_a_heartbeat_an_open_bag_is_active_while_its_mtime_is_within_three_splits(
-    eye: Eye, tmp_path: Path, age_s: float, standing: FileState
+    scan: RepeatedScan, tmp_path: Path, age_s: float, state: FileState
 ) -> None:
     path = plain(tmp_path / "rec" / "rec_0.mcap", [1, 2], closed=False)
-    assert eye.look(path, age_s=age_s) is standing
-    assert eye.is_watched()
+    assert scan.run(path, age_s=age_s) is state
+    assert scan.is_watched()
 
 
 @pytest.mark.parametrize("age_s", [0, 30.001, 86_400, -86_400])
 def test_an_open_bag_of_a_recording_that_the_heartbeat_names_is_active_however_still_it_lies(
-    eye: Eye, tmp_path: Path, age_s: float
+    scan: RepeatedScan, tmp_path: Path, age_s: float
 ) -> None:
     path = plain(tmp_path / "day" / "rec_1" / "rec_1_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=age_s, names={"day/rec_1", "rec_2"}) is FileState.ACTIVE
+    assert scan.run(path, age_s=age_s, names={"day/rec_1", "rec_2"}) is FileState.ACTIVE
 
 
 @pytest.mark.parametrize("names", [set(), {"rec_2"}, {"rec_1"}, {"day"}])
 def test_an_open_bag_of_a_recording_that_a_live_heartbeat_does_not_name_is_left_behind(
-    eye: Eye, tmp_path: Path, names: set[str]
+    scan: RepeatedScan, tmp_path: Path, names: set[str]
 ) -> None:
     path = plain(tmp_path / "day" / "rec_1" / "rec_1_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=0, names=names) is FileState.INCOMPLETE
+    assert scan.run(path, age_s=0, names=names) is FileState.INCOMPLETE
 
 
 def test_an_open_bag_in_the_bag_directory_itself_is_named_by_a_dot(
-    eye: Eye, tmp_path: Path
+    scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=3600, names={"."}) is FileState.ACTIVE
+    assert scan.run(path, age_s=3600, names={"."}) is FileState.ACTIVE
 
 
-def test_a_bag_left_open_serves_what_is_readable(eye: Eye, tmp_path: Path) -> None:
+def test_a_bag_left_open_serves_what_is_readable(scan: RepeatedScan, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1, 2], closed=False)
-    eye.look(path, age_s=3600)
-    assert eye.verdict is not None
-    assert eye.verdict.bag is not None
-    assert eye.verdict.bag.state is BagState.INCOMPLETE
-    assert (eye.verdict.bag.start, eye.verdict.bag.end) == (1, 2)
+    scan.run(path, age_s=3600)
+    assert scan.classification is not None
+    assert scan.classification.bag is not None
+    assert scan.classification.bag.state is BagState.INCOMPLETE
+    assert (scan.classification.bag.start, scan.classification.bag.end) == (1, 2)
 
 
-def test_a_growth_that_was_seen_counts_whatever_the_mtime_says(eye: Eye, tmp_path: Path) -> None:
+def test_a_growth_that_was_seen_counts_whatever_the_mtime_says(
+    scan: RepeatedScan, tmp_path: Path
+) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=-86_400) is FileState.INCOMPLETE
+    assert scan.run(path, age_s=-86_400) is FileState.INCOMPLETE
     grow(path, 2)
-    assert eye.look(path, age_s=-86_400) is FileState.ACTIVE
-    assert eye.look(path, now=NOW + THREE_SPLITS) is FileState.ACTIVE
-    assert eye.look(path, now=NOW + THREE_SPLITS + 1) is FileState.INCOMPLETE
+    assert scan.run(path, age_s=-86_400) is FileState.ACTIVE
+    assert scan.run(path, now=NOW + THREE_SPLITS) is FileState.ACTIVE
+    assert scan.run(path, now=NOW + THREE_SPLITS + 1) is FileState.INCOMPLETE
 
 
-def test_a_larger_file_put_in_its_place_did_not_grow(eye: Eye, tmp_path: Path) -> None:
+def test_a_larger_file_put_in_its_place_did_not_grow(scan: RepeatedScan, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=3600) is FileState.INCOMPLETE
+    assert scan.run(path, age_s=3600) is FileState.INCOMPLETE
     plain(tmp_path / "other", [1, 2, 3], closed=False).rename(path)
-    assert eye.look(path, age_s=3600) is FileState.INCOMPLETE
+    assert scan.run(path, age_s=3600) is FileState.INCOMPLETE
 
 
 def test_the_growth_of_a_file_is_not_that_of_the_one_put_in_its_place(
-    eye: Eye, tmp_path: Path
+    scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    eye.look(path, age_s=3600)
+    scan.run(path, age_s=3600)
     grow(path, 2)
-    assert eye.look(path, age_s=3600) is FileState.ACTIVE
+    assert scan.run(path, age_s=3600) is FileState.ACTIVE
     plain(tmp_path / "other", [1, 2, 3], closed=False).rename(path)
-    assert eye.look(path, age_s=3600) is FileState.INCOMPLETE
+    assert scan.run(path, age_s=3600) is FileState.INCOMPLETE
 
 
 def test_after_the_clock_was_set_back_a_growth_counts_for_three_splits_more(
-    eye: Eye, tmp_path: Path
+    scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    eye.look(path, age_s=-86_400)
+    scan.run(path, age_s=-86_400)
     grow(path, 2)
-    assert eye.look(path, age_s=-86_400) is FileState.ACTIVE
+    assert scan.run(path, age_s=-86_400) is FileState.ACTIVE
     earlier = NOW - 7200 * S
-    assert eye.look(path, now=earlier) is FileState.ACTIVE
-    assert eye.look(path, now=earlier + THREE_SPLITS) is FileState.ACTIVE
-    assert eye.look(path, now=earlier + THREE_SPLITS + 1) is FileState.INCOMPLETE
+    assert scan.run(path, now=earlier) is FileState.ACTIVE
+    assert scan.run(path, now=earlier + THREE_SPLITS) is FileState.ACTIVE
+    assert scan.run(path, now=earlier + THREE_SPLITS + 1) is FileState.INCOMPLETE
 
 
-def test_an_active_bag_is_not_summarised(eye: Eye, tmp_path: Path) -> None:
+def test_an_active_bag_is_not_summarised(scan: RepeatedScan, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    eye.look(path, age_s=0)
-    assert eye.reader.summaries.total() == 0
-    assert eye.reason() == "still being written"
+    scan.run(path, age_s=0)
+    assert scan.reader.summaries.total() == 0
+    assert scan.reason() == "still being written"
 
 
-def test_an_active_bag_becomes_a_bag_when_it_is_closed_in_place(eye: Eye, tmp_path: Path) -> None:
+def test_an_active_bag_becomes_a_bag_when_it_is_closed_in_place(
+    scan: RepeatedScan, tmp_path: Path
+) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert eye.look(path, age_s=0) is FileState.ACTIVE
+    assert scan.run(path, age_s=0) is FileState.ACTIVE
     close(path)
-    assert eye.look(path, age_s=0, names={"."}) is FileState.CLOSED
+    assert scan.run(path, age_s=0, names={"."}) is FileState.CLOSED
 
 
 def test_a_file_of_0_bytes_is_active_while_its_recorder_writes_and_damaged_after(
-    eye: Eye, tmp_path: Path
+    scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = tmp_path / "rec_0.mcap"
     path.touch()
-    assert eye.look(path, age_s=5) is FileState.ACTIVE
-    assert eye.look(path, age_s=31) is FileState.DAMAGED
-    assert eye.reason() == "the file is empty"
-    assert eye.is_watched()
+    assert scan.run(path, age_s=5) is FileState.ACTIVE
+    assert scan.run(path, age_s=31) is FileState.DAMAGED
+    assert scan.reason() == "the file is empty"
+    assert scan.is_watched()
 
 
-def test_a_file_that_is_no_bag_is_damaged_with_the_readers_reason(eye: Eye, tmp_path: Path) -> None:
+def test_a_file_that_is_no_bag_is_damaged_with_the_readers_reason(
+    scan: RepeatedScan, tmp_path: Path
+) -> None:
     path = tmp_path / "rec_0.mcap"
     path.write_text("# Dockerfile", encoding="utf-8")
-    assert eye.look(path, age_s=0) is FileState.DAMAGED
-    assert eye.reason() == "not a bag"
+    assert scan.run(path, age_s=0) is FileState.DAMAGED
+    assert scan.reason() == "not a bag"
 
 
-def test_a_bag_left_open_before_its_first_message_is_damaged(eye: Eye, tmp_path: Path) -> None:
+def test_a_bag_left_open_before_its_first_message_is_damaged(
+    scan: RepeatedScan, tmp_path: Path
+) -> None:
     path = plain(tmp_path / "rec_0.mcap", silent=["/scan"], closed=False)
-    assert eye.look(path, age_s=3600) is FileState.DAMAGED
-    assert "before its first message" in eye.reason()
+    assert scan.run(path, age_s=3600) is FileState.DAMAGED
+    assert "before its first message" in scan.reason()
 
 
 def test_a_closed_bag_without_a_message_is_empty_and_names_its_silent_topics(
-    eye: Eye, tmp_path: Path
+    scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", silent=["/scan", "/tf"])
-    assert eye.look(path, age_s=3600) is FileState.EMPTY
-    assert eye.verdict == Classification(FileState.EMPTY, silent=("/scan", "/tf"))
+    assert scan.run(path, age_s=3600) is FileState.EMPTY
+    assert scan.classification == Classification(FileState.EMPTY, silent=("/scan", "/tf"))
 
 
 def test_a_file_of_a_kind_that_is_not_read_names_the_storage_that_reads_it(
     tmp_path: Path,
 ) -> None:
-    eye = Eye(tmp_path, ".mcap")
+    scan = RepeatedScan(tmp_path, ".mcap")
     path = plain(tmp_path / "rec_0.db3", [1])
-    assert eye.look(path, age_s=0) is FileState.UNREAD
+    assert scan.run(path, age_s=0) is FileState.UNREAD
     assert (
-        eye.reason() == "this storage does not read .db3 files: choose storage=rosbag2, which does"
+        scan.reason() == "this storage does not read .db3 files: choose storage=rosbag2, which does"
     )
-    assert eye.reader.closings.total() == 0
-    assert not eye.is_watched()
+    assert scan.reader.closings.total() == 0
+    assert not scan.is_watched()
 
 
-def test_a_name_in_capitals_is_not_read_and_says_what_to_do(eye: Eye, tmp_path: Path) -> None:
+def test_a_name_in_capitals_is_not_read_and_says_what_to_do(
+    scan: RepeatedScan, tmp_path: Path
+) -> None:
     path = plain(tmp_path / "REC_0.MCAP", [1])
-    assert eye.look(path, age_s=0) is FileState.UNREAD
-    assert "must end in .mcap, in lower case: rename it" in eye.reason()
+    assert scan.run(path, age_s=0) is FileState.UNREAD
+    assert "must end in .mcap, in lower case: rename it" in scan.reason()
 
 
-def test_an_unchanged_file_is_read_once(eye: Eye, tmp_path: Path) -> None:
+def test_an_unchanged_file_is_read_once(scan: RepeatedScan, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1])
     for later in range(3):
-        eye.look(path, age_s=100 if later == 0 else None, now=NOW + later * S)
-    assert eye.reader.summaries == {"rec_0.mcap": 1}
-    assert eye.reader.closings == {"rec_0.mcap": 1}
+        scan.run(path, age_s=100 if later == 0 else None, now=NOW + later * S)
+    assert scan.reader.summaries == {"rec_0.mcap": 1}
+    assert scan.reader.closings == {"rec_0.mcap": 1}
 
 
 @pytest.mark.parametrize("age_s", [0, 1.9, -1.9])
 def test_what_was_read_of_a_file_younger_than_2_s_is_read_again(
-    eye: Eye, tmp_path: Path, age_s: float
+    scan: RepeatedScan, tmp_path: Path, age_s: float
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", [11])
-    eye.look(path, age_s=age_s)
-    assert eye.is_watched()
+    scan.run(path, age_s=age_s)
+    assert scan.is_watched()
     plain(path, [22])
     os.utime(path, ns=(NOW - round(age_s * S),) * 2)  # the same size in the same tick
-    eye.look(path, now=NOW + 10 * S)
-    assert eye.verdict is not None
-    assert eye.verdict.bag is not None
-    assert eye.verdict.bag.start == 22
-    assert not eye.is_watched()
+    scan.run(path, now=NOW + 10 * S)
+    assert scan.classification is not None
+    assert scan.classification.bag is not None
+    assert scan.classification.bag.start == 22
+    assert not scan.is_watched()
 
 
-def test_a_replaced_file_is_read_again(eye: Eye, tmp_path: Path) -> None:
+def test_a_replaced_file_is_read_again(scan: RepeatedScan, tmp_path: Path) -> None:
     path = plain(tmp_path / "rec_0.mcap", [11])
-    eye.look(path, age_s=100)
+    scan.run(path, age_s=100)
     plain(path, [22])
-    eye.look(path, age_s=50)
-    assert eye.verdict is not None
-    assert eye.verdict.bag is not None
-    assert (eye.verdict.bag.start, eye.verdict.bag.mtime_ns) == (22, NOW - 50 * S)
+    scan.run(path, age_s=50)
+    assert scan.classification is not None
+    assert scan.classification.bag is not None
+    assert (scan.classification.bag.start, scan.classification.bag.mtime_ns) == (22, NOW - 50 * S)
 
 
 def test_a_damaged_file_is_tried_again_when_it_changed_or_after_ten_minutes(
-    eye: Eye, tmp_path: Path
+    scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = tmp_path / "rec_0.mcap"
     path.write_text("junk", encoding="utf-8")
-    eye.look(path, age_s=100)
-    eye.look(path, now=NOW + RETRY_NS - 1)
-    assert eye.reader.summaries.total() == 1
-    eye.look(path, now=NOW + RETRY_NS)
-    assert eye.reader.summaries.total() == 2
+    scan.run(path, age_s=100)
+    scan.run(path, now=NOW + RETRY_NS - 1)
+    assert scan.reader.summaries.total() == 1
+    scan.run(path, now=NOW + RETRY_NS)
+    assert scan.reader.summaries.total() == 2
     path.chmod(0o600)
-    eye.look(path, now=NOW + RETRY_NS + 1)
-    assert eye.reader.summaries.total() == 3
+    scan.run(path, now=NOW + RETRY_NS + 1)
+    assert scan.reader.summaries.total() == 3
     plain(path, [1])
-    assert eye.look(path, age_s=100) is FileState.CLOSED
+    assert scan.run(path, age_s=100) is FileState.CLOSED
 
 
-def test_a_file_that_cannot_be_opened_is_damaged(eye: Eye, tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_opened_is_damaged(scan: RepeatedScan, tmp_path: Path) -> None:
     class Locked(PlainReader):
         def closing(self, path: Path) -> Closing:
             raise BagError(str(path), "cannot be opened: Permission denied")
 
-    eye.reader = Locked()
+    scan.reader = Locked()
     path = plain(tmp_path / "rec_0.mcap", [1])
     for _ in range(2):
-        assert eye.look(path, age_s=0) is FileState.DAMAGED
-        assert eye.reason() == "cannot be opened: Permission denied"
-    assert eye.reader.summaries.total() == 0
+        assert scan.run(path, age_s=0) is FileState.DAMAGED
+        assert scan.reason() == "cannot be opened: Permission denied"
+    assert scan.reader.summaries.total() == 0
 
 
-def test_a_file_that_vanishes_while_it_is_read_is_no_verdict(eye: Eye, tmp_path: Path) -> None:
+def test_a_file_that_vanishes_while_it_is_read_is_not_classified(
+    scan: RepeatedScan, tmp_path: Path
+) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1])
-    eye.reader.before_summary = Path.unlink
+    scan.reader.before_summary = Path.unlink
     with pytest.raises(BagVanishedError):
-        eye.look(path, age_s=0)
+        scan.run(path, age_s=0)
 
 
 @pytest.mark.parametrize(
-    ("age_s", "standing"),
+    ("age_s", "state"),
     [(0, FileState.ACTIVE), (30, FileState.ACTIVE), (30.001, FileState.CLOSED)],
 )
 def test_a_db3_that_looks_closed_is_active_for_three_splits(
-    eye: Eye, tmp_path: Path, age_s: float, standing: FileState
+    scan: RepeatedScan, tmp_path: Path, age_s: float, state: FileState
 ) -> None:
     path = plain(tmp_path / "rec" / "rec_0.db3", [1])
-    assert eye.look(path, age_s=age_s) is standing
-    assert eye.is_watched() is (standing is FileState.ACTIVE)
+    assert scan.run(path, age_s=age_s) is state
+    assert scan.is_watched() is (state is FileState.ACTIVE)
 
 
 @pytest.mark.parametrize("name", ["rec_0.db3", "rec_1.db3", "rec_2.db3"])
 def test_a_db3_that_metadata_mentions_is_closed_at_once(
-    eye: Eye, tmp_path: Path, name: str
+    scan: RepeatedScan, tmp_path: Path, name: str
 ) -> None:
     path = plain(tmp_path / "rec" / name, [1])
     (path.parent / "metadata.yaml").write_text(METADATA, encoding="utf-8")
-    assert eye.look(path, age_s=0) is FileState.CLOSED
+    assert scan.run(path, age_s=0) is FileState.CLOSED
 
 
 @pytest.mark.parametrize("name", ["rec_3.db3", "c_0.db3"])
-def test_a_db3_that_metadata_does_not_mention_is_not(eye: Eye, tmp_path: Path, name: str) -> None:
+def test_a_db3_that_metadata_does_not_mention_is_not(
+    scan: RepeatedScan, tmp_path: Path, name: str
+) -> None:
     path = plain(tmp_path / "rec" / name, [1])
     (path.parent / "metadata.yaml").write_text(METADATA, encoding="utf-8")
-    assert eye.look(path, age_s=0) is FileState.ACTIVE
+    assert scan.run(path, age_s=0) is FileState.ACTIVE
 
 
 def test_a_young_db3_is_active_only_where_no_heartbeat_names_other_recordings(
-    eye: Eye, tmp_path: Path
+    scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec" / "rec_0.db3", [1])
-    assert eye.look(path, age_s=5, names={"rec"}) is FileState.ACTIVE
-    assert eye.look(path, age_s=5, names={"rec_2"}) is FileState.CLOSED
-    assert eye.is_watched()
-    assert eye.look(path, age_s=5) is FileState.ACTIVE
+    assert scan.run(path, age_s=5, names={"rec"}) is FileState.ACTIVE
+    assert scan.run(path, age_s=5, names={"rec_2"}) is FileState.CLOSED
+    assert scan.is_watched()
+    assert scan.run(path, age_s=5) is FileState.ACTIVE
 
 
-def test_a_finished_split_of_a_db3_recording_under_way_is_closed(eye: Eye, tmp_path: Path) -> None:
+def test_a_finished_split_of_a_db3_recording_under_way_is_closed(
+    scan: RepeatedScan, tmp_path: Path
+) -> None:
     path = plain(tmp_path / "rec" / "rec_0.db3", [1])
-    assert eye.look(path, age_s=31, names={"rec"}) is FileState.CLOSED
+    assert scan.run(path, age_s=31, names={"rec"}) is FileState.CLOSED
 
 
 @pytest.mark.parametrize("kind", [".mcap.zstd", ".db3.zstd"])
 def test_a_compressed_bag_is_closed_as_soon_as_its_frame_is_whole(
-    eye: Eye, tmp_path: Path, kind: str
+    scan: RepeatedScan, tmp_path: Path, kind: str
 ) -> None:
     path = plain(tmp_path / f"rec_0{kind}", [1], closed=False)
-    assert eye.look(path, age_s=0) is FileState.ACTIVE
+    assert scan.run(path, age_s=0) is FileState.ACTIVE
     close(path)
-    assert eye.look(path, age_s=0) is FileState.CLOSED
+    assert scan.run(path, age_s=0) is FileState.CLOSED
 
 
 def test_metadata_that_is_missing_or_no_file_mentions_nothing(tmp_path: Path) -> None:
@@ -399,39 +417,39 @@ def test_metadata_of_any_bytes_is_read_for_the_lines_that_name_bags(tmp_path: Pa
 class TestWhereNothingIsRecorded:
     """A young mtime may be that of a copy."""
 
-    def look(self, path: Path, kind: str, *ages_s: float) -> list[FileState]:
-        eye = Eye(path.parent, kind)
-        eye.trusts_mtime = False
-        return [eye.look(path, age_s=age_s) for age_s in ages_s]
+    def run(self, path: Path, kind: str, *ages_s: float) -> list[FileState]:
+        scan = RepeatedScan(path.parent, kind)
+        scan.trusts_mtime = False
+        return [scan.run(path, age_s=age_s) for age_s in ages_s]
 
     @pytest.mark.parametrize("old_s", [31, 3600, -3600, 1.8e9])
     @pytest.mark.parametrize(
-        ("kind", "closed", "standing"),
+        ("kind", "closed", "state"),
         [(".mcap", False, FileState.INCOMPLETE), (".db3", True, FileState.CLOSED)],
     )
     def test_a_copy_of_other_times_is_not_being_written(
-        self, tmp_path: Path, old_s: float, kind: str, closed: bool, standing: FileState
+        self, tmp_path: Path, old_s: float, kind: str, closed: bool, state: FileState
     ) -> None:
         path = plain(tmp_path / f"bag{kind}", [NOW - round(old_s * S)], closed=closed)
-        assert self.look(path, kind, 0) == [standing]
+        assert self.run(path, kind, 0) == [state]
 
     @pytest.mark.parametrize(("kind", "closed"), [(".mcap", False), (".db3", True)])
     def test_the_recording_of_another_program_is(
         self, tmp_path: Path, kind: str, closed: bool
     ) -> None:
         path = plain(tmp_path / f"bag{kind}", [NOW - 3600 * S, NOW - 5 * S], closed=closed)
-        assert self.look(path, kind, 0) == [FileState.ACTIVE]
+        assert self.run(path, kind, 0) == [FileState.ACTIVE]
 
     def test_so_is_one_without_a_message_yet(self, tmp_path: Path) -> None:
         (tmp_path / "bag.mcap").touch()
-        assert self.look(tmp_path / "bag.mcap", ".mcap", 0) == [FileState.ACTIVE]
+        assert self.run(tmp_path / "bag.mcap", ".mcap", 0) == [FileState.ACTIVE]
         begun = plain(tmp_path / "begun.mcap", closed=False)
-        assert self.look(begun, ".mcap", 0) == [FileState.ACTIVE]
+        assert self.run(begun, ".mcap", 0) == [FileState.ACTIVE]
 
     def test_so_is_one_that_was_seen_to_grow(self, tmp_path: Path) -> None:
         path = plain(tmp_path / "bag.mcap", [1], closed=False)
-        eye = Eye(tmp_path)
-        eye.trusts_mtime = False
-        assert eye.look(path, age_s=0) is FileState.INCOMPLETE
+        scan = RepeatedScan(tmp_path)
+        scan.trusts_mtime = False
+        assert scan.run(path, age_s=0) is FileState.INCOMPLETE
         grow(path, 2)
-        assert eye.look(path, age_s=0) is FileState.ACTIVE
+        assert scan.run(path, age_s=0) is FileState.ACTIVE

@@ -135,7 +135,7 @@ class Tail:
         return [bag.state for bag in self.memory.index.refresh().bags]
 
     def asked(self, name: str, **arguments: object) -> Any:
-        return told(self.memory, name, **arguments)
+        return reply_of(self.memory, name, **arguments)
 
 
 @cache
@@ -144,7 +144,7 @@ def tools() -> Mapping[str, Tool]:
     return {tool.name: tool for tool in build_tools(LIVE, 25.0)}
 
 
-def told(memory: Memory, name: str, **arguments: object) -> Any:
+def reply_of(memory: Memory, name: str, **arguments: object) -> Any:
     """A reply as a client gets it."""
     replies, call = Replies(Path("bags"), 24_000), Call()
     try:
@@ -177,7 +177,7 @@ def test_wherever_the_file_ends_all_whole_chunks_answer_and_nothing_that_is_not_
         assert aside.until == (T0 + (len(ticks) - 1) * TENTH if ticks else None)
         for tick in {*ticks[:1], *ticks[-1:]}:
             live = tail.asked("get_position_at", timestamp=T0 / S + tick / 10)
-            whole = told(closed(layout), "get_position_at", timestamp=T0 / S + tick / 10)
+            whole = reply_of(closed(layout), "get_position_at", timestamp=T0 / S + tick / 10)
             assert live.pop("from_active") is True
             assert {**live, "notes": None} == {**whole, "notes": None}
 
@@ -193,18 +193,18 @@ def test_by_default_the_split_being_written_does_not_answer(tmp_path: Path) -> N
 def test_an_active_file_answers_and_is_named_as_active_all_the_same(tail: Tail) -> None:
     tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
     assert tail.states() == [BagState.ACTIVE]
-    told = tail.asked("data_time_range")
-    assert (told["bags"], told["from_active"]) == (1, True)
+    reply = tail.asked("data_time_range")
+    assert (reply["bags"], reply["from_active"]) == (1, True)
     assert tail.asked("memory_status")["from_active"] is True
-    assert told["active"] == [
+    assert reply["active"] == [
         {"file": "rec_0.mcap", "reason": "still being written: its complete chunks answer"}
     ]
-    assert (told["incomplete"], told["damaged"]) == ([], [])
-    assert not any("ends early" in note for note in told.get("notes", ()))
+    assert (reply["incomplete"], reply["damaged"]) == ([], [])
+    assert not any("ends early" in note for note in reply.get("notes", ()))
 
 
 @pytest.mark.parametrize("recall", [False, True], ids=["plain", "catalogue"])
-def test_what_is_amiss_inside_is_told_before_the_split_closes(tail: Tail, recall: bool) -> None:
+def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, recall: bool) -> None:
     content, ends = split(LAYOUTS[0])
     path = tail.write("rec/rec_0.mcap", content, at=10 * S)
     spoil_chunk(path, 1)
@@ -229,7 +229,7 @@ def test_with_the_catalogue_the_same_is_answered(tail: Tail) -> None:
             ("trajectory_summary", {"start": T0 / S, "end": T0 / S + 30}),
             ("get_topic_in_range", {"topic": "/odom", "start": T0 / S, "end": T0 / S + 30}),
         ):
-            assert told(catalogued, name, **arguments) == tail.asked(name, **arguments)
+            assert reply_of(catalogued, name, **arguments) == tail.asked(name, **arguments)
 
 
 def test_a_file_that_is_no_bag_yet_stays_aside(tail: Tail) -> None:
@@ -322,13 +322,13 @@ def test_what_the_older_of_two_recordings_has_yet_to_write_is_no_gap(tmp_path: P
     missing = {"timestamp": T0 / S + 8.5, "tolerance_s": 0.2}
     within = {"topic": "/odom", "start": T0 / S + 8, "end": T0 / S + 8.8}
     assert tail.ticks() == [*range(reach), *range(90, tail.ticks()[-1] + 1)]
-    for told in (
+    for reply in (
         tail.asked("get_position_at", **missing),
         tail.asked("get_topic_in_range", **within),
     ):
-        assert told["reason"] == "not_closed_yet"
-        assert told["notes"] == ["still being written and not all on disk yet: a/a_0.mcap"]
-        assert "again in 3 s" in told["detail"]
+        assert reply["reason"] == "not_closed_yet"
+        assert reply["notes"] == ["still being written and not all on disk yet: a/a_0.mcap"]
+        assert "again in 3 s" in reply["detail"]
     tail.write("a/a_0.mcap", old, at=12 * S)
     assert tail.asked("get_position_at", **missing)["x"] == pytest.approx(8.5)
 
@@ -336,8 +336,8 @@ def test_what_the_older_of_two_recordings_has_yet_to_write_is_no_gap(tmp_path: P
 def test_between_messages_that_are_on_disk_a_gap_is_one_while_more_is_written(tail: Tail) -> None:
     content = written(tail.bag_dir / "x" / "x_0.mcap", [*driven(0, 30), *driven(50, 60)])
     tail.write("rec/rec_0.mcap", content[: len(content) * 9 // 10], at=11 * S)
-    told = tail.asked("get_position_at", timestamp=T0 / S + 4.5, tolerance_s=0.5)
-    assert told["reason"] == "gap"
+    reply = tail.asked("get_position_at", timestamp=T0 / S + 4.5, tolerance_s=0.5)
+    assert reply["reason"] == "gap"
 
 
 def test_where_the_robot_was_2_s_ago_is_answered_and_says_from_what(tail: Tail) -> None:
@@ -348,9 +348,9 @@ def test_where_the_robot_was_2_s_ago_is_answered_and_says_from_what(tail: Tail) 
     at = tail.memory.index.snapshot().latest
     assert at is not None
     tail.clock.at = at + 2 * S
-    told = tail.asked("get_position_seconds_ago", seconds_ago=2)
-    assert told["x"] == pytest.approx((at - T0) / S)
-    assert told["from_active"] is True
+    reply = tail.asked("get_position_seconds_ago", seconds_ago=2)
+    assert reply["x"] == pytest.approx((at - T0) / S)
+    assert reply["from_active"] is True
     assert "from_active" not in tail.asked("get_position_at", timestamp=T0 / S + 5)
     ranged = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 5)
     assert "from_active" not in ranged
@@ -362,10 +362,10 @@ def test_past_what_is_on_disk_the_answer_says_where_that_ends(tail: Tail) -> Non
     assert end is not None
     sentence = f"nothing after {end / S:.6f} is on disk yet"
     tail.clock.at = end + 4 * S
-    told = tail.asked("get_position_seconds_ago", seconds_ago=1)
-    assert (told["reason"], told["notes"]) == ("not_closed_yet", [sentence])
-    assert "again in 3 s" in told["detail"]
-    assert "closes" not in told["detail"]
+    reply = tail.asked("get_position_seconds_ago", seconds_ago=1)
+    assert (reply["reason"], reply["notes"]) == ("not_closed_yet", [sentence])
+    assert "again in 3 s" in reply["detail"]
+    assert "closes" not in reply["detail"]
     assert sentence in tail.asked("get_topic_in_last", topic="/odom", seconds=60)["notes"]
     before = (end - TENTH) / S
     inside = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=before)
@@ -374,9 +374,9 @@ def test_past_what_is_on_disk_the_answer_says_where_that_ends(tail: Tail) -> Non
 
 def test_a_first_split_of_which_nothing_is_on_disk_yet_is_no_empty_memory(tail: Tail) -> None:
     tail.write("rec/rec_0.mcap", b"", at=S)
-    told = tail.asked("get_position_seconds_ago", seconds_ago=1)
-    assert told["reason"] == "not_closed_yet"
-    assert told["detail"] == "nothing of the first split is on disk yet; ask again in 3 s"
+    reply = tail.asked("get_position_seconds_ago", seconds_ago=1)
+    assert reply["reason"] == "not_closed_yet"
+    assert reply["detail"] == "nothing of the first split is on disk yet; ask again in 3 s"
 
 
 def test_of_two_files_being_written_the_one_that_is_behind_is_named(tail: Tail) -> None:
@@ -384,10 +384,10 @@ def test_of_two_files_being_written_the_one_that_is_behind_is_named(tail: Tail) 
     tail.write("a/a_0.mcap", content[:5000], at=5 * S)
     tail.write("b/b_0.mcap", content[:9000], at=5 * S)
     behind, ahead = sorted(aside.until or 0 for aside in tail.memory.index.snapshot().active)
-    told = tail.asked(
+    reply = tail.asked(
         "get_topic_in_range", topic="/odom", start=(behind + TENTH) / S, end=(ahead - TENTH) / S
     )
-    assert told["notes"][0] == "still being written and not all on disk yet: a/a_0.mcap"
+    assert reply["notes"][0] == "still being written and not all on disk yet: a/a_0.mcap"
 
 
 def test_each_call_says_for_itself_whether_it_drew_on_what_is_being_written(tail: Tail) -> None:
@@ -398,11 +398,11 @@ def test_each_call_says_for_itself_whether_it_drew_on_what_is_being_written(tail
         tail.memory, [*tools().values()], Replies(tail.bag_dir, 24_000), call_timeout_s=25.0
     )
     old, new = {"timestamp": T0 / S + 5}, {"timestamp": T0 / S + 11}
-    said: list[bool] = []
+    from_active: list[bool] = []
 
     async def ask(arguments: dict[str, float]) -> None:
         reply = json.loads((await dispatcher.answer("get_position_at", arguments)).text)
-        said.append(reply.get("from_active", False))
+        from_active.append(reply.get("from_active", False))
         assert reply.get("from_active", False) is (arguments is new), reply
 
     async def go() -> None:
@@ -411,7 +411,7 @@ def test_each_call_says_for_itself_whether_it_drew_on_what_is_being_written(tail
                 group.start_soon(ask, arguments)
 
     anyio.run(go)
-    assert said.count(True) == said.count(False) == 20
+    assert from_active.count(True) == from_active.count(False) == 20
 
 
 def test_lists_have_no_place_for_it_and_stay_lists(tail: Tail) -> None:

@@ -29,8 +29,8 @@ def _aged(root: Path, at: int = LONG_AGO) -> Path:
     return root
 
 
-def _names(walked: ScanResult) -> list[str]:
-    return sorted(Path(path).name for path in walked.stamps)
+def _names(scanned: ScanResult) -> list[str]:
+    return sorted(Path(path).name for path in scanned.stamps)
 
 
 @pytest.mark.parametrize(
@@ -69,8 +69,8 @@ def test_bags_are_found_at_any_depth_and_foreign_files_are_not(tmp_path: Path) -
 def test_what_a_file_system_check_put_aside_is_left_out(tmp_path: Path) -> None:
     _file(tmp_path / "lost+found" / "a.mcap")
     _file(tmp_path / "b.mcap")
-    walked = Tree(tmp_path).scan(NOW, ())
-    assert (_names(walked), walked.damaged) == (["b.mcap"], [])
+    scanned = Tree(tmp_path).scan(NOW, ())
+    assert (_names(scanned), scanned.damaged) == (["b.mcap"], [])
 
 
 def test_folders_and_files_that_begin_with_a_dot_are_left_out(tmp_path: Path) -> None:
@@ -124,8 +124,8 @@ def test_a_watched_file_is_looked_at_though_its_folder_did_not_change(tmp_path: 
     tree = Tree(_aged(tmp_path))
     tree.scan(NOW, ())
     _file(path, "longer")
-    walked = tree.scan(NOW, [str(path)])
-    assert {key: stamp.size for key, stamp in walked.stamps.items()} == {str(path): 6}
+    scanned = tree.scan(NOW, [str(path)])
+    assert {key: stamp.size for key, stamp in scanned.stamps.items()} == {str(path): 6}
 
 
 def test_what_vanished_is_named_once(tmp_path: Path) -> None:
@@ -171,14 +171,14 @@ def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
     tree = Tree(_aged(bags))
     first, second = tree.scan(NOW, ()), tree.scan(NOW, ())
     assert _names(first) == ["b.mcap"]
-    for walked in (first, second):
-        assert sorted(each.path.name for each in walked.links) == [
+    for scanned in (first, second):
+        assert sorted(each.path.name for each in scanned.links) == [
             "broken.mcap",
             "c.mcap",
             "latest",
             "up",
         ]
-        assert all("not followed" in each.reason for each in walked.links)
+        assert all("not followed" in each.reason for each in scanned.links)
 
 
 def test_the_bag_directory_itself_may_be_a_link(tmp_path: Path) -> None:
@@ -192,9 +192,9 @@ def test_the_bag_directory_itself_may_be_a_link(tmp_path: Path) -> None:
 def test_a_pipe_with_the_name_of_a_bag_is_damaged_and_never_opened(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.mcap")
     tree = Tree(_aged(tmp_path))
-    for walked in (tree.scan(NOW, ()), tree.scan(NOW, ())):
-        assert walked.stamps == {}
-        assert [(each.path.name, each.reason) for each in walked.damaged] == [
+    for scanned in (tree.scan(NOW, ()), tree.scan(NOW, ())):
+        assert scanned.stamps == {}
+        assert [(each.path.name, each.reason) for each in scanned.damaged] == [
             ("a.mcap", "not a regular file")
         ]
 
@@ -206,9 +206,9 @@ def test_a_folder_that_cannot_be_listed_is_damaged_and_hides_no_other(tmp_path: 
     first, second = tree.scan(NOW, ()), tree.scan(NOW, ())
     assert _names(first) == ["a.mcap"]
     assert second.gone == set()
-    for walked in (first, second):
-        assert [each.path.parts[len(tmp_path.parts)] for each in walked.damaged] == [deep]
-        assert walked.damaged[0].reason == "the directory cannot be listed: File name too long"
+    for scanned in (first, second):
+        assert [each.path.parts[len(tmp_path.parts)] for each in scanned.damaged] == [deep]
+        assert scanned.damaged[0].reason == "the directory cannot be listed: File name too long"
 
 
 @pytest.mark.parametrize("kind", ["missing", "file"])
@@ -222,11 +222,11 @@ def test_a_root_that_is_no_directory_is_a_problem_and_empties_the_tree(
     bags.rename(tmp_path / "aside")
     if kind == "file":
         bags.write_text("", encoding="utf-8")
-    walked = tree.scan(NOW, [str(path)])
-    assert walked.gone == {str(path)}
-    assert walked.stamps == {}
+    scanned = tree.scan(NOW, [str(path)])
+    assert scanned.gone == {str(path)}
+    assert scanned.stamps == {}
     assert ("does not exist" if kind == "missing" else "recording.bag_dir") in (
-        walked.problem or ""
+        scanned.problem or ""
     )
     bags.unlink(missing_ok=True)
     (tmp_path / "aside").rename(bags)

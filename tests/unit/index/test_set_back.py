@@ -30,7 +30,7 @@ LAYOUTS: Final = {
 }
 
 
-def said(seconds: float) -> Msg:
+def message(seconds: float) -> Msg:
     return text(T0 + round(seconds * S), "x" * 100)
 
 
@@ -47,24 +47,24 @@ def layout(request: pytest.FixtureRequest) -> McapLayout:
 def test_how_far_it_was_set_back_is_told_whatever_the_layout(
     tmp_path: Path, layout: McapLayout
 ) -> None:
-    way = [said(n) for n in range(20)] + [said(n - STEP) for n in range(20, 40)]
-    found = set_back(tmp_path / "a.mcap", way, layout)
-    # Chunks hold two messages: what lies within one of them is not told apart.
+    messages = [message(n) for n in range(20)] + [message(n - STEP) for n in range(20, 40)]
+    found = set_back(tmp_path / "a.mcap", messages, layout)
+    # Chunks hold two messages: what lies within one of them is not result apart.
     assert (STEP - 3) * S <= found <= (STEP - 1) * S
 
 
 def test_messages_a_little_out_of_order_are_no_sign_of_it(
     tmp_path: Path, layout: McapLayout
 ) -> None:
-    way = [said(n - 0.9 * (n % 2)) for n in range(20)]
-    assert set_back(tmp_path / "a.mcap", way, layout) == 0
+    messages = [message(n - 0.9 * (n % 2)) for n in range(20)]
+    assert set_back(tmp_path / "a.mcap", messages, layout) == 0
 
 
 def test_topics_that_were_written_one_after_another_are_no_sign_of_it(
     tmp_path: Path, layout: McapLayout
 ) -> None:
-    way = [said(n) for n in range(20)] + [boolean(T0 + n * S, data=True) for n in range(20)]
-    assert set_back(tmp_path / "a.mcap", way, layout) == 0
+    messages = [message(n) for n in range(20)] + [boolean(T0 + n * S, data=True) for n in range(20)]
+    assert set_back(tmp_path / "a.mcap", messages, layout) == 0
 
 
 @settings(max_examples=40, deadline=None)
@@ -75,7 +75,7 @@ def test_topics_that_were_written_one_after_another_are_no_sign_of_it(
 def test_it_is_never_more_than_the_times_of_a_topic_go_back(times: list[int], name: str) -> None:
     most = max(max(times[: at + 1]) - time for at, time in enumerate(times))
     with TemporaryDirectory() as folder:
-        found = set_back(Path(folder) / "a.mcap", [said(each) for each in times], LAYOUTS[name])
+        found = set_back(Path(folder) / "a.mcap", [message(each) for each in times], LAYOUTS[name])
     assert found <= most * S
     assert found == 0 or found > S
     if name == "without chunks":
@@ -83,19 +83,21 @@ def test_it_is_never_more_than_the_times_of_a_topic_go_back(times: list[int], na
 
 
 def test_it_is_listed_and_told_where_it_matters_and_changes_no_span(tmp_path: Path) -> None:
-    way = [said(n) for n in range(20)] + [said(n - STEP) for n in range(20, 50)]
-    write_mcap(tmp_path / "a.mcap", way, LAYOUTS["indexed"])
+    messages = [message(n) for n in range(20)] + [message(n - STEP) for n in range(20, 50)]
+    write_mcap(tmp_path / "a.mcap", messages, LAYOUTS["indexed"])
     memory = memory_of(tmp_path)
     [fault] = data_time_range(memory, Call()).clock_faults
     assert "set back by 28 s or more while it was being written" in fault.reason
     assert data_time_range(memory, Call()).earliest == T0 - 10 * S
-    told = topic_range(memory, Call(), way[0].topic, TimeRange(start_s=T0 / S, end_s=T0 / S + 10))
-    assert any("set back" in note for note in told.notes)
+    result = topic_range(
+        memory, Call(), messages[0].topic, TimeRange(start_s=T0 / S, end_s=T0 / S + 10)
+    )
+    assert any("set back" in note for note in result.notes)
 
 
 def test_the_catalogue_keeps_it(tmp_path: Path) -> None:
-    way = [said(n) for n in range(20)] + [said(n - STEP) for n in range(20, 40)]
-    write_mcap(tmp_path / "a.mcap", way, LAYOUTS["indexed"])
+    messages = [message(n) for n in range(20)] + [message(n - STEP) for n in range(20, 40)]
+    write_mcap(tmp_path / "a.mcap", messages, LAYOUTS["indexed"])
     shape = McapReader().summarize(tmp_path / "a.mcap").schema
     assert shape.set_back
     assert decode_schema(encode_schema(shape)) == shape
