@@ -39,18 +39,18 @@ def asked(
     bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW
 ) -> PendingRequest:
     """Asks for what was recorded in these seconds."""
-    slot = PendingRequest(bag_dir, label, T0 + start * S, T0 + end * S, at)
-    slot.post()
-    return slot
+    pending = PendingRequest(bag_dir, label, T0 + start * S, T0 + end * S, at)
+    pending.post()
+    return pending
 
 
 def kept(
     house: Housekeeping, bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW
 ) -> Outcome:
-    slot = asked(bag_dir, start, end, label, at)
+    pending = asked(bag_dir, start, end, label, at)
     house.keep_moments()
-    outcome = slot.outcome()
-    slot.close()
+    outcome = pending.outcome()
+    pending.close()
     assert outcome is not None
     return outcome
 
@@ -69,5 +69,5 @@ def in_moments(bag_dir: Path) -> list[str]:
 
 def told_of(bag_dir: Path) -> dict[str, Any]:
     [path] = (bag_dir / "moments").glob(f"*/{MOMENT_FILE}")
-    told: dict[str, Any] = json.loads(path.read_text())
-    return told
+    reported: dict[str, Any] = json.loads(path.read_text())
+    return reported

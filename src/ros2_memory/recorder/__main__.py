@@ -111,8 +111,8 @@ def _lock_bag_dir(bag_dir: Path, *, clear: bool) -> BagDirLock:
     """Makes the bag directory where it does not exist, and locks it.
 
     Raises:
-        RecorderError: another recorder holds it, it cannot be written to, or it is to be cleared
-            and holds a home directory.
+        RecorderError: another recorder has locked it, it cannot be written to, or it is to be
+            cleared and contains a home directory.
     """
     if clear:
         refuse_homes(bag_dir)

@@ -1,6 +1,6 @@
 """The port for recording and its null adapter, and what a recorder asks of its housekeeper.
 
-The docstrings of `Recorder` are the contract; one suite holds every adapter to it.
+The docstrings of `Recorder` are the contract; one test suite checks every adapter.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class NullRecorder(Recorder):
         """Does nothing."""
 
     def start(self) -> None:
-        """Does nothing; `is_running` stays False."""
+        """Does nothing; `is_running` remains False."""
 
     def tick(self) -> None:
         """Does nothing."""
@@ -81,8 +81,8 @@ class NullRecorder(Recorder):
 class Housekeeper:
     """Repairs what crashes left and deletes what exceeds the limits. This base class does nothing.
 
-    The recorder calls it between two ticks, so a call should return at once; the work may go on in
-    the background.
+    The recorder calls it between two ticks, so a call should return at once; the work may
+    continue in the background.
     """
 
     def repair(self) -> None:

@@ -43,7 +43,7 @@ class EventLog:
         _log.info(event, **values)
 
     def warn(self, event: str, sentence: str, **values: object) -> None:
-        """Logs a fault that recording goes on with."""
+        """Logs a fault that does not stop recording."""
         self.last_error = sentence
         _log.warning(event, reason=sentence, **values)
 

@@ -54,7 +54,7 @@ _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 class Housekeeping(Housekeeper):
-    """Repairs and deletes in one bag directory, whose lock its caller holds.
+    """Repairs and deletes in one bag directory, which its caller has locked.
 
     Args:
         bag_dir: the bag directory.
@@ -170,7 +170,7 @@ class Housekeeping(Housekeeper):
             self._index.refresh()
 
     def keep_moments(self) -> None:
-        """Saves the moments that were asked for, and goes on with those that wait for bags.
+        """Saves the moments that were asked for, and continues those that wait for bags.
 
         Raises:
             OSError: the folders of requests or moments cannot be listed or written to.
@@ -348,8 +348,9 @@ class Housekeeping(Housekeeper):
 class BackgroundHousekeeper(Housekeeper):
     """Runs the tasks of another housekeeper in threads, so that its methods return at once.
 
-    The first scan of a week of bags takes from seconds to minutes, in which the recorder must go on
-    and answer the service manager's watchdog. Only `repair` waits: nothing is recorded yet.
+    The first scan of a week of bags takes from seconds to minutes, in which the recorder must
+    continue and answer the service manager's watchdog. Only `repair` waits: nothing is recorded
+    yet.
     """
 
     def __init__(self, housekeeper: Housekeeper) -> None:

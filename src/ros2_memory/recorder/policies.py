@@ -1,4 +1,4 @@
-"""When to begin anew, when to make room or pause, and what a silence means. Pure decisions."""
+"""Decides when to start again, rotate, make room and pause. Pure."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def space_action(
 
     Args:
         free_bytes: what the file system of the bag directory has left for this user.
-        min_free_bytes: what it must have for recording to go on.
+        min_free_bytes: what it must have for recording to continue.
         paused: whether recording is paused.
         room_requested: whether deleting was requested for this shortage already.
         making_room: whether that is still under way; it is waited for while half of

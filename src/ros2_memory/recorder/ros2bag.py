@@ -54,7 +54,7 @@ class Ros2BagRecorder(Recorder):
         split_duration_s: length of one bag file, whole seconds.
         session_duration_s: how long one recording lasts before the next takes over.
         use_sim_time: whether log times come from `/clock`.
-        min_free_gb: what must be free on the disk for recording to go on, in 10^9 bytes.
+        min_free_gb: what must be free on the disk for recording to continue, in 10^9 bytes.
         setup_files: bash files that make the ROS environment.
         latched_topics: topics whose publishers are transient local; of those that `topics_file`
             names, all messages are recorded, however many there are.

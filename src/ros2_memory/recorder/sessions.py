@@ -1,4 +1,4 @@
-"""The recordings under way: mostly one, two during a handover, and those that are ending.
+"""Runs the recordings: mostly one, two during a handover, and those that are ending.
 
 This module does each step; `supervisor` decides when. Nothing here waits, except `stop`.
 """
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 WHOLE_RECORDING_S: Final = 15.0
-"""A recording that lived for less says nothing about topics that brought no message."""
+"""A recording that lived for less is too short to report topics without messages."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +70,7 @@ class RecordingSessions:
     Attributes:
         current: the session that records; None while none does.
         handover: the handover from the current session to the next; None mostly.
-        restarts: how often a recording had to be begun anew.
+        restarts: how often a recording had to be started again.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class RecordingSessions:
         """Starts a recording that is to take over from the current one.
 
         Raises:
-            RecorderError: it cannot be started; the current one goes on.
+            RecorderError: it cannot be started; the current one continues.
         """
         old = self.current
         if old is None or self.handover is not None:
@@ -279,7 +279,7 @@ class RecordingSessions:
         self._events.info("rotated", recording=handover.old.name, next=handover.new.name)
 
     def _abandon(self, handover: HandoverTransfer) -> None:
-        """Ends the new session; the old one goes on."""
+        """Ends the new session; the old one continues."""
         self.handover = None
         with self._reported(handover.old):
             handover.abandon()
@@ -292,7 +292,7 @@ class RecordingSessions:
         if handover is not None:
             self.current = handover.new
             with self._reported(handover.old):
-                handover.settle()
+                handover.recover()
 
     def _handle_vanished(self, session: RecordingSession) -> None:
         sentence = f"the directory of recording {session.name} has gone; a new one is begun"
@@ -345,7 +345,7 @@ class RecordingSessions:
 
     @contextmanager
     def _reported(self, session: RecordingSession) -> Iterator[None]:
-        """Reports an error of the handover from this session, and goes on after the block."""
+        """Reports an error of the handover from this session, and continues after the block."""
         try:
             yield
         except RecorderError as error:

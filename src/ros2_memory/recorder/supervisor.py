@@ -43,7 +43,7 @@ MOMENTS_S: Final = 1.0
 FAULT_S: Final = 60.0
 """How often a failing task, which every tick tries again, is reported."""
 SETTLE_S: Final = 5.0
-"""A recording this young writes its headers and latched messages, which say nothing of silence."""
+"""A recording this young writes its headers and latched messages, which do not end a silence."""
 RETENTION_S: Final = 10.0
 """How often the limits are applied when splits were closed."""
 QUIET_RETENTION_S: Final = 60.0

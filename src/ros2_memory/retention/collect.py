@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ros2_memory.retention.recorded_time import RecordedTime
 
 MOST_AT_ONCE: Final = 2000
-"""Bags deleted in one pass, which take some tenths of a second. The next pass goes on."""
+"""Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -197,15 +197,15 @@ class GarbageCollector:
         snapshot: Snapshot,
         run: _Pass,
     ) -> None:
-        leaving = {Path(bag.path) for bag in to_delete} | {Path(path) for path in run.deleted}
-        latched = {str(bag.path) for bag in self._carrier.with_latched(snapshot, leaving)}
+        paths = {Path(bag.path) for bag in to_delete} | {Path(path) for path in run.deleted}
+        latched = {str(bag.path) for bag in self._carrier.with_latched(snapshot, paths)}
         try:
             run.saved |= {
                 Path(bag.path)
                 for bag in to_delete
                 if any(each.inode in saved for each in bag.files)
             }
-            carried = self._carrier.carry(snapshot, leaving, run.saved)
+            carried = self._carrier.carry(snapshot, paths, run.saved)
         except (EpisodicError, OSError) as error:
             # Bags without latched messages can be deleted all the same, and may make enough room.
             reason = f"its latched messages cannot be carried on: {error}"

@@ -1,7 +1,7 @@
 """Deletes bags and the files that belong to them, and never anything else.
 
 Every name is looked up below the bag directory without following a link, and a bag file is deleted
-only while it is the very file that was judged. A recording's directory goes when it is empty.
+only while it is the very file that was judged. A recording's directory is deleted when it is empty.
 """
 
 from __future__ import annotations
@@ -71,10 +71,10 @@ def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
 def remove_emptied(root: Path, recording: Path) -> int:
     """Deletes a recording of which no bag is left; returns how many files were deleted.
 
-    A file that is not known by name stays, and so does the directory then.
+    A file that is not known by name is kept, and so is the directory then.
 
     Raises:
-        OSError: something that has to go cannot be deleted.
+        OSError: a file or the directory cannot be deleted.
     """
     if recording == root:
         return 0

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
 """Data derived from bags, and the logs of `ros2`."""
-SETTLED_NS: Final[Ns] = 120 * NS_PER_S
+COMPLETE_AFTER_NS: Final[Ns] = 120 * NS_PER_S
 """A directory that has not changed for so long is complete."""
 _BLOCK: Final = 4096
 _WHOLE: Final = frozenset({FileState.CLOSED, FileState.EMPTY})
@@ -82,7 +82,7 @@ class _Folder(NamedTuple):
     """
 
     mtime_ns: Ns
-    settled: bool
+    is_complete: bool
     device: int
     size: int
     ctime_ns: Ns = 0
@@ -177,7 +177,7 @@ class Inventory:
         return self._own.lists(name, self._folder(recording, now).identity)
 
     def _counts(self, deletable: Deletable, bag: StoredBag) -> bool:
-        """Whether a bag that stays counts among the other bytes."""
+        """Whether a bag that is kept counts among the other bytes."""
         if deletable is Deletable.DAMAGED:
             # Where all bags may be deleted, only its name shows whether the recorder made it.
             return self._own is not None or has_own_name(Path(bag.recording).name)
@@ -238,12 +238,12 @@ class Inventory:
         try:
             status = Path(path).stat()
         except OSError:
-            return _Folder(0, settled=False, device=-1, size=0)
-        if known is None or not known.settled or known.mtime_ns != status.st_mtime_ns:
+            return _Folder(0, is_complete=False, device=-1, size=0)
+        if known is None or not known.is_complete or known.mtime_ns != status.st_mtime_ns:
             # metadata.yaml is created first and written some moments later.
             since = abs(now - status.st_mtime_ns)
             size = beside_bags(Path(path))
-            known = _Folder(status.st_mtime_ns, since >= SETTLED_NS, status.st_dev, size)
+            known = _Folder(status.st_mtime_ns, since >= COMPLETE_AFTER_NS, status.st_dev, size)
             self._folders[path] = known
         if known.ctime_ns != status.st_ctime_ns or known.identity is None:
             identity = None

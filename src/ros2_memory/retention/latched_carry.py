@@ -169,8 +169,8 @@ class Carrier:
             BagError: it cannot be written; what was carried before still is.
             OSError: likewise.
         """
-        leaving = self.with_latched(snapshot, to_delete)
-        if not leaving:
+        with_messages = self.with_latched(snapshot, to_delete)
+        if not with_messages:
             return None
         topics = self._topics(snapshot)
         gone = {*to_delete} - {*saved}
@@ -178,7 +178,7 @@ class Carrier:
         carried = dict(self._carried(topics))
         origins = dict(carried)
         remaining = {self._folder(bag.path) for bag in kept}
-        for bag in leaving:
+        for bag in with_messages:
             origins.update(self._read(snapshot, bag, topics))
         wanted = worth_carrying(
             origins, _recorded_in(kept), self._repeated(snapshot, topics, to_delete)
@@ -186,7 +186,7 @@ class Carrier:
         chosen = {each[:2]: _merged_origin(each, origins, remaining) for each in wanted}
         if chosen == {each[:2]: origin for each, origin in carried.items()}:
             return None
-        sources = [self.path, *(bag.path for bag in leaving)]
+        sources = [self.path, *(bag.path for bag in with_messages)]
         fetched = sorted(self._fetched(sources, topics, chosen), key=lambda each: each.log_time)
         if len(fetched) < len(chosen):
             raise BagError(str(self.path), "a latched message could not be read a second time")

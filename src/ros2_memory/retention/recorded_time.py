@@ -1,6 +1,6 @@
 """Measures how long was recorded since each recording ended, whatever the wall clock did.
 
-The monotonic clock begins anew at every boot, so recorded time is added up and stored in
+The monotonic clock starts again at every boot, so recorded time is added up and stored in
 `.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,
 with the total recorded time when it last grew. The last line of a recording counts. A recording
 without a line counts as recorded when it is first asked about: nothing shows that it is older.
@@ -41,7 +41,7 @@ _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 class RecordedTime:
-    """The recorded time of one bag directory, whose lock the caller holds. Thread-safe.
+    """The recorded time of one bag directory, which the caller has locked. Thread-safe.
 
     The file is first read when a method is called. Recordings are directories relative to the bag
     directory, with forward slashes.

@@ -93,7 +93,7 @@ class Repairer:
         return None if repaired is None else replace(repaired, path=path)
 
     def correct_metadata(self, recording: Path) -> bool:
-        """Writes metadata.yaml by what the files hold, as `metadata.correct` does."""
+        """Rewrites metadata.yaml from the files' contents; returns whether it had to be."""
         with directories.opened(self._root, recording.absolute()):
             return correct(recording, self._reader)
 

@@ -159,7 +159,7 @@ class MomentKeeper:
         return not self._started or self._waiting or self._queue.has_requests()
 
     def keep(self, snapshot: Snapshot) -> None:
-        """Answers requests and goes on with pending moments. Nothing may be deleted meanwhile.
+        """Answers requests and continues pending moments. Nothing may be deleted meanwhile.
 
         Raises:
             OSError: the folders cannot be listed or written to; the next call tries again.
@@ -252,7 +252,7 @@ class MomentKeeper:
     def _advance(
         self, stored: StoredMoment, files: dict[int, int], snapshot: Snapshot
     ) -> StoredMoment:
-        """Goes on with a moment; what of it cannot be kept is listed in its file."""
+        """Continues a pending moment; its file lists what cannot be kept."""
         before = stored.moment
         need = self._needed(before.request, snapshot)
         try:

@@ -19,7 +19,7 @@ def no_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", lambda _descriptor: None)
 
 
-def test_recorders_that_had_to_be_started_anew_are_counted_and_rotations_are_not(
+def test_recorders_that_had_to_be_restarted_are_counted_and_rotations_are_not(
     tmp_path: Path,
 ) -> None:
     world = World(tmp_path, session_duration_s=20)

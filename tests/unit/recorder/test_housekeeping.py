@@ -143,7 +143,7 @@ class TestRetention:
         assert files_in(tmp_path / "b") == ["b_0.mcap"]
         assert not old.exists()
 
-    def test_it_is_told_once_for_each_pass_what_was_deleted(self, tmp_path: Path) -> None:
+    def test_it_is_reported_once_for_each_pass_what_was_deleted(self, tmp_path: Path) -> None:
         recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
         keeper = keeper_of(tmp_path, max_bytes=45_000)
         with structlog.testing.capture_logs() as captured:
@@ -288,26 +288,26 @@ class TestDeletionsThatFail:
         with immovable(bag(tmp_path / "a/a_0.mcap", 0)) as path:
             yield path
 
-    def test_are_told_once_and_do_not_stop_the_rest(self, tmp_path: Path, stuck: Path) -> None:
+    def test_are_reported_once_and_do_not_stop_the_rest(self, tmp_path: Path, stuck: Path) -> None:
         recording(tmp_path, "b", 100)
         keeper = keeper_of(tmp_path, max_bytes=45_000)
         with structlog.testing.capture_logs() as captured:
             keeper.apply()
             keeper.apply()
-        (told,) = events(captured, "not_deleted")
-        assert told["path"] == str(stuck)
-        assert told["reason"]
+        (reported,) = events(captured, "not_deleted")
+        assert reported["path"] == str(stuck)
+        assert reported["reason"]
         assert "b/b_0.mcap" not in files_in(tmp_path)
         assert size_of(tmp_path) <= 45_000
 
-    def test_that_the_budget_cannot_be_held_is_told_once(self, tmp_path: Path) -> None:
+    def test_that_the_budget_cannot_be_held_is_reported_once(self, tmp_path: Path) -> None:
         recording(tmp_path, "b", 100, splits=1)
         keeper = keeper_of(tmp_path, max_bytes=1)
         with structlog.testing.capture_logs() as captured:
             keeper.apply()
             keeper.apply()
-        (told,) = events(captured, "budget_not_held")
-        assert told["total_bytes"] == size_of(tmp_path)
+        (reported,) = events(captured, "budget_not_held")
+        assert reported["total_bytes"] == size_of(tmp_path)
 
 
 @contextmanager
@@ -394,14 +394,14 @@ class TestInTheBackground:
         assert all(asked)
 
     @pytest.mark.parametrize(
-        ("error", "told"),
+        ("error", "reported"),
         [
             (OSError("the disk is gone"), "the disk is gone"),
             (KeyError("x"), "a fault in this program (KeyError); see its log"),
         ],
         ids=["of the disk", "of this program"],
     )
-    def test_a_failure_is_reported(self, tmp_path: Path, error: Exception, told: str) -> None:
+    def test_a_failure_is_reported(self, tmp_path: Path, error: Exception, reported: str) -> None:
         class Failing(Housekeeper):
             mended = False
 
@@ -413,7 +413,7 @@ class TestInTheBackground:
         keeper = BackgroundHousekeeper(failing)
         keeper.apply()
         keeper.wait()
-        assert keeper.faults() == {"apply": told}
+        assert keeper.faults() == {"apply": reported}
         failing.mended = True
         keeper.apply()
         keeper.wait()
@@ -443,9 +443,9 @@ class TestQuestionsMeanwhile:
         for path in paths[: 3 - kept]:
             path.unlink()
         if kept:
-            told = queries.topic_range(memory, Call(), "/odom", span)
-            assert len(told.samples) == 19
-            [gone] = [note for note in told.notes if "deleted before" in note]
+            reported = queries.topic_range(memory, Call(), "/odom", span)
+            assert len(reported.samples) == 19
+            [gone] = [note for note in reported.notes if "deleted before" in note]
             assert gone.startswith("2 bags were deleted before they could be read: ")
             assert queries.trajectory_summary(memory, Call(), span).start == T0 + 20 * S
         else:

@@ -52,10 +52,10 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     after = McapReader().summarize(open_one)
     assert (after.complete, after.topics) == (True, readable)
     assert not empty.exists()
-    (told,) = events(captured, "bag_repaired")
-    assert told["path"] == str(open_one)
-    assert told["messages"] == after.count
-    assert told["lost_bytes"] >= 0
+    (reported,) = events(captured, "bag_repaired")
+    assert reported["path"] == str(open_one)
+    assert reported["messages"] == after.count
+    assert reported["lost_bytes"] >= 0
     assert [each["path"] for each in events(captured, "empty_split_removed")] == [str(empty)]
 
 
@@ -122,7 +122,7 @@ def test_splits_that_a_full_disk_cut_short_are_repaired_later_on(tmp_path: Path)
     assert not empty.exists()
 
 
-def test_what_cannot_be_repaired_is_told_once_and_stays(tmp_path: Path) -> None:
+def test_what_cannot_be_repaired_is_reported_once_and_stays(tmp_path: Path) -> None:
     damaged = tmp_path / OWN / f"{OWN}_0.mcap"
     damaged.parent.mkdir()
     damaged.write_bytes(b"\x89MCAP")
@@ -130,9 +130,9 @@ def test_what_cannot_be_repaired_is_told_once_and_stays(tmp_path: Path) -> None:
     with structlog.testing.capture_logs() as captured:
         keeper.apply()
         keeper.apply()
-    (told,) = events(captured, "bag_not_repaired")
-    assert told["path"] == str(damaged)
-    assert "first 5 bytes" in told["reason"]
+    (reported,) = events(captured, "bag_not_repaired")
+    assert reported["path"] == str(damaged)
+    assert "first 5 bytes" in reported["reason"]
     assert damaged.read_bytes() == b"\x89MCAP"
 
 

@@ -22,7 +22,9 @@ def test_it_never_runs_however_it_is_driven() -> None:
     assert seen == [False] * 6
 
 
-def test_it_writes_nothing_where_it_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_writes_nothing_in_its_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     recorder = NullRecorder()
     recorder.start()

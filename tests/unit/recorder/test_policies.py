@@ -25,7 +25,7 @@ class TestBackoff:
         waits = [backoff.failed(0.1) for _ in range(9)]
         assert waits == [1, 2, 4, 8, 16, 32, 60, 60, 60]
 
-    def test_begins_anew_after_a_stable_minute(self) -> None:
+    def test_starts_again_after_a_stable_minute(self) -> None:
         backoff = Backoff(first_s=1, cap_s=60, stable_s=60)
         assert [backoff.failed(59.9) for _ in range(3)] == [1, 2, 4]
         assert backoff.failed(60.0) == 1
@@ -156,7 +156,7 @@ def test_only_a_clock_set_back_by_minutes_calls_for_a_new_recording(
 
 
 class TestSilentTopics:
-    def test_nothing_is_said_where_all_were_heard(self) -> None:
+    def test_nothing_is_reported_where_all_were_heard(self) -> None:
         assert describe_silent_topics(["/odom"], ["/odom", "/tf"]) is None
         assert describe_silent_topics([], []) is None
 

@@ -31,7 +31,7 @@ def test_a_directory_that_is_not_there_yet_is_no_fault(splits: Splits) -> None:
     assert not splits.exists
 
 
-def test_a_split_is_told_once_when_it_closes(splits: Splits) -> None:
+def test_a_split_is_reported_once_when_it_closes(splits: Splits) -> None:
     write(splits, 0, "/a", finish=False)
     assert splits.observe(0) == SplitChanges()
     write(splits, 0, "/a")
@@ -50,7 +50,7 @@ def test_what_was_heard_is_counted_over_closed_splits_alone(splits: Splits) -> N
     assert splits.messages == 3
 
 
-def test_a_directory_that_was_there_and_is_gone_is_told_once(splits: Splits) -> None:
+def test_a_directory_that_was_there_and_is_gone_is_reported_once(splits: Splits) -> None:
     write(splits, 0, "/a")
     splits.observe(0)
     splits.directory.rename(splits.directory.with_name("elsewhere"))
@@ -74,7 +74,9 @@ def test_an_open_split_of_no_bytes_is_as_it_should_be(splits: Splits) -> None:
     assert [splits.observe(now).empty for now in (0, 10, 100)] == [(), (), ()]
 
 
-def test_a_split_of_no_bytes_behind_a_newer_one_is_told_once_after_a_while(splits: Splits) -> None:
+def test_a_split_of_no_bytes_behind_a_newer_one_is_reported_once_after_a_while(
+    splits: Splits,
+) -> None:
     splits.directory.mkdir()
     (splits.directory / "rec_1_0.mcap").touch()
     splits.observe(0)
@@ -85,7 +87,9 @@ def test_a_split_of_no_bytes_behind_a_newer_one_is_told_once_after_a_while(split
     assert splits.observe(100).empty == ()
 
 
-def test_a_closed_split_that_cannot_be_read_is_told_and_counts_as_closed(splits: Splits) -> None:
+def test_a_closed_split_that_cannot_be_read_is_reported_and_counts_as_closed(
+    splits: Splits,
+) -> None:
     splits.directory.mkdir()
     (splits.directory / "rec_1_0.mcap").write_bytes(b"a text file of that name")
     changes = splits.observe(0)
@@ -105,7 +109,7 @@ def test_other_files_are_not_looked_at(splits: Splits) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read every directory")
-def test_a_directory_that_may_not_be_read_is_told(splits: Splits) -> None:
+def test_a_directory_that_may_not_be_read_is_reported(splits: Splits) -> None:
     write(splits, 0, "/a")
     splits.directory.chmod(0)
     assert len(splits.observe(0).faults) == 1

@@ -23,7 +23,7 @@ class TestStart:
         world.supervisor.start()
         assert world.named_at_start == [[world.recorders[0].directory.name]]
 
-    def test_it_records_once_the_recorder_says_so(self, tmp_path: Path) -> None:
+    def test_it_records_once_the_recorder_reports_it(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()
         assert world.heartbeat()["state"] == "starting"

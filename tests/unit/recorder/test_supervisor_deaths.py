@@ -34,7 +34,7 @@ class TestDeath:
             waits.append(round(world.mono - before))
         assert waits == [1, 2, 4, 8]
 
-    def test_it_is_told_with_its_last_words(self, tmp_path: Path) -> None:
+    def test_it_is_reported_with_its_last_words(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()
         world.run(2)
@@ -187,7 +187,7 @@ class TestFailingDisk:
         assert len(world.recorders) == 2
         assert_each_counts_once(world)
 
-    def test_a_handover_is_given_up_where_the_new_directory_cannot_be_told(
+    def test_a_handover_is_given_up_where_the_new_directory_cannot_be_found_out(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         world = World(tmp_path, session_duration_s=20)
@@ -232,7 +232,7 @@ class TestFailingDisk:
         monkeypatch.setattr(world.recorders[0], "take_lines", fails)
         with capture_logs() as logs:
             world.run(30)
-        (told,) = events(logs, "supervision_failed")
-        assert (told["task"], told["reason"]) == ("look", "[Errno 5] Input/output error")
+        (reported,) = events(logs, "supervision_failed")
+        assert (reported["task"], reported["reason"]) == ("look", "[Errno 5] Input/output error")
         world.run(40)
         assert "apply" in keeper.asked

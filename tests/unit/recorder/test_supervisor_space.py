@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("no_flushing")
 
 
 class TestRecordedTime:
-    def test_the_house_is_told_what_is_recorded_and_what_it_holds_stands_in_the_heartbeat(
+    def test_the_house_is_reported_what_is_recorded_and_what_it_holds_is_in_the_heartbeat(
         self, tmp_path: Path
     ) -> None:
         housekeeping = PlayedHousekeeper()
@@ -138,16 +138,16 @@ class TestSpace:
         assert world.running == []
         assert_each_counts_once(world)
 
-    def test_a_split_that_stays_empty_is_told(self, tmp_path: Path) -> None:
+    def test_a_split_that_stays_empty_is_reported(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()
         world.run(8)
         world.disk_full = True
         with capture_logs() as logs:
             world.run(30)
-        told = events(logs, "split_empty")
-        assert len(told) >= 2
-        assert len({each["reason"] for each in told}) == len(told)
+        reported = events(logs, "split_empty")
+        assert len(reported) >= 2
+        assert len({each["reason"] for each in reported}) == len(reported)
 
 
 class TestUnmounted:
@@ -161,7 +161,9 @@ class TestUnmounted:
         world.device = 2
         return aside
 
-    def test_nothing_is_recorded_onto_another_disk_and_that_is_told(self, tmp_path: Path) -> None:
+    def test_nothing_is_recorded_onto_another_disk_and_that_is_reported(
+        self, tmp_path: Path
+    ) -> None:
         housekeeping = PlayedHousekeeper()
         world = World(tmp_path / "bags", housekeeper=housekeeping)
         world.supervisor.start()
@@ -211,7 +213,7 @@ class TestUnmounted:
 
 
 class TestHouse:
-    def test_what_failed_while_nobody_waited_is_told_once_and_in_the_heartbeat(
+    def test_what_failed_while_nobody_waited_is_reported_once_and_in_the_heartbeat(
         self, tmp_path: Path
     ) -> None:
         housekeeping = PlayedHousekeeper()
@@ -221,8 +223,11 @@ class TestHouse:
         housekeeping.failed = {"make_room": "the oldest bags cannot be deleted"}
         with capture_logs() as logs:
             world.run(130)
-        (told,) = events(logs, "housekeeping_failed")
-        assert (told["task"], told["reason"]) == ("make_room", "the oldest bags cannot be deleted")
+        (reported,) = events(logs, "housekeeping_failed")
+        assert (reported["task"], reported["reason"]) == (
+            "make_room",
+            "the oldest bags cannot be deleted",
+        )
         assert world.heartbeat()["last_error"] == "the oldest bags cannot be deleted"
 
     def test_it_is_kept_after_splits_were_closed(self, tmp_path: Path) -> None:
@@ -240,7 +245,7 @@ class TestHouse:
         world.run(130)
         assert housekeeping.asked.count("apply") == 2
 
-    def test_what_goes_wrong_there_is_told_once_and_stops_nothing(self, tmp_path: Path) -> None:
+    def test_what_goes_wrong_there_is_reported_once_and_stops_nothing(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
         housekeeping.failed = {"apply": "the catalogue is locked"}
         world = World(tmp_path, housekeeper=housekeeping)

@@ -23,8 +23,8 @@ class TestWatch:
         world.silent = True
         with capture_logs() as logs:
             world.run(300)
-        (told,) = events(logs, "no_growth")
-        assert world.heartbeat()["last_error"] == told["reason"]
+        (reported,) = events(logs, "no_growth")
+        assert world.heartbeat()["last_error"] == reported["reason"]
         assert len(world.recorders) == 2
         assert world.recorders[0].status == 0
         world.silent = False
@@ -36,7 +36,7 @@ class TestWatch:
         stands, counts = world.published(counting=False), world.published(counting=True)
         assert counts == dict.fromkeys(stands, 1)
 
-    def test_a_directory_that_vanished_is_told_and_recording_goes_on_elsewhere(
+    def test_a_directory_that_vanished_is_reported_and_recording_goes_on_elsewhere(
         self, tmp_path: Path
     ) -> None:
         world = World(tmp_path)
@@ -77,7 +77,7 @@ class TestWatch:
         stands, counts = world.published(counting=False), world.published(counting=True)
         assert counts == dict.fromkeys(stands, 1)
 
-    def test_topics_that_brought_nothing_in_a_whole_recording_are_told(
+    def test_topics_that_brought_nothing_in_a_whole_recording_are_reported(
         self, tmp_path: Path
     ) -> None:
         world = World(tmp_path, session_duration_s=20)
@@ -85,8 +85,8 @@ class TestWatch:
         world.supervisor.start()
         with capture_logs() as logs:
             world.run(30)
-        (told,) = events(logs, "topics_silent")
-        assert str(told["reason"]).endswith("/door")
+        (reported,) = events(logs, "topics_silent")
+        assert str(reported["reason"]).endswith("/door")
         assert world.heartbeat()["silent"] == ["/door"]
 
     def test_subscribed_to_all_and_hearing_nothing_points_at_the_transport(
@@ -97,10 +97,10 @@ class TestWatch:
         world.supervisor.start()
         with capture_logs() as logs:
             world.run(30)
-        (told,) = events(logs, "topics_silent")
-        assert "UDPv4" in str(told["reason"])
+        (reported,) = events(logs, "topics_silent")
+        assert "UDPv4" in str(reported["reason"])
 
-    def test_a_warning_that_repeats_is_told_once_for_each_topic(self, tmp_path: Path) -> None:
+    def test_a_warning_that_repeats_is_reported_once_for_each_topic(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()
         world.run(2)
@@ -115,7 +115,7 @@ class TestWatch:
         assert len(events(logs, "several_types")) == 2
         assert "/cam2" in str(world.heartbeat()["last_error"])
 
-    def test_a_refused_publisher_is_told_with_what_it_means(self, tmp_path: Path) -> None:
+    def test_a_refused_publisher_is_reported_with_what_it_means(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()
         world.run(2)
@@ -125,9 +125,11 @@ class TestWatch:
         )
         with capture_logs() as logs:
             world.run(3)
-        (told,) = events(logs, "qos_refused")
-        assert str(told["reason"]).startswith("/scan: messages of this publisher are not recorded")
-        assert world.heartbeat()["last_error"] == told["reason"]
+        (reported,) = events(logs, "qos_refused")
+        assert str(reported["reason"]).startswith(
+            "/scan: messages of this publisher are not recorded"
+        )
+        assert world.heartbeat()["last_error"] == reported["reason"]
 
 
 class TestHeartbeat:
@@ -141,7 +143,7 @@ class TestHeartbeat:
             moments.add(world.heartbeat()["updated"])
         assert len(moments) == 4
 
-    def test_a_change_is_told_at_once(self, tmp_path: Path) -> None:
+    def test_a_change_is_reported_at_once(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.supervisor.start()
         world.run(7)
@@ -150,7 +152,7 @@ class TestHeartbeat:
         beat = world.heartbeat()
         assert (beat["state"], beat["recordings"]) == ("starting", [])
 
-    def test_one_that_cannot_be_written_is_told_once_and_recording_goes_on(
+    def test_one_that_cannot_be_written_is_reported_once_and_recording_goes_on(
         self, tmp_path: Path
     ) -> None:
         world = World(tmp_path)

@@ -24,7 +24,7 @@ def left(root: Path) -> list[str]:
     return sorted(str(path.relative_to(root)) for path in root.rglob("*"))
 
 
-def test_bags_of_every_kind_go_with_what_stands_beside_them(tmp_path: Path) -> None:
+def test_bags_of_every_kind_go_with_what_lies_beside_them(tmp_path: Path) -> None:
     make(
         tmp_path,
         "rec_1/rec_1_0.mcap",

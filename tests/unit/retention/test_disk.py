@@ -72,7 +72,7 @@ def test_what_is_recorded_on_another_disk_makes_it_none_of_its_own(
 
 
 @pytest.mark.parametrize("away", [False, True])
-def test_where_it_cannot_be_told_it_is_as_before(
+def test_where_it_cannot_be_found_out_it_is_as_before(
     home: HomeDisk, devices: Devices, away: bool
 ) -> None:
     devices.number = 2 if away else 1

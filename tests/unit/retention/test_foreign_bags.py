@@ -103,9 +103,9 @@ class TestRetention:
         counted -= (bag_dir / "session_mcap" / "metadata.yaml").stat().st_size
         with structlog.testing.capture_logs() as logs:
             house_of(bag_dir, keeps_foreign=True, max_bytes=counted).apply()
-        [told] = [each for each in logs if each["event"] == "retention_applied"]
-        assert (told["bags"], told["total_bytes"]) == (0, counted)
-        assert told["foreign_bytes"] == besides + len(b"no bag")
+        [reported] = [each for each in logs if each["event"] == "retention_applied"]
+        assert (reported["bags"], reported["total_bytes"]) == (0, counted)
+        assert reported["foreign_bytes"] == besides + len(b"no bag")
         assert list_bytes
         [warned] = [each for each in logs if each["event"] == "foreign_bags_kept"]
         assert "adopt" in warned["reason"]
@@ -137,8 +137,8 @@ class TestRetention:
         with structlog.testing.capture_logs() as logs:
             house.apply()
         assert not old.exists()
-        [told] = [each for each in logs if each["event"] == "retention_applied"]
-        assert told["foreign_bytes"] == 0
+        [reported] = [each for each in logs if each["event"] == "retention_applied"]
+        assert reported["foreign_bytes"] == 0
 
     def test_a_restored_recording_is_kept_until_it_is_adopted(self, tmp_path: Path) -> None:
         bags = tmp_path / "bags"
@@ -289,7 +289,9 @@ class TestReports:
         recording_now(tmp_path, "rec_now")
         assert memory_status(self.memory(tmp_path), Call()).budget.foreign == 0
 
-    def test_nothing_is_said_where_it_is_not_known_or_does_not_matter(self, tmp_path: Path) -> None:
+    def test_nothing_is_reported_where_it_is_not_known_or_does_not_matter(
+        self, tmp_path: Path
+    ) -> None:
         foreign(tmp_path, "session_mcap/session_0.mcap")
         assert memory_status(self.memory(tmp_path), Call()).budget.foreign is None
         own_all(tmp_path)
@@ -310,9 +312,9 @@ class TestReports:
         assert "bags that this recorder did not make take" in disk
         assert "ros2-memory adopt DIR" in disk
         cli.main(["info", "--json"])
-        told = json.loads(capsys.readouterr().out)["memory_status"]["budget"]
-        assert told["used_gb"] == 0.0
-        assert told["foreign_gb"] is not None
+        reported = json.loads(capsys.readouterr().out)["memory_status"]["budget"]
+        assert reported["used_gb"] == 0.0
+        assert reported["foreign_gb"] is not None
 
 
 class TestAdopt:
@@ -326,9 +328,9 @@ class TestAdopt:
         own = OwnRecordings(tmp_path)
         assert [*own.names()] == ["old/a", "old/b/c"]
         assert own.owns(tmp_path / "old" / "a")
-        told = capsys.readouterr().out
-        assert "adopted: old/a (2 bag files, " in told
-        assert "retention deletes them from now on" in told
+        reported = capsys.readouterr().out
+        assert "adopted: old/a (2 bag files, " in reported
+        assert "retention deletes them from now on" in reported
 
     def test_by_its_name_in_the_bag_directory(self, tmp_path: Path, capsys: Capture) -> None:
         foreign(tmp_path, "session_mcap/s_0.mcap")
@@ -396,5 +398,5 @@ def test_a_bag_of_latched_messages_that_are_carried_is_not_foreign(tmp_path: Pat
     write_mcap(tmp_path / "latched" / "carried.mcap", [boolean(T0, True)])
     with structlog.testing.capture_logs() as logs:
         house_of(tmp_path, keeps_foreign=True).apply()
-    [told] = [each for each in logs if each["event"] == "retention_applied"]
-    assert told["foreign_bytes"] == 0
+    [reported] = [each for each in logs if each["event"] == "retention_applied"]
+    assert reported["foreign_bytes"] == 0

@@ -82,8 +82,8 @@ class TestRetention:
             house_of(tmp_path, max_bytes=total - 1).apply()
         # The first two would free nothing.
         assert [path.exists() for path in made] == [True, True, False, True, True, True]
-        told = [event for event in captured if event["event"] == "retention_applied"]
-        assert [event["total_bytes"] for event in told] == [total, size_of(tmp_path)]
+        reported = [event for event in captured if event["event"] == "retention_applied"]
+        assert [event["total_bytes"] for event in reported] == [total, size_of(tmp_path)]
 
     def test_a_bag_that_lies_in_moments_alone_counts_once_in_the_budget(
         self, tmp_path: Path
@@ -97,9 +97,9 @@ class TestRetention:
         assert not (tmp_path / A).exists()
         with structlog.testing.capture_logs() as captured:
             house.apply()
-        [told] = [event for event in captured if event["event"] == "retention_applied"]
+        [reported] = [event for event in captured if event["event"] == "retention_applied"]
         sidecars = [path.stat() for path in (tmp_path / "moments").rglob("handover.json")]
-        assert told["total_bytes"] - size_of(tmp_path) in {0, sidecars[0].st_size}
+        assert reported["total_bytes"] - size_of(tmp_path) in {0, sidecars[0].st_size}
 
     def test_moments_stay_where_the_budget_cannot_be_held(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
@@ -153,8 +153,8 @@ class TestRetention:
         kept(house_of(tmp_path), tmp_path, 15, 25)
         with structlog.testing.capture_logs() as captured:
             house_of(tmp_path).apply()
-        [told] = [event for event in captured if event["event"] == "retention_applied"]
-        assert told["total_bytes"] == size_of(tmp_path)
+        [reported] = [event for event in captured if event["event"] == "retention_applied"]
+        assert reported["total_bytes"] == size_of(tmp_path)
 
 
 STEPS = st.lists(
@@ -197,8 +197,8 @@ def test_no_moments_in_any_order_break_a_budget_or_lose_what_is_kept(
         else:
             with structlog.testing.capture_logs() as captured:
                 house.apply()
-            [told] = [each for each in captured if each["event"] == "retention_applied"]
-            assert told["total_bytes"] == size_of(root) <= rooms
+            [reported] = [each for each in captured if each["event"] == "retention_applied"]
+            assert reported["total_bytes"] == size_of(root) <= rooms
         assert {path: path.stat().st_ino for path in promised} == promised
         held = {path.stat().st_ino: path.stat().st_size for path in promised}
         assert sum(held.values()) <= size * share + 10

@@ -90,7 +90,7 @@ def places(memory: Memory, moment: int, children: Iterable[str]) -> list[object]
 
 
 class TestTheBagOfCarriedMessages:
-    def test_a_transform_outlives_the_split_that_it_stands_in(self, tmp_path: Path) -> None:
+    def test_a_transform_outlives_the_split_that_it_is_in(self, tmp_path: Path) -> None:
         recording(
             tmp_path,
             "rec",
@@ -405,6 +405,6 @@ class TestAnswers:
         self, bag_dir: Path
     ) -> None:
         keep_only(bag_dir, "six_more/six_more_0.mcap", "six/six_1.mcap")
-        told = queries.data_time_range(memory_of(bag_dir), Call())
-        assert told.earliest == T0 + 250 * S
-        assert (told.bags, told.gaps) == (2, ())
+        reported = queries.data_time_range(memory_of(bag_dir), Call())
+        assert reported.earliest == T0 + 250 * S
+        assert (reported.bags, reported.gaps) == (2, ())

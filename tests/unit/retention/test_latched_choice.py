@@ -32,7 +32,7 @@ class TestWorthCarrying:
         a, b = message(1, "/a"), message(2, "/a")
         assert worth_carrying([a, b], nowhere, {a.identity: 50}) == {a, b}
 
-    def test_not_one_that_stands_in_a_kept_bag_as_early(self) -> None:
+    def test_not_one_that_is_in_a_kept_bag_as_early(self) -> None:
         a = message(1, "/a")
         assert worth_carrying([a], nowhere, {a.identity: 1}) == set()
 

@@ -103,7 +103,7 @@ class TestAge:
         assert expired(stock(*early, bag("new", NOW)), LIMITS) == ()
         assert expired(stock(*early, now=NOW), LIMITS) == ()
 
-    def test_where_the_clock_stands_in_1970_nothing_is_aged(self) -> None:
+    def test_where_the_clock_is_in_1970_nothing_is_aged(self) -> None:
         assert expired(stock(*hourly(400), now=5 * HOUR), LIMITS) == ()
 
     def test_a_bag_across_a_clock_step_neither_ages_nor_is_aged(self) -> None:

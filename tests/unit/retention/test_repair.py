@@ -158,7 +158,7 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
-def test_a_file_that_is_not_there_is_said_to_be_gone(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_is_reported_as_gone(tmp_path: Path) -> None:
     with pytest.raises(BagVanishedError):
         repairer().repair(tmp_path / "a_0.mcap")
 
@@ -177,7 +177,9 @@ def test_open_files_are_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["rec", "rec_2026", "rec_20261120T043000Z_x", "a/rec_1"])
-def test_a_directory_of_another_is_told_from_one_of_this_program(name: str, tmp_path: Path) -> None:
+def test_a_directory_of_another_is_distinguished_from_one_of_this_program(
+    name: str, tmp_path: Path
+) -> None:
     own = recording_name(T0, tmp_path)
     (tmp_path / own).mkdir()
     assert has_own_name(own)

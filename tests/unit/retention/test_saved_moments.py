@@ -74,9 +74,9 @@ class TestKeeping:
             f"{A}_2.mcap",
         ]
         assert (folder / A / f"{A}_1.mcap").samefile(made[1])
-        told = told_of(tmp_path)
-        assert (told["label"], told["complete"], told["missing"]) == ("Küche", True, [])
-        assert (told["start_ns"], told["end_ns"]) == (T0 + 15 * S, T0 + 25 * S)
+        reported = told_of(tmp_path)
+        assert (reported["label"], reported["complete"], reported["missing"]) == ("Küche", True, [])
+        assert (reported["start_ns"], reported["end_ns"]) == (T0 + 15 * S, T0 + 25 * S)
         assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
 
     def test_a_bag_that_went_since_the_index_was_made_is_named_as_missing(
@@ -85,16 +85,18 @@ class TestKeeping:
         # As `forget`, in another process, deletes beside the recorder.
         made = recording(tmp_path, A, 0)
         house = house_of(tmp_path)
-        slot = asked(tmp_path, 15, 25)
+        pending = asked(tmp_path, 15, 25)
         with house._index.undisturbed() as snapshot:
             made[1].unlink()
             house._moments.keep(snapshot)
-        outcome = slot.outcome()
+        outcome = pending.outcome()
         assert outcome is not None
         assert outcome.bags == 1
-        told = told_of(tmp_path)
-        assert told["complete"] is False
-        assert told["missing"] == [f"{A}/{A}_1.mcap has gone, or another file of that name is kept"]
+        reported = told_of(tmp_path)
+        assert reported["complete"] is False
+        assert reported["missing"] == [
+            f"{A}/{A}_1.mcap has gone, or another file of that name is kept"
+        ]
 
     def test_a_sidecar_that_goes_meanwhile_refuses_no_moment(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -146,18 +148,18 @@ class TestKeeping:
         assert "by hard links: Operation not permitted" in outcome.refused
         assert files_in(tmp_path / "moments") == []
 
-    def test_a_wish_is_not_granted_twice(self, tmp_path: Path) -> None:
+    def test_a_request_is_not_granted_twice(self, tmp_path: Path) -> None:
         """As where the recorder was killed after it kept a moment, and before it answered."""
         recording(tmp_path, A, 0)
-        slot = asked(tmp_path, 15, 25)
-        request = tmp_path / REQUESTS_FOLDER / f"{slot.request.number}.json"
+        pending = asked(tmp_path, 15, 25)
+        request = tmp_path / REQUESTS_FOLDER / f"{pending.request.number}.json"
         text = request.read_text()
         house_of(tmp_path).keep_moments()
-        first = slot.outcome()
-        slot.close()
+        first = pending.outcome()
+        pending.close()
         request.with_suffix(".taken").write_text(text)
         house_of(tmp_path).keep_moments()
-        assert slot.outcome() == first
+        assert pending.outcome() == first
         assert len(list(stored_moments_in(tmp_path))) == 1
 
     def test_a_moment_in_a_moment_is_kept_under_the_name_that_it_was_recorded_by(
@@ -213,7 +215,7 @@ class TestOpenBags:
         assert told_of(tmp_path)["complete"] is True
         assert len(in_moments(tmp_path)) == 3
 
-    def test_what_passes_the_share_when_it_closes_is_told_and_not_kept(
+    def test_what_passes_the_share_when_it_closes_is_reported_and_not_kept(
         self, tmp_path: Path
     ) -> None:
         made = recording(tmp_path, A, 0, splits=2)
@@ -224,9 +226,9 @@ class TestOpenBags:
         bag(tmp_path / A / f"{A}_2.mcap", 20)
         clock.at = T0 + 26 * S
         house.keep_moments()
-        told = told_of(tmp_path)
-        assert (told["pending"], told["complete"]) == (False, False)
-        assert "retention.max_moments_gb" in told["missing"][0]
+        reported = told_of(tmp_path)
+        assert (reported["pending"], reported["complete"]) == (False, False)
+        assert "retention.max_moments_gb" in reported["missing"][0]
         assert len(in_moments(tmp_path)) == 2
 
     def test_a_bag_that_a_crash_left_open_is_kept_when_it_is_repaired(self, tmp_path: Path) -> None:
@@ -257,11 +259,11 @@ class TestCrashes:
         self, tmp_path: Path
     ) -> None:
         recording(tmp_path, A, 0)
-        slot = asked(tmp_path, 15, 25)
-        folder = make_moment_folder(tmp_path, slot.request)
-        write_saved_moment(folder, SavedMoment(slot.request))
+        pending = asked(tmp_path, 15, 25)
+        folder = make_moment_folder(tmp_path, pending.request)
+        write_saved_moment(folder, SavedMoment(pending.request))
         house_of(tmp_path).keep_moments()
-        outcome = slot.outcome()
+        outcome = pending.outcome()
         assert outcome is not None
         assert (outcome.moment, outcome.bags, outcome.pending) == (folder.name, 2, False)
         assert len(in_moments(tmp_path)) == 2
@@ -272,7 +274,7 @@ class TestCrashes:
     ) -> None:
         """It dies as it makes its second link, or writes what it made for the second time."""
         recording(tmp_path, A, 0)
-        slot = asked(tmp_path, 15, 25)
+        pending = asked(tmp_path, 15, 25)
         owner: Any = os if step == "link" else saved_moments
         done, real = [], getattr(owner, step)
 
@@ -287,18 +289,18 @@ class TestCrashes:
             with pytest.raises(KeyboardInterrupt):
                 house_of(tmp_path).keep_moments()
         house_of(tmp_path).keep_moments()
-        outcome = slot.outcome()
+        outcome = pending.outcome()
         assert outcome is not None
-        told = told_of(tmp_path)
-        assert (told["pending"], told["missing"]) == (False, [])
+        reported = told_of(tmp_path)
+        assert (reported["pending"], reported["missing"]) == (False, [])
         assert outcome.bags == len(in_moments(tmp_path)) >= 2
         assert len(list(stored_moments_in(tmp_path))) == 1
 
     def test_a_folder_that_is_no_moment_yet_is_removed_and_nothing_else(
         self, tmp_path: Path
     ) -> None:
-        wish = SaveRequest("0" * 32, "here", T0, T0, NOW)
-        begun = make_moment_folder(tmp_path, wish)
+        request = SaveRequest("0" * 32, "here", T0, T0, NOW)
+        begun = make_moment_folder(tmp_path, request)
         (begun / f".{MOMENT_FILE}.tmp").write_text("{")
         mine = tmp_path / "moments/mine"
         mine.mkdir()

@@ -129,7 +129,7 @@ class HandoverTransfer:
         return True
 
     def abandon(self) -> None:
-        """Marks the new recording as not counting: the old one goes on and has all of it.
+        """Marks the new recording as not counting: the old one continues and has all of it.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -150,8 +150,8 @@ class HandoverTransfer:
             files = tuple(sorted(self._old_files() | frozenset(handover.end.files)))
             write_handover(directory, replace(handover, end=replace(handover.end, files=files)))
 
-    def settle(self) -> None:
-        """Has the new recording count from where the old one ends, whose recorder died half-way.
+    def recover(self) -> None:
+        """Has the new recording count from the end of the old one, whose recorder died half-way.
 
         Raises:
             RecorderError: a sidecar cannot be written.

@@ -142,10 +142,10 @@ def _sourced(setup_files: Sequence[Path], base: Mapping[str, str]) -> dict[str, 
 
 def _failure(begun: str, status: int, errors: str) -> str:
     name = begun.rstrip("\0").rpartition("\0")[2] or "the shell"
-    said = " ".join(errors.split())[-300:]
+    printed = " ".join(errors.split())[-300:]
     return (
         f"{name} failed with status {status}"
-        f"{f' ({said})' if said else ''}; correct it, or recorder.setup_files"
+        f"{f' ({printed})' if printed else ''}; correct it, or recorder.setup_files"
     )
 
 

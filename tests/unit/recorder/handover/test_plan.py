@@ -59,7 +59,7 @@ class TestSteps:
         assert waited(plan, 20.0, 21.9, ready=True, missing=("/gone",)) is Step.WAIT
         assert waited(plan, 22.0, ready=True, missing=("/gone",)) is Step.COMPLETE
 
-    def test_a_publisher_that_appears_while_both_record_is_waited_for_anew(self) -> None:
+    def test_a_publisher_that_appears_while_both_record_is_waited_for_again(self) -> None:
         plan = HandoverPlan(at(0), subscribe_timeout_s=20)
         assert waited(plan, 1.0, 2.5, ready=True) is Step.WAIT
         assert waited(plan, 2.7, 3.9, ready=True, missing=("/late",)) is Step.WAIT

@@ -87,7 +87,7 @@ def test_whatever_either_holds_counts_exactly_once(
     assert incomplete_handover(old) is None
 
 
-def test_a_new_one_that_left_no_sidecar_is_settled_too(tmp_path: Path) -> None:
+def test_a_new_one_that_left_no_sidecar_is_completed_too(tmp_path: Path) -> None:
     old = recording(tmp_path, "a", 0, 10, delay=5)
     recording(tmp_path, "b", 8, 12, delay=9)
     write_handover(old, intended(Handover(), "b"))
@@ -158,7 +158,7 @@ def test_after_a_clock_that_was_set_back_no_more_than_a_minute_is_in_doubt(tmp_p
     assert len(counted(tmp_path)) >= 20 + 2400
 
 
-def test_recordings_that_are_settled_are_left_alone(tmp_path: Path) -> None:
+def test_recordings_that_are_completed_are_left_alone(tmp_path: Path) -> None:
     old = recording(tmp_path, "a", 0, 1, delay=0)
     write_handover(old, Handover(next="b", counts_until=7, end=Overlap(None, None, ())))
     recording(tmp_path, "b", 0, 1, delay=0)
@@ -167,7 +167,7 @@ def test_recordings_that_are_settled_are_left_alone(tmp_path: Path) -> None:
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
 
-def test_what_cannot_be_settled_is_told_and_the_rest_is_settled(tmp_path: Path) -> None:
+def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path: Path) -> None:
     for name in ("a", "c"):
         old = recording(tmp_path, name, 0, 1, delay=0)
         write_handover(old, intended(Handover(), name + "2"))
@@ -189,7 +189,7 @@ class TestCutClock:
         old = recording(tmp_path, "a", 0, 3, delay=0)
         assert cut_clock(old / "a_0.mcap", READER) is CutClock.LOG
 
-    def test_a_bag_that_holds_or_says_nothing_says_nothing_of_it(self, tmp_path: Path) -> None:
+    def test_a_bag_that_is_empty_or_unreadable_counts_as_publish_time(self, tmp_path: Path) -> None:
         write_mcap(tmp_path / "empty.mcap", [])
         (tmp_path / "broken.mcap").write_bytes(b"broken")
         assert cut_clock(tmp_path / "empty.mcap", READER) is CutClock.PUBLISH
@@ -226,7 +226,7 @@ class TestWhileSomethingIsRecorded:
         write_heartbeat(bag_dir, beat)
         recover_unwritten(bag_dir, READER)
 
-    def test_what_nobody_writes_is_settled(self, bag_dir: Path) -> None:
+    def test_what_nobody_writes_is_completed(self, bag_dir: Path) -> None:
         self.settle_beside(bag_dir, "c")
         assert counted(bag_dir) == dict.fromkeys((T0 + n * S // 10 for n in range(120)), 1)
 

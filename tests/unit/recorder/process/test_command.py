@@ -162,7 +162,7 @@ def test_every_distribution_understands_it(distribution: str, use_sim_time: bool
 
 
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
-def test_the_help_of_every_distribution_tells_its_options(distribution: str) -> None:
+def test_the_help_of_every_distribution_lists_its_options(distribution: str) -> None:
     known = options_in_help(parser_of(distribution).format_help())
     wanted = {*OPTIONAL, "--repeat-transient-local"}
     assert known & wanted == wanted & set(DISTRIBUTIONS[distribution][1])

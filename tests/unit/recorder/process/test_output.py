@@ -123,7 +123,7 @@ def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended
         ("", LineKind.OTHER, None),
     ],
 )
-def test_a_line_says_what_it_says(raw: str, said: LineKind, topic: str | None) -> None:
+def test_a_line_is_classified(raw: str, said: LineKind, topic: str | None) -> None:
     line = parse_line(raw)
     assert (line.kind, line.topic) == (said, topic)
 

@@ -52,7 +52,7 @@ def test_a_topic_that_is_commented_out_stays_out(tmp_path: Path) -> None:
     assert not topics.matches("/camera/image_raw")
 
 
-def test_an_entry_that_stands_twice_counts_once(tmp_path: Path) -> None:
+def test_an_entry_that_is_listed_twice_counts_once(tmp_path: Path) -> None:
     assert load_topics(listed(tmp_path, "topics: [/tf, /odom, /tf]")).entries == ("/tf", "/odom")
 
 
@@ -67,7 +67,7 @@ def test_a_topic_does_not_bring_those_whose_names_begin_or_end_alike() -> None:
     ] == ["/tf"]
 
 
-def test_a_glob_stands_for_one_part_of_a_name() -> None:
+def test_a_glob_matches_one_part_of_a_name() -> None:
     topics = TopicSelection(("/vision/*/detections_meta", "/cam*/info"))
     assert topics.regex == "^(/vision/[^/]+/detections_meta|/cam[^/]+/info)$"
     assert topics.matches("/vision/find_object/detections_meta")
