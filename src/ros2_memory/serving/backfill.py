@@ -53,7 +53,7 @@ LATEST_UNIX_S: Final = 9.2e9
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long a bag that could not be digested is tried again: the disk may have failed."""
 
-_MOST_REFUSED: Final = 10_000
+_MAX_REFUSED: Final = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ class Backfill:
 
     def _refuse(self, bag: BagFile, reason: str) -> None:
         log.warning("bag_not_digested", path=str(bag.path), reason=reason)
-        if len(self._refused) >= _MOST_REFUSED:
+        if len(self._refused) >= _MAX_REFUSED:
             self._refused.clear()
         self._refused[self._key(bag)] = self._memory.clock.now()
 

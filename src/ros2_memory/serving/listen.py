@@ -1,4 +1,4 @@
-"""The address that the server listens on: who can reach it, and why it cannot be had."""
+"""The address that the server listens on."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Final
 
 BACKLOG: Final = 128
-"""Connections that wait to be taken in."""
+"""Connections that may wait to be accepted."""
 
 
 class CannotListenError(Exception):
-    """The address cannot be listened on; the sentence says why and what to do."""
+    """The address cannot be listened on; the message says why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +27,9 @@ class Address:
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only programs on this machine can reach it.
+        """Returns whether only programs on this machine can reach it.
 
-        Judged by the address itself: a name may stand for any.
+        The resolved address decides, because a name may resolve to any.
         """
         try:
             return ipaddress.ip_address(self.ip.partition("%")[0]).is_loopback
@@ -38,10 +38,10 @@ class Address:
 
 
 def resolved(host: str, port: int) -> Address:
-    """The address that a host stands for; its IPv4 one where it has addresses of both kinds.
+    """Returns the address that a host resolves to; the IPv4 one where it has both kinds.
 
     Raises:
-        CannotListenError: it stands for none.
+        CannotListenError: it resolves to none.
     """
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -52,7 +52,7 @@ def resolved(host: str, port: int) -> Address:
 
 
 def bound(address: Address) -> socket.socket:
-    """A socket that listens.
+    """Returns a socket that listens on the address.
 
     Raises:
         CannotListenError: the address is in use, not this machine's, or not allowed.
@@ -63,8 +63,8 @@ def bound(address: Address) -> socket.socket:
         )
     except OSError as error:
         raise CannotListenError(_why_not(address.host, address.port, error)) from error
-    # asyncio sets this on sockets of its own making only. Accepted ones inherit it; without it each
-    # reply on a kept connection waits 40 ms for the client's delayed acknowledgement.
+    # asyncio sets this only on sockets that it creates itself. Accepted sockets inherit it; without
+    # it each reply on a kept connection waits 40 ms for the client's delayed acknowledgement.
     listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listening
 

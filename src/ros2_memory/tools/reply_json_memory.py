@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue, SetAside
     from ros2_memory.tools.reply_size import JsonObject
 
-_NEWEST_LISTED: Final = 20
-_MOST_TOPICS: Final = 10
+_MAX_LISTED: Final = 20
+_MAX_TOPICS: Final = 10
 _S_PER_DAY: Final = 86_400
 
 
@@ -54,9 +54,9 @@ def time_range(answer: results.DataTimeRange, bag_dir: Path) -> JsonObject:
         "bags": answer.bags,
     }
     for name, rows in lists.items():
-        reply[name] = rows[-_NEWEST_LISTED:]
-        if len(rows) > _NEWEST_LISTED:
-            notes.append(f"{name}: the last {_NEWEST_LISTED} of {len(rows)} are listed")
+        reply[name] = rows[-_MAX_LISTED:]
+        if len(rows) > _MAX_LISTED:
+            notes.append(f"{name}: the last {_MAX_LISTED} of {len(rows)} are listed")
             reply[f"{name}_count"] = len(rows)
     reply["silent_topics"] = answer.silent_topics
     return with_notes(reply, notes)
@@ -79,6 +79,18 @@ def file_name(path: Path | str, bag_dir: Path) -> str:
 @render.register(results.Status)
 def _status(answer: results.Status) -> JsonObject:
     latest = answer.latest
+    lists: dict[str, list[JsonValue]] = {
+        "fell_silent": [
+            {
+                "topic": each.topic,
+                "last_ts": moment(each.last),
+                "ago_s": seconds(answer.now - each.last),
+            }
+            for each in answer.fell_silent
+        ],
+        "never_heard": [*answer.never_heard],
+        "missing": [*answer.missing],
+    }
     reply: JsonObject = {
         "trust": "; ".join(answer.problems) or "nothing is known to be missing",
         "recorder": answer.recorder,
@@ -88,27 +100,17 @@ def _status(answer: results.Status) -> JsonObject:
         "earliest": moment(answer.earliest),
         "latest": moment(latest),
         "newest_age_s": None if latest is None else seconds(answer.now - latest),
-        "fell_silent": [
-            {
-                "topic": each.topic,
-                "last_ts": moment(each.last),
-                "ago_s": seconds(answer.now - each.last),
-            }
-            for each in answer.fell_silent[:_MOST_TOPICS]
-        ],
-        "never_heard": [*answer.never_heard[:_MOST_TOPICS]],
-        "missing": [*answer.missing[:_MOST_TOPICS]],
+        **{name: topics[:_MAX_TOPICS] for name, topics in lists.items()},
         "damaged": answer.damaged,
         "incomplete": answer.incomplete,
         "unread": answer.unread,
         "budget": _budget(answer.budget),
+        **{
+            f"{name}_count": len(topics)
+            for name, topics in lists.items()
+            if len(topics) > _MAX_TOPICS
+        },
     }
-    counts = {
-        "fell_silent": len(answer.fell_silent),
-        "never_heard": len(answer.never_heard),
-        "missing": len(answer.missing),
-    }
-    reply |= {f"{name}_count": count for name, count in counts.items() if count > _MOST_TOPICS}
     return with_notes(reply, answer.notes)
 
 
@@ -138,14 +140,7 @@ def _gigabytes(size: float | None) -> float | None:
 
 @render.register(results.RememberedMoment)
 def _saved_moment(answer: results.RememberedMoment) -> JsonObject:
-    return {
-        "moment": answer.moment,
-        "label": answer.label,
-        "start": moment(answer.start),
-        "end": moment(answer.end),
-        "bags": answer.bags,
-        "pending": answer.pending,
-    }
+    return {**_labelled_window(answer), "bags": answer.bags, "pending": answer.pending}
 
 
 @render.register(results.MomentList)
@@ -158,10 +153,7 @@ def _stored_moments(answer: results.MomentList) -> JsonObject:
 
 def _stored(stored: results.ListedMoment, now: Ns) -> JsonObject:
     reply: JsonObject = {
-        "moment": stored.moment,
-        "label": stored.label,
-        "start": moment(stored.start),
-        "end": moment(stored.end),
+        **_labelled_window(stored),
         "ago_s": seconds(now - stored.end),
         "bags": stored.bags,
         "size_gb": round(stored.size / GB, 6),
@@ -170,3 +162,12 @@ def _stored(stored: results.ListedMoment, now: Ns) -> JsonObject:
     if stored.pending:
         reply["pending"] = True
     return with_notes(reply, stored.missing)
+
+
+def _labelled_window(saved: results.RememberedMoment | results.ListedMoment) -> JsonObject:
+    return {
+        "moment": saved.moment,
+        "label": saved.label,
+        "start": moment(saved.start),
+        "end": moment(saved.end),
+    }

@@ -28,7 +28,7 @@ ZEROS_SHOWN_BELOW_CHARS: Final = 4000
 
 _LONGEST_LAST_ROW_CHARS: Final = 200
 """Characters of the row that sums up those left out, whatever its numbers."""
-_MOST_ZEROS_NAMED: Final = 20
+_MAX_ZEROS_NAMED: Final = 20
 
 
 def fit_topics(rows: Sequence[results.TopicRow], max_chars: int) -> str:
@@ -91,8 +91,8 @@ def _topic_range(answer: results.TopicRange) -> JsonObject:
     values, zeros = without_constant_zeros([sample.value for sample in answer.samples])
     if not zeros:
         return reply
-    more = len(zeros) - _MOST_ZEROS_NAMED
-    named = ", ".join(zeros[:_MOST_ZEROS_NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(zeros) - _MAX_ZEROS_NAMED
+    named = ", ".join(zeros[:_MAX_ZEROS_NAMED]) + (f" and {more} more" if more > 0 else "")
     note = f"0 in every sample and left out: {named}"
     return _range_of(answer, values, (*answer.notes, note))
 

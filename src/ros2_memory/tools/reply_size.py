@@ -30,10 +30,10 @@ _FEWEST_ROWS: Final = 2
 _SHORTEST_TEXT: Final = 200
 _ARRAY_STEPS: Final = (50, 25, 12, 6, 3, 2)
 _KEY_STEPS: Final = (200, 50, 12, 4)
-_MOST_NOTES: Final = 12
+_MAX_NOTES: Final = 12
 _LONGEST_NOTE: Final = 600
 _LONGEST_OUTLINED: Final = 80
-_MOST_NAMES: Final = 8
+_MAX_NAMES: Final = 8
 
 
 def to_json_text(value: JsonValue) -> str:
@@ -142,10 +142,10 @@ def _with_few_notes(reply: JsonObject) -> JsonObject:
         return reply
     kept = [
         shortened(note, _LONGEST_NOTE) if isinstance(note, str) else note
-        for note in notes[:_MOST_NOTES]
+        for note in notes[:_MAX_NOTES]
     ]
-    if len(notes) > _MOST_NOTES:
-        kept.append(f"and {len(notes) - _MOST_NOTES} more notes")
+    if len(notes) > _MAX_NOTES:
+        kept.append(f"and {len(notes) - _MAX_NOTES} more notes")
     return {**reply, "notes": kept}
 
 
@@ -210,8 +210,8 @@ def _shorter_values(reply: JsonObject, max_chars: int) -> JsonObject:
         f"{_as_field(path)} ({how}{f': {kept} of {total} kept' if total else ''})"
         for (path, how), (kept, total) in shortener.shortened.items()
     ]
-    if len(named) > _MOST_NAMES:
-        named[_MOST_NAMES:] = [f"and {len(named) - _MOST_NAMES} more"]
+    if len(named) > _MAX_NAMES:
+        named[_MAX_NAMES:] = [f"and {len(named) - _MAX_NAMES} more"]
     sentence = (
         f"shortened to keep the reply under {max_chars} characters: {', '.join(named)}; "
         "name one of them in fields to see more of it"

@@ -197,7 +197,7 @@ async def test_requests_sent_without_waiting_are_answered_in_order() -> None:
 async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(connection_limits, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(connection_limits, "MAX_CONNECTIONS", 3)
     async with serving() as served:
         open_ones = [await served.connect() for _ in range(3)]
         for reader, writer in open_ones:
@@ -248,14 +248,14 @@ async def test_the_system_keeps_little_and_gives_up_a_peer_that_vanished() -> No
         assert waits == connection_limits.UNREAD_S * 1000
         # Linux doubles what it is told, for its own bookkeeping.
         kept = connected.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
-        assert kept <= 2 * connection_limits.KEPT_BYTES
+        assert kept <= 2 * connection_limits.SEND_BUFFER_BYTES
         writer.close()
 
 
 async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(connection_limits, "MOST_STRANGERS", 3)
+    monkeypatch.setattr(connection_limits, "MAX_UNKNOWN", 3)
     async with serving() as served:
         known, to_known = await served.connect()
         to_known.write(GET)
@@ -291,7 +291,7 @@ async def test_a_request_that_was_not_admitted_leaves_a_stranger() -> None:
                 await reader.readuntil(b"ok")
             [connection] = served.server.server_state.connections
             assert isinstance(connection, connection_limits.BoundedConnection)
-            assert connection.is_stranger is stranger
+            assert connection.is_unknown is stranger
         writer.close()
 
 

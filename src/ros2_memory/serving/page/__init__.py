@@ -1,8 +1,8 @@
 """The page at `/`: the memory at a glance, for a browser on this machine.
 
-It holds no data and asks for none but through `/mcp`, so whoever may not ask sees an empty page.
-What was recorded is hostile text: the page writes it as text alone, and its policy allows no
-script, style, or destination but its own, should that ever fail.
+The page has no data of its own and reads it through `/mcp`, so a browser without the token sees an
+empty page. Recorded text may be hostile: the page shows it as text alone. Should that ever fail,
+its Content-Security-Policy allows no script, style or destination but its own.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Page:
         }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """ASGI."""
+        """Handles an ASGI connection."""
         is_page = scope["type"] == "http" and scope["path"] == PAGE_PATH
         if not is_page or scope["method"] not in _METHODS:
             await self._app(scope, receive, send)
@@ -51,10 +51,10 @@ class Page:
 
 
 def policy(html: bytes) -> str:
-    """The Content-Security-Policy of a page that is whole in itself.
+    """Returns the Content-Security-Policy of a page that loads nothing.
 
-    Its inline scripts and styles are allowed by their hash (CSP level 3, section 2.3.1), and
-    nothing else is loaded, sent, framed, or made of text.
+    Its inline scripts and styles are allowed by their hash (CSP level 3, section 2.3.1). It may
+    load no other, connect only to its own origin, and not be framed.
     """
     hashes: dict[bytes, list[str]] = {b"script": [], b"style": []}
     for kind, body in _INLINE.findall(html):
