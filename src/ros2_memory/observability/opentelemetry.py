@@ -1,8 +1,9 @@
 """Spans of tool calls for OpenTelemetry, sent over OTLP (HTTP).
 
-The MCP library begins a span for every request, `tools/call NAME` for a tool, as a child of the
-client's where that sends its trace context. It goes nowhere until a provider is set. So none is
-begun here beside it: it is told what became of the call. Arguments and replies are in no span.
+The MCP library starts a span for every request, `tools/call NAME` for a tool, as a child of the
+client's span if the client sends its trace context. Spans are exported once a provider is set. So
+no other span is started for a call; its outcome is added to the library's. No span holds arguments
+or replies.
 """
 
 from __future__ import annotations
@@ -29,27 +30,27 @@ if TYPE_CHECKING:
     from ros2_memory.core.telemetry import Answered
 
 SERVICE: Final = "ros2-memory-server"
-LONGEST: Final = 256
-"""Characters of a name or a value: of what clients send, some is shown, and nothing grows."""
+MAX_CHARS: Final = 256
+"""Of a name or a value, since clients choose some of them."""
 
-_ENDS_WITHIN_S: Final = 1.0
+_SHUTDOWN_S: Final = 1.0
 _UNNAMED: Final = "unknown_service"
-_NO_FAULT: Final = frozenset({"ok", "no_data"})
+_SUCCESSFUL: Final = frozenset({"ok", "no_data"})
 
 
 class Traces(Observer):
-    """Tells the span of each call its outcome, and how long it spent in which stage."""
+    """Adds to the span of each call its outcome, and the time spent in each stage."""
 
     def __init__(self, provider: TracerProvider) -> None:
         self._provider = provider
         self._tracer = provider.get_tracer("ros2_memory")
 
     def answered(self, call: Answered) -> None:
-        """A call is over; where no span was begun for it, it gets one."""
+        """Adds the outcome of a call to its span; starts one where the library did not."""
         attributes = _attributes(call)
         span = trace.get_current_span()
         if span.get_span_context().is_valid:
-            # Also where it is not sampled: then there is none of the call.
+            # A span that is not sampled is valid too, and the call gets no other.
             span.set_attributes(attributes)
             return
         end = time.time_ns()
@@ -59,27 +60,27 @@ class Traces(Observer):
             attributes=attributes,
             start_time=end - ns_from_unix(call.duration_s),
         )
-        if call.code not in _NO_FAULT:
+        if call.code not in _SUCCESSFUL:
             own.set_status(Status(StatusCode.ERROR))
         own.end(end)
 
     def stop(self) -> None:
-        """Sends what waits, as far as that takes no longer than a second."""
-        # Neither the provider nor its exporter can be told how long they may take.
+        """Exports the remaining spans, for at most a second."""
+        # `shutdown` of the provider and of its exporter takes no timeout.
         ending = threading.Thread(target=self._provider.shutdown, name="last-spans", daemon=True)
         ending.start()
-        ending.join(_ENDS_WITHIN_S)
+        ending.join(_SHUTDOWN_S)
 
 
-class Bounded(SpanProcessor):
-    """Passes spans on whose names and sentences are of bounded length, as their attributes are.
+class BoundedSpanProcessor(SpanProcessor):
+    """Passes spans on with names and descriptions of bounded length, as their attributes are.
 
-    A client may call a tool or a method whatever it likes, and the MCP library repeats that in the
+    The MCP library repeats the names of tools and methods that a client sends, however long, in the
     name and the status of a span.
 
     Args:
-        processor: what they are passed on to.
-        arguments: whether texts that a client chose may be shown, cut short.
+        processor: receives the bounded spans.
+        arguments: whether they may hold texts that a client chose, cut short.
     """
 
     def __init__(self, processor: SpanProcessor, *, arguments: bool) -> None:
@@ -87,13 +88,14 @@ class Bounded(SpanProcessor):
         self._arguments = arguments
 
     def on_start(self, span: Span, parent_context: Context | None = None) -> None:
-        """Passes it on."""
+        """Passes a span on."""
         self._processor.on_start(span, parent_context)
 
     def on_end(self, span: ReadableSpan) -> None:
-        """Passes on what may be shown of it."""
+        """Passes on what a span may show."""
         attributes = dict(span.attributes or {})
-        name, description, events = span.name, span.status.description, span.events
+        name, events = span.name, span.events
+        description = (span.status.description or "")[:MAX_CHARS] or None
         if not self._arguments:
             attributes.pop("gen_ai.prompt.name", None)
             tool = attributes.get("gen_ai.tool.name")
@@ -101,7 +103,7 @@ class Bounded(SpanProcessor):
             description, events = None, ()
         self._processor.on_end(
             ReadableSpan(
-                name=name if len(name) <= LONGEST else f"{name[: LONGEST - 3]}...",
+                name=name if len(name) <= MAX_CHARS else f"{name[: MAX_CHARS - 3]}...",
                 context=span.context,
                 parent=span.parent,
                 resource=span.resource,
@@ -110,7 +112,8 @@ class Bounded(SpanProcessor):
                 links=span.links,
                 kind=span.kind,
                 status=Status(
-                    span.status.status_code, None if description is None else description[:LONGEST]
+                    span.status.status_code,
+                    None if description is None else description[:MAX_CHARS],
                 ),
                 start_time=span.start_time,
                 end_time=span.end_time,
@@ -119,40 +122,38 @@ class Bounded(SpanProcessor):
         )
 
     def shutdown(self) -> None:
-        """Passes it on."""
+        """Shuts the processor down."""
         self._processor.shutdown()
 
     def force_flush(self, timeout_millis: int = 30000) -> bool:
-        """Passes it on."""
+        """Flushes the processor."""
         return self._processor.force_flush(timeout_millis)
 
 
 def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerProvider:
-    """A provider whose spans are of bounded size; sampler and resource are the environment's.
+    """Returns a provider of spans of bounded size, with the environment's sampler and resource.
 
-    `arguments`: whether texts that a client chose, such as a tool's name, may be in them.
-
-    It is named `ros2-memory-server` unless `OTEL_SERVICE_NAME` or `OTEL_RESOURCE_ATTRIBUTES` name
+    `arguments`: whether spans may hold texts that a client chose, such as a tool's name. The
+    service is `ros2-memory-server` unless `OTEL_SERVICE_NAME` or `OTEL_RESOURCE_ATTRIBUTES` name
     it.
     """
     resource = Resource.create()
     if str(resource.attributes.get(SERVICE_NAME, _UNNAMED)).startswith(_UNNAMED):
         resource = resource.merge(Resource({SERVICE_NAME: SERVICE}))
-    limits = SpanLimits(max_attribute_length=LONGEST, max_span_attribute_length=LONGEST)
+    limits = SpanLimits(max_attribute_length=MAX_CHARS, max_span_attribute_length=MAX_CHARS)
     provider = TracerProvider(resource=resource, span_limits=limits, shutdown_on_exit=False)
-    provider.add_span_processor(Bounded(processor, arguments=arguments))
+    provider.add_span_processor(BoundedSpanProcessor(processor, arguments=arguments))
     return provider
 
 
 def traces_from_environment(*, arguments: bool) -> Traces:
-    """Sets the provider of this process, to which the MCP library's spans go too.
+    """Sets the provider of this process, which receives the MCP library's spans too.
 
-    `arguments` is as for `provider_to`.
-
-    Where spans are sent to, and how, is said by the standard `OTEL_*` variables.
+    The standard `OTEL_*` variables say where spans are sent to, and how. `arguments` is as for
+    `provider_to`.
 
     Raises:
-        ConfigError: one of them holds what cannot be used.
+        ConfigError: one of the variables is invalid.
     """
     try:
         provider = provider_to(BatchSpanProcessor(OTLPSpanExporter()), arguments=arguments)

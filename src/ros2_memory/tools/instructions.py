@@ -1,4 +1,4 @@
-"""What the server tells a planner before it calls any tool."""
+"""The instructions that a planner receives before it calls any tool, and the prompt."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ values with fields, or ask for a shorter window.
 
 
 def instructions(settings: QuerySettings, *, additions: bool = True) -> str:
-    """The rules whose neglect makes most wrong calls, with this deployment's defaults.
+    """Returns the rules that prevent most wrong calls, with this deployment's defaults.
 
-    Clients cut instructions at about 2,000 characters; these stay below. `additions`: whether the
-    tools beyond the specification's are offered.
+    Clients cut instructions at about 2,000 characters; these are shorter. `additions`: whether the
+    tools beyond the specification are offered.
     """
     return (_RULES + (_HAPPENED if additions else _SEEN) + _REST).format(
         newest="the newest 3 s or so are not on disk yet and"
@@ -72,4 +72,4 @@ else held: get_value_when.
 - What do you remember at all, and how well: data_time_range, memory_status, list_recorded_topics.
 Answer with the figures of the reply as they stand: ages, durations and distances are in it.
 """
-"""What the prompt adds to the instructions."""
+"""The text that the prompt appends to the instructions."""

@@ -36,7 +36,7 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.parser import text_string_to_metric_families
 
 from ros2_memory.observability.opentelemetry import (
-    LONGEST,
+    MAX_CHARS,
     SERVICE,
     Traces,
     provider_to,
@@ -223,10 +223,10 @@ class TestTraces:
         async with Client(traced()) as client:
             await client.call_tool("x" * 100_000, {})
         span = told(spans, "invalid_arguments")
-        assert len(span.name) == LONGEST
+        assert len(span.name) == MAX_CHARS
         attributes = span.attributes or {}
         assert attributes["gen_ai.tool.name"] == UNKNOWN_TOOL
-        assert max(len(str(each)) for each in attributes.values()) <= LONGEST
+        assert max(len(str(each)) for each in attributes.values()) <= MAX_CHARS
 
     async def test_whatever_a_client_sends_spans_stay_small(
         self, spans: InMemorySpanExporter
