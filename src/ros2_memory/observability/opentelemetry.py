@@ -111,10 +111,7 @@ class BoundedSpanProcessor(SpanProcessor):
                 events=events,
                 links=span.links,
                 kind=span.kind,
-                status=Status(
-                    span.status.status_code,
-                    None if description is None else description[:MAX_CHARS],
-                ),
+                status=Status(span.status.status_code, description),
                 start_time=span.start_time,
                 end_time=span.end_time,
                 instrumentation_scope=span.instrumentation_scope,
