@@ -173,87 +173,76 @@ def _print(console: Console, findings: Sequence[Finding]) -> None:
 
 
 def check_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Finding]:
-    """Whether the bag directory is there, may be used by this user, and has room.
+    """Checks that the bag directory exists, that this user may use it, and that its disk has room.
 
-    `foreign_bytes` is what bags take that its recorder did not make, and keeps.
+    `foreign_bytes` is the size of the bags that the recorder did not make and does not delete.
     """
-    bag_dir, about = settings.recording.bag_dir.absolute(), "bag_dir"
+    bag_dir = settings.recording.bag_dir.absolute()
     records = not isinstance(settings.recorder, NullRecorderNode)
     if not bag_dir.is_dir():
         if not records:
             do = "name the directory of the bags: MEMORY_BAG_DIR, or recording.bag_dir=DIR"
-            yield _error(about, f"{bag_dir} is no directory", do)
+            yield _error("bag_dir", f"{bag_dir} is no directory", do)
             return
-        yield _warning(
-            about,
-            f"{bag_dir} is not there",
-            "the recorder makes it when it starts; is its disk mounted?",
-        )
+        do = "the recorder makes it when it starts; is its disk mounted?"
+        yield _warning("bag_dir", f"{bag_dir} is not there", do)
     else:
-        yield from _permissions(bag_dir, records=records)
+        yield _check_permissions(bag_dir, records=records)
     if records:
-        yield from _room(settings, bag_dir, foreign_bytes)
+        yield _check_disk(settings, bag_dir, foreign_bytes)
 
 
-def _permissions(bag_dir: Path, *, records: bool) -> Iterator[Finding]:
-    user = _user()
-    wanted = os.R_OK | os.X_OK
-    if not os.access(bag_dir, wanted):
-        do = "give this user the right to read it, or run as the user of the services"
-        yield _error("bag_dir", f"{user} may not read {bag_dir}", do)
-    elif records and not os.access(bag_dir, wanted | os.W_OK):
-        yield _warning(
-            "bag_dir",
-            f"{user} may read {bag_dir}, and not write there",
-            "fine if the recorder runs as another user, who may: "
-            "sudo -u USER ros2-memory doctor looks as that one",
-        )
-    else:
-        may = "read and write" if records else "read"
-        yield _ok("bag_dir", f"{bag_dir}, where {user} may {may}")
-
-
-def _user() -> str:
+def _check_permissions(bag_dir: Path, *, records: bool) -> Finding:
     try:
-        return getpass.getuser()
+        user = getpass.getuser()
     except (KeyError, OSError):  # a container's user without an entry
-        return f"user {os.getuid()}"
+        user = f"user {os.getuid()}"
+    if not os.access(bag_dir, os.R_OK | os.X_OK):
+        do = "give this user the right to read it, or run as the user of the services"
+        return _error("bag_dir", f"{user} may not read {bag_dir}", do)
+    if not records:
+        return _ok("bag_dir", f"{bag_dir}, where {user} may read")
+    if os.access(bag_dir, os.R_OK | os.W_OK | os.X_OK):
+        return _ok("bag_dir", f"{bag_dir}, where {user} may read and write")
+    do = (
+        "fine if the recorder runs as another user, who may: "
+        "sudo -u USER ros2-memory doctor looks as that one"
+    )
+    return _warning("bag_dir", f"{user} may read {bag_dir}, and not write there", do)
 
 
-def _room(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Iterator[Finding]:
-    there = next(each for each in (bag_dir, *bag_dir.parents) if each.is_dir())
+def _check_disk(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Finding:
+    existing = next(each for each in (bag_dir, *bag_dir.parents) if each.is_dir())
     try:
-        disk = shutil.disk_usage(there)
+        disk = shutil.disk_usage(existing)
     except OSError as error:
-        yield _error("disk", f"{there} cannot be measured: {error}", "look after the disk")
-        return
-    mount = next(each for each in (there, *there.parents) if os.path.ismount(each))
-    kept = settings.retention
+        return _error("disk", f"{existing} cannot be measured: {error}", "look after the disk")
+    mount = next(each for each in (existing, *existing.parents) if os.path.ismount(each))
+    limits = settings.retention
     free, used = disk.free / GB, max(_size(bag_dir) - foreign_bytes, 0) / GB
-    seen = f"{free:.1f} GB free on {mount}; {used:.1f} of {kept.max_total_gb:g} GB used"
+    seen = f"{free:.1f} GB free on {mount}; {used:.1f} of {limits.max_total_gb:g} GB used"
     if foreign_bytes:
         seen += (
             f"; bags that this recorder did not make take {foreign_bytes / GB:.2g} GB more, and "
             "are neither deleted nor counted: `ros2-memory adopt DIR` takes those of a directory"
         )
-    if free < kept.min_free_gb:
+    if free < limits.min_free_gb:
         do = (
-            f"recording pauses below retention.min_free_gb={kept.min_free_gb:g}; delete what else "
-            "lies on this disk"
+            f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete what "
+            "else lies on this disk"
         )
-        yield _error("disk", seen, do)
-    elif free - kept.min_free_gb < kept.max_total_gb - used:
+        return _error("disk", seen, do)
+    if free - limits.min_free_gb < limits.max_total_gb - used:
         do = (
             "the disk is full before the budget is: lower retention.max_total_gb to "
-            f"{max(free - kept.min_free_gb + used, 0):.1f}, or make room"
+            f"{max(free - limits.min_free_gb + used, 0):.1f}, or make room"
         )
-        yield _warning("disk", seen, do)
-    else:
-        yield _ok("disk", seen)
+        return _warning("disk", seen, do)
+    return _ok("disk", seen)
 
 
 def _size(folder: Path) -> int:
-    """The bytes of all files below a folder, as far as they can be seen; two names count once."""
+    """Returns the bytes of all readable files below a folder; hard links count once."""
     sizes: dict[tuple[int, int], int] = {}
     for _, entries in directories.walk(folder):
         for entry in entries:
@@ -265,7 +254,7 @@ def _size(folder: Path) -> int:
 
 
 def check_clock(snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
-    """Whether this machine's clock can be right, and those that dated the bags."""
+    """Checks this machine's clock, and those of the machines that dated the bags."""
     do = "set the clock (timedatectl, chrony); bags keep the dates they were given"
     latest = snapshot.dating.latest
     if now < FIRST_BAGS_NS:
@@ -282,65 +271,56 @@ def check_clock(snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
 
 
 def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
-    """Whether all bags can be read, and all messages in them understood."""
-    told = data_time_range(memory, Call())
+    """Checks that all bags can be read, and all messages in them decoded."""
+    covered = data_time_range(memory, Call())
     snapshot = memory.index.snapshot()
     if snapshot.problem:
-        do = "see bag_dir above; is the disk mounted?"
-        yield _error("bags", snapshot.problem, do)
+        yield _error("bags", snapshot.problem, "see bag_dir above; is the disk mounted?")
         return
-    newest = "" if told.latest is None else f", the newest from {iso_local(told.latest)}"
-    answering = counted(told.bags, "bag answers", "bags answer")
-    if told.bags or told.active:
-        yield _ok("bags", f"{answering}{newest}")
+    if covered.bags or covered.active:
+        newest = "" if covered.latest is None else f", the newest from {iso_local(covered.latest)}"
+        yield _ok("bags", f"{counted(covered.bags, 'bag answers', 'bags answer')}{newest}")
     else:
         do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
         yield _warning("bags", nothing_here(snapshot), do)
-    left = (*told.damaged, *told.incomplete)
-    if left:
-        yield _warning(
-            "bags",
-            f"{len(told.damaged)} damaged and {len(told.incomplete)} unfinished: "
-            f"{listed([f'{each.path.name} ({each.reason})' for each in left])}",
-            _how_to_repair(left, memory.reader, settings.recording.bag_dir),
-        )
-    if told.unread:
-        names = listed([each.path.name for each in told.unread])
+    if broken := (*covered.damaged, *covered.incomplete):
+        names = listed([f"{each.path.name} ({each.reason})" for each in broken])
+        seen = f"{len(covered.damaged)} damaged and {len(covered.incomplete)} unfinished: {names}"
+        yield _warning("bags", seen, _how_to_repair(broken, memory.reader, settings))
+    if covered.unread:
+        names = listed([each.path.name for each in covered.unread])
+        files = counted(len(covered.unread), "file is", "files are")
         do = "storage=rosbag2 reads sqlite and compressed bags, too"
-        files = counted(len(told.unread), "file is", "files are")
         yield _warning("bags", f"{files} not read: {names}", do)
-    odd = odd_bags(snapshot)
-    if odd:
-        seen = counted(len(odd), "bag is not whole", "bags are not whole")
+    if odd := odd_bags(snapshot):
+        bags = counted(len(odd), "bag is not whole", "bags are not whole")
         names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in odd])
         do = "what is readable of them answers; record or copy them anew for the rest"
-        yield _warning("bags", f"{seen}: {names}", do)
+        yield _warning("bags", f"{bags}: {names}", do)
     for sentence in describe_absent(absent_splits(snapshot, memory.index.bag_dir)):
-        do = "copy what is missing from where it was recorded"
-        yield _warning("bags", sentence, do)
-    if told.undecodable:
-        # Those that a configured folder would mend say so themselves.
-        lacking = [each for each in told.undecodable if _MSG_FOLDERS in each.reason]
-        others = [each for each in told.undecodable if _MSG_FOLDERS not in each.reason]
-        name_them = f"name the folder with the .msg files in {_MSG_FOLDERS}"
-        for some, do in ((lacking, name_them), (others, _NOT_DECODED)):
-            if some:
-                topics = listed([f"{each.topic} ({each.reason})" for each in some])
-                seen = f"{counted(len(some), 'topic')} cannot be decoded: {topics}"
-                yield _warning("bags", seen, do)
+        yield _warning("bags", sentence, "copy what is missing from where it was recorded")
+    # The reason names the key where a configured folder would help.
+    missing = [each for each in covered.undecodable if _MSG_FOLDERS in each.reason]
+    others = [each for each in covered.undecodable if _MSG_FOLDERS not in each.reason]
+    name_them = f"name the folder with the .msg files in {_MSG_FOLDERS}"
+    for topics, do in ((missing, name_them), (others, _NOT_DECODED)):
+        if topics:
+            names = listed([f"{each.topic} ({each.reason})" for each in topics])
+            yield _warning(
+                "bags", f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do
+            )
 
 
-def _how_to_repair(left: Sequence[SetAside], reader: BagReader, bag_dir: Path) -> str:
-    """What mends bags that were left open or are damaged, as far as anything does."""
-    others = sum(not _is_repairable(each.path, reader) for each in left)
-    if others == len(left):
+def _how_to_repair(broken: Sequence[SetAside], reader: BagReader, settings: Settings) -> str:
+    others = sum(not _is_repairable(each.path, reader) for each in broken)
+    if others == len(broken):
         return _NOT_REPAIRED
     rest = f"; {others} of them it cannot repair: {_NOT_REPAIRED}" if others else ""
-    return f"ros2-memory recover {bag_dir}{rest}"
+    return f"ros2-memory recover {settings.recording.bag_dir}{rest}"
 
 
 def _is_repairable(path: Path, reader: BagReader) -> bool:
-    """Whether `ros2-memory recover` takes a file: MCAP that its writer did not finish."""
+    """Returns whether `ros2-memory recover` repairs a file: MCAP that its writer did not finish."""
     try:
         return path.suffix == ".mcap" and reader.closing(path) is Closing.OPEN
     except BagError:
@@ -348,7 +328,7 @@ def _is_repairable(path: Path, reader: BagReader) -> bool:
 
 
 def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
-    """Whether what lies in the directory is one history, and whether all of it is told of."""
+    """Checks that the recordings are one history, and that no file counts as active by mistake."""
     pairs = overlaps(snapshot)
     for pair in pairs[:MAX_NAMED]:
         seen = (
@@ -358,9 +338,8 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
         do = "give the bags of each robot or run a folder of their own, and a server each"
         yield _warning("bags", seen, do)
     if len(pairs) > MAX_NAMED:
-        seen = f"{counted(len(pairs) - MAX_NAMED, 'more pair overlaps', 'more pairs overlap')}"
-        do = "`ros2-memory info` lists them all"
-        yield _warning("bags", seen, do)
+        seen = counted(len(pairs) - MAX_NAMED, "more pair overlaps", "more pairs overlap")
+        yield _warning("bags", seen, "`ros2-memory info` lists them all")
     for path, until in assumed_active(memory, snapshot):
         seen = (
             f"{path.parent.name}/{path.name} has no end and was written lately: until "
@@ -371,40 +350,36 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
 
 
 def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
-    """What the recorder last said of itself."""
-    about = "recorder"
+    """Checks what the recorder's heartbeat reports."""
     if isinstance(settings.recorder, NullRecorderNode):
-        yield _ok(about, "recorder=none: nothing is recorded here")
+        yield _ok("recorder", "recorder=none: nothing is recorded here")
         return
-    start = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
     heartbeat, reason = read_heartbeat(settings.recording.bag_dir)
     if heartbeat is None:
-        yield _error(about, str(reason), start)
+        yield _error("recorder", str(reason), _START_RECORDER)
         return
     age = f"{unix_from_ns(abs(now - heartbeat.updated)):.0f} s ago"
     if heartbeat.state is RecorderState.STOPPED:
-        yield _warning(about, f"it was stopped {age}", start)
+        yield _warning("recorder", f"it was stopped {age}", _START_RECORDER)
     elif not heartbeat.is_live(now):
-        do = "journalctl -u ros2-memory-recorder says why it ended; " + start
-        yield _error(about, f"it was last heard of {age}, and never said why", do)
+        do = f"journalctl -u ros2-memory-recorder says why it ended; {_START_RECORDER}"
+        yield _error("recorder", f"it was last heard of {age}, and never said why", do)
     elif heartbeat.state is RecorderState.PAUSED:
         why = heartbeat.last_error or "it does not say why"
-        yield _error(about, f"it is paused: {why}", "see disk above")
+        yield _error("recorder", f"it is paused: {why}", "see disk above")
     else:
-        yield _ok(
-            about, f"{heartbeat.state}, {counted(len(heartbeat.subscribed), 'topic')} subscribed"
-        )
-        yield from _troubles(heartbeat)
+        subscribed = counted(len(heartbeat.subscribed), "topic")
+        yield _ok("recorder", f"{heartbeat.state}, {subscribed} subscribed")
+        yield from _check_heartbeat(heartbeat)
 
 
-def _troubles(heartbeat: Heartbeat) -> Iterator[Finding]:
+def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.silent:
         do = (
             "is their publisher running? Under another user it is heard over the network alone: "
             "FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder"
         )
-        seen = f"subscribed and never heard: {listed(heartbeat.silent)}"
-        yield _warning("recorder", seen, do)
+        yield _warning("recorder", f"subscribed and never heard: {listed(heartbeat.silent)}", do)
     if heartbeat.age_held:
         do = "have the clock synchronised: timedatectl set-ntp true, or chrony; the budget holds"
         yield _warning("recorder", heartbeat.age_held, do)
@@ -417,7 +392,7 @@ def _troubles(heartbeat: Heartbeat) -> Iterator[Finding]:
 
 
 def check_ros(settings: Settings, reader: BagReader) -> Iterator[Finding]:
-    """Whether `ros2 bag record` can be run, in the environment that the recorder gives it."""
+    """Checks that `ros2 bag record` runs in the environment that the recorder gives it."""
     if isinstance(settings.recorder, NullRecorderNode):
         return
     try:
@@ -426,61 +401,56 @@ def check_ros(settings: Settings, reader: BagReader) -> Iterator[Finding]:
         reason, _, do = str(error).partition("; ")
         yield _error("ros", reason, do or "correct recorder.setup_files")
     else:
-        named = ", ".join(str(each) for each in settings.recorder.setup_files)
-        seen = f"ros2 bag record can be run{f' after {named}' if named else ''}"
-        yield _ok("ros", seen)
+        files = ", ".join(str(each) for each in settings.recorder.setup_files)
+        yield _ok("ros", f"ros2 bag record can be run{f' after {files}' if files else ''}")
 
 
 def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
-    """Whether what `topics.yaml` names has been recorded lately."""
+    """Checks that the topics of `topics.yaml` have been recorded lately."""
     if isinstance(settings.recorder, NullRecorderNode):
         return
+    file = settings.recording.topics_file
     try:
-        selection = load_topics(settings.recording.topics_file)
+        selection = load_topics(file)
     except EpisodicError as error:
         yield _error("topics", str(error), "correct recording.topics_file")
         return
-    missing = never_heard(selection, snapshot, query_settings_of(settings).latching)
+    missing = _unheard_entries(selection, snapshot, query_settings_of(settings).latching)
     heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
-    live = heartbeat is not None and heartbeat.is_live(now)
-    unoffered = [*heartbeat.missing] if live and heartbeat is not None else []
-    listed_there = counted(len(selection.entries), "entry", "entries")
-    file = settings.recording.topics_file
+    is_live = heartbeat is not None and heartbeat.is_live(now)
+    unoffered = heartbeat.missing if is_live and heartbeat is not None else ()
+    entries = counted(len(selection.entries), "entry", "entries")
     if not snapshot.bags:
-        seen = f"{file} lists {listed_there}; nothing is recorded yet"
-        yield _ok("topics", seen)
+        yield _ok("topics", f"{file} lists {entries}; nothing is recorded yet")
     elif not missing and not unoffered:
-        seen = f"{listed_there} of {file}: all are in the newest hour of data, or latched"
+        seen = f"{entries} of {file}: all are in the newest hour of data, or latched"
         yield _ok("topics", seen)
-    for entry, near in missing.items():
-        hint = f"is it {' or '.join(near)}? " if near else ""
+    for entry, similar in missing.items():
+        hint = f"is it {' or '.join(similar)}? " if similar else ""
         why = f"; {_UNOFFERED}" if entry in unoffered else ""
-        yield _warning(
-            "topics",
-            f"{entry} is in {file}, and not in the newest hour of data{why}",
-            f"{hint}compare with `ros2 topic list`; a name that nobody publishes is recorded by "
-            "nobody",
-        )
-
+        seen = f"{entry} is in {file}, and not in the newest hour of data{why}"
+        do = "compare with `ros2 topic list`; a name that nobody publishes is recorded by nobody"
+        yield _warning("topics", seen, f"{hint}{do}")
     for entry in unoffered:
         if entry not in missing:
             do = "is its publisher running? compare with `ros2 topic list`"
             yield _warning("topics", f"{entry} is in {file}; {_UNOFFERED}", do)
 
 
-def never_heard(
+def _unheard_entries(
     selection: TopicSelection, snapshot: Snapshot, latching: Latching
 ) -> Mapping[str, list[str]]:
-    """The entries of which nothing was recorded lately, with recorded names that are like them."""
+    """Returns the entries without a recent message, with similar names among recorded topics."""
+    if not snapshot.bags:
+        return {}
     latest = snapshot.dating.latest
     heard = []
     for topic in snapshot.topics():
         last = max(each.last for each in snapshot.totals(topic).values())
-        waits = latching.is_latched(snapshot, topic) or snapshot.is_log(topic)
-        if latest is None or waits or last > latest - _RECENT_NS:
+        # Nobody expects a latched topic or a log to have a message in every hour.
+        is_seldom = latching.is_latched(snapshot, topic) or snapshot.is_log(topic)
+        if latest is None or is_seldom or last > latest - _RECENT_NS:
             heard.append(topic)
-    if not snapshot.bags:
-        return {}
     return {
         entry: get_close_matches(entry, snapshot.topics(), n=2)
         for entry in selection.entries
@@ -507,11 +477,9 @@ def check_extras(settings: Settings) -> Iterator[Finding]:
         seen = "server.metrics=true with server.transport=stdio, which has no /metrics"
         do = "choose server.transport=sse, or set server.metrics to false"
         yield _error("extras", seen, do)
-    if _is_installed("pyarrow"):
-        yield _ok("extras", "export --parquet is installed")
-    else:
-        seen = "export --parquet is not installed: pip install 'ros2-memory[parquet]' adds it"
-        yield _ok("extras", seen)
+    seen = "is not installed: pip install 'ros2-memory[parquet]' adds it"
+    seen = "is installed" if _is_installed("pyarrow") else seen
+    yield _ok("extras", f"export --parquet {seen}")
 
 
 def _is_installed(module: str) -> bool:
@@ -523,45 +491,44 @@ def _is_installed(module: str) -> bool:
 
 
 def check_server(settings: Settings) -> Iterator[Finding]:
-    """What the server's `/health` says."""
-    at, about = settings.server, "server"
-    if at.transport == "stdio":
+    """Checks what the server's `/health` reports."""
+    server = settings.server
+    if server.transport == "stdio":
         seen = "server.transport=stdio: each client starts its own, there is none to ask"
-        yield _ok(about, seen)
+        yield _ok("server", seen)
         return
-    begun = time.monotonic()
+    address = f"{server.host} port {server.port}"
+    start = time.monotonic()
     try:
-        status, reply = _health(_LOCAL_ADDRESSES.get(at.host, at.host), at.port)
+        status, reply = _health(_LOCAL_ADDRESSES.get(server.host, server.host), server.port)
     except (OSError, http.client.HTTPException) as error:
-        seen = f"nothing answers on {at.host} port {at.port}: {error}"
         do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
-        yield _error(about, seen, do)
+        yield _error("server", f"nothing answers on {address}: {error}", do)
         return
     except (ValueError, EpisodicError) as error:
-        seen = f"what answers on {at.host} port {at.port} is another program: {error}"
-        yield _error(about, seen, "give the server another port: server.port")
+        seen = f"what answers on {address} is another program: {error}"
+        yield _error("server", seen, "give the server another port: server.port")
         return
-    if status == http.HTTPStatus.UNAUTHORIZED:
-        seen = f"the server on {at.host} port {at.port} takes another token than MEMORY_API_TOKEN"
-        do = "give doctor the token that the server was started with"
-        yield _warning(about, seen, do)
-        return
-    took = f"in {(time.monotonic() - begun) * 1000:.0f} ms"
-    if reply.get("status") == "ok":
-        yield _ok(about, f"ok on {at.host} port {at.port}, {took}")
-        return
+    duration_ms = (time.monotonic() - start) * 1000
     problems = reply.get("problems")
-    named = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
-    seen = f"{reply.get('status', f'HTTP {status}')}: {named or 'it does not say why'}"
-    yield _warning(about, seen, "the findings above and its log have the cause")
+    if status == http.HTTPStatus.UNAUTHORIZED:
+        seen = f"the server on {address} takes another token than MEMORY_API_TOKEN"
+        yield _warning("server", seen, "give doctor the token that the server was started with")
+    elif reply.get("status") == "ok":
+        yield _ok("server", f"ok on {address}, in {duration_ms:.0f} ms")
+    else:
+        why = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
+        seen = f"{reply.get('status', f'HTTP {status}')}: {why or 'it does not say why'}"
+        yield _warning("server", seen, "the findings above and its log have the cause")
 
 
 def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
-    """Status and reply of `/health`; no reply where it refuses the token.
+    """Returns the status and the reply of `/health`; an empty reply if it refuses the token.
 
     Raises:
-        OSError: nothing answers; what answers in no HTTP raises an HTTPException.
-        ValueError: the reply is no JSON object with a status.
+        OSError: nothing answers.
+        HTTPException: what answers does not speak HTTP.
+        ValueError: the reply is not a JSON object with a status.
         ConfigError: the token to show cannot be read.
     """
     token = api_token(os.environ)
