@@ -1,4 +1,4 @@
-"""`ros2-memory adopt`: takes recordings that another program made for the recorder's own."""
+"""`ros2-memory adopt`: lists recordings of other programs as the recorder's own."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -16,6 +16,7 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags,
 from ros2_memory.bootstrap import claim
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
+    MB,
     BagDir,
     Sets,
     load_for,
@@ -30,8 +31,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.text import counted
 
-_MB = 1_000_000
-_NAMED = 5
+_MAX_LINKS_NAMED = 5
 _INSTEAD = "move or mount the bags into the bag directory"
 
 
@@ -58,43 +58,48 @@ def adopt(
             )
         root = settings.recording.bag_dir
         own = OwnRecordings(root)
-        places = [_place(each, root) for each in directories]
-        found = {name: path for each in places for name, path in _folders(each, own)}
+        given = [_below(root, each) for each in directories]
+        found = {
+            name: path
+            for directory in given
+            for path in folders_with_bags(directory)
+            if (name := own.name_of(path)) and not is_kept_apart(name)
+        }
         _require_list(root, own)
         new = {name: path for name, path in found.items() if not own.owns(path)}
         own.adopt({name: _identity(path) for name, path in new.items()})
     for name, path in new.items():
-        files, size = _taken(path)
-        print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size / _MB:.1f} MB)")
-    already = len(found) - len(new)
-    if already:
-        print_line(
-            f"{counted(already, 'directory is', 'directories are')} the recorder's own already"
-        )
+        files, size = _count_bags(path)
+        print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size / MB:.1f} MB)")
+    if already := len(found) - len(new):
+        folders = counted(already, "directory is", "directories are")
+        print_line(f"{folders} the recorder's own already")
     if new:
         print_line("retention deletes them from now on, by its limits, oldest first")
     if not found:
         print_line("no bag files lie there")
-        for link in islice(_links(places), _NAMED):
-            print_line(
-                f"{link.relative_to(root)} is a symbolic link, which is not followed: {_INSTEAD}"
-            )
+        for link in islice(_links(given), _MAX_LINKS_NAMED):
+            name = str(link.relative_to(root))
+            print_line(f"{name} is a symbolic link, which is not followed: {_INSTEAD}")
         raise typer.Exit(EXIT_NEGATIVE)
 
 
-def _place(directory: Path, root: Path) -> Path:
-    """The directory to adopt, given by its path or by its name in the bag directory.
+def _below(root: Path, directory: Path) -> Path:
+    """Returns a directory, given by its path or its name in the bag directory, as a path below it.
 
     Raises:
-        InvalidArgumentsError: it is no directory below the bag directory.
+        InvalidArgumentsError: it is not a directory below the bag directory, or behind a link.
     """
+    # `abspath` follows no link, unlike `resolve`.
+    base = Path(os.path.abspath(root))  # noqa: PTH100
     for given in (directory, root / directory):
-        place = Path(os.path.abspath(given))  # noqa: PTH100 - follows no link
-        base = Path(os.path.abspath(root))  # noqa: PTH100
-        if not place.is_dir() or not place.is_relative_to(base):
+        path = Path(os.path.abspath(given))  # noqa: PTH100
+        if not path.is_dir() or not path.is_relative_to(base):
             continue
-        inside = root / place.relative_to(base)
-        link = next((each for each in (inside, *inside.parents) if _is_link(each, root)), None)
+        inside = root / path.relative_to(base)
+        # The bag directory itself may be a link.
+        parts = [each for each in (inside, *inside.parents) if each.is_relative_to(root)]
+        link = next((each for each in parts if each != root and each.is_symlink()), None)
         if link is not None:
             raise InvalidArgumentsError(f"{link} is a symbolic link, which is not followed")
         return inside
@@ -103,37 +108,21 @@ def _place(directory: Path, root: Path) -> Path:
     )
 
 
-def _folders(place: Path, own: OwnRecordings) -> Iterator[tuple[str, Path]]:
-    """By name the directories to adopt.
-
-    Raises:
-        OSError: one cannot be listed.
-    """
-    for path in folders_with_bags(place):
-        name = own.name_of(path)
-        if name and not is_kept_apart(name):
-            yield name, path
-
-
-def _links(places: Iterable[Path]) -> Iterator[Path]:
-    """The links that might lead to bags."""
-    for place in places:
-        for folder, folders, files in os.walk(place):
+def _links(directories: Iterable[Path]) -> Iterator[Path]:
+    """Yields the symbolic links that may lead to bags."""
+    for directory in directories:
+        for folder, folders, files in os.walk(directory):
             for name in sorted((*folders, *filter(bag_kind, files))):
                 path = Path(folder, name)
                 if path.is_symlink() and not name.startswith("."):
                     yield path
 
 
-def _is_link(path: Path, root: Path) -> bool:
-    return path != root and path.is_relative_to(root) and path.is_symlink()
-
-
 def _require_list(root: Path, own: OwnRecordings) -> None:
-    """Makes the list where there is none, as the recorder does before it records.
+    """Writes the list of own recordings if there is none, as the recorder does when it starts.
 
     Raises:
-        RecorderError: a recorder of a version without a list records there, or it cannot be made.
+        RecorderError: a recorder of a version without lists is recording, or writing fails.
     """
     if own.exists():
         return
@@ -151,8 +140,8 @@ def _identity(path: Path) -> Identity:
     return identity
 
 
-def _taken(folder: Path) -> tuple[int, int]:
-    """How many bag files lie in a directory, and their bytes."""
+def _count_bags(folder: Path) -> tuple[int, int]:
+    """Returns the number of bag files in a directory, and their bytes."""
     files = size = 0
     for path in folder.iterdir():
         if bag_kind(path.name):
