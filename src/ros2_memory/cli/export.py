@@ -94,19 +94,19 @@ def export(
         window = parse_window(memory, start, end, last)
         topics = _topics(view, topic or ())
         note_unread(view, window)
-        with _progress(view, window) as tell:
-            held = _held(view, topics, window.start) if latched else []
+        with _progress(view, window) as report:
+            earlier = _latched_before(view, topics, window.start) if latched else []
             within = view.stream.messages(topics, window)
             first = list(islice(within, 1))
-            if held and not first:
+            if earlier and not first:
                 view.notes.add(
                     "no message lies in the window: what latched ones held is all there is"
                 )
-            found = _reported(chain(held, first, within), tell)
+            messages = _reported(chain(earlier, first, within), report)
             if mcap is not None:
-                done = as_mcap(mcap, found, _profile(view, topics, window, held))
+                done = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
             elif parquet is not None:
-                done = _as_parquet(parquet, found, memory, robot)
+                done = _write_parquet(parquet, messages, memory, robot)
     print_line(done)
     for note in view.notes.sentences():
         typer.echo(f"note: {note}", err=True)
@@ -115,105 +115,105 @@ def export(
 
 
 def _topics(view: View, globs: Sequence[str]) -> list[str]:
-    """The recorded topics that are asked for.
+    """Returns the recorded topics that match one of the globs; all without any.
 
     Raises:
-        NoDataError: there is none.
+        NoDataError: no topic matches.
     """
     names = view.snapshot.topics()
-    chosen = [name for glob in globs or ("*",) for name in match_topics(names, glob)]
+    chosen = {name for glob in globs or ("*",) for name in match_topics(names, glob)}
     if not chosen:
         asked = f"no recorded topic matches {', '.join(globs)}" if globs else "nothing is recorded"
         raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{asked}; see ros2-memory topics")
-    return sorted(set(chosen))
+    return sorted(chosen)
 
 
-def _held(view: View, topics: Sequence[str], start: Ns) -> list[StoredMessage]:
-    """The latched messages of before that hold at a moment, with their own times.
+def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[StoredMessage]:
+    """Returns the latched messages that are valid when a window starts, by log time.
 
-    That is the newest of a topic; and of transforms the newest of each child frame, since every
+    These are the newest of each topic; of transforms the newest for each child frame, since every
     broadcaster publishes only its own.
     """
     before = TimeWindow(MIN_NS, start)
     latching = view.memory.limits.latching
-    held: dict[tuple[str, str], StoredMessage] = {}
+    valid: dict[tuple[str, str], StoredMessage] = {}
     for topic in topics:
         if not latching.may_hold(view.snapshot, topic):
             continue
         if any(each.endswith("/TFMessage") for each in view.snapshot.types_of(topic)):
-            if not latching.is_latched(view.snapshot, topic):
-                continue
-            for found in view.stream.messages([topic], before):
-                held.update(((topic, frame), found) for frame in _frames(view.memory, found))
-        elif (newest := view.stream.newest(topic, before)) is not None and latching.holds(
-            view.snapshot, newest
-        ):
-            held[topic, ""] = newest
-    once = {id(found): found for found in held.values()}
-    return sorted(once.values(), key=lambda found: found.time)
+            if latching.is_latched(view.snapshot, topic):
+                for each in view.stream.messages([topic], before):
+                    frames = _child_frames(view.memory, each)
+                    valid.update(((topic, frame), each) for frame in frames)
+            continue
+        newest = view.stream.newest(topic, before)
+        if newest is not None and latching.holds(view.snapshot, newest):
+            valid[topic, ""] = newest
+    # A message is valid for several frames, and is exported once.
+    once = {id(each): each for each in valid.values()}
+    return sorted(once.values(), key=lambda each: each.time)
 
 
-def _frames(memory: Memory, found: StoredMessage) -> set[str]:
-    """The child frames of a message of transforms; none where it cannot be decoded."""
+def _child_frames(memory: Memory, stored: StoredMessage) -> set[str]:
+    """Returns the child frames of a TFMessage; none if it cannot be decoded."""
     try:
-        message = memory.reader.decode(found.record)
+        message = memory.reader.decode(stored.record)
     except UndecodableError:
         return set()
-    edges = memory.extractor.transforms(message, found.time, static=True)
-    return {edge.child for edge in edges}
+    return {edge.child for edge in memory.extractor.transforms(message, stored.time, static=True)}
 
 
 def _profile(
-    view: View, topics: Sequence[str], window: TimeWindow, held: Sequence[StoredMessage]
+    view: View, topics: Sequence[str], window: TimeWindow, earlier: Sequence[StoredMessage]
 ) -> str:
-    """The MCAP profile of all the bags that hold the messages; empty where they differ."""
+    """Returns the MCAP profile of all bags that hold the messages; empty if they differ."""
     chosen = frozenset(topics)
     within = view.snapshot.overlapping(window)
     bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.schema.positions)}
-    bags.update(found.bag.path for found in held)
+    bags.update(each.bag.path for each in earlier)
     profiles: set[str] = set()
     for path in bags:
-        # What cannot be read is reported where its messages are.
+        # A bag that cannot be read is reported when its messages are read.
         with suppress(BagError):
             profiles.add(view.memory.reader.profile(path))
     return profiles.pop() if len(profiles) == 1 else ""
 
 
-def as_mcap(path: Path, found: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> str:
-    """Writes the file, which is there when it is whole; what was done, in a sentence.
+def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> str:
+    """Writes an MCAP file, which appears when it is complete; returns what was done, for people.
 
     Raises:
         BagError: it cannot be written.
-        InvalidArgumentsError: there is such a file.
-        NoDataError: there is no message.
+        InvalidArgumentsError: the file exists.
+        NoDataError: there are no messages.
     """
     if path.exists():
         raise InvalidArgumentsError(f"{path} exists; name another file, or delete it first")
-    first = next(found, None)
+    first = next(messages, None)
     if first is None:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, "no message lies in the window")
     written = 0
 
     def records() -> Iterator[Record]:
         nonlocal written
-        for each in chain((first,), found):
+        for each in chain((first,), messages):
             written += 1
             yield each.record
 
-    beside = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        beside.unlink(missing_ok=True)
-        McapWriter().write(beside, records(), profile=profile)
-        beside.replace(path)
+        temporary.unlink(missing_ok=True)
+        McapWriter().write(temporary, records(), profile=profile)
+        temporary.replace(path)
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     return f"{counted(written, 'message')} in {path}"
 
 
-def _as_parquet(
-    path: Path, found: Iterator[StoredMessage], memory: Memory, robot: str | None
+def _write_parquet(
+    path: Path, messages: Iterator[StoredMessage], memory: Memory, robot: str | None
 ) -> str:
-    """Writes the rows; what was done, in a sentence.
+    """Writes rows of Parquet; returns what was done, for people.
 
     Raises:
         ConfigError: the optional dependency is missing.
@@ -226,7 +226,7 @@ def _as_parquet(
             "pip install 'ros2-memory[parquet]'"
         ) from error
     with Dataset(path, memory.reader, memory.extractor, robot) as dataset:
-        for each in found:
+        for each in messages:
             dataset.add(each)
     return f"{counted(dataset.rows, 'message')} in {counted(dataset.files, 'file')} below {path}"
 

@@ -1,4 +1,4 @@
-"""A folder of Parquet files, one row for a message, partitioned as query engines expect it.
+"""Writes Parquet files, a row for each message, partitioned as query engines expect it.
 
     DIR/[robot=NAME/]recording=rec_20261120T043000Z/date=2026-11-20/part-0.parquet
 
@@ -11,7 +11,7 @@ a pose `frame_id`, `x`, `y`, `z` (m) and `qx`, `qy`, `qz`, `qw`, unrounded.
 from __future__ import annotations
 
 import json
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Self
 from urllib.parse import quote
@@ -42,44 +42,44 @@ SCHEMA: Final = pa.schema(
         *((name, pa.float64()) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")),
     ]
 )
-_ROWS_AT_ONCE: Final = 20_000
-"""Rows of one group in a file: some megabytes."""
-_OPEN_AT_ONCE: Final = 16
-"""Files that are being written; messages come in time order, so few recordings are under way."""
+_GROUP_ROWS: Final = 20_000
+"""Rows of a row group: some megabytes."""
+_MAX_OPEN_FILES: Final = 16
+"""Messages come in time order, so few recordings are written at a time."""
 
 Row = dict[str, object]
 
 
-class _Part:
-    """One file under way, of which nothing is seen before all of the dataset is written."""
+class _PartFile:
+    """One file being written, under a temporary name until the dataset is complete."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.beside = path.with_name(f".{path.name}.tmp")
+        self.temporary = path.with_name(f".{path.name}.tmp")
         self.rows: list[Row] = []
-        self.beside.unlink(missing_ok=True)  # or a link there would be written through
-        self._writer = pq.ParquetWriter(self.beside, SCHEMA, compression="zstd")
+        self.temporary.unlink(missing_ok=True)  # or a link there would be written through
+        self._writer = pq.ParquetWriter(self.temporary, SCHEMA, compression="zstd")
 
     def flush(self) -> None:
-        """Writes what has been gathered."""
+        """Writes the buffered rows as a row group."""
         if self.rows:
             self._writer.write_table(pa.Table.from_pylist(self.rows, schema=SCHEMA))
             self.rows.clear()
 
     def close(self) -> None:
-        """Writes the rest, and ends the file."""
+        """Writes the buffered rows, and ends the file."""
         self.flush()
         self._writer.close()
 
 
 class Dataset:
-    """Takes messages and writes them as rows; all files appear at the end, or none.
+    """Writes messages as rows; all files appear at the end of a `with` block, or none.
 
     Args:
         root: the folder; partitions that exist already are refused.
         reader: decodes messages.
-        extractor: makes values and poses of them.
-        robot: the name of a further partition, so that many robots make one dataset.
+        extractor: extracts their values and poses.
+        robot: the name of a further partition, so that many robots share a dataset.
     """
 
     def __init__(
@@ -88,9 +88,9 @@ class Dataset:
         self._root = root if robot is None else root / f"robot={quote(robot, safe=' ')}"
         self._reader = reader
         self._extractor = extractor
-        self._under_way: OrderedDict[Path, _Part] = OrderedDict()
-        self._closed: list[_Part] = []
-        self._numbers: dict[Path, int] = {}
+        self._open: OrderedDict[Path, _PartFile] = OrderedDict()
+        self._closed: list[_PartFile] = []
+        self._parts: Counter[Path] = Counter()
         self.rows = 0
         self.files = 0
 
@@ -103,56 +103,57 @@ class Dataset:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        parts = [*self._closed, *self._under_way.values()]
+        parts = [*self._closed, *self._open.values()]
         try:
-            for part in self._under_way.values():
+            for part in self._open.values():
                 part.close()
             if kind is None:
                 for part in parts:
-                    part.beside.replace(part.path)
+                    part.temporary.replace(part.path)
                 self.files = len(parts)
         finally:
             for part in parts:
-                part.beside.unlink(missing_ok=True)
+                part.temporary.unlink(missing_ok=True)
 
-    def add(self, found: StoredMessage) -> None:
+    def add(self, stored: StoredMessage) -> None:
         """Adds one message.
 
         Raises:
-            InvalidArgumentsError: its partition was there before.
+            InvalidArgumentsError: its partition existed before.
         """
-        part = self._part(found)
-        part.rows.append(self._row(found))
+        part = self._part_for(stored)
+        part.rows.append(self._row(stored))
         self.rows += 1
-        if len(part.rows) >= _ROWS_AT_ONCE:
+        if len(part.rows) >= _GROUP_ROWS:
             part.flush()
 
-    def _part(self, found: StoredMessage) -> _Part:
-        date = datetime.fromtimestamp(found.time // NS_PER_S, tz=UTC).date()
-        name = quote(found.bag.recording.name, safe=" ")
+    def _part_for(self, stored: StoredMessage) -> _PartFile:
+        """Returns the file of a message's partition; closes the one that was unused for longest."""
+        date = datetime.fromtimestamp(stored.time // NS_PER_S, tz=UTC).date()
+        name = quote(stored.bag.recording.name, safe=" ")
         folder = self._root / f"recording={name}" / f"date={date}"
-        part = self._under_way.get(folder)
-        if part is None:
-            part = self._under_way[folder] = self._begun(folder)
-        self._under_way.move_to_end(folder)
-        if len(self._under_way) > _OPEN_AT_ONCE:
-            _, oldest = self._under_way.popitem(last=False)
+        if folder not in self._open:
+            self._open[folder] = self._new_part(folder)
+        self._open.move_to_end(folder)
+        if len(self._open) > _MAX_OPEN_FILES:
+            _, oldest = self._open.popitem(last=False)
             oldest.close()
             self._closed.append(oldest)
-        return part
+        return self._open[folder]
 
-    def _begun(self, folder: Path) -> _Part:
+    def _new_part(self, folder: Path) -> _PartFile:
         folder.mkdir(parents=True, exist_ok=True)
-        if folder not in self._numbers and any(folder.glob("*.parquet")):
+        if folder not in self._parts and any(folder.glob("*.parquet")):
             raise InvalidArgumentsError(
                 f"{folder} has rows already, which would stand there twice; export whole days (UTC)"
                 ", name another folder, or delete this one"
             )
-        number = self._numbers[folder] = self._numbers.get(folder, -1) + 1
-        return _Part(folder / f"part-{number}.parquet")
+        part = _PartFile(folder / f"part-{self._parts[folder]}.parquet")
+        self._parts[folder] += 1
+        return part
 
-    def _row(self, found: StoredMessage) -> Row:
-        record = found.record
+    def _row(self, stored: StoredMessage) -> Row:
+        record = stored.record
         row: Row = {
             "topic": record.channel.topic,
             "type": record.channel.type,
@@ -164,16 +165,18 @@ class Dataset:
         except UndecodableError as error:
             return {**row, "undecodable": error.reason}
         value = self._extractor.shown(message, record.channel.type).value
-        row["value"] = _sound(json.dumps(value, ensure_ascii=False, separators=(",", ":")))
+        row["value"] = _without_surrogates(
+            json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+        )
         pose = self._extractor.pose(message, record.channel.type)
         if pose is not None:
-            row["frame_id"] = _sound(pose.frame_id) or None
+            row["frame_id"] = _without_surrogates(pose.frame_id) or None
             row.update(zip("xyz", pose.position, strict=True))
             if pose.orientation is not None:
                 row.update(zip(("qx", "qy", "qz", "qw"), pose.orientation, strict=True))
         return row
 
 
-def _sound(text: str) -> str:
-    """The text, in which what is no Unicode is escaped as JSON has it."""
+def _without_surrogates(text: str) -> str:
+    """Returns the text with lone surrogates, which UTF-8 cannot hold, escaped as in JSON."""
     return text.encode("utf-8", "backslashreplace").decode()

@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import cli
-from ros2_memory.cli.export import as_mcap
+from ros2_memory.cli.export import write_mcap as export_mcap
 from ros2_memory.cli.options import parse_time
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
@@ -315,7 +315,7 @@ class TestMcap:
         folder = tmp_path / "out"
         folder.mkdir()
         with pytest.raises(KeyboardInterrupt):
-            as_mcap(folder / "out.mcap", interrupted())
+            export_mcap(folder / "out.mcap", interrupted())
         assert [*folder.iterdir()] == []
 
     def test_of_a_window_without_messages_no_file_is_made(
