@@ -192,7 +192,7 @@ def test_fields_of_a_vehicles_odometry_read_as_a_point_and_angles(tmp_path: Path
 
 
 @each_way
-def test_a_satellite_fix_is_told_in_degrees(tmp_path: Path, recalls: bool) -> None:
+def test_a_satellite_fix_is_reported_in_degrees(tmp_path: Path, recalls: bool) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(9)])
     assert ask(tmp_path, recalls, "get_position_at", topic="/fix", timestamp=T0_S + 2) == {
         "x": None,

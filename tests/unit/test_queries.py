@@ -86,7 +86,7 @@ def test_nothing_seen_in_the_newest_message_does_not_make_a_field_unknown(tmp_pa
     assert (answer.found, answer.notes) == (None, ())
 
 
-def test_a_pose_that_cannot_be_decoded_is_left_out_of_the_way_and_counted(tmp_path: Path) -> None:
+def test_a_pose_that_cannot_be_decoded_is_left_out_of_the_path_and_counted(tmp_path: Path) -> None:
     poses = [odom(T0 + n * S, n, 0.0) for n in range(10)]
     poses[5] = Msg("/odom", poses[5].type, T0 + 5 * S, b"\x00\x01\x00\x00")
     write_mcap(tmp_path / "a" / "a_0.mcap", poses)
@@ -95,7 +95,7 @@ def test_a_pose_that_cannot_be_decoded_is_left_out_of_the_way_and_counted(tmp_pa
     assert any("cannot be decoded: 1 " in note for note in answer.notes)
 
 
-def test_a_way_of_which_nothing_can_be_decoded_has_no_answer(tmp_path: Path) -> None:
+def test_a_path_of_which_nothing_can_be_decoded_has_no_answer(tmp_path: Path) -> None:
     broken = Msg("/odom", odom(T0, 0, 0).type, T0, b"\x00\x01\x00\x00")
     write_mcap(tmp_path / "a" / "a_0.mcap", [broken])
     with pytest.raises(NoDataError) as caught:
@@ -142,7 +142,7 @@ def test_many_latched_messages_of_a_simulated_clock_count_once_each(tmp_path: Pa
     assert [(row.topic, row.count) for row in rows] == [("/log", 40)]
 
 
-def test_bags_that_stand_apart_stay_apart_after_a_takeover(tmp_path: Path) -> None:
+def test_bags_that_stand_apart_stay_apart_after_a_handover(tmp_path: Path) -> None:
     for name, begin in (("a", 0), ("b", 58)):
         for split in range(6):
             start = T0 + (begin + split * 10) * S
@@ -185,7 +185,7 @@ def test_the_clock_is_read_once_for_each_call(tmp_path: Path) -> None:
         (109.0, "outside_range"),
     ],
 )
-def test_why_there_is_no_transform_is_said_of_the_whole_memory(
+def test_why_there_is_no_transform_is_reported_of_the_whole_memory(
     tmp_path: Path, at: float, reason: str
 ) -> None:
     for name, begin in (("a", 0), ("b", 80)):
@@ -219,7 +219,9 @@ def test_what_is_listed_reaches_to_the_bag_that_closed_last(tmp_path: Path) -> N
     assert [row.count for row in queries.list_recorded_topics(memory, Call())] == [1, 2]
 
 
-def test_without_a_bag_directory_it_is_not_told_that_nothing_was_recorded(tmp_path: Path) -> None:
+def test_without_a_bag_directory_it_is_not_reported_that_nothing_was_recorded(
+    tmp_path: Path,
+) -> None:
     memory = memory_of(tmp_path / "away")
     with pytest.raises(NoDataError, match="the bag directory does not exist"):
         queries.list_recorded_topics(memory, Call())

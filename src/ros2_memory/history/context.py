@@ -209,7 +209,7 @@ class Note(NamedTuple):
         kind: the sentence.
         file: its name as replies have it.
         detail: what is special about this one; may be empty.
-        until: nothing of it lies after this log time.
+        until: no part of it is after this log time.
     """
 
     kind: Reason

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 RELATCHED_NS: Final[Ns] = NS_PER_S
 """A latched message logged so long after it was published may have been received before."""
 _MAX_SEARCHES: Final = 8
+"""After so many single searches on a topic, one pass finds the first copies of all its messages."""
 
 
 class MergedStream:

@@ -157,7 +157,7 @@ class ReverseSearch:
             self._has_decoded = True
             return self._condition.matches(value)
         except UndecodableError as error:
-            # One that was raised keeps all that was on the way, the message with it.
+            # A copy: the raised error keeps its traceback alive, and the message with it.
             alone = UndecodableError(error.topic, error.type_name, error.reason)
             self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
             return None

@@ -225,13 +225,19 @@ def _joined(paths: Mapping[str, Path]) -> dict[str, Session]:
     for folder in paths:
         if folder in joined:
             continue
-        chain, waiting = {folder}, [folder]
-        while waiting:
-            fresh = beside[waiting.pop()] - chain
-            chain |= fresh
-            waiting += fresh
-        joined.update(dict.fromkeys(chain, frozenset(chain)))
+        chain = frozenset(reachable(folder, beside))
+        joined.update(dict.fromkeys(chain, chain))
     return joined
+
+
+def reachable(begin: str, beside: Mapping[str, set[str]]) -> set[str]:
+    """Returns the nodes of an undirected graph that are connected with one, itself included."""
+    reached, waiting = {begin}, [begin]
+    while waiting:
+        fresh = beside.get(waiting.pop(), set()) - reached
+        reached |= fresh
+        waiting += fresh
+    return reached
 
 
 def _distance(span: tuple[Ns, Ns], moment: Ns) -> Ns:

@@ -7,6 +7,7 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -44,7 +45,7 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.sessions import Sessions
+from ros2_memory.history.sessions import Sessions, reachable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -377,14 +378,12 @@ def connected(
         pairs |= _pairs(view, limits.tf_static_topics, static=True, among=among)
     except QueryTimeoutError:
         return False
+    beside: defaultdict[str, set[str]] = defaultdict(set)
+    for parent, child in filter(_is_edge, pairs):
+        beside[parent.lstrip("/")].add(child.lstrip("/"))
+        beside[child.lstrip("/")].add(parent.lstrip("/"))
     origin, target = (name.lstrip("/") for name in frames)
-    pairs = {(pair[0].lstrip("/"), pair[1].lstrip("/")) for pair in pairs if _is_edge(pair)}
-    reached, waiting = {origin}, [origin]
-    while waiting:
-        here = waiting.pop()
-        beside = {b if a == here else a for a, b in pairs if here in {a, b}} - reached
-        reached |= beside
-        waiting += beside
+    reached = reachable(origin, beside)
     return target in reached and len(reached) > 1
 
 

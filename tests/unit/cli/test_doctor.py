@@ -251,7 +251,7 @@ def test_files_that_metadata_lists_and_are_not_there_are_counted(
         (RecorderState.RECORDING, {"last_error": "ros2 bag record died"}, 1),
     ],
 )
-def test_a_recorder_that_does_not_record_is_told(
+def test_a_recorder_that_does_not_record_is_reported(
     robot: Path, capsys: Capture, state: RecorderState, more: dict[str, Any], code: int
 ) -> None:
     beat(robot, state, **more)

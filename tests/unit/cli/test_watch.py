@@ -101,7 +101,9 @@ def test_a_terminal_gets_a_table() -> None:
     assert b"silent" in shown
 
 
-def test_restarts_and_topics_that_nobody_offers_are_told(bag_dir: Path, capsys: Capture) -> None:
+def test_restarts_and_topics_that_nobody_offers_are_reported(
+    bag_dir: Path, capsys: Capture
+) -> None:
     now = time.time_ns()
     beat = Heartbeat(
         1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, ("/gone", "/lost")

@@ -50,14 +50,14 @@ LOST_SPLIT = Snapshot(bags=(split(0), split(2), split(3)), damaged=(torn(1),), s
     ("start", "stop", "touched"),
     [(0, 9, False), (5, 12, True), (12, 15, True), (19.5, 31, True), (21, 31, False)],
 )
-def test_a_split_that_could_not_be_read_is_told_in_windows_that_may_touch_it(
+def test_a_split_that_could_not_be_read_is_reported_in_windows_that_may_touch_it(
     start: float, stop: float, touched: bool
 ) -> None:
     sentence = "1 bag file could not be read and may hold more: rec/rec_1.mcap (torn)"
     assert told(LOST_SPLIT, start, stop) == [sentence] * touched
 
 
-def test_a_file_of_which_the_time_is_unknown_is_told_where_nothing_was_found() -> None:
+def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found() -> None:
     snapshot = Snapshot(bags=(split(0),), damaged=(torn(7, None, "alone"),), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 9) == []
     assert told(snapshot, 0, 9, nothing=True) == [
@@ -92,7 +92,7 @@ def test_many_files_are_counted_and_the_last_ones_named() -> None:
     ]
 
 
-def test_the_split_being_written_is_told_from_the_end_of_the_one_before_it_on() -> None:
+def test_the_split_being_written_is_reported_from_the_end_of_the_one_before_it_on() -> None:
     active = SetAside(Path("/b/rec/rec_1.mcap"), "still being written")
     snapshot = Snapshot(bags=(split(0),), active=(active,), scanned_at=T0 + 15 * S)
     assert told(snapshot, 0, 9) == []
@@ -107,7 +107,7 @@ def test_a_file_that_is_written_beside_closed_ones_is_named() -> None:
     assert told(snapshot, 0, 9) == ["still being written and not included: other/other_0.mcap"]
 
 
-def test_a_bag_that_a_crash_left_open_is_told_with_what_is_lost_of_it() -> None:
+def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it() -> None:
     cut = split(1, state=BagState.INCOMPLETE, notes=("the last 41 bytes could not be read",))
     snapshot = Snapshot(bags=(split(0), cut), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 9) == []
@@ -119,7 +119,7 @@ def test_a_bag_that_a_crash_left_open_is_told_with_what_is_lost_of_it() -> None:
     ]
 
 
-def test_a_closed_bag_that_contradicts_itself_is_told() -> None:
+def test_a_closed_bag_that_contradicts_itself_is_reported() -> None:
     odd = [split(number, notes=("its own statistics are wrong",)) for number in range(5)]
     snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 5) == ["rec/rec_0.mcap: its own statistics are wrong"]
@@ -127,7 +127,7 @@ def test_a_closed_bag_that_contradicts_itself_is_told() -> None:
     assert told(snapshot, 0, 60) == [f"5 bags ({named}): its own statistics are wrong"]
 
 
-def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_told() -> None:
+def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_reported() -> None:
     odd = [split(number, notes=(f"way {number}",)) for number in range(5)]
     snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 60) == [
@@ -144,7 +144,7 @@ def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_told() -> None:
     window=st.tuples(st.integers(-100, 500), st.integers(-100, 500)),
     nothing=st.booleans(),
 )
-def test_what_is_told_stays_short_however_much_was_lost(
+def test_what_is_reported_stays_short_however_much_was_lost(
     lost: set[int], reason: str, window: tuple[int, int], nothing: bool
 ) -> None:
     asides = tuple(SetAside(Path(f"/b/rec/rec_{n}.mcap"), reason, T0) for n in sorted(lost))

@@ -57,7 +57,7 @@ def test_the_same_copies_are_kept_newest_first(messages: list[StoredMessage]) ->
 
 
 @given(histories(), st.integers(0, 30 * S), st.integers(0, 30 * S))
-def test_what_lies_outside_of_the_contested_time_is_kept_both_ways(
+def test_what_lies_outside_of_the_overlap_is_kept_both_ways(
     messages: list[StoredMessage], one: int, other: int
 ) -> None:
     spans = [(min(one, other), max(one, other))]

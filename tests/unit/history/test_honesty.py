@@ -157,7 +157,7 @@ def test_never_seen_is_null_only_where_everything_was_searched(tmp_path: Path) -
     assert [*reply] == ["notes"]
 
 
-def test_the_split_being_written_is_told_where_it_may_hold_newer(tmp_path: Path) -> None:
+def test_the_split_being_written_is_reported_where_it_may_hold_newer(tmp_path: Path) -> None:
     write_splits(tmp_path, 2)
     active = write_mcap(tmp_path / "rec" / "rec_2.mcap", messages(20), McapLayout(finish=False))
     os.utime(active, ns=(T0 + 29 * S,) * 2)
@@ -176,7 +176,7 @@ def test_the_split_being_written_is_told_where_it_may_hold_newer(tmp_path: Path)
 SEEN = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
 
 
-def test_a_bag_that_a_crash_left_open_is_told_with_what_is_lost_of_it(tmp_path: Path) -> None:
+def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_path: Path) -> None:
     paths = write_splits(tmp_path, 3)
     paths[2].write_bytes(paths[2].read_bytes()[:6000])
     os.utime(paths[2], ns=(T0 + 32 * S,) * 2)
@@ -191,7 +191,7 @@ def test_a_bag_that_a_crash_left_open_is_told_with_what_is_lost_of_it(tmp_path: 
     assert [row.notes for row in rows if row.topic == "/odom"] == [(told,)]
 
 
-def test_a_chunk_that_is_lost_of_a_closed_bag_is_told_in_windows_that_touch_the_bag(
+def test_a_chunk_that_is_lost_of_a_closed_bag_is_reported_in_windows_that_touch_the_bag(
     tmp_path: Path,
 ) -> None:
     paths = write_splits(tmp_path, 3)
@@ -225,7 +225,7 @@ def test_what_does_not_answer_is_listed_with_reasons(tmp_path: Path) -> None:
     assert odometry.notes[0].startswith("1 bag dated by a wrong clock: boot/boot_0.mcap (")
 
 
-def test_what_a_wrong_clock_dated_is_found_by_its_times_and_told_so(tmp_path: Path) -> None:
+def test_what_a_wrong_clock_dated_is_found_by_its_times_and_reported_so(tmp_path: Path) -> None:
     write_splits(tmp_path, 2)
     write_mcap(tmp_path / "boot" / "boot_0.mcap", [odom(0, 0, 0), odom(5 * S, 1, 0)])
     memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))

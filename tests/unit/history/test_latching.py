@@ -133,7 +133,7 @@ def test_telemetry_that_is_transient_local_does_not_hold(tmp_path: Path, recalls
 
 @each_way
 @pytest.mark.parametrize(("period_s", "holds"), [(4.9, False), (5.1, True), (60.0, True)])
-def test_what_is_said_every_five_seconds_or_less_often_holds(
+def test_what_is_published_every_five_seconds_or_less_often_holds(
     tmp_path: Path, period_s: float, holds: bool, recalls: bool
 ) -> None:
     said = every(period_s, 120, MAP)

@@ -44,7 +44,7 @@ def frames_that_part(bag_dir: Path) -> None:
     write_mcap(bag_dir / "run" / "run_0.mcap", messages)
 
 
-def test_a_frame_that_is_not_told_of_around_a_time_is_not_said_to_be_unknown_at_all_times(
+def test_a_frame_that_is_not_reported_around_a_time_is_not_reported_to_be_unknown_at_all_times(
     tmp_path: Path,
 ) -> None:
     frames_that_part(tmp_path)
@@ -64,7 +64,7 @@ def test_a_frame_that_is_not_told_of_around_a_time_is_not_said_to_be_unknown_at_
         ("map", "base_link", 3 * 3600 + 50, NoDataReason.FRAME_UNKNOWN),
     ],
 )
-def test_a_frame_that_is_told_of_within_an_hour_is_not_unknown_but_silent(
+def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
     tmp_path: Path, parent: str, child: str, later: float, reason: NoDataReason
 ) -> None:
     frames_that_part(tmp_path)
@@ -78,7 +78,7 @@ def test_a_frame_that_is_told_of_within_an_hour_is_not_unknown_but_silent(
         assert caught.value.reason is reason
 
 
-def test_the_reach_of_a_transform_is_told_of_the_time_asked_alone(tmp_path: Path) -> None:
+def test_notes_beside_a_transform_are_about_the_time_asked_alone(tmp_path: Path) -> None:
     frames_that_part(tmp_path)
     with pytest.raises(NoDataError, match="around then it is recorded"):
         queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(61))
@@ -96,7 +96,7 @@ def test_by_header_stamps_a_time_without_any_is_out_of_range_and_no_fault_of_the
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_told(
+def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_reported(
     tmp_path: Path, sign: float
 ) -> None:
     turned = Transform((1.0, 2.0, 3.0), (0.0, 0.0, sign * 0.6, sign * 0.8))
@@ -109,7 +109,7 @@ def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_told(
     ("length_s", "told"),
     [(0.0493, "0.0493 s"), (2.0, "2 s"), (99.96, "100 s"), (515_219.9, "515220 s")],
 )
-def test_a_duration_is_told_without_powers_of_ten(length_s: float, told: str) -> None:
+def test_a_duration_is_reported_without_powers_of_ten(length_s: float, told: str) -> None:
     assert seconds(round(length_s * NS_PER_S)) == told
 
 
@@ -128,7 +128,7 @@ def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s
     assert told.sample.time == T0
 
 
-def test_what_never_had_a_message_before_a_time_is_said_in_words(tmp_path: Path) -> None:
+def test_what_never_had_a_message_before_a_time_is_reported_in_words(tmp_path: Path) -> None:
     frames_that_part(tmp_path)
     with pytest.raises(NoDataError, match=f"no message of /tf within 10 s of {T0_S - 100}"):
         queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(-100))

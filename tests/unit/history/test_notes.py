@@ -167,7 +167,7 @@ def test_a_slow_detector_is_not_silent_while_its_messages_cannot_be_decoded(
         ("recap", {"start": T0_S, "end": T0_S + 9}),
     ],
 )
-def test_what_is_wrong_with_a_bag_is_told_once(
+def test_what_is_wrong_with_a_bag_is_reported_once(
     tmp_path: Path, tool: str, given: dict[str, object], bags: int
 ) -> None:
     for name in "abc"[:bags]:

@@ -142,7 +142,7 @@ def test_a_place_is_looked_for_only_where_it_may_be(bag_dir: Path) -> None:
     assert reader.read == ["rec_2.mcap"]
 
 
-def test_what_is_known_of_all_bags_is_told_without_reading_one(bag_dir: Path) -> None:
+def test_what_is_known_of_all_bags_is_reported_without_reading_one(bag_dir: Path) -> None:
     memory, reader = filled(bag_dir)
     queries.list_recorded_topics(memory, Call())
     queries.data_time_range(memory, Call())

@@ -55,7 +55,7 @@ def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
 
 @needs_recorded
 @each_way
-def test_a_recorded_session_is_told_as_it_happened(tmp_path: Path, recalls: bool) -> None:
+def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path, recalls: bool) -> None:
     session = SESSIONS["session_mcap"]
     for bag in session.folder.glob("*.mcap"):
         (tmp_path / bag.name).write_bytes(bag.read_bytes())
@@ -264,7 +264,7 @@ def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
 
 @each_way
 @pytest.mark.parametrize("speed", [0.005, 0.01, 0.03, 0.05])
-def test_a_robot_that_creeps_is_not_said_to_stand(
+def test_a_robot_that_creeps_is_not_taken_to_stand(
     tmp_path: Path, recalls: bool, speed: float
 ) -> None:
     _drive(tmp_path, [(60.0, speed)], hz=20)
@@ -343,7 +343,7 @@ def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
     assert {note for note in some.notes if "pose" in note} <= set(shown)
 
 
-def test_a_gap_in_the_memory_is_told(tmp_path: Path) -> None:
+def test_a_gap_in_the_memory_is_reported(tmp_path: Path) -> None:
     for nth, at in enumerate((0, 100)):
         write_mcap(
             tmp_path / f"bag_{nth}.mcap",
@@ -354,7 +354,7 @@ def test_a_gap_in_the_memory_is_told(tmp_path: Path) -> None:
     assert ((gap.start - BEGIN) / S, ((gap.end or 0) - BEGIN) / S) == (9.0, 100.0)
 
 
-def test_errors_in_logs_are_told_once_with_their_count(tmp_path: Path) -> None:
+def test_errors_in_logs_are_reported_once_with_their_count(tmp_path: Path) -> None:
     def log(at: int, level: int, msg: str) -> object:
         return make(
             "rcl_interfaces/msg/Log",
@@ -511,7 +511,7 @@ def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
     assert over(memory, -10, 60).throughout == ()
 
 
-def test_a_thing_that_several_detectors_see_is_told_once(tmp_path: Path) -> None:
+def test_a_thing_that_several_detectors_see_is_reported_once(tmp_path: Path) -> None:
     one = [detections(BEGIN + at * S, ["cup"] if at in {2, 3} else []) for at in range(10)]
     other = [
         detections(BEGIN + at * S, ["cup"] if at in {3, 4} else [], topic="/vision/other")
@@ -563,7 +563,7 @@ def _answer(memory: Memory, span: TimeRange) -> str:
         return repr(error)
 
 
-def test_a_stop_a_hair_below_0_is_told_without_a_sign(tmp_path: Path) -> None:
+def test_a_stop_a_hair_below_0_is_reported_without_a_sign(tmp_path: Path) -> None:
     stood = [odom(BEGIN + at * S // 2, -0.0001, 2.0, 0.0) for at in range(40)]
     write_mcap(tmp_path / "bag.mcap", stood)
     told = [each.text for each in over(memory_of(tmp_path), 0, 30).events]

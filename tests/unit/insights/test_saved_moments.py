@@ -113,7 +113,7 @@ def test_a_moment_is_kept_by_the_recorder_and_then_listed(tmp_path: Path) -> Non
     }
 
 
-def test_what_the_recorder_refuses_is_told_with_its_reason(tmp_path: Path) -> None:
+def test_what_the_recorder_refuses_is_reported_with_its_reason(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
     beating(tmp_path)
     (tmp_path / MOMENTS_FOLDER).symlink_to(tmp_path)
@@ -155,14 +155,14 @@ def test_a_recorder_that_does_not_answer_is_not_waited_for_for_ever(
     assert requests(tmp_path) == []
 
 
-def test_a_call_that_is_over_withdraws_its_wish(tmp_path: Path) -> None:
+def test_a_call_that_is_over_withdraws_its_request(tmp_path: Path) -> None:
     memory = remembering(tmp_path)
     beating(tmp_path)
     assert "did not answer" in refusal(memory, Call(Deadline.after(-1)))
     assert requests(tmp_path) == []
 
 
-def test_a_wish_that_was_begun_just_in_time_is_waited_for(
+def test_a_request_that_was_begun_just_in_time_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     memory = remembering(tmp_path)

@@ -120,7 +120,7 @@ def test_a_silence_ends_a_sighting(tmp_path: Path) -> None:
     assert seconds(memory, "cup", topic) == [(21.5, 21.5), (1, 11)]
 
 
-def test_the_window_and_the_limit_bound_what_is_told(tmp_path: Path) -> None:
+def test_the_window_and_the_limit_bound_what_is_reported(tmp_path: Path) -> None:
     topic = detections(BEGIN, []).topic
     said = [(float(t), "cup" if t % 2 else "") for t in range(20)]
     memory = spoken(tmp_path, *said)
@@ -169,7 +169,7 @@ def test_a_number_beyond_a_limit_is_a_sighting_too(tmp_path: Path) -> None:
     assert ((fast.first - BEGIN) // S, (fast.last - BEGIN) // S) == (5, 9)
 
 
-def test_a_thing_is_told_in_the_map_where_transforms_lead_there(tmp_path: Path) -> None:
+def test_a_thing_is_reported_in_the_map_where_transforms_lead_there(tmp_path: Path) -> None:
     seen = detections(BEGIN + S, ["cup"], at=(1.0, 0.0, 0.5))
     messages = [
         odom(BEGIN + S - 1, 3.0, 0.0, 0.0),
@@ -200,7 +200,7 @@ def test_what_was_never_seen_is_an_empty_list_with_what_was_searched(tmp_path: P
     assert shown["searched_to"] == (BEGIN + 2 * S) / S
 
 
-def test_a_reply_tells_how_long_ago_so_that_nobody_has_to_subtract(tmp_path: Path) -> None:
+def test_a_reply_reports_how_long_ago_so_that_nobody_has_to_subtract(tmp_path: Path) -> None:
     memory = spoken(tmp_path, (1, "cup"), (3, "cup"), (4, ""))
     latest = replace(memory, limits=replace(memory.limits, now="latest"))
     answer = find_matches(latest, Call(), detections(BEGIN, []).topic, "contains", "cup")

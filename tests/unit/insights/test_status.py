@@ -68,7 +68,7 @@ def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
     assert told["fell_silent"] == []
 
 
-def test_age_that_is_held_is_told_while_the_recorder_lives(tmp_path: Path) -> None:
+def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
     beating(tmp_path, RecorderState.RECORDING, 59, age_held="72 bags stay")
     told = shown(memory, tmp_path)
@@ -92,7 +92,7 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     assert ("stopped without saying so" in reply["trust"]) == (now == "wall")
 
 
-def test_restarts_and_topics_that_nobody_offers_are_told(tmp_path: Path) -> None:
+def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
     missing = tuple(f"/gone_{n:02}" for n in range(30))
     beating(tmp_path, RecorderState.RECORDING, 59, restarts=3, missing=missing)
@@ -110,7 +110,7 @@ def test_restarts_and_topics_that_nobody_offers_are_told(tmp_path: Path) -> None
         (RecorderState.STOPPED, 59, "nothing is known to be missing"),
     ],
 )
-def test_a_recorder_that_does_not_record_is_told(
+def test_a_recorder_that_does_not_record_is_reported(
     tmp_path: Path, state: RecorderState, at: float, trust: str
 ) -> None:
     memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
@@ -129,7 +129,7 @@ def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Pat
     assert answer.fell_silent == (SilentTopic("/bumper", BEGIN + 79 * S, S),)
 
 
-def test_damaged_files_are_counted_and_told(tmp_path: Path) -> None:
+def test_damaged_files_are_counted_and_reported(tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"no bag at all, whatever its name says")
     told = shown(remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=9e6), tmp_path)
     assert told["damaged"] == 1
@@ -263,7 +263,9 @@ class TestWhatIsMissingIsNamedAndCounted:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
         assert self.trust(tmp_path) == SOUND
 
-    def test_metadata_that_cannot_be_read_is_not_compared_and_told(self, tmp_path: Path) -> None:
+    def test_metadata_that_cannot_be_read_is_not_compared_and_reported(
+        self, tmp_path: Path
+    ) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5))
         (tmp_path / "rec" / "metadata.yaml").write_text("")
         assert self.trust(tmp_path).startswith("metadata.yaml of rec cannot be read")
@@ -307,7 +309,7 @@ class TestWhatIsMissingIsNamedAndCounted:
         self.recording(tmp_path / "rec", ("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5))
         assert self.trust(tmp_path) == SOUND
 
-    def test_it_is_no_longer_told_when_the_file_is_back(self, tmp_path: Path) -> None:
+    def test_it_is_no_longer_reported_when_the_file_is_back(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
         second = tmp_path / "rec" / "rec_1.mcap"
         content = second.read_bytes()

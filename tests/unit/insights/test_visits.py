@@ -186,7 +186,7 @@ def test_a_place_where_it_never_was_has_no_visits(tmp_path: Path) -> None:
     assert (answer.visits, answer.more) == ((), False)
 
 
-def test_the_newest_visits_come_first_and_more_are_told_of(tmp_path: Path) -> None:
+def test_the_newest_visits_come_first_and_more_are_counted(tmp_path: Path) -> None:
     there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
     memory = remembering(tmp_path, line(*there_and_back))
     answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0, limit=2)
@@ -398,7 +398,9 @@ def test_a_newest_pose_that_cannot_be_decoded_hides_no_visit(
 
 
 @each_way
-def test_a_pose_on_the_way_that_cannot_be_decoded_is_told(tmp_path: Path, *, recalls: bool) -> None:
+def test_a_pose_in_between_that_cannot_be_decoded_is_reported(
+    tmp_path: Path, *, recalls: bool
+) -> None:
     way = line((20.0, 0.1))
     way[3] = replace(way[3], body=way[3].payload[:40])
     memory = remembering(tmp_path, way)
@@ -409,7 +411,7 @@ def test_a_pose_on_the_way_that_cannot_be_decoded_is_told(tmp_path: Path, *, rec
     assert [note for note in found.notes if "cannot be decoded" in note]
 
 
-def test_of_poses_of_which_none_can_be_decoded_it_is_told_that(tmp_path: Path) -> None:
+def test_of_poses_of_which_none_can_be_decoded_it_is_reported_that(tmp_path: Path) -> None:
     way = [replace(each, body=each.payload[:40]) for each in line((3.0, 0.1))]
     with pytest.raises(UndecodableError, match="does not fit"):
         visits(remembering(tmp_path, way), Call(), 0.0, 0.0)
