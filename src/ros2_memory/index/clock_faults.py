@@ -60,11 +60,6 @@ class ClockFault(NamedTuple):
     misleads: bool = True
 
     @property
-    def file(self) -> str:
-        """The path of the bag file."""
-        return self.bag.file
-
-    @property
     def reason(self) -> str:
         """What is wrong, as a sentence, and what follows from it."""
         left_out = "; left out of earliest and latest" if self.misleads else ""
@@ -114,7 +109,7 @@ class Dating:
     @property
     def misdated(self) -> frozenset[str]:
         """The paths of the bags that are left out of the span."""
-        return frozenset(fault.file for fault in self.faults if fault.misleads)
+        return frozenset(fault.bag.file for fault in self.faults if fault.misleads)
 
 
 class DatedBags(NamedTuple):
@@ -160,7 +155,7 @@ def check_dates(
     elif len(ahead) + len(unset) == bags:
         unset = []  # a simulated clock, or a robot that has none
     faults = [*unset, *ahead]
-    faults += _step_faults(steps, {fault.file for fault in faults}, around)
+    faults += _step_faults(steps, {fault.bag.file for fault in faults}, around)
     dating = Dating(faults=tuple(faults), note=note)
     if len(dating.misdated) == bags:
         dating = replace(dating, faults=tuple(each._replace(misleads=False) for each in faults))

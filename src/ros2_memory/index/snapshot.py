@@ -130,14 +130,10 @@ class Snapshot:
         Of very many files that cannot be read only the last ones are looked at.
         """
         closed = (*self.damaged, *self.unread)
-        skipped = max(len(self.active) + len(closed) - _MAX_PLACED, len(self.active))
         return {
-            **{aside: self._unread_span(aside, growing=True) for aside in self.active},
+            **{each: self._unread_span(each, growing=True) for each in self.active},
             **dict.fromkeys(closed),
-            **{
-                aside: self._unread_span(aside, growing=False)
-                for aside in closed[skipped - len(self.active) :]
-            },
+            **{each: self._unread_span(each, growing=False) for each in closed[-_MAX_PLACED:]},
         }
 
     def _unread_span(self, aside: SetAside, *, growing: bool) -> TimeWindow | None:
