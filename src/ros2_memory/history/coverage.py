@@ -20,6 +20,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
+from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.bag_summary import (
     DOUBTS,
     MESSAGES_MISSING,
@@ -253,7 +254,8 @@ def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tup
     longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
     reach = None if window is None else max(window.start, snapshot.earliest)
     for bag in snapshot.overlapping(window or TimeWindow.everything()):
-        if bag.file in snapshot.dating.misdated:
+        # Carried messages do not show when something was recorded.
+        if bag.file in snapshot.dating.misdated or is_carried(bag.path):
             continue
         if reach is not None and bag.start - reach > longest:
             yield reach, bag.start
