@@ -31,7 +31,7 @@ FLICKER_NS: Final[Ns] = 3 * NS_PER_S
 USUAL_PERIODS: Final = 3
 SHORT_NS: Final[Ns] = NS_PER_S
 
-_ROW: Final = np.dtype(
+ROW: Final = np.dtype(
     [
         ("first", "<i8"),
         ("last", "<i8"),
@@ -41,6 +41,7 @@ _ROW: Final = np.dtype(
         ("longest", "<i8"),
     ]
 )
+"""A row of an `IntervalTable`."""
 Rows: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.void]]"
 
 _FROM_START: Final = 1
@@ -73,12 +74,12 @@ class IntervalTable(NamedTuple):
     @property
     def size(self) -> int:
         """How many intervals there are."""
-        return len(self.rows) // _ROW.itemsize
+        return len(self.rows) // ROW.itemsize
 
     @property
     def is_sound(self) -> bool:
         """Whether every row has one of the labels; a damaged file may contain others."""
-        if len(self.rows) % _ROW.itemsize:
+        if len(self.rows) % ROW.itemsize:
             return False
         return not self.rows or int(_rows(self.rows)["label"].max()) < len(self.labels)
 
@@ -126,13 +127,6 @@ class IntervalTable(NamedTuple):
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
         rows = _rows(self.rows)
         return IntervalTable(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).intervals()
-
-    def moved(self, by: Ns) -> IntervalTable:
-        """Returns the same intervals so many nanoseconds later."""
-        rows = _rows(self.rows).copy()
-        rows["first"] += by
-        rows["last"] += by
-        return IntervalTable(self.labels, rows.tobytes())
 
 
 class IntervalPart(NamedTuple):
@@ -203,7 +197,7 @@ class IntervalBuilder:
             for label, each in every
         ]
         return IntervalPart(
-            self._first, self._last, IntervalTable(labels, np.array(rows, _ROW).tobytes())
+            self._first, self._last, IntervalTable(labels, np.array(rows, ROW).tobytes())
         )
 
 
@@ -252,7 +246,7 @@ def _merged(tables: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> Inter
     goes_on &= label[1:] == label[:-1]
     begins = np.flatnonzero(np.append(True, ~goes_on))
     stops = np.append(begins[1:], len(rows)) - 1
-    found = np.empty(len(begins), _ROW)
+    found = np.empty(len(begins), ROW)
     found["first"], found["last"], found["label"] = first[begins], reach[stops], label[begins]
     found["count"] = np.add.reduceat(rows["count"], begins)
     # Times below may be as far apart as any two can be: only those of one interval are subtracted.
@@ -308,4 +302,4 @@ def _by_length(rows: Rows) -> NDArray[np.intp]:
 
 
 def _rows(packed: bytes) -> Rows:
-    return np.frombuffer(packed, _ROW)
+    return np.frombuffer(packed, ROW)

@@ -191,11 +191,6 @@ class TrajectoryBuilder(_Poses):
             self._path.part()
         self._path.extend(whole.vertices, whole.error_m)
 
-    @property
-    def vertices(self) -> int:
-        """How many poses are held, to measure them and to draw the path: about 25,000 at most."""
-        return self._path.size + len(self._waiting)
-
     def result(self) -> Trajectory:
         """Returns the trajectory so far; more poses may be added after."""
         self._measure()
