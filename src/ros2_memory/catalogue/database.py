@@ -300,8 +300,10 @@ class CatalogueDatabase:
             self._opened = found
             self._databases += 1
             self._trouble, self._failing = None, False
-            event = "catalogue_in_file_again" if before.path is None else "catalogue_moved"
-            log.info(event, path=str(found.path))
+            if before.path is None:
+                log.info("catalogue_in_file_again", path=str(found.path))
+            else:
+                log.info("catalogue_moved", path=str(found.path))
 
     def _failed(self, error: Exception) -> None:
         """Sets a damaged database aside; one that is only busy or full is asked again."""
