@@ -39,7 +39,7 @@ class Closing(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """A message definition as it stands in a bag. Equal by content: ids are local to one file.
+    """A message definition, as a bag holds it. Compared by content: ids are local to one file.
 
     `encoding` is `ros2msg`, `ros2idl`, `jsonschema`, ... or empty where the recorder found none.
     """
@@ -53,8 +53,8 @@ class Schema:
 class Channel:
     """One topic under one type in one bag. `encoding` is the message encoding (`cdr`, `json`).
 
-    `metadata` is what the recorder noted of it, such as what publishers offer
-    (`offered_qos_profiles`), as it stands in the bag.
+    `metadata` is what the recorder wrote about it, such as the QoS that publishers offer
+    (`offered_qos_profiles`).
     """
 
     topic: str
@@ -70,7 +70,7 @@ class Channel:
 
     @property
     def memory_bytes(self) -> int:
-        """About how much memory its texts take."""
+        """About how much memory its texts take, in bytes."""
         held = len(self.topic) + len(self.schema.name) + len(self.schema.text)
         for name, text in self.metadata:
             held += len(name) + len(text)
@@ -91,15 +91,15 @@ class Record(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CdrLayout:
-    """Where the numbers of a message lie: offsets in its payload, little-endian.
+    """Where the numbers of a message lie: offsets in its little-endian payload.
 
-    It is of every payload of `size` bytes that is the same outside of these numbers.
+    It holds for every payload of `size` bytes that has the same bytes outside of these numbers.
 
     Attributes:
         size: bytes of the payload.
-        doubles: of each float64.
-        singles: of each float32.
-        times: of each time or duration: int32 seconds, then uint32 nanoseconds.
+        doubles: offset of each float64.
+        singles: offset of each float32.
+        times: offset of each time or duration: int32 seconds, then uint32 nanoseconds.
     """
 
     size: int
@@ -113,14 +113,14 @@ class BagReader(ABC):
 
     @abstractmethod
     def reads(self, path: Path) -> bool:
-        """Whether the file is of a kind this adapter reads, judged by its name alone."""
+        """Returns whether this adapter reads such a file, judged by its name alone."""
 
     @abstractmethod
     def closing(self, path: Path) -> Closing:
-        """Whether the writer has finished the file.
+        """Returns whether the writer has finished the file.
 
         Closing magic for MCAP; no journal or WAL beside a sqlite file; a whole frame for `.zstd`.
-        A file that is not a bag at all counts as closed: `summarize` then says what is wrong.
+        A file that is not a bag at all counts as closed: `summarize` then raises the reason.
 
         Raises:
             BagVanishedError: the file is not there.
@@ -129,7 +129,7 @@ class BagReader(ABC):
 
     @abstractmethod
     def summarize(self, path: Path) -> BagSummary:
-        """Topics with exact counts and exact first and last log times.
+        """Returns topics with exact counts and exact first and last log times.
 
         Costs the summary section where the file has one. A file that ends early is summarised by
         what is readable, with `complete=False`.
@@ -148,23 +148,23 @@ class BagReader(ABC):
         *,
         newest_first: bool = False,
     ) -> Iterator[Record]:
-        """The undecoded messages of `topics` with log time inside the half-open window.
+        """Yields the undecoded messages of `topics` with log time inside the half-open window.
 
         Ordered by log time whatever the order in the file, ties in file order; `newest_first`
-        gives exactly the reverse. Both channels of a topic that has two are read. Reads only
-        what overlaps the window; holds a chunk (and those that overlap it in time), never a file.
-        Payloads are plain serialized messages: message compression is already undone.
-        Lazy: nothing is opened before the first item is asked for.
+        yields exactly the reverse. Both channels of a topic that has two are read. Reads only
+        what overlaps the window; keeps a chunk (and those that overlap it in time) in memory, never
+        a file. Payloads are plain serialized messages: message compression is already undone.
+        Lazy: nothing is opened before the first item is requested.
 
         Raises:
             BagVanishedError: the file is not there.
             BagError: what comes next cannot be read. With `lost` that is some messages only, and
-                the iterator goes on behind them when it is asked again; else it has ended. Where
-                `summarize` gave `complete=False` the early end is known, and simply ends it.
+                the iterator continues behind them with the next item; else it has ended. If
+                `summarize` returned `complete=False`, the early end is known and raises nothing.
         """
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """The first of `records(path, [topic], window, newest_first=True)`; None without any.
+        """Returns the first of `records(path, [topic], window, newest_first=True)`, or None.
 
         Raises:
             BagVanishedError: the file is not there.
@@ -174,7 +174,7 @@ class BagReader(ABC):
 
     @abstractmethod
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """The log times that `records(path, [topic], window)` would give, without the payloads.
+        """Returns the log times of `records(path, [topic], window)`, without the payloads.
 
         Raises:
             BagVanishedError: the file is not there.
@@ -183,11 +183,11 @@ class BagReader(ABC):
 
     @abstractmethod
     def undecodable(self, channel: Channel) -> str | None:
-        """Why no message of this channel can be decoded, or None where its type is understood."""
+        """Returns why no message of this channel can be decoded; None if its type is known."""
 
     @abstractmethod
     def channels(self, path: Path) -> Sequence[Channel]:
-        """Every channel that is declared in the file, with or without messages.
+        """Returns every channel that is declared in the file, with or without messages.
 
         Raises:
             BagVanishedError: the file is not there.
@@ -195,7 +195,7 @@ class BagReader(ABC):
         """
 
     def profile(self, path: Path) -> str:
-        """The profile of the file, as MCAP names it: `ros2`, or what its header holds.
+        """Returns the MCAP profile of the file: `ros2`, or the one in its header.
 
         Raises:
             BagVanishedError: the file is not there.
@@ -206,7 +206,7 @@ class BagReader(ABC):
 
     @abstractmethod
     def decode(self, record: Record) -> object:
-        """The message: an attribute object for a ROS type, a plain value for JSON.
+        """Decodes a message: an attribute object for a ROS type, a plain value for JSON.
 
         The definition inside the bag counts first, then the configured `.msg` folders, then the
         standard types.
@@ -216,17 +216,20 @@ class BagReader(ABC):
         """
 
     def layout(self, record: Record) -> CdrLayout | None:
-        """Where the numbers of this message lie; None where that is not told: then decode it."""
+        """Returns where the numbers of this message lie; None if it must be decoded."""
         del record
         return None
 
 
 @dataclass(frozen=True, slots=True)
 class Rewritten:
-    """What became of a file that was cut short.
+    """The result of rewriting a file that was cut short.
 
-    `lost_bytes` are the bytes of it that made no whole record; how many messages never reached the
-    disk nobody knows. `notes` are sentences on what was lost.
+    Attributes:
+        messages: how many were written.
+        lost_bytes: bytes of the source that made no whole record; how many messages never reached
+            the disk is unknown.
+        notes: sentences on what was lost.
     """
 
     messages: int
@@ -235,7 +238,11 @@ class Rewritten:
 
 
 class BagWriter(ABC):
-    """Writes closed, indexed bag files."""
+    """Writes closed, indexed bag files.
+
+    Whatever goes wrong is raised as a `BagError` about the file that was to be written, with the
+    `reason`, and nothing is left of that file.
+    """
 
     @abstractmethod
     def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
@@ -258,7 +265,7 @@ class BagWriter(ABC):
         Schemas, channels, metadata, attachments, both times and sequence numbers stay as they are,
         and so does the order; what makes no whole record is left out. The target was read back and
         compared with the source, and is on the disk, when this returns. There must be no file of
-        its name; the source is only read. `progress` is told how many bytes of it were read.
+        its name; the source is only read. `progress` is called with the bytes read so far.
 
         Raises:
             BagVanishedError: the source is not there.
@@ -277,32 +284,32 @@ class ChannelTotal(NamedTuple):
 
 
 def summarize_channels(
-    held: Iterable[ChannelTotal],
+    totals: Iterable[ChannelTotal],
     declared: Iterable[Channel],
     *,
     complete: bool = True,
     notes: tuple[str, ...] = (),
     set_back: Ns = 0,
 ) -> BagSummary:
-    """The summary of a file: channels of one topic and type count as one."""
+    """Returns the summary of a file; channels of one topic and type count as one."""
     found: dict[tuple[str, str], ChannelTotal] = {}
-    for each in held:
+    for each in totals:
         key = (each.channel.topic, each.channel.type)
         other = found.get(key)
         found[key] = each if other is None else _together(other, each)
     silent = {channel.topic for channel in declared} - {topic for topic, _ in found}
-    headings: list[TopicHeader] = []
+    headers: list[TopicHeader] = []
     numbers: list[int] = []
-    # Past the objects of single topics: an index makes one summary after the other.
+    # Encoded at once, without an object for each topic: an index makes thousands of summaries.
     for (topic, type_name), (channel, *stated) in sorted(found.items(), key=itemgetter(0)):
-        headings.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
+        headers.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
         numbers += stated
-    shape = shared_schema(tuple(headings), tuple(sorted(silent)), complete, notes, set_back)
-    return BagSummary.decoded(shape, shape.numbers.pack(*numbers))
+    schema = shared_schema(tuple(headers), tuple(sorted(silent)), complete, notes, set_back)
+    return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
 
 
 def _together(one: ChannelTotal, other: ChannelTotal) -> ChannelTotal:
-    """Two channels of one topic and type."""
+    """Returns two channels of one topic and type as one."""
     channel = one.channel
     if other.channel.latched and not channel.latched:
         channel = replace(channel, latched=True)

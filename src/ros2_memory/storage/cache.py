@@ -1,4 +1,4 @@
-"""What is kept between calls: a cache bounded in bytes, and one object for equal ones."""
+"""Caches of the readers: one that is bounded in bytes, and one object for equal channels."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ _SHARED_BYTES: Final = 32 << 10
 
 
 class ByteLru(Generic[T]):
-    """Keeps what was used last, up to `capacity` bytes. Safe to use from several threads.
+    """An LRU cache of up to `capacity` bytes. Safe to use from several threads.
 
-    What alone is larger than the capacity is not kept.
+    A value that is larger than the capacity is not cached.
     """
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
-        self._held: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
+        self._values: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
 
     def get(self, key: Hashable) -> T | None:
-        """What is kept under the key, or None."""
+        """Returns the value of the key, or None."""
         with self._lock:
-            entry = self._held.get(key)
+            entry = self._values.get(key)
             if entry is None:
                 return None
-            self._held.move_to_end(key)
+            self._values.move_to_end(key)
             return entry[0]
 
     def put(self, key: Hashable, value: T, size: int) -> None:
-        """Keeps `value`, which takes about `size` bytes, and lets go of the least recently used."""
+        """Caches `value`, which takes about `size` bytes, and drops the least recently used."""
         with self._lock:
-            replaced = self._held.pop(key, None)
+            replaced = self._values.pop(key, None)
             if replaced is not None:
                 self._bytes -= replaced[1]
             if size > self._capacity:
                 return
-            self._held[key] = (value, size)
+            self._values[key] = (value, size)
             self._bytes += size
             while self._bytes > self._capacity:
-                _, (_, dropped) = self._held.popitem(last=False)
+                _, (_, dropped) = self._values.popitem(last=False)
                 self._bytes -= dropped
 
 

@@ -1,4 +1,4 @@
-"""The decoding room: from the payload of a record to a message."""
+"""Decodes the payload of a record into a message."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAX_KNOWN = 10_000
 _MAX_JSON_BYTES = 4 << 20
 """A byte of JSON can become thirty of memory."""
 _EMPTY_MESSAGE_BYTES = 8
-"""CDR's header, the byte that stands for no fields, and padding."""
+"""The CDR header, the one byte of a message without fields, and padding."""
 
 
 class Decoding:
@@ -43,12 +43,12 @@ class Decoding:
         self._known: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
 
     def undecodable(self, channel: Channel) -> str | None:
-        """Why no message of this channel can be decoded, or None."""
+        """Returns why no message of this channel can be decoded, or None."""
         decoder = self._decoder(channel)
         return decoder if isinstance(decoder, str) else None
 
     def decode(self, record: Record) -> object:
-        """The message of a record: an attribute object for CDR, a plain value for JSON.
+        """Decodes a record: an attribute object for CDR, a plain value for JSON.
 
         Raises:
             UndecodableError: the channel cannot be decoded, or the bytes do not fit its type.
@@ -61,11 +61,11 @@ class Decoding:
             return decoder(record.payload)
         # rosbags raises whatever the generated code runs into; a payload may hold anything.
         except Exception as error:
-            reason = _why(record, error)
+            reason = _reason(record, error)
             raise UndecodableError(channel.topic, channel.type, reason) from error
 
     def layout(self, record: Record) -> CdrLayout | None:
-        """Where the numbers of a message lie; None where only decoding tells."""
+        """Returns where the numbers of a message lie; None if it must be decoded."""
         channel = record.channel
         if channel.encoding != "cdr":
             return None
@@ -95,7 +95,7 @@ class Decoding:
         if found.deserialize is None:
             return found.reason or "its definition cannot be used"
         if found.fieldless:
-            return _of_nothing(found.deserialize)
+            return _fieldless(found.deserialize)
         if found.definitions is None:
             return found.deserialize
         return _bounded(found.deserialize, found.definitions, full_name(schema.name))
@@ -111,7 +111,7 @@ def _json(payload: bytes) -> object:
 def _bounded(
     deserialize: Callable[[bytes], object], definitions: Typesdict, root: str
 ) -> Callable[[bytes], object]:
-    """Decodes what does not hold more objects than there is room for."""
+    """Returns a decoder that refuses messages of more than `MAX_OBJECTS` objects."""
 
     def decode(payload: bytes) -> object:
         if holds_too_many(definitions, root, payload):
@@ -121,8 +121,8 @@ def _bounded(
     return decode
 
 
-def _of_nothing(deserialize: Callable[[bytes], object]) -> Callable[[bytes], object]:
-    """For a type whose definition is empty, which may also mean that its text was not found."""
+def _fieldless(deserialize: Callable[[bytes], object]) -> Callable[[bytes], object]:
+    """Returns a decoder for an empty definition, whose text the recorder may not have found."""
 
     def decode(payload: bytes) -> object:
         if len(payload) > _EMPTY_MESSAGE_BYTES:
@@ -135,7 +135,7 @@ def _of_nothing(deserialize: Callable[[bytes], object]) -> Callable[[bytes], obj
     return decode
 
 
-def _why(record: Record, error: Exception) -> str:
+def _reason(record: Record, error: Exception) -> str:
     if record.payload[:4] == FRAME_MAGIC and record.channel.encoding == "cdr":
         return "its compressed payload is damaged or too large"
     words = " ".join(str(error).split())[:160] or type(error).__name__

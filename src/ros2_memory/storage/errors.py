@@ -1,9 +1,12 @@
-"""Where everything foreign becomes the error tree.
+"""Translates foreign exceptions into the error tree, and bounds what a file may make a reader do.
 
 Reading bytes that anybody may have written raises whatever the libraries and the interpreter make
 of them: struct.error, ZstdError, sqlite3.Error, lz4's RuntimeError, MemoryError, UnicodeDecodeError
-and more. The rooms below the adapters let all of it pass, and say `UnreadableError` for what they
-find wrong themselves; `reading` names the file.
+and more. The modules below the adapters let all of them pass, and raise `UnreadableError` for what
+they find wrong themselves; `reading` adds the name of the file.
+
+No size that a file states is allocated before it was compared with the limits here and with the
+bytes that are really there.
 """
 
 from __future__ import annotations
@@ -29,9 +32,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Not ESTALE and ENODEV: a server or a disk that went may come back with all its files.
+# Not ESTALE and ENODEV: a server or a disk that is gone may come back with all its files.
 _GONE = {errno.ENOENT, errno.ENOTDIR}
-_OF_THE_DISK = {
+_DISK_ERRORS = {
     sqlite3.SQLITE_IOERR,
     sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_NOMEM,
@@ -45,13 +48,15 @@ class UnreadableError(Exception):
 
 
 class UnreachableError(UnreadableError):
-    """As `UnreadableError`, where the fault is not the file's and may pass."""
+    """An `UnreadableError` whose cause is not the file, and may pass."""
 
 
 class LostError(UnreadableError):
     """Messages that cannot be read, while those around them may be.
 
-    `first` and `last` are log times: none of the lost ones lies outside of them.
+    Attributes:
+        first: a log time; no lost message is earlier.
+        last: a log time; no lost message is later.
     """
 
     def __init__(self, reason: str, first: Ns, last: Ns) -> None:
@@ -61,15 +66,15 @@ class LostError(UnreadableError):
 
 
 class ContradictionError(LostError):
-    """Indexes that contradict the messages: these are read without them, from `first` to `last`."""
+    """Indexes that contradict the messages, which are read without them from `first` to `last`."""
 
 
 def raise_if_lost(path: Path, item: T | LostError) -> T:
-    """The item itself.
+    """Returns the item, unless it is an error.
 
     Raises:
-        BagContradictionError: it says that the indexes of `path` are not believed.
-        BagError: it stands for messages of `path` that are lost.
+        BagContradictionError: the indexes of `path` contradict its messages.
+        BagError: messages of `path` are lost.
     """
     if isinstance(item, ContradictionError):
         raise BagContradictionError(str(path), str(item), (item.first, item.last))
@@ -100,9 +105,10 @@ def reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def as_unreadable() -> Iterator[None]:
-    """Raises `UnreadableError` for whatever damaged bytes raise, where others may be whole.
+    """Raises every exception that damaged bytes cause as an `UnreadableError`.
 
-    What the disk or the machine lacks (OSError, MemoryError) passes: whole bytes raise it too.
+    For parts of a file whose neighbours may be whole. OSError and MemoryError pass, since whole
+    bytes raise them too.
     """
     try:
         yield
@@ -113,62 +119,62 @@ def as_unreadable() -> Iterator[None]:
 
 
 def reason_of(error: Exception) -> str:
-    """One line that says why the bytes cannot be read."""
+    """Returns one line on why the bytes cannot be read."""
     if isinstance(error, UnreadableError):
         return str(error)
     if isinstance(error, OSError):
         return f"it cannot be opened or read: {error.strerror or error}"
     if isinstance(error, MemoryError):
         return "there is not enough memory to read it"
-    if _sqlite_code(error) in _OF_THE_DISK:
+    if _sqlite_code(error) in _DISK_ERRORS:
         return f"it cannot be opened or read: {error}"
     words = " ".join(str(error).split())[:160]
     return f"damaged: {words} ({type(error).__name__})" if words else type(error).__name__
 
 
 def _may_pass(error: Exception) -> bool:
-    """Whether the same bytes may be read later."""
+    """Returns whether the same bytes may be readable later."""
     if isinstance(error, (OSError, MemoryError, UnreachableError)):
         return True
-    return _sqlite_code(error) in _OF_THE_DISK
+    return _sqlite_code(error) in _DISK_ERRORS
 
 
 def _sqlite_code(error: Exception) -> int | None:
-    """SQLite's primary code; None of any other error."""
+    """Returns the primary result code of SQLite; None for any other error."""
     code: object = getattr(error, "sqlite_errorcode", None)
     return code & 0xFF if isinstance(code, int) else None
 
 
 MAX_CHUNK_MB: Final = 64
-"""What one chunk or one message may hold, unpacked, unless the configuration says otherwise."""
+"""The decompressed size of one chunk or one message, unless the configuration sets another."""
 MAX_SECTION_BYTES: Final = 64 << 20
-"""What one record, and a summary section, may hold: it is held in memory as a whole."""
+"""The size of one record or of a summary section, which is read into memory as a whole."""
 MAX_CHUNK_MESSAGES: Final = 1_000_000
-"""More messages than these take more memory than their chunk, and seconds to look through."""
+"""More take more memory than their chunk, and seconds to index."""
 MAX_CHANNELS: Final = 5_000
-"""The largest robots have some hundred topics; every list and search goes through all there are."""
+"""The largest robots have some hundred topics; every list and search goes through all of them."""
 MAX_NAMES_CHARS: Final = 1 << 20
-"""Names of all topics and types of one file, which are held for as long as the bag lies there."""
+"""Names of all topics and types of one file, which stay in memory as long as the bag exists."""
 MAX_DEFINITION_BYTES: Final = 1 << 20
-"""A larger one is not used, so no more of it is held than what shows that it is larger."""
+"""A longer definition is not used; one byte more of it is kept, so that this shows."""
 MAX_CHUNK_DECLARATIONS: Final = 20_000
 """Schemas and channels in one chunk; a writer declares each once."""
 MESSAGE_BYTES: Final = 64
-"""What a message takes besides itself while its file is looked through."""
+"""Memory that a message takes besides its payload while its file is scanned."""
 MAX_CHUNKS: Final = 150_000
-"""Each is kept in mind for as long as its file is asked about."""
-MAX_TIMES_PACKED: Final = 100
-"""Nothing that a robot records shrinks to less than this part of itself, but for what is small."""
+"""Each takes memory as long as queries read its file."""
+MAX_COMPRESSION_RATIO: Final = 100
+"""Nothing large that a robot records compresses better than this."""
 _ALWAYS_ALLOWED: Final = 32 << 20
 
 
-def most_unpacked(packed: int) -> int:
-    """How many bytes so many compressed bytes may unpack to; more is made to do harm."""
-    return _ALWAYS_ALLOWED + MAX_TIMES_PACKED * packed
+def max_decompressed_bytes(packed: int) -> int:
+    """Returns the most bytes that so many compressed bytes may decompress to."""
+    return _ALWAYS_ALLOWED + MAX_COMPRESSION_RATIO * packed
 
 
 def too_large(what: str, max_bytes: int) -> str:
-    """The reason why something is not read."""
+    """Returns the reason why something is not read."""
     return (
         f"{what} is larger than the {max_bytes >> 20} MiB allowed; where that is right, raise"
         " reader.max_chunk_mb"

@@ -1,4 +1,4 @@
-"""A file on disk: bounded reads at any place, and what tells one content from another."""
+"""Opens files on disk for bounded reads at any offset, and identifies their content."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ LINK: Final = "a symbolic link, which is not followed"
 
 
 def open_regular(path: Path) -> int:
-    """A descriptor of a regular file, which stands there itself and not through a link.
+    """Returns a descriptor of a regular file; a symbolic link is not followed.
 
     Raises:
         OSError: it cannot be opened.
         UnreadableError: it is not a regular file.
     """
     try:
-        # Without blocking: opening a pipe would wait for somebody to write into it.
+        # O_NONBLOCK: opening a pipe would wait for a writer.
         flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
         descriptor = os.open(path, flags)
     except OSError as error:
@@ -39,7 +39,7 @@ def open_regular(path: Path) -> int:
 
 
 class FileKey(NamedTuple):
-    """Which content a file had: another size, time or inode is another content."""
+    """Identifies the content of a file: with another size, time or inode it is another."""
 
     path: str
     size: int
@@ -48,10 +48,10 @@ class FileKey(NamedTuple):
 
 
 class OpenFile:
-    """A file opened for reading at any place; a context manager.
+    """A file that is open for reads at any offset; a context manager.
 
-    What was read of it stays readable after the file is deleted, until it is closed. Safe to use
-    from several threads at once.
+    It stays readable after the file is deleted, until it is closed. Safe to use from several
+    threads at once.
 
     Raises:
         OSError: it cannot be opened.
@@ -65,7 +65,7 @@ class OpenFile:
         self.key = FileKey(str(path), status.st_size, status.st_mtime_ns, status.st_ino)
 
     def __enter__(self) -> Self:
-        """The open file."""
+        """Returns the open file."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -73,10 +73,10 @@ class OpenFile:
         os.close(self._descriptor)
 
     def read(self, offset: int, length: int) -> bytes:
-        """Exactly `length` bytes from `offset`.
+        """Returns exactly `length` bytes from `offset`.
 
         Raises:
-            UnreadableError: the file has fewer; nothing is allocated for them then.
+            UnreadableError: the file has fewer; this is checked before anything is allocated.
         """
         if offset < 0 or length < 0 or offset + length > self.size:
             raise UnreadableError("damaged: it refers to bytes past its end")

@@ -13,8 +13,8 @@ from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.sqlite_bag import (
     SqliteBags,
     closing_of_db3,
+    copy_with_journal,
     journals_beside,
-    settled_copy,
 )
 from ros2_memory.storage.temp_files import Scratch
 from ros2_memory.storage.zstd_bag import closing_of_zstd, unpack
@@ -75,7 +75,7 @@ class Rosbag2Reader(FileReader):
             fill = partial(unpack, path)
         elif plain.suffix == ".db3" and journals_beside(path):
             sources += journals_beside(path)
-            fill = partial(settled_copy, path)
+            fill = partial(copy_with_journal, path)
         elif self.reads(path):
             yield OpenedBag(bags, path, "")
             return

@@ -1,7 +1,9 @@
-"""The sqlite3 room: summaries, messages and log times of rosbag2's `.db3` files.
+"""Reads the `.db3` files of rosbag2: summaries, messages and log times.
 
-Every schema version since 2018 has the tables `topics` and `messages`; which columns there are
-beyond the oldest ones, and whether definitions lie in the file, is looked up in the file.
+Every schema version since 2018 has the tables `topics` and `messages`; newer columns, and message
+definitions, are looked up in each file. A hostile file can call an endless query a table, or have
+pages that lead back to themselves, and sqlite runs both: `guard` and `require_plain_tables` bound
+what it may do. `rosbags` takes 5.5 ms to open a bag, nearly all of it for the YAML of QoS.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from ros2_memory.storage.errors import (
 )
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.mcap.records import offered_as_latched
-from ros2_memory.storage.zstd_bag import plain_payload
+from ros2_memory.storage.zstd_bag import uncompressed_payload
 from ros2_memory.typestore import full_name
 
 if TYPE_CHECKING:
@@ -62,7 +64,7 @@ _TOTALS: Final = """
            timestamp IS ? AS impossible
     FROM messages NOT INDEXED GROUP BY topic_id, impossible
 """
-# Without the payload, so that sorting holds none of them; it follows row by row.
+# Without payloads, so that sorting needs no memory for them; they are read row by row.
 _ASCENDING: Final = """
     SELECT timestamp, rowid, topic_id FROM messages
     WHERE timestamp >= ? AND timestamp < ? AND topic_id IN (SELECT value FROM json_each(?))
@@ -74,7 +76,7 @@ _BEHIND: Final = """
     WHERE rowid > ? AND rowid <= ? AND timestamp > ? AND timestamp < ?
     AND topic_id IN (SELECT value FROM json_each(?)) LIMIT 1
 """
-_LOOKED_BEHIND: Final = 128
+_ROWS_BEHIND: Final = 128
 _WRONG_INDEX: Final = "its index by time is damaged; its messages were read without it"
 _METADATA: Final = (
     ("offered_qos_profiles", "offered_qos_profiles"),
@@ -87,12 +89,25 @@ _SIZE_OF_DEFINITIONS: Final = (
 _PAYLOAD: Final = "SELECT data, timestamp, topic_id FROM messages WHERE rowid = ?"
 
 
+_STEP: Final = 10_000
+"""Instructions of the virtual machine of sqlite between two calls of the progress handler."""
+_ALWAYS_ALLOWED: Final = 20_000_000
+_FOR_EACH_BYTE: Final = 50
+_READ: Final = ("topics", "messages", "message_definitions")
+_ODD: Final = """
+    SELECT name, type FROM sqlite_master
+    WHERE lower(name) IN (SELECT value FROM json_each(?))
+    AND (type != 'table' OR rootpage = 0)
+"""
+_COMPUTED: Final = "SELECT count(*) FROM pragma_table_xinfo(?) WHERE hidden != 0"
+
+
 _MESSAGE_COLUMNS: Final = {"topic_id", "timestamp", "data"}
 
 
 @dataclass(frozen=True, slots=True)
 class _Topics:
-    """The channels of a file by topic id; `key` is the content of the file."""
+    """The channels of a file by topic id; `key` identifies the content of the file."""
 
     key: FileKey
     channels: Mapping[int, Channel]
@@ -104,23 +119,24 @@ class _Topics:
 
 
 class SqliteBags:
-    """Reads sqlite3 bag files that are settled: no journal or WAL beside them.
+    """Reads sqlite3 bag files without a journal or WAL beside them.
 
     Nothing is written or locked; a connection is opened for each call. Safe to use from several
-    threads at once. What goes wrong is raised as it comes (`faults.reading` translates it).
+    threads at once. Exceptions are raised as they come; the adapter translates them
+    (`errors.reading`).
 
     Args:
-        max_message_mb: what one message, or any one value of a file, may hold.
+        max_message_mb: size up to which a message, or another value of a file, is read, in MiB.
     """
 
     def __init__(self, max_message_mb: int = MAX_CHUNK_MB) -> None:
         self._max_message_bytes = max_message_mb << 20
         self._known: ByteLru[_Topics] = ByteLru(_KEPT_BYTES)
-        # Whether the indexes of a file give what its table holds.
+        # Whether the indexes of a file agree with its table.
         self._proven: ByteLru[bool] = ByteLru(_KEPT_BYTES)
 
     def summarize(self, path: Path) -> BagSummary:
-        """Topics with exact counts and first and last log times."""
+        """Returns topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
             found: list[tuple[int, int, int, int, int, int]]
             found = base.execute(_TOTALS, (MAX_NS,)).fetchall()
@@ -144,21 +160,21 @@ class SqliteBags:
         return summarize_channels(held, topics.channels.values(), notes=tuple(notes))
 
     def channels(self, path: Path) -> Sequence[Channel]:
-        """The topics declared in the file."""
+        """Returns the topics declared in the file."""
         with self._opened(path) as (_, topics):
             return list(topics.channels.values())
 
     def profile(self, path: Path) -> str:
-        """That of ROS 2: no other program writes such files."""
+        """Returns the profile of ROS 2: no other program writes such files."""
         with OpenFile(path):
             return ROS2_PROFILE
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool
     ) -> Iterator[Record | LostError]:
-        """The messages of `topics` inside the window, in order.
+        """Yields the messages of `topics` inside the window, in order.
 
-        An error stands for an index that is not believed; no message is lost with it.
+        An error is yielded first if the indexes of the file are wrong; no message is lost with it.
         """
         if window.empty:
             return
@@ -167,16 +183,16 @@ class SqliteBags:
             right = self._is_indexed_right(base, known)
             if not right:
                 yield ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
-            for time, row, number in _placed(
+            for time, row, number in _ordered_rows(
                 base, wanted, window, newest_first=newest_first, indexed=right
             ):
                 yield self._record(base, wanted, time, row, number)
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """The latest message of the topic inside the window: what `records` begins with.
+        """Returns the latest message of the topic inside the window.
 
-        Where it is not known yet whether the indexes are right, only what this one message needs of
-        them is held against the table, which takes some microseconds.
+        As long as it is unknown whether the indexes are right, it compares only what this message
+        needs of them with the table, which takes some microseconds.
 
         Raises:
             ContradictionError: the indexes do not agree with the table.
@@ -188,7 +204,7 @@ class SqliteBags:
             right = self._proven.get(known.key)
             found = None
             if right is not False:
-                rows = _placed(base, wanted, window, newest_first=True, indexed=True)
+                rows = _ordered_rows(base, wanted, window, newest_first=True, indexed=True)
                 found = rows.fetchone()
             if right is None and (found is None or not _is_newest(base, wanted, window, found)):
                 right = self._is_indexed_right(base, known)
@@ -197,10 +213,10 @@ class SqliteBags:
             return None if found is None else self._record(base, wanted, *found)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
-        """The log times of a topic's messages inside the window, ascending."""
+        """Returns the log times of a topic's messages inside the window, ascending."""
         with self._opened(path) as (base, known):
             wanted, right = known.named({topic}), self._is_indexed_right(base, known)
-            rows = _placed(base, wanted, window, indexed=right)
+            rows = _ordered_rows(base, wanted, window, indexed=right)
             return [time for time, _, _ in rows]
 
     def _record(
@@ -218,17 +234,17 @@ class SqliteBags:
             raise UnreadableError("damaged: a message is not the one that an index names")
         channel = wanted[number]
         payload = (
-            plain_payload(found[0], self._max_message_bytes)
+            uncompressed_payload(found[0], self._max_message_bytes)
             if channel.encoding == "cdr"
             else found[0]
         )
         return Record(channel, time, time, payload)
 
     def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:
-        """Whether the indexes of a file give what its table holds; looked at once for each file."""
+        """Returns whether the indexes of a file agree with its table; compares them once."""
         right = self._proven.get(known.key)
         if right is None:
-            every = partial(_placed, base, known.channels, TimeWindow.everything())
+            every = partial(_ordered_rows, base, known.channels, TimeWindow.everything())
             try:
                 both = zip_longest(every(indexed=True), every(indexed=False))
                 right = all(starmap(eq, both))
@@ -248,10 +264,10 @@ class SqliteBags:
         address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         # A generator of records may be resumed on another thread.
         with closing(sqlite3.connect(address, uri=True, check_same_thread=False)) as base:
-            # SQLite opens by name, and has by now: it must be the file that was looked at.
+            # SQLite opens by name, and has by now: it must be the file that was opened above.
             if path.lstat().st_ino != key.inode:
                 raise UnreadableError("it was replaced while it was being opened")
-            # One name that is not UTF-8 must not hide the others.
+            # A name that is not UTF-8 must not hide the others.
             base.text_factory = partial(str, encoding="utf-8", errors="replace")
             guard(base, self._max_message_bytes, size)
             topics = self._known.get(key)
@@ -293,7 +309,7 @@ class SqliteBags:
         return channels
 
 
-def _placed(
+def _ordered_rows(
     base: sqlite3.Connection,
     wanted: Collection[int],
     window: TimeWindow,
@@ -301,7 +317,7 @@ def _placed(
     newest_first: bool = False,
     indexed: bool,
 ) -> sqlite3.Cursor:
-    """Log time, row and topic of the messages, in order; by an index only where that is right."""
+    """Returns log time, row and topic of the messages, in order; by an index if `indexed`."""
     query = _DESCENDING if newest_first else _ASCENDING
     arguments = (window.start, window.stop, json.dumps(list(wanted)))
     return base.execute(query if indexed else _without_index(query), arguments)
@@ -317,13 +333,13 @@ def _is_newest(
     window: TimeWindow,
     found: tuple[Ns, int, int],
 ) -> bool:
-    """Whether a message that an index gave is the newest, as far as the table tells for little.
+    """Returns whether a message found by an index is the newest, as far as the next rows tell.
 
-    A message that the index lacks, or has elsewhere, or that is not found since the index is stored
-    in another order than it declares, was mostly written soon after the one given in its place.
+    A message that the index lacks, or has elsewhere, or that is not found because the index is
+    stored in another order than it declares, was mostly written soon after the one found instead.
     """
     time, row, _ = found
-    arguments = (row, row + _LOOKED_BEHIND, time, window.stop, json.dumps(list(wanted)))
+    arguments = (row, row + _ROWS_BEHIND, time, window.stop, json.dumps(list(wanted)))
     return base.execute(_BEHIND, arguments).fetchone() is None
 
 
@@ -333,7 +349,7 @@ def _columns(base: sqlite3.Connection, table: str) -> set[str]:
 
 
 def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
-    """The definitions in the file, by type name; none before schema version 4."""
+    """Returns the definitions in the file, by type name; none before schema version 4."""
     needed = {"topic_type", "encoding", "encoded_message_definition"}
     if not needed <= _columns(base, "message_definitions"):
         return {}
@@ -354,13 +370,13 @@ def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
 
 
 def journals_beside(path: Path) -> list[Path]:
-    """The journal and WAL that hold what the file itself does not, or not yet."""
+    """Returns the journal and WAL with content that the file itself lacks."""
     beside = [path.with_name(path.name + suffix) for suffix in JOURNALS]
-    return [journal for journal in beside if _holds_something(journal)]
+    return [journal for journal in beside if _has_content(journal)]
 
 
-def _holds_something(journal: Path) -> bool:
-    """A link counts, and is then refused: what it leads to may be what the file lacks."""
+def _has_content(journal: Path) -> bool:
+    """Returns whether a journal is not empty; a link counts, and is refused when it is opened."""
     try:
         status = journal.lstat()
     except OSError:
@@ -369,20 +385,20 @@ def _holds_something(journal: Path) -> bool:
 
 
 def closing_of_db3(path: Path) -> Closing:
-    """Open while a journal or WAL lies beside it, or nothing is in it."""
+    """Returns open if a journal or WAL lies beside the file, or it is empty."""
     with OpenFile(path) as file:
         unfinished = not file.size or journals_beside(path)
     return Closing.OPEN if unfinished else Closing.CLOSED
 
 
-def settled_copy(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Path, str]:
-    """A copy in which the journal or WAL beside the file has been played back by sqlite.
+def copy_with_journal(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Path, str]:
+    """Returns a copy of the file to which sqlite has applied the journal or WAL beside it.
 
-    Playing it back in place would write into the folder of bags.
+    Applied in place, it would be written into the folder of bags.
 
     Args:
         path: the file.
-        folder: where the copy is made.
+        folder: the folder for the copy.
         reserve: called with a number of bytes before as many are written.
 
     Returns:
@@ -403,27 +419,14 @@ def settled_copy(path: Path, folder: Path, reserve: Callable[[int], None]) -> tu
     return copy, "its writer did not finish it: a journal lay beside it and was played back"
 
 
-_STEP: Final = 10_000
-"""Instructions of sqlite's machine between two looks at how many there were."""
-_ALWAYS_ALLOWED: Final = 20_000_000
-_FOR_EACH_BYTE: Final = 50
-_READ: Final = ("topics", "messages", "message_definitions")
-_ODD: Final = """
-    SELECT name, type FROM sqlite_master
-    WHERE lower(name) IN (SELECT value FROM json_each(?))
-    AND (type != 'table' OR rootpage = 0)
-"""
-_COMPUTED: Final = "SELECT count(*) FROM pragma_table_xinfo(?) WHERE hidden != 0"
-
-
 def guard(base: sqlite3.Connection, max_value_bytes: int, size: int) -> None:
-    """Bounds what a connection holds at once, and how long it works in all.
+    """Bounds the memory of a connection, and how long it works in all.
 
     Args:
         base: the connection.
-        max_value_bytes: what one value may hold; sqlite refuses more before it allocates it.
-        size: the size of the file. Going once through every row of a bag takes about one
-            instruction for a byte; after many times that, statements are interrupted.
+        max_value_bytes: the size of one value; sqlite refuses more before it allocates it.
+        size: the size of the file. To go through every row of a bag once takes about one
+            instruction a byte; statements are interrupted after many times that.
     """
     base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max_value_bytes)
     left = (_ALWAYS_ALLOWED + _FOR_EACH_BYTE * size) // _STEP
@@ -437,7 +440,7 @@ def guard(base: sqlite3.Connection, max_value_bytes: int, size: int) -> None:
 
 
 def require_plain_tables(base: sqlite3.Connection) -> None:
-    """Refuses views, virtual tables and computed columns where a bag has tables.
+    """Refuses a file with views, virtual tables or computed columns in place of tables.
 
     Raises:
         UnreadableError: there is one.

@@ -1,4 +1,4 @@
-"""Bag files that rosbag2 compressed as a whole: `.mcap.zstd`, `.db3.zstd`."""
+"""Decompresses zstd: single frames, messages, and whole bag files (`.mcap.zstd`, `.db3.zstd`)."""
 
 from __future__ import annotations
 
@@ -9,21 +9,37 @@ from typing import TYPE_CHECKING, Final
 import zstandard
 
 from ros2_memory.storage.base import Closing
-from ros2_memory.storage.errors import MAX_TIMES_PACKED, UnreadableError, most_unpacked, too_large
+from ros2_memory.storage.errors import (
+    MAX_COMPRESSION_RATIO,
+    UnreadableError,
+    max_decompressed_bytes,
+    too_large,
+)
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-# As large as a block: what stands before a damaged one is not lost with it.
+# As large as a block, so that the data before a damaged block is not lost with it.
 _PIECE: Final = zstandard.DECOMPRESSION_RECOMMENDED_OUTPUT_SIZE
 
 
+FRAME_MAGIC: Final = b"\x28\xb5\x2f\xfd"
+_SKIPPABLE: Final = b"\x2a\x4d\x18"
+_HEADER_BYTES: Final = 18
+_RLE_BLOCK: Final = 1
+_MAX_BLOCK_BYTES: Final = 128 << 10
+_MIN_BLOCK_BYTES: Final = 4
+_MAX_FRAMES: Final = 10_000
+_MAX_BLOCKS: Final = 1_000_000
+"""A file of 128 GB has as many full blocks; to go through more, small ones, takes minutes."""
+
+
 def closing_of_zstd(path: Path) -> Closing:
-    """Closed when the file is made of whole frames; what is not zstd at all counts as closed."""
+    """Returns whether the file is made of whole frames; one that is not zstd counts as closed."""
     with OpenFile(path) as file:
-        if file.size and not begins_as_zstd(file):
+        if file.size and not starts_as_zstd(file):
             return Closing.CLOSED
         return Closing.CLOSED if ends_whole(file) else Closing.OPEN
 
@@ -37,15 +53,15 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
         reserve: called with a number of bytes before as many are written.
 
     Returns:
-        The bag, and a note on where the compressed file ends early (empty where it does not).
+        The bag, and a note if the compressed file is damaged or ends early; else an empty one.
 
     Raises:
-        UnreadableError: nothing of it can be decompressed, or there is no room for it.
+        UnreadableError: nothing of it can be decompressed, or it takes more space than allowed.
     """
     with OpenFile(path) as file:
         if not file.size:
             raise UnreadableError(EMPTY_FILE)
-        if not begins_as_zstd(file):
+        if not starts_as_zstd(file):
             raise UnreadableError("not a zstd file: it does not begin as one")
         whole = ends_whole(file)
     target = folder / path.stem
@@ -58,10 +74,10 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
 
 
 def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
-    """Writes what can be decompressed; what is wrong with the rest, or nothing."""
+    """Writes what can be decompressed; returns what is wrong with the rest, or an empty text."""
     with os.fdopen(open_regular(path), "rb") as packed, target.open("wb") as out:
         reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-        left = most_unpacked(path.stat().st_size)
+        left = max_decompressed_bytes(path.stat().st_size)
         while True:
             try:
                 piece = reader.read(_PIECE)
@@ -71,24 +87,15 @@ def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
                 return ""
             left -= len(piece)
             if left < 0:
-                raise UnreadableError(f"it unpacks to more than {MAX_TIMES_PACKED} times its size")
+                raise UnreadableError(
+                    f"it unpacks to more than {MAX_COMPRESSION_RATIO} times its size"
+                )
             reserve(len(piece))
             out.write(piece)
 
 
-FRAME_MAGIC: Final = b"\x28\xb5\x2f\xfd"
-_SKIPPABLE: Final = b"\x2a\x4d\x18"
-_HEADER_BYTES: Final = 18
-_RLE_BLOCK: Final = 1
-_MAX_BLOCK_BYTES: Final = 128 << 10
-_MIN_BLOCK_BYTES: Final = 4
-_MAX_FRAMES: Final = 10_000
-_MAX_BLOCKS: Final = 1_000_000
-"""Of whole ones a file of 128 GB is made; small ones would be looked through for minutes."""
-
-
 class _Own(threading.local):
-    """One for each thread, since it is not safe to share, and costs more than a chunk to make."""
+    """One decompressor a thread: a shared one corrupts data, a new one costs more than a chunk."""
 
     def __init__(self) -> None:
         self.decompressor = zstandard.ZstdDecompressor()
@@ -97,8 +104,8 @@ class _Own(threading.local):
 _OWN: Final = _Own()
 
 
-def unpacked_zstd(packed: bytes, max_bytes: int) -> bytes:
-    """One zstd frame, decompressed.
+def decompress_zstd(packed: bytes, max_bytes: int) -> bytes:
+    """Decompresses one zstd frame.
 
     Raises:
         UnreadableError: it holds, or states to hold, more than `max_bytes`, or states more than
@@ -107,7 +114,8 @@ def unpacked_zstd(packed: bytes, max_bytes: int) -> bytes:
     stated = zstandard.frame_content_size(packed)
     if stated > max_bytes:
         raise UnreadableError(too_large("compressed data", max_bytes))
-    # What is stated is allocated: no block takes fewer bytes, or holds more (RFC 8878, 3.1.1.2).
+    # zstandard allocates the stated size, so it must be possible: no block takes fewer bytes, or
+    # decompresses to more (RFC 8878, 3.1.1.2).
     if stated > (len(packed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES:
         raise UnreadableError("damaged: compressed data states more than it can hold")
     if stated >= 0:
@@ -119,32 +127,32 @@ def unpacked_zstd(packed: bytes, max_bytes: int) -> bytes:
     return data
 
 
-def plain_payload(payload: bytes, max_bytes: int) -> bytes:
-    """A serialized message as it was before rosbag2's message compression.
+def uncompressed_payload(payload: bytes, max_bytes: int) -> bytes:
+    """Returns a serialized message as it was before rosbag2's message compression.
 
-    Nothing but the frame's magic says that a payload is compressed; no CDR message begins so. One
-    that cannot be decompressed, or holds more than `max_bytes`, is given as it stands, for
-    decoding to say so.
+    Nothing but the magic of the frame tells that a payload is compressed; no CDR message begins
+    with it. A payload that cannot be decompressed, or not into `max_bytes`, is returned as it is:
+    decoding reports it.
     """
     if payload[:4] != FRAME_MAGIC:
         return payload
     try:
-        return unpacked_zstd(payload, max_bytes)
+        return decompress_zstd(payload, max_bytes)
     except (UnreadableError, zstandard.ZstdError, MemoryError):
         return payload
 
 
-def begins_as_zstd(file: OpenFile) -> bool:
-    """Whether it begins with a frame's magic, or with as much of it as the file has bytes."""
+def starts_as_zstd(file: OpenFile) -> bool:
+    """Returns whether it begins with the magic of a frame, as far as the file reaches."""
     head = file.read(0, min(file.size, 4))
     return FRAME_MAGIC.startswith(head) or _is_skippable(head)
 
 
 def ends_whole(file: OpenFile) -> bool:
-    """Whether the file is made of whole frames, by their block headers alone (RFC 8878, 3.1).
+    """Returns whether the file is made of whole frames, by block headers alone (RFC 8878, 3.1).
 
     Raises:
-        UnreadableError: it is made of more than any writer makes.
+        UnreadableError: it has more frames or blocks than any writer makes.
     """
     position, frames = 0, 0
     while position < file.size:
@@ -163,7 +171,7 @@ def _is_skippable(head: bytes) -> bool:
 
 
 def _frame_end(file: OpenFile, start: int) -> int | None:
-    """Where the frame at `start` ends, None where the file ends before that shows."""
+    """Returns where the frame at `start` ends; None if the file ends before that is known."""
     head = file.read(start, min(_HEADER_BYTES, file.size - start))
     if _is_skippable(head[:4]):
         if len(head) < 8:

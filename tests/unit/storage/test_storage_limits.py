@@ -28,14 +28,14 @@ from ros2_memory.storage.errors import (
     MAX_CHUNK_MESSAGES,
     MAX_CHUNKS,
     UnreadableError,
-    most_unpacked,
+    max_decompressed_bytes,
 )
 from ros2_memory.storage.mcap.chunk import walk_chunk
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.storage.sqlite_bag import guard
-from ros2_memory.storage.zstd_bag import unpacked_zstd
+from ros2_memory.storage.zstd_bag import decompress_zstd
 from tests.fuzz.bombs import rle_frame
 from tests.fuzz.records import (
     MAGIC,
@@ -88,12 +88,12 @@ class TestChunks:
 
     def test_a_frame_that_states_more_than_its_blocks_can_hold_is_refused(self) -> None:
         with pytest.raises(UnreadableError, match="states more than it can hold"):
-            unpacked_zstd(rle_frame(10, stated=50 * MB), 64 * MB)
+            decompress_zstd(rle_frame(10, stated=50 * MB), 64 * MB)
 
     @pytest.mark.parametrize("size", [0, 1, 131_072, 131_073, MB])
     def test_a_frame_that_holds_what_it_states_is_read_however_small_it_is(self, size: int) -> None:
-        assert unpacked_zstd(rle_frame(size, stated=size), 64 * MB) == bytes(size)
-        assert unpacked_zstd(zstandard.compress(bytes(size)), 64 * MB) == bytes(size)
+        assert decompress_zstd(rle_frame(size, stated=size), 64 * MB) == bytes(size)
+        assert decompress_zstd(zstandard.compress(bytes(size)), 64 * MB) == bytes(size)
 
     def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
         self, tmp_path: Path
@@ -250,7 +250,7 @@ class TestWholeFiles:
     ) -> None:
         path = tmp_path / "bag.mcap.zstd"
         start = zstandard.compress(MAGIC + header().data)
-        path.write_bytes(start + rle_frame(most_unpacked(MB)))
+        path.write_bytes(start + rle_frame(max_decompressed_bytes(MB)))
         with pytest.raises(BagError, match="unpacks to more than 100 times its size"):
             Rosbag2Reader().summarize(path)
 

@@ -58,7 +58,7 @@ from ros2_memory.storage.mcap.records import (
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.mcap.summary import Chunk, DoubtError
-from ros2_memory.storage.zstd_bag import plain_payload
+from ros2_memory.storage.zstd_bag import uncompressed_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
@@ -594,5 +594,5 @@ def _record(
     if channel is None:
         raise UnreadableError("damaged: a message is not of the channel that its index says")
     if channel.encoding == "cdr":
-        payload = plain_payload(payload, max_bytes)
+        payload = uncompressed_payload(payload, max_bytes)
     return Record(channel, log_time, publish_time if publish_time < MAX_NS else log_time, payload)

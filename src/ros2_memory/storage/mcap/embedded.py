@@ -1,7 +1,7 @@
-"""What rosbag2 embeds in each MCAP file besides messages: a metadata record with its metadata.yaml.
+"""Reads the metadata record that rosbag2 embeds in each MCAP file, with its metadata.yaml.
 
-It stands right behind the header, and again before the end, and holds the custom data that `ros2
-bag record --custom-data` was given (seen in the files of Jazzy; Humble has no such option).
+It follows the header, is repeated before the end, and has the custom data of `ros2 bag record
+--custom-data` (seen in the files of Jazzy; Humble has no such option).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mcap.records import Metadata
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.records import MAGIC_SIZE, Opcode
-from ros2_memory.storage.mcap.salvage import parsed
+from ros2_memory.storage.mcap.salvage import decode_records
 from ros2_memory.storage.mcap.walk import file_records
 
 if TYPE_CHECKING:
@@ -26,24 +26,24 @@ if TYPE_CHECKING:
 
 _NAME: Final = "rosbag2"
 _KEY: Final = "serialized_metadata"
-_OF_HUMBLE: Final = frozenset({"ROS_DISTRO"})
-"""What Humble's record has instead (seen in its files)."""
+_HUMBLE_KEYS: Final = frozenset({"ROS_DISTRO"})
+"""The keys of the record of Humble (seen in its files)."""
 _NEXT_KEY: Final = re.compile(r"[a-z_]+:|\s*\Z")
-_MOST_BYTES: Final = 16 << 20
-"""A longer record is not read. The metadata record grows by 180 bytes a split."""
+_MAX_BYTES: Final = 16 << 20
+"""A longer record is not read. The metadata record grows by 180 bytes with each split."""
 _BEFORE: Final = frozenset(
     {Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.ATTACHMENT}
 )
 _END: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.DATA_END})
-# The whole text lists every split: parsing it as YAML takes a thousand times as long.
+# The text lists every split: to parse all of it as YAML takes a thousand times as long.
 _CUSTOM_DATA: Final = re.compile(r"^custom_data:[^\n]*\n(?: +[^\s#][^\n]*(?:\n|$))*", re.MULTILINE)
 
 
 def custom_data(path: Path) -> dict[str, str] | None:
-    """The custom data that `ros2 bag record` embedded in an MCAP file; empty where there is none.
+    """Returns the custom data that `ros2 bag record` embedded in an MCAP file; empty without any.
 
-    Reads up to the first message or chunk, so a file that ends after that has it too. None where
-    that cannot be known: the file is no MCAP file, ends before it, or is damaged there.
+    Reads up to the first message or chunk, so that it works for a file that ends early. Returns
+    None if that cannot be known: the file is not MCAP, ends before it, or is damaged there.
 
     Raises:
         OSError: it cannot be read.
@@ -55,7 +55,7 @@ def custom_data(path: Path) -> dict[str, str] | None:
                     text = record.metadata.get(_KEY)
                     if text is not None:
                         return _custom_data_in(text) if record.name == _NAME else None
-                    if record.name == _NAME and record.metadata.keys() - _OF_HUMBLE:
+                    if record.name == _NAME and record.metadata.keys() - _HUMBLE_KEYS:
                         return None
     except UnreadableError:
         return None
@@ -74,9 +74,9 @@ def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
             raise UnreadableError("damaged: it does not begin with one header")
         if opcode in _END:
             return
-        if opcode not in _BEFORE or size > _MOST_BYTES:
+        if opcode not in _BEFORE or size > _MAX_BYTES:
             raise UnreadableError("damaged: no such record stands before the first message")
-        read = next(parsed([(opcode, file.read(record.body_at, size))]), None)
+        read = next(decode_records([(opcode, file.read(record.body_at, size))]), None)
         if read is None:
             raise UnreadableError("damaged: a record before the first message cannot be read")
         yield read

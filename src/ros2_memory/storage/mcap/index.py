@@ -25,12 +25,12 @@ from ros2_memory.storage.mcap.chunk import (
     Column,
     Extent,
     columns_from_index,
+    decompressed_chunk,
+    decompressed_prefix,
     extents_from_index,
     index_bytes,
     indexed_channels,
-    packed_chunk,
-    unpacked,
-    unpacked_in_part,
+    read_packed_chunk,
 )
 from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
@@ -193,10 +193,10 @@ def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
         UnreadableError: the chunk is damaged or larger than `max_bytes`.
     """
     body_at, body_size = chunk.offset + RECORD.size, chunk.length - RECORD.size
-    head, packed = packed_chunk(file, body_at, body_size, max_bytes)
+    head, packed = read_packed_chunk(file, body_at, body_size, max_bytes)
     if chunk.usable is not None:
-        return unpacked_in_part(head, packed, max_bytes)[: chunk.usable]
-    return unpacked(head, packed, max_bytes)
+        return decompressed_prefix(head, packed, max_bytes)[: chunk.usable]
+    return decompressed_chunk(head, packed, max_bytes)
 
 
 def index_from_summary(file: OpenFile) -> McapIndex:
@@ -227,7 +227,7 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     if not all(map(known.issuperset, {chunk.channels for chunk in filled})):
         raise DoubtError("its chunk indexes name channels that it does not declare")
     if chunks:
-        _require_as_stated(file, start, chunks)
+        _require_chunks_as_indexed(file, start, chunks)
     if not _agrees(stated, chunks, filled):
         raise DoubtError
     if not _indexes_all(filled, stated.message_count):
@@ -248,7 +248,7 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     )
 
 
-def _require_as_stated(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:
+def _require_chunks_as_indexed(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:
     """Compares every chunk index with the head of its chunk, and looks between the chunks.
 
     Raises:

@@ -1,4 +1,7 @@
-"""Merging runs of messages that are each in order and may overlap in time."""
+"""Merges runs of messages that are each in order and may overlap in time.
+
+`heapq.merge` compares every message; this yields whole stretches that no other run interrupts.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,9 @@ T = TypeVar("T")
 
 
 class Rows(NamedTuple, Generic[T]):
-    """The messages of one run in output order: log times, places, and how to fetch one by both.
+    """The messages of one run in output order: log times, offsets, and how to fetch one by both.
 
-    For newest first the times are descending, and equal ones stand in reverse file order.
+    For newest first the times are descending, and equal ones are in reverse file order.
     """
 
     times: list[Ns]
@@ -26,9 +29,9 @@ class Rows(NamedTuple, Generic[T]):
 
 
 class SortedRun(NamedTuple, Generic[T]):
-    """A stretch of a file: no message in it lies outside `first` to `last` (inclusive).
+    """A part of a file: no message in it lies outside `first` to `last` (inclusive).
 
-    `rank` is its place in the file; `rows` reads it, and is called only when its turn comes.
+    `rank` is its position in the file; `rows` reads it, and is called only when its turn comes.
     """
 
     first: Ns
@@ -38,10 +41,10 @@ class SortedRun(NamedTuple, Generic[T]):
 
 
 def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
-    """The messages of all runs by log time, ties in file order; or exactly the reverse.
+    """Yields the messages of all runs by log time, ties in file order; or exactly the reverse.
 
-    A run is read only when it can hold the next message, and let go at its end: what is held
-    are the runs that overlap in time.
+    A run is read only when it can hold the next message, and dropped at its end: only the runs that
+    overlap in time are in memory.
     """
     sign = -1 if newest_first else 1
     # Sorted so that the next to be read is the last of the list.

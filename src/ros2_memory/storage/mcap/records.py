@@ -1,8 +1,8 @@
-"""The records of an MCAP file, from bytes (https://mcap.dev/spec).
+"""Decodes the records of an MCAP file (https://mcap.dev/spec).
 
 A file is magic, records, magic; a record is an opcode (1 byte), a length (8 bytes, little endian)
-and a body. What is read of every file is read with `struct`; what the bags of one robot have in
-common, and what is seldom read, by the `mcap` package.
+and a body. Records that every file is full of are read with `struct`; those that the bags of one
+robot have in common, and those that are seldom read, with the `mcap` package.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ __all__ = [
     "Declarations",
     "Opcode",
     "Statistics",
-    "framed",
     "offered_as_latched",
+    "section_records",
     "statistics",
 ]
 
@@ -67,17 +67,21 @@ _COUNTS_AT: Final = 46
 _COUNT_BYTES: Final = 10
 _LONGEST_CACHED: Final = 16 * 1024
 
-# QoS stands in a channel's metadata as YAML; parsing it costs fifty times this search. Newer
-# distros write the durability's name, older ones rmw's number for it.
+_MAX_PROFILE_BYTES: Final = 256
+_LENGTH_BYTES: Final = 4
+
+
+# rosbag2 writes QoS into the metadata of a channel as YAML; to parse it takes fifty times as long
+# as this search. Newer distros write the name of the durability, older ones the number of rmw.
 _TRANSIENT_LOCAL: Final = re.compile(r"durability:\s*(?:transient_local|1)\b")
 
 
 def offered_as_latched(qos_profiles: str) -> bool:
-    """Whether some publisher offered the topic as transient local, by rosbag2's QoS text."""
+    """Returns whether a publisher offers the topic as transient local, by the QoS of rosbag2."""
     return _TRANSIENT_LOCAL.search(qos_profiles) is not None
 
 
-def framed(section: bytes) -> Iterator[tuple[int, int, int]]:
+def section_records(section: bytes) -> Iterator[tuple[int, int, int]]:
     """Yields the opcode of each record of a section, and where its body begins and ends.
 
     Raises:
@@ -112,13 +116,13 @@ def statistics(body: bytes) -> Statistics:
 
 @dataclass(slots=True)
 class Declarations:
-    """The schemas and channels met so far; ids are local to one file."""
+    """The schemas and channels of one file, by id, as far as it was read."""
 
     _schemas: dict[int, Schema] = field(default_factory=dict)
     _channels: dict[int, mcap_records.Channel] = field(default_factory=dict)
 
     def add(self, opcode: int, body: bytes) -> None:
-        """Takes note of a schema or channel record; others are ignored."""
+        """Adds a schema or channel record; others are ignored."""
         # Short ones only, so that what the cache holds stays below 8 MiB.
         decode = _declaration if len(body) <= _LONGEST_CACHED else _declaration.__wrapped__
         number, declared = decode(opcode, body)
@@ -128,13 +132,13 @@ class Declarations:
             self._channels[number] = declared
 
     def agrees(self, opcode: int, body: bytes) -> bool:
-        """Whether a schema or channel record declares what is known of its number, if anything."""
+        """Returns whether a record agrees with the known schema or channel of its id, if any."""
         other = Declarations()
         other.add(opcode, body)
         return not self._differing(other)
 
     def update(self, other: Declarations) -> bool:
-        """Takes over what another declares; returns whether that replaced something else."""
+        """Adds the records of another; returns whether one of them replaced a different one."""
         differing = self._differing(other)
         self._schemas |= other._schemas
         self._channels |= other._channels
@@ -149,14 +153,14 @@ class Declarations:
 
     @property
     def resolved(self) -> bool:
-        """Whether every channel's schema is known. Id 0 means a channel without one."""
+        """Whether the schema of every channel is known; id 0 means a channel without one."""
         return all(
             channel.schema_id == 0 or channel.schema_id in self._schemas
             for channel in self._channels.values()
         )
 
     def channels(self) -> dict[int, Channel]:
-        """The channels by id; one whose schema is nowhere in the file has an empty schema.
+        """Returns the channels by id; one whose schema is not in the file has an empty schema.
 
         Raises:
             UnreadableError: they are more than any robot has.
@@ -197,20 +201,16 @@ def _declaration(opcode: int, body: bytes) -> tuple[int, Schema | mcap_records.C
     return 0, None
 
 
-_MOST_PROFILE_BYTES: Final = 256
-_LENGTH_BYTES: Final = 4
-
-
 def closing_of(file: OpenFile) -> Closing:
-    """Open while the closing magic is missing; what is not MCAP at all counts as closed."""
-    if file.size and not begins_as_mcap(file):
+    """Returns open if the closing magic is missing; a file that is not MCAP counts as closed."""
+    if file.size and not starts_as_mcap(file):
         return Closing.CLOSED
     return Closing.CLOSED if _ends_as_mcap(file) else Closing.OPEN
 
 
 def is_finished(file: OpenFile) -> bool:
-    """Whether it is MCAP and its writer finished it."""
-    return _ends_as_mcap(file) and begins_as_mcap(file)
+    """Returns whether it is MCAP and its writer finished it."""
+    return _ends_as_mcap(file) and starts_as_mcap(file)
 
 
 def _ends_as_mcap(file: OpenFile) -> bool:
@@ -218,30 +218,30 @@ def _ends_as_mcap(file: OpenFile) -> bool:
     return whole and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
 
 
-def begins_as_mcap(file: OpenFile) -> bool:
-    """Whether it begins with MCAP's magic, or with as much of it as the file has bytes."""
+def starts_as_mcap(file: OpenFile) -> bool:
+    """Returns whether it begins with the magic of MCAP, as far as the file reaches."""
     return MAGIC.startswith(file.read(0, min(file.size, MAGIC_SIZE)))
 
 
 def require_mcap(file: OpenFile) -> None:
-    """Refuses what cannot be read as MCAP from its beginning.
+    """Checks that a file begins as MCAP.
 
     Raises:
-        UnreadableError: it is no MCAP file, or ends within its magic.
+        UnreadableError: it is not MCAP, or ends within its magic.
     """
     if not file.size:
         raise UnreadableError(EMPTY_FILE)
-    if not begins_as_mcap(file):
+    if not starts_as_mcap(file):
         raise UnreadableError("not an MCAP file: it does not begin as one")
     if file.size < MAGIC_SIZE:
         raise UnreadableError(f"only its first {file.size} bytes had reached the disk")
 
 
 def profile_of(file: OpenFile) -> str:
-    """The profile that the header record holds; empty where there is no header.
+    """Returns the profile in the header record; empty if there is no header.
 
     Raises:
-        UnreadableError: it is no MCAP file, or its header is damaged.
+        UnreadableError: it is not MCAP, or its header is damaged.
     """
     require_mcap(file)
     text_at = MAGIC_SIZE + RECORD.size + _LENGTH_BYTES
@@ -251,6 +251,6 @@ def profile_of(file: OpenFile) -> str:
     if head[0] != Opcode.HEADER:
         return ""
     length = int.from_bytes(head[RECORD.size :], "little")
-    if length > _MOST_PROFILE_BYTES:
+    if length > _MAX_PROFILE_BYTES:
         raise UnreadableError("damaged: its profile is longer than any can be")
     return file.read(text_at, length).decode()

@@ -17,7 +17,7 @@ from mcap.data_stream import ReadDataStream
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import MAX_SECTION_BYTES, UnreadableError, as_unreadable
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, Opcode, framed
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, Opcode, section_records
 from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _READERS: Final[dict[int, Callable[[ReadDataStream], mcap_records.McapRecord]]] 
     Opcode.METADATA: mcap_records.Metadata.read,
 }
 _CONTENT: Final = frozenset((*_READERS, Opcode.MESSAGE))
-"""The records that say something of their own; the others say where these are."""
+"""Records with content of their own; the others are indexes of these."""
 _MESSAGE_BODY: Final = struct.Struct("<HIQQ")
 """Channel, sequence, log time and publish time; the payload follows."""
 
@@ -100,13 +100,13 @@ class Salvage:
 
 
 def _content_of(data: bytes, usable: int) -> Iterator[tuple[int, bytes]]:
-    for opcode, begin, end in framed(data[:usable]):
+    for opcode, begin, end in section_records(data[:usable]):
         if opcode in _CONTENT:
             yield opcode, data[begin:end]
 
 
-def parsed(records: Iterable[tuple[int, bytes]]) -> Iterator[mcap_records.McapRecord]:
-    """The records themselves; a damaged one is left out, as readers leave it out."""
+def decode_records(records: Iterable[tuple[int, bytes]]) -> Iterator[mcap_records.McapRecord]:
+    """Decodes records by the `mcap` library; leaves out damaged ones, as readers do."""
     for opcode, body in records:
         if opcode == Opcode.MESSAGE:
             channel, sequence, log_time, publish_time = _MESSAGE_BODY.unpack_from(body)
@@ -121,28 +121,28 @@ def parsed(records: Iterable[tuple[int, bytes]]) -> Iterator[mcap_records.McapRe
         yield record
 
 
-class Tally:
-    """What counts of a file; `said` is the same for two files that hold the same.
+class ContentDigest:
+    """A digest of the content of a file, to compare a rewritten file with its source.
 
-    Schemas and channels count by what they say, since their numbers are local to a file. A message
-    counts where its channel is declared before it and its log time is one.
+    Schemas and channels count by their content, since ids are local to a file. A message counts if
+    its channel is declared before it and its log time is possible.
     """
 
     def __init__(self) -> None:
         self._schemas: dict[int, mcap_records.Schema] = {}
         self._channels: dict[int, bytes] = {}
         self._in_order = hashlib.blake2b()
-        self._beside = hashlib.blake2b()
+        self._between = hashlib.blake2b()
         self.messages = 0
 
     @property
-    def said(self) -> tuple[bytes, bytes, frozenset[bytes]]:
-        """Digests of the messages in their order, of what stands between them, and of channels."""
+    def digests(self) -> tuple[bytes, bytes, frozenset[bytes]]:
+        """Digests of the messages in order, of attachments and metadata, and of each channel."""
         channels = frozenset(self._channels.values())
-        return self._in_order.digest(), self._beside.digest(), channels
+        return self._in_order.digest(), self._between.digest(), channels
 
-    def counts(self, record: mcap_records.McapRecord) -> bool:
-        """Takes a record in; whether it counts. A declaration that is repeated does not."""
+    def add(self, record: mcap_records.McapRecord) -> bool:
+        """Adds a record; returns whether it counts: a repeated declaration does not."""
         if isinstance(record, mcap_records.Message):
             return self._message(record)
         if isinstance(record, mcap_records.Schema):
@@ -152,7 +152,7 @@ class Tally:
         if isinstance(record, mcap_records.Channel):
             return self._channel(record)
         if not isinstance(record, mcap_records.Header):
-            self._beside.update(repr(record).encode())
+            self._between.update(repr(record).encode())
         return True
 
     def _channel(self, channel: mcap_records.Channel) -> bool:
@@ -160,8 +160,8 @@ class Tally:
             return False
         schema = self._schemas.get(channel.schema_id)
         definition = (schema.name, schema.encoding, schema.data) if schema else None
-        said = repr((channel.topic, channel.message_encoding, channel.metadata, definition))
-        self._channels[channel.id] = hashlib.blake2b(said.encode()).digest()
+        content = repr((channel.topic, channel.message_encoding, channel.metadata, definition))
+        self._channels[channel.id] = hashlib.blake2b(content.encode()).digest()
         return True
 
     def _message(self, message: mcap_records.Message) -> bool:

@@ -22,7 +22,7 @@ from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
     RECORD,
     Declarations,
-    framed,
+    section_records,
     statistics,
 )
 
@@ -118,7 +118,7 @@ def read_summary(file: OpenFile) -> Summary:
     declaring: list[bytes] = []
     chunks: list[Chunk] = []
     stated: Statistics | None = None
-    for opcode, begin, end in framed(section):
+    for opcode, begin, end in section_records(section):
         if opcode == _CHUNK_INDEX_OPCODE:
             chunks.append(_chunk(section, begin, end))
         elif opcode in _DECLARES:
@@ -169,7 +169,7 @@ def _numbers(low: bytes, high: bytes) -> frozenset[int]:
 @lru_cache(32)
 def _declared(records: bytes) -> Declared:
     declarations = Declarations()
-    for opcode, begin, end in framed(records):
+    for opcode, begin, end in section_records(records):
         declarations.add(opcode, records[begin:end])
     channels = declarations.channels()
     return Declared(channels, unshared_bytes(channels), declarations)

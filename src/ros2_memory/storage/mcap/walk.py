@@ -12,13 +12,18 @@ from mcap.opcode import Opcode
 
 from ros2_memory.storage.errors import (
     MAX_CHUNKS,
-    MAX_TIMES_PACKED,
+    MAX_COMPRESSION_RATIO,
     MESSAGE_BYTES,
     UnreadableError,
     as_unreadable,
-    most_unpacked,
+    max_decompressed_bytes,
 )
-from ros2_memory.storage.mcap.chunk import packed_chunk, unpacked, unpacked_in_part, walk_chunk
+from ros2_memory.storage.mcap.chunk import (
+    decompressed_chunk,
+    decompressed_prefix,
+    read_packed_chunk,
+    walk_chunk,
+)
 from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
     MESSAGE,
@@ -110,7 +115,7 @@ class ChunkOpener:
     def __init__(self, file: OpenFile, max_chunk_bytes: int) -> None:
         self._file = file
         self._max_chunk_bytes = max_chunk_bytes
-        self._max_bytes = most_unpacked(file.size)
+        self._max_bytes = max_decompressed_bytes(file.size)
         self._bytes = 0
         self._chunks = 0
 
@@ -124,12 +129,14 @@ class ChunkOpener:
             raise UnreadableError(f"it has more than {MAX_CHUNKS} chunks")
         if self._bytes > self._max_bytes:
             raise UnreadableError(
-                f"its chunks hold more than {MAX_TIMES_PACKED} times what the file does"
+                f"its chunks hold more than {MAX_COMPRESSION_RATIO} times what the file does"
             )
         in_file = min(record.end, self._file.size) - record.body_at
-        decompress = unpacked if record.end <= self._file.size else unpacked_in_part
+        decompress = decompressed_chunk if record.end <= self._file.size else decompressed_prefix
         with as_unreadable():
-            head, packed = packed_chunk(self._file, record.body_at, in_file, self._max_chunk_bytes)
+            head, packed = read_packed_chunk(
+                self._file, record.body_at, in_file, self._max_chunk_bytes
+            )
             data = decompress(head, packed, self._max_chunk_bytes)
             self._bytes += len(data)
             content = walk_chunk(data)

@@ -15,7 +15,7 @@ from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Rewritten
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, reason_of
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
-from ros2_memory.storage.mcap.salvage import Salvage, Tally, parsed
+from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage, decode_records
 from ros2_memory.typestore import full_name
 
 if TYPE_CHECKING:
@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Channel, Record, Schema
 
 CHUNK_BYTES: Final = 64 << 10
-"""Small, since whoever asks for one message has the whole of its chunk unpacked."""
+"""Small, since a reader decompresses a whole chunk for one message."""
 LIBRARY: Final = "ros2-memory"
 _ROS2_ENCODINGS: Final = frozenset(("ros2msg", "ros2idl", ""))
-"""Empty where the recorder found no definition."""
+"""Empty if the recorder found no definition."""
 
 
 class McapWriter(BagWriter):
     """Writes `.mcap` files, chunks compressed with zstd.
 
     Args:
-        max_chunk_mb: what one chunk of a file that is rewritten may hold, decompressed.
+        max_chunk_mb: decompressed size up to which a chunk of a source is read, in MiB.
     """
 
     def __init__(self, max_chunk_mb: int = MAX_CHUNK_MB) -> None:
@@ -49,7 +49,7 @@ class McapWriter(BagWriter):
             writer.start(profile, LIBRARY)
             channels = _Channels(writer)
             for record in records:
-                number = channels.number_of(record.channel)
+                number = channels.id_of(record.channel)
                 writer.add_message(number, record.log_time, record.payload, record.publish_time)
             writer.finish()
 
@@ -61,34 +61,34 @@ class McapWriter(BagWriter):
             with reading(source), OpenFile(source) as file:
                 salvage = Salvage(file, self._max_chunk_mb << 20)
                 copy = _Copy(_writer(stream))
-                tally = Tally()
-                for record in parsed(salvage.records(progress)):
-                    if tally.counts(record):
+                digest = ContentDigest()
+                for record in decode_records(salvage.records(progress)):
+                    if digest.add(record):
                         copy.put(record)
             copy.finish()
             stream.flush()
-            notes = self._compared(source, target, tally)
-        return Rewritten(tally.messages, salvage.lost_bytes, notes)
+            notes = self._compare(source, target, digest)
+        return Rewritten(digest.messages, salvage.lost_bytes, notes)
 
-    def _compared(self, source: Path, target: Path, tally: Tally) -> tuple[str, ...]:
-        """Reads the target both as questions do and as it was written; gives the source's notes."""
+    def _compare(self, source: Path, target: Path, digest: ContentDigest) -> tuple[str, ...]:
+        """Compares the target, read back, with the source; returns the notes on the source."""
         bags = McapBags(cache_mb=1, max_chunk_mb=self._max_chunk_mb)
         with reading(source):
             before = bags.summarize(source)
         after = bags.summarize(target)
         if not after.complete or after.notes:
             raise UnreadableError(f"what was written is not whole ({'; '.join(after.notes)})")
-        again = Tally()
+        again = ContentDigest()
         with OpenFile(target) as file:
-            for record in parsed(Salvage(file, self._max_chunk_mb << 20).records()):
-                again.counts(record)
-        if (after.topics, again.said) != (before.topics, tally.said):
+            for record in decode_records(Salvage(file, self._max_chunk_mb << 20).records()):
+                again.add(record)
+        if (after.topics, again.digests) != (before.topics, digest.digests):
             raise UnreadableError("what was written is not what could be read")
         return before.notes
 
 
 class _Copy:
-    """Puts the records of another file into a writer, which numbers schemas and channels anew."""
+    """Writes the records of another file; the writer gives schemas and channels new ids."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -129,7 +129,7 @@ class _Copy:
             )
 
     def finish(self) -> None:
-        """Writes what closes the file."""
+        """Writes the summary section and the footer."""
         self._start(ROS2_PROFILE, LIBRARY)
         self._writer.finish()
 
@@ -147,8 +147,8 @@ class _Channels:
         self._schemas: dict[Schema, int] = {}
         self._channels: dict[Channel, int] = {}
 
-    def number_of(self, channel: Channel) -> int:
-        """The channel's number in the file."""
+    def id_of(self, channel: Channel) -> int:
+        """Returns the id of the channel in the file."""
         number = self._channels.get(channel)
         if number is None:
             schema = _exported(channel)
@@ -164,7 +164,7 @@ class _Channels:
 
 
 def _exported(channel: Channel) -> Schema:
-    """The schema of a channel; a ROS 2 type is named as rosbag2 and its readers name it."""
+    """Returns the schema of a channel; a ROS 2 type gets the name that rosbag2 gives it."""
     schema = channel.schema
     if channel.encoding != "cdr" or schema.encoding not in _ROS2_ENCODINGS:
         return schema
@@ -177,10 +177,10 @@ def _writer(stream: IO[bytes]) -> Writer:
 
 @contextmanager
 def _written(path: Path) -> Iterator[IO[bytes]]:
-    """A stream into a file that is made, on the disk at the end, and gone after a failure.
+    """Yields a stream into a new file, which is synced at the end, and deleted after a failure.
 
     Raises:
-        BagError: whatever went wrong inside, as far as it is not of the error tree already.
+        BagError: any other exception of the block than an `EpisodicError`.
     """
     try:
         stream = path.open("xb")
@@ -191,7 +191,7 @@ def _written(path: Path) -> Iterator[IO[bytes]]:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-    # The library raises whatever it runs into, such as struct.error for a negative time.
+    # The library lets every exception pass, such as struct.error for a negative time.
     except Exception as error:
         with suppress(OSError):
             path.unlink()
