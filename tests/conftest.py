@@ -48,15 +48,18 @@ UNMEASURED = (
     "test_documents.py",
     "test_hostile_arguments.py",
     "test_*_real_bags.py",
+    "test_path_length.py",
     "test_planner_questions.py",
     "test_real_bags*.py",
     "test_recorded_sessions.py",
     "test_same_answers.py",
+    "test_standstills.py",
     "test_week.py",
 )
 """Tests in which coverage is not measured, which takes up to five times as long as the test itself.
 
-They ask much of everything at once; what they run is run by each room's own tests as well.
+They ask much of everything at once, or of hours of poses; what they run is run by other tests of
+the same room, or of the tools above it, as well.
 """
 _IN_PROGRAMS = "COVERAGE_PROCESS_CONFIG"
 """By this, coverage.py measures in the programs that are started."""

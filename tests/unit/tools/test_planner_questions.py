@@ -234,6 +234,7 @@ def is_right(question: Planned, replies: list[JsonValue], asked: Asked) -> bool:
     return True
 
 
+@pytest.mark.parametrize("asking", ["plain"], indirect=True)
 @pytest.mark.parametrize("words", BY_WORDS)
 def test_each_judge_finds_out_a_reply_that_says_something_else(asking: Asking, words: str) -> None:
     replies: list[JsonValue] = [json.loads(text) for text in asking.replies[words]]
@@ -249,6 +250,7 @@ def test_each_judge_finds_out_a_reply_that_says_something_else(asking: Asking, w
     assert expected <= wrong
 
 
+@pytest.mark.parametrize("asking", ["plain"], indirect=True)
 @pytest.mark.parametrize("words", sorted(OF_NOTHING))
 def test_that_there_is_nothing_is_wrong_where_there_is_something(
     asking: Asking, words: str
