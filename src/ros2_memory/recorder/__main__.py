@@ -20,7 +20,7 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_housekeeper, build_reader, build_recorder, claim
 from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_settings
-from ros2_memory.core.errors import ConfigError, EpisodicError, RecorderError
+from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.sd_notify import (
     READY,
@@ -31,6 +31,7 @@ from ros2_memory.core.sd_notify import (
 )
 from ros2_memory.recorder.handover.recovery import recover_handovers, recover_unwritten
 from ros2_memory.recorder.process.topics import load_topics
+from ros2_memory.recorder.supervisor import make_bag_dir
 from ros2_memory.retention.clear import clear_bags, refuse_homes
 
 if TYPE_CHECKING:
@@ -116,12 +117,7 @@ def _lock_bag_dir(bag_dir: Path, *, clear: bool) -> BagDirLock:
     """
     if clear:
         refuse_homes(bag_dir)
-    try:
-        bag_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RecorderError(
-            f"{bag_dir} cannot be made: {error.strerror}; correct recording.bag_dir"
-        ) from error
+    make_bag_dir(bag_dir)
     return BagDirLock.acquire(bag_dir)
 
 

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.recorder.handover.plan import ClockReading
 
+FIRST_WAIT_S: Final = 1.0
+MAX_WAIT_S: Final = 60.0
+STABLE_S: Final = 60.0
 SILENT_SPLITS: Final = 3
 """Splits without growth after which a robot counts as silent."""
 RESUME_FACTOR: Final = 1.2
@@ -24,22 +27,19 @@ _MAX_DOUBLINGS: Final = 16
 class Backoff:
     """How long to wait before the next attempt: twice as long each time, up to a cap.
 
-    An attempt that lasted at least `stable_s` ends a series of failures: the wait after it is the
-    first again. All in seconds.
+    An attempt that lasted at least `STABLE_S` ends a series of failures: the wait after it is the
+    first again.
     """
 
-    def __init__(self, first_s: float = 1.0, cap_s: float = 60.0, stable_s: float = 60.0) -> None:
-        self._first_s = first_s
-        self._cap_s = cap_s
-        self._stable_s = stable_s
+    def __init__(self) -> None:
         self._failures = 0
 
     def failed(self, lasted_s: float) -> float:
-        """Returns the wait after an attempt that ended after `lasted_s`."""
-        if lasted_s >= self._stable_s:
+        """Returns the wait in seconds after an attempt that ended after `lasted_s`."""
+        if lasted_s >= STABLE_S:
             self._failures = 0
         doublings = min(self._failures, _MAX_DOUBLINGS)
-        wait_s = min(self._first_s * (1 << doublings), self._cap_s)
+        wait_s = min(FIRST_WAIT_S * (1 << doublings), MAX_WAIT_S)
         self._failures += 1
         return wait_s
 

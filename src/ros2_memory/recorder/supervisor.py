@@ -135,7 +135,7 @@ class Supervisor:
             return
         self._last = now = self._now()
         self._due_s.clear()
-        self._make_bag_dir()
+        make_bag_dir(self._bag_dir)
         try:
             self._disk.remember()
         except OSError as error:
@@ -320,17 +320,9 @@ class Supervisor:
             self._postpone("restart", self._backoff.failed(0.0), now)
 
     def _begin(self, now: ClockReading) -> None:
-        self._make_bag_dir()
+        make_bag_dir(self._bag_dir)
         self._sessions.begin(now)
         self._silence.began(now.monotonic_s, SETTLE_S)
-
-    def _make_bag_dir(self) -> None:
-        try:
-            self._bag_dir.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RecorderError(
-                f"{self._bag_dir} cannot be made: {error.strerror or error}"
-            ) from error
 
     def _note_recorded(self, now: ClockReading) -> None:
         names = [each.name for each in self._sessions.running if each.has_recorded]
@@ -389,3 +381,17 @@ class Supervisor:
 
     def _now(self) -> ClockReading:
         return ClockReading(self._monotonic(), self._clock.now())
+
+
+def make_bag_dir(bag_dir: Path) -> None:
+    """Makes the bag directory where it does not exist.
+
+    Raises:
+        RecorderError: it cannot be made.
+    """
+    try:
+        bag_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecorderError(
+            f"{bag_dir} cannot be made: {error.strerror or error}; correct recording.bag_dir"
+        ) from error

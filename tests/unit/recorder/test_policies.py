@@ -21,12 +21,12 @@ from ros2_memory.recorder.policies import (
 
 class TestBackoff:
     def test_doubles_up_to_its_cap(self) -> None:
-        backoff = Backoff(first_s=1, cap_s=60, stable_s=60)
+        backoff = Backoff()
         waits = [backoff.failed(0.1) for _ in range(9)]
         assert waits == [1, 2, 4, 8, 16, 32, 60, 60, 60]
 
     def test_starts_again_after_a_stable_minute(self) -> None:
-        backoff = Backoff(first_s=1, cap_s=60, stable_s=60)
+        backoff = Backoff()
         assert [backoff.failed(59.9) for _ in range(3)] == [1, 2, 4]
         assert backoff.failed(60.0) == 1
         assert backoff.failed(0.0) == 2
@@ -35,7 +35,7 @@ class TestBackoff:
     def test_never_waits_for_less_than_the_first_nor_more_than_the_cap(
         self, lives: list[float]
     ) -> None:
-        backoff = Backoff(first_s=1, cap_s=60, stable_s=60)
+        backoff = Backoff()
         assert all(1 <= backoff.failed(lived) <= 60 for lived in lives)
 
     def test_a_recorder_that_died_for_days_still_has_a_wait(self) -> None:

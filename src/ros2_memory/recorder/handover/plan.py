@@ -80,11 +80,9 @@ class HandoverPlan:
         began: ClockReading,
         *,
         subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S,
-        both_s: float = BOTH_S,
     ) -> None:
         self.began = began
         self._timeout_s = subscribe_timeout_s
-        self._both_s = both_s
         self._both: ClockReading | None = None
         self._last = began
 
@@ -108,7 +106,7 @@ class HandoverPlan:
             self._both = now
         if self._both is None:
             return Step.WAIT if ready or age_s < READY_TIMEOUT_S else Step.ABANDON
-        over = now.monotonic_s - self._both.monotonic_s >= self._both_s
+        over = now.monotonic_s - self._both.monotonic_s >= BOTH_S
         return Step.COMPLETE if over else Step.WAIT
 
     def bounds(self, now: ClockReading) -> Bounds | None:
