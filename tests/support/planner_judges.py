@@ -37,12 +37,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.answer_checks import Asked
+    from ros2_memory.demo.answer_checks import CallContext
     from ros2_memory.demo.published_topics import Message, Stream
 
 Replies: TypeAlias = "Sequence[JsonValue]"
 Arguments: TypeAlias = "Mapping[str, JsonValue]"
-Judge: TypeAlias = "Callable[[Replies, Asked], object]"
+Judge: TypeAlias = "Callable[[Replies, CallContext], object]"
 
 STARTED_S: Final = 1_784_023_200
 """When the robot started, in Unix seconds: it was on its dock."""
@@ -71,7 +71,7 @@ BATTERY: Final = _BY_TOPIC[published_topics.BATTERY]
 
 
 @cache
-def _known(asked: Asked, stream: Stream) -> tuple[Message, ...]:
+def _known(asked: CallContext, stream: Stream) -> tuple[Message, ...]:
     """All messages that the memory knows."""
     end = asked.known[-1]
     return tuple(
@@ -84,14 +84,14 @@ def _labels(t: float) -> frozenset[str]:
     return frozenset(thing.label for thing in robot.seen(t))
 
 
-def _messages(asked: Asked, stream: Stream, since_s: float = 0.0) -> list[Message]:
+def _messages(asked: CallContext, stream: Stream, since_s: float = 0.0) -> list[Message]:
     """All messages that the memory knows, from so many Unix seconds on."""
     since = ns_from_unix(since_s)
     return [message for message in _known(asked, stream) if message.log_time >= since]
 
 
 def _rows(
-    asked: Asked, stream: Stream, holds: Callable[[float], bool], since_s: float = 0.0
+    asked: CallContext, stream: Stream, holds: Callable[[float], bool], since_s: float = 0.0
 ) -> list[list[Message]]:
     """Messages in a row at whose time (s) something holds, oldest first."""
     grouped = groupby(_messages(asked, stream, since_s), key=lambda message: holds(message.t))
@@ -114,7 +114,7 @@ def _stands(t: float) -> bool:
     return abs(robot.twist(t)[0]) < 0.005
 
 
-def _stops(asked: Asked, since_s: float, least_s: float = 3.0) -> list[list[Message]]:
+def _stops(asked: CallContext, since_s: float, least_s: float = 3.0) -> list[list[Message]]:
     """Where the robot stood for so long and more, as far as it is since then."""
     rows = _rows(asked, ODOM, _stands)
     since = ns_from_unix(since_s)
@@ -166,7 +166,7 @@ def sighting_of(
 ) -> Judge:
     """The newest sighting, or the nth from the start or (negative) the end."""
 
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         told = at(replies[-1], "sightings", 0 if nth >= 0 else -1 - nth)
         same("topic", text(told, "topic"), stream.topic)
         _sighting(told, _rows(asked, stream, holds)[nth])
@@ -179,7 +179,7 @@ def sighting_of(
 
 
 def how_often(stream: Stream, holds: Callable[[float], bool], last_s: float = math.inf) -> Judge:
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         since = 0.0 if math.isinf(last_s) else ASKED_AT_S - last_s
         same("total", number(replies[-1], "total"), len(_rows(asked, stream, holds, since)))
 
@@ -189,7 +189,7 @@ def how_often(stream: Stream, holds: Callable[[float], bool], last_s: float = ma
 def visited(place: Planar | tuple[float, float], radius: float = 0.5) -> Judge:
     """The newest visit, how many there were, and whether it is there now."""
 
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         rows = _rows(asked, ODOM, _near(place, radius))
         newest = _messages(asked, ODOM)[-1]
         there = rows[-1][-1].log_time == newest.log_time
@@ -212,20 +212,20 @@ def visited(place: Planar | tuple[float, float], radius: float = 0.5) -> Judge:
     return judge
 
 
-def never(replies: Replies, _asked: Asked) -> None:
+def never(replies: Replies, _asked: CallContext) -> None:
     reply = replies[-1]
     same("found", items(reply, "visits" if "visits" in str(reply) else "sightings"), [])
     same("total", number(reply, "total"), 0)
 
 
-def no_error(replies: Replies, _asked: Asked) -> None:
+def no_error(replies: Replies, _asked: CallContext) -> None:
     told = [text(event, "text") for event in items(replies[-1], "events")]
     same("errors", [each for each in told if each.startswith("error")], [])
     same("gaps", [each for each in told if each == "nothing was recorded"], [])
 
 
 def pose_at(moment_s: float) -> Judge:
-    def judge(replies: Replies, _asked: Asked) -> None:
+    def judge(replies: Replies, _asked: CallContext) -> None:
         truth = robot.pose(_t(moment_s))
         near("x", number(replies[-1], "x"), truth.x, PLACE_M)
         near("y", number(replies[-1], "y"), truth.y, PLACE_M)
@@ -236,7 +236,7 @@ def pose_at(moment_s: float) -> Judge:
 
 
 def in_map(seconds_ago: float) -> Judge:
-    def judge(replies: Replies, _asked: Asked) -> None:
+    def judge(replies: Replies, _asked: CallContext) -> None:
         truth = robot.pose_in_map(_t(ASKED_AT_S - seconds_ago))
         near("x", number(replies[-1], "translation", "x"), truth.x, PLACE_M)
         near("y", number(replies[-1], "translation", "y"), truth.y, PLACE_M)
@@ -248,7 +248,7 @@ def in_map(seconds_ago: float) -> Judge:
 def way_of_recap(last_s: float) -> Judge:
     """Distance, top speed and time stood of a recap, as far as it is in closed files."""
 
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         reply, driven = replies[-1], _messages(asked, ODOM, ASKED_AT_S - last_s)
         way = robot.driven(driven[-1].t) - robot.driven(driven[0].t)
         near("distance", number(reply, "distance_m"), way, PLACE_M)
@@ -264,7 +264,7 @@ def way_of_recap(last_s: float) -> Judge:
 def stopped(last_s: float) -> Judge:
     """Every stop of a recap: when, where, how long, and whether it goes on."""
 
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         told = _of_kind(replies[-1], "stood at")
         same("number of stops", number(replies[-1], "counts", "stops"), len(told))
         stops = _stops(asked, ASKED_AT_S - last_s)
@@ -290,7 +290,7 @@ def _of_kind(reply: JsonValue, begins: str) -> list[JsonValue]:
     return [each for each in items(reply, "events") if text(each, "text").startswith(begins)]
 
 
-def standing_since(replies: Replies, asked: Asked) -> None:
+def standing_since(replies: Replies, asked: CallContext) -> None:
     event = _of_kind(replies[-1], "stood at")[-1]
     _stop(event, _stops(asked, 0.0)[-1])
     same("still", at(event, "goes_on"), expected=True)
@@ -299,7 +299,7 @@ def standing_since(replies: Replies, asked: Asked) -> None:
 def came_into_view(last_s: float) -> Judge:
     """What was seen, by the names of things, and when each came into view."""
 
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         told = [
             (text(event, "text").removesuffix(" in view"), number(event, "timestamp"))
             for event in items(replies[-1], "events")
@@ -320,7 +320,7 @@ def came_into_view(last_s: float) -> Judge:
 def seen_there(place: Planar) -> Judge:
     """What was in view while the robot was last at a place."""
 
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         row = _rows(asked, ODOM, _near(place, 0.5))[-1]
         there = [
             message
@@ -338,7 +338,7 @@ def seen_there(place: Planar) -> Judge:
     return judge
 
 
-def flips_of_path(replies: Replies, asked: Asked) -> None:
+def flips_of_path(replies: Replies, asked: CallContext) -> None:
     told = [
         (number(event, "timestamp"), text(event, "text").rsplit(" ", 1)[1] == "true")
         for event in _of_kind(replies[-1], published_topics.PATH_CLEAR)
@@ -356,7 +356,7 @@ def flips_of_path(replies: Replies, asked: Asked) -> None:
 def later(first: str, second: str) -> Judge:
     """Which of two things was seen last: a comparison of two moments."""
 
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         for label, reply in zip((first, second), replies, strict=True):
             _sighting(at(reply, "sightings", 0), _rows(asked, SEEN, sees(label))[-1])
 
@@ -364,7 +364,7 @@ def later(first: str, second: str) -> Judge:
 
 
 def charge_when_seen(label: str) -> Judge:
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         last = _rows(asked, SEEN, sees(label))[-1][-1]
         one_of("the match at", number(replies[-1], "timestamp"), [last.log_time])
         then = asked.timeline.newest(BATTERY, last.log_time)
@@ -374,7 +374,7 @@ def charge_when_seen(label: str) -> Judge:
     return judge
 
 
-def driven_between_stops(replies: Replies, asked: Asked) -> None:
+def driven_between_stops(replies: Replies, asked: CallContext) -> None:
     *_, before, last = _stops(asked, ASKED_AT_S - 60)
     way = robot.driven(last[0].t) - robot.driven(before[0].t)
     near("distance", number(replies[-1], "distance_m"), way, PLACE_M)
@@ -392,7 +392,7 @@ def last_stay(replies: Replies) -> Arguments:
     }
 
 
-def said_last(replies: Replies, asked: Asked) -> None:
+def said_last(replies: Replies, asked: CallContext) -> None:
     newest = _messages(asked, SAID)[-1]
     told = at(replies[-1], "samples", -1)
     one_of("the words at", number(told, "timestamp"), [newest.log_time])
@@ -400,7 +400,7 @@ def said_last(replies: Replies, asked: Asked) -> None:
 
 
 def commanded(seconds_ago: float) -> Judge:
-    def judge(replies: Replies, _asked: Asked) -> None:
+    def judge(replies: Replies, _asked: CallContext) -> None:
         forward, turning = robot.twist(_t(number(replies[-1], "timestamp")))
         near("time", number(replies[-1], "timestamp"), ASKED_AT_S - seconds_ago, 0.2)
         told = at(replies[-1], "value")
@@ -411,7 +411,7 @@ def commanded(seconds_ago: float) -> Judge:
 
 
 def lowest_charge(last_s: float) -> Judge:
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         known = _messages(asked, BATTERY, ASKED_AT_S - last_s)
         least = min(known, key=lambda message: robot.battery(message.t))
         told = at(replies[-1], "extremes", "percentage")
@@ -422,7 +422,7 @@ def lowest_charge(last_s: float) -> Judge:
 
 
 def nearest_wall(last_s: float) -> Judge:
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         scans = _messages(asked, _BY_TOPIC[published_topics.SCAN], ASKED_AT_S - last_s)
         nearest = min(float(robot.scan(message.t).min()) for message in scans)
         near("distance", number(replies[-1], "extremes", "ranges", "min"), nearest, PLACE_M)
@@ -430,7 +430,7 @@ def nearest_wall(last_s: float) -> Judge:
     return judge
 
 
-def trusted(replies: Replies, asked: Asked) -> None:
+def trusted(replies: Replies, asked: CallContext) -> None:
     reply = replies[-1]
     same("trust", text(reply, "trust"), "nothing is known to be missing")
     near("age", number(reply, "newest_age_s"), _ago(asked.known[-1]), SAME_S)
@@ -438,12 +438,12 @@ def trusted(replies: Replies, asked: Asked) -> None:
     same("damaged", number(reply, "damaged"), 0)
 
 
-def none_kept(replies: Replies, _asked: Asked) -> None:
+def none_kept(replies: Replies, _asked: CallContext) -> None:
     same("moments", items(replies[-1], "moments"), [])
 
 
 def counted(topic: str) -> Judge:
-    def judge(replies: Replies, asked: Asked) -> None:
+    def judge(replies: Replies, asked: CallContext) -> None:
         [row] = items(replies[-1])
         same("topic", text(row, "topic"), topic)
         same("messages", number(row, "count"), len(_messages(asked, _BY_TOPIC[topic])))

@@ -142,7 +142,7 @@ def info(
         raise typer.Exit(EXIT_NEGATIVE)
 
 
-class Overlap(NamedTuple):
+class OverlappingPair(NamedTuple):
     """Two recordings by name, and when they overlap (log times, inclusive)."""
 
     first: str
@@ -151,14 +151,14 @@ class Overlap(NamedTuple):
     end: Ns
 
 
-def overlaps(snapshot: Snapshot) -> list[Overlap]:
+def overlaps(snapshot: Snapshot) -> list[OverlappingPair]:
     """Returns the recordings that overlap although neither continues the other.
 
     Answers mix their messages.
     """
     pairs = overlapping_recordings(snapshot)
     return [
-        Overlap(first, second, pair.start, pair.end)
+        OverlappingPair(first, second, pair.start, pair.end)
         for pair, (first, second) in zip(pairs, pair_names(pairs), strict=True)
     ]
 

@@ -1,4 +1,4 @@
-"""How an answer is judged: reading its JSON, and which messages it may speak of.
+"""Checks of answers: reads a reply's JSON, and knows which messages it may be about.
 
 The memory answers from closed splits, and "ago" counts from the moment at which the server read
 its clock. Neither is known to the client exactly, only between two bounds; so a question has a
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.published_topics import Message, Stream, Timeline
+    from ros2_memory.demo.published_topics import Message, MessageSchedule, Stream
 
 METRES: Final = 1e-3
 DEGREES: Final = 0.05
-"""What an answer may be off by: its rounding, with room."""
+"""The tolerance of an answer: its rounding, with some room."""
 
 _SAME_MOMENT_S: Final = 2e-6
 
 
 class WrongAnswerError(Exception):
-    """The answer is not right; the sentence says what was expected."""
+    """The answer is wrong; the text says what was expected."""
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class CallContext:
     """The circumstances of one call.
 
     Attributes:
@@ -49,13 +49,13 @@ class Asked:
             it must have known, and of each that was closed since.
     """
 
-    timeline: Timeline
+    timeline: MessageSchedule
     before: Ns
     after: Ns
     known: tuple[Ns, ...]
 
     def ago(self, stream: Stream, seconds: float) -> list[Message]:
-        """The messages that may be the newest so many seconds before the server's now."""
+        """Returns the messages that may be the newest so many seconds before now."""
         back = ns_from_unix(seconds)
         fits: list[Message] = []
         for message in self.timeline.newest_first(stream, self.after - back):
@@ -65,27 +65,27 @@ class Asked:
         return fits
 
     def newest_known(self, stream: Stream) -> list[Message]:
-        """The messages that may be the newest one that the memory knows."""
+        """Returns the messages that may be the newest one that the memory knows."""
         return self.last_where(stream, lambda _: True)
 
     def last_where(self, stream: Stream, holds: Callable[[float], bool]) -> list[Message]:
-        """The messages that may be the newest known one at whose time t (s) `holds` is true."""
+        """Returns the messages that may be the newest known one for which `holds(t)` is true."""
         newest_first = (self.timeline.newest_first(stream, end) for end in self.known)
         fits = (next((one for one in some if holds(one.t)), None) for some in newest_first)
         return [message for message in fits if message is not None]
 
     def when(self, moment_s: float) -> str:
-        """A moment (Unix seconds) for people: its local time and how long ago it was."""
+        """Formats a time (Unix seconds): its local time and how long ago it was."""
         local = datetime.fromtimestamp(moment_s, tz=UTC).astimezone()
         return f"{local:%H:%M:%S}, {self.age_s(moment_s):.1f} s ago"
 
     def age_s(self, moment_s: float) -> float:
-        """How long ago a moment (Unix seconds) was when the answer came."""
+        """Returns the age of a time (Unix seconds) when the answer came."""
         return unix_from_ns(self.after) - moment_s
 
 
 def parsed(text: str) -> JsonValue:
-    """The JSON of a reply.
+    """Parses the JSON of a reply.
 
     Raises:
         WrongAnswerError: it is not JSON (NaN and infinities are not).
@@ -98,7 +98,7 @@ def parsed(text: str) -> JsonValue:
 
 
 def at(value: JsonValue, *path: str | int) -> JsonValue:
-    """What stands at the path of keys and indices.
+    """Returns the value at a path of keys and indices.
 
     Raises:
         WrongAnswerError: nothing does.
@@ -116,7 +116,7 @@ def at(value: JsonValue, *path: str | int) -> JsonValue:
 
 
 def number(value: JsonValue, *path: str | int) -> float:
-    """The number at the path.
+    """Returns the number at a path.
 
     Raises:
         WrongAnswerError: there is none.
@@ -128,7 +128,7 @@ def number(value: JsonValue, *path: str | int) -> float:
 
 
 def text(value: JsonValue, *path: str | int) -> str:
-    """The string at the path.
+    """Returns the string at a path.
 
     Raises:
         WrongAnswerError: there is none.
@@ -140,7 +140,7 @@ def text(value: JsonValue, *path: str | int) -> str:
 
 
 def items(value: JsonValue, *path: str | int) -> list[JsonValue]:
-    """The list at the path.
+    """Returns the list at a path.
 
     Raises:
         WrongAnswerError: there is none.
@@ -152,7 +152,7 @@ def items(value: JsonValue, *path: str | int) -> list[JsonValue]:
 
 
 def one_of(what: str, moment_s: float, moments: Sequence[Ns]) -> None:
-    """Nothing, if the moment (Unix seconds) is one of them.
+    """Checks that a time (Unix seconds) is one of several.
 
     Raises:
         WrongAnswerError: it is not.
@@ -162,8 +162,8 @@ def one_of(what: str, moment_s: float, moments: Sequence[Ns]) -> None:
         raise WrongAnswerError(f"expected {what} {right or 'no moment'}, not {moment_s:.6f}")
 
 
-def told_of(moment_s: float, candidates: Sequence[Message]) -> Message:
-    """Which of the candidates has this log time (Unix seconds).
+def match_time(moment_s: float, candidates: Sequence[Message]) -> Message:
+    """Returns the candidate with this log time (Unix seconds).
 
     Raises:
         WrongAnswerError: none of them.
@@ -173,7 +173,7 @@ def told_of(moment_s: float, candidates: Sequence[Message]) -> Message:
 
 
 def near(what: str, got: float, expected: float, tolerance: float) -> None:
-    """Nothing, if the two agree.
+    """Checks that two numbers agree.
 
     Raises:
         WrongAnswerError: they do not.
@@ -185,7 +185,7 @@ def near(what: str, got: float, expected: float, tolerance: float) -> None:
 def near_angle(
     what: str, got_deg: float, expected_rad: float, tolerance_deg: float = DEGREES
 ) -> None:
-    """Nothing, if the two are one direction.
+    """Checks that two angles are the same direction.
 
     Raises:
         WrongAnswerError: they are not.
@@ -197,7 +197,7 @@ def near_angle(
 
 
 def same(what: str, got: object, expected: object) -> None:
-    """Nothing, if the two are equal.
+    """Checks that two values are equal.
 
     Raises:
         WrongAnswerError: they are not.
@@ -207,7 +207,7 @@ def same(what: str, got: object, expected: object) -> None:
 
 
 def within(what: str, moment_s: float, bounds: tuple[Ns, Ns]) -> None:
-    """Nothing, if the moment (Unix seconds) lies between the bounds, both included.
+    """Checks that a time (Unix seconds) is between two bounds, both included.
 
     Raises:
         WrongAnswerError: it does not.

@@ -1,4 +1,4 @@
-"""A small flat: three rooms in a row, the walls between them, and the things that stand there.
+"""A small flat: three rooms in a row, the walls between them, and the objects in them.
 
 All coordinates are metres in the frame `map`: x points east, y north, z up. The living room is in
 the west, the kitchen in the east, the hall between them; its front door is in the north wall.
@@ -48,18 +48,18 @@ THINGS: Final[Mapping[str, Vector3]] = {
     "table": (8.8, 0.9, 0.7),
     "fridge": (10.7, 2.0, 1.0),
 }
-"""Where each thing stands; nothing moves."""
+"""The position of each object (m); nothing moves."""
 
 
 def room_at(x: float) -> str:
-    """The name of the room at `x` (the rooms lie in a row from west to east)."""
+    """Returns the name of the room at `x` (the rooms lie in a row from west to east)."""
     if x < _HALL_WEST:
         return "living room"
     return "hall" if x < _HALL_EAST else "kitchen"
 
 
 def wall_distances(x: float, y: float, bearings: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far (m) it is from (x, y) to the nearest wall along each bearing (rad, from east).
+    """Returns the distance (m) from (x, y) to the nearest wall along each bearing (rad, from east).
 
     Ray and segment: with ray o + r d and wall p + s (q - p), r = (p - o) x (q - p) / d x (q - p)
     and s = (p - o) x d / d x (q - p). Walls are met from inside the flat, so every ray ends.

@@ -1,4 +1,4 @@
-"""The judge of each kind of answer.
+"""Judges, one for each kind of answer.
 
 A judge compares a reply with the robot's closed form at the reply's own moment, checks that this
 moment is the right one, and returns the answer as a sentence; `WrongAnswerError` otherwise.
@@ -13,16 +13,16 @@ from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, ns_from_unix
 from ros2_memory.demo import published_topics, robot
 from ros2_memory.demo.answer_checks import (
     METRES,
-    Asked,
+    CallContext,
     at,
     items,
+    match_time,
     near,
     near_angle,
     number,
     one_of,
     same,
     text,
-    told_of,
     within,
 )
 from ros2_memory.demo.floor_plan import room_at
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.demo.published_topics import Message
 
-Judge: TypeAlias = "Callable[[JsonValue, Asked], str]"
+Judge: TypeAlias = "Callable[[JsonValue, CallContext], str]"
 
 NEAR_M: Final = 0.5
-"""What counts as being at a place: the server's default `data.position_tolerance_m`."""
+"""The radius of a place: the server's default `data.position_tolerance_m`."""
 
 _MPS: Final = 1e-3
 _SHARE_OF_PATH: Final = 1e-3
@@ -49,36 +49,36 @@ _ODOM: Final = _BY_TOPIC[published_topics.ODOM]
 
 
 def in_odom(place: Planar) -> Planar:
-    """A place of the flat in the frame of the robot's poses."""
+    """Returns a place of the flat in `odom`, the frame of the robot's poses."""
     return robot.MAP_TO_ODOM.inverse().then(place)
 
 
-def time_range(reply: JsonValue, asked: Asked) -> str:
-    """All of what was recorded, no holes, nothing damaged, and a file being written."""
-    first = next(asked.timeline.everything()).log_time
+def time_range(reply: JsonValue, call: CallContext) -> str:
+    """Judges the range: all that was recorded, without gaps or damage, and an active file."""
+    first = next(call.timeline.everything()).log_time
     earliest, latest = number(reply, "earliest"), number(reply, "latest")
     one_of("earliest", earliest, [first])
-    one_of("latest", latest, asked.known)
+    one_of("latest", latest, call.known)
     for kind in ("gaps", "damaged", "incomplete", "unread"):
         same(kind, items(reply, kind), [])
     if not items(reply, "active"):
         same("active files", 0, 1)
     return (
         f"{latest - earliest:.0f} s, in {number(reply, 'bags'):.0f} closed bag files, up to "
-        f"{asked.age_s(latest):.1f} s ago. What is being written joins them as its file closes."
+        f"{call.age_s(latest):.1f} s ago. What is being written joins them as its file closes."
     )
 
 
-def topics(reply: JsonValue, asked: Asked) -> str:
-    """Every topic with its type, its count and its newest message."""
+def topics(reply: JsonValue, call: CallContext) -> str:
+    """Judges the list of topics: the type, the count and the newest message of each."""
     counts: dict[str, int] = {}
     rows = items(reply)
     same("topics", sorted(text(row, "topic") for row in rows), sorted(_BY_TOPIC))
     for row in rows:
         stream = _BY_TOPIC[text(row, "topic")]
         same(f"type of {stream.topic}", text(row, "type"), stream.type)
-        newest = told_of(number(row, "last_ts"), asked.newest_known(stream))
-        counts[stream.topic] = asked.timeline.count(stream, newest.log_time)
+        newest = match_time(number(row, "last_ts"), call.newest_known(stream))
+        counts[stream.topic] = call.timeline.count(stream, newest.log_time)
         same(f"count of {stream.topic}", number(row, "count"), counts[stream.topic])
     total = sum(counts.values())
     of_odom = counts[published_topics.ODOM]
@@ -86,20 +86,20 @@ def topics(reply: JsonValue, asked: Asked) -> str:
 
 
 def position(seconds_ago: float) -> Judge:
-    """The pose of `/odom` so long ago."""
+    """Judges the pose of `/odom` so long ago."""
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
-        message = told_of(number(reply, "timestamp"), asked.ago(_ODOM, seconds_ago))
+    def judge(reply: JsonValue, call: CallContext) -> str:
+        message = match_time(number(reply, "timestamp"), call.ago(_ODOM, seconds_ago))
         return f"{_at_place(reply, message)}, facing {_facing(reply, message.t)}."
 
     return judge
 
 
 def velocity(seconds_ago: float) -> Judge:
-    """The twist of `/odom` so long ago."""
+    """Judges the twist of `/odom` so long ago."""
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
-        message = told_of(number(reply, "timestamp"), asked.ago(_ODOM, seconds_ago))
+    def judge(reply: JsonValue, call: CallContext) -> str:
+        message = match_time(number(reply, "timestamp"), call.ago(_ODOM, seconds_ago))
         forward, turning = robot.twist(message.t)
         near("forward speed", number(reply, "linear", "x"), forward, _MPS)
         near("turning rate", number(reply, "angular", "z"), turning, _MPS)
@@ -109,84 +109,84 @@ def velocity(seconds_ago: float) -> Judge:
 
 
 def seen_near(place: Planar) -> Judge:
-    """What the camera saw when the robot last was at a place."""
+    """Judges what the camera saw when the robot last was at a place."""
     spot = in_odom(place)
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
+    def judge(reply: JsonValue, call: CallContext) -> str:
         moment = number(reply, "timestamp")
-        match = told_of(moment, asked.last_where(_ODOM, _near(spot)))
-        then = _held(reply, asked, published_topics.SCENE_OBJECTS, match)
+        match = match_time(moment, call.last_where(_ODOM, _near(spot)))
+        then = _held(reply, call, published_topics.SCENE_OBJECTS, match)
         labels = [text(found, "label") for found in items(reply, "value", "detections")]
         same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(then.t)))
-        return f"{_listed(labels).capitalize()}, at {asked.when(moment)}."
+        return f"{_listed(labels).capitalize()}, at {call.when(moment)}."
 
     return judge
 
 
 def last_near(place: Planar) -> Judge:
-    """When the robot last was at a place."""
+    """Judges when the robot last was at a place."""
     spot = in_odom(place)
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
+    def judge(reply: JsonValue, call: CallContext) -> str:
         moment = number(reply, "timestamp")
-        message = told_of(moment, asked.last_where(_ODOM, _near(spot)))
+        message = match_time(moment, call.last_where(_ODOM, _near(spot)))
         _at_place(at(reply, "value", "position"), message)
-        return f"At {asked.when(moment)}."
+        return f"At {call.when(moment)}."
 
     return judge
 
 
-def path_clear(reply: JsonValue, asked: Asked) -> str:
-    """When the path was last clear."""
+def path_clear(reply: JsonValue, call: CallContext) -> str:
+    """Judges when the path was last clear."""
     moment = number(reply, "timestamp")
-    told_of(moment, asked.last_where(_BY_TOPIC[published_topics.PATH_CLEAR], robot.path_clear))
+    match_time(moment, call.last_where(_BY_TOPIC[published_topics.PATH_CLEAR], robot.path_clear))
     same("value", at(reply, "value", "value"), expected=True)
-    return f"At {asked.when(moment)}."
+    return f"At {call.when(moment)}."
 
 
 def last_seen(label: str) -> Judge:
-    """When a thing was last seen."""
+    """Judges when an object was last seen."""
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
+    def judge(reply: JsonValue, call: CallContext) -> str:
         moment = number(reply, "timestamp")
-        sighting = asked.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
-        message = told_of(moment, sighting)
+        sighting = call.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
+        message = match_time(moment, sighting)
         same("topic", text(reply, "topic"), published_topics.SCENE_OBJECTS)
         labels = [text(found, "label") for found in items(reply, "value", "detections")]
         same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(message.t)))
-        return f"At {asked.when(moment)}; in view: {_listed(labels)}."
+        return f"At {call.when(moment)}; in view: {_listed(labels)}."
 
     return judge
 
 
 def where_seen(label: str) -> Judge:
-    """Where the robot was when it last saw a thing."""
+    """Judges where the robot was when it last saw an object."""
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
+    def judge(reply: JsonValue, call: CallContext) -> str:
         moment = number(reply, "timestamp")
-        sighting = asked.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
-        message = _held(reply, asked, published_topics.ODOM, told_of(moment, sighting))
-        return f"{_at_place(at(reply, 'value', 'position'), message)}, at {asked.when(moment)}."
+        sighting = call.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
+        message = _held(reply, call, published_topics.ODOM, match_time(moment, sighting))
+        return f"{_at_place(at(reply, 'value', 'position'), message)}, at {call.when(moment)}."
 
     return judge
 
 
 def driven(seconds: float) -> Judge:
-    """The way driven in the last so many seconds, as far as it is in closed files."""
+    """Judges the distance driven in the last seconds, as far as closed files have it."""
     window = ns_from_unix(seconds)
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
+    def judge(reply: JsonValue, call: CallContext) -> str:
         start, end = number(reply, "start"), number(reply, "end")
-        last = told_of(end, asked.newest_known(_ODOM))
-        begun = (asked.before - window, asked.after - window + _ODOM.period + NS_PER_MS)
+        last = match_time(end, call.newest_known(_ODOM))
+        begun = (call.before - window, call.after - window + _ODOM.period + NS_PER_MS)
         within("start", start, begun)
-        newest = asked.timeline.newest(_ODOM, ns_from_unix(start) + NS_PER_MS)
-        first = told_of(start, [newest] if newest else [])
+        newest = call.timeline.newest(_ODOM, ns_from_unix(start) + NS_PER_MS)
+        first = match_time(start, [newest] if newest else [])
         expected = robot.driven(last.t) - robot.driven(first.t)
         near("distance", number(reply, "distance_m"), expected, METRES + _SHARE_OF_PATH * expected)
         near("duration", number(reply, "duration_s"), end - start, 2e-3)
         near("mean speed", number(reply, "avg_speed"), expected / (end - start), _MPS)
-        fastest = max(_speeds(asked, first, last))
+        fastest = max(_speeds(call, first, last))
         near("top speed", number(reply, "max_speed"), fastest, _MPS)
         return (
             f"{expected:.2f} m, at up to {fastest:.2f} m/s, in the {end - start:.1f} s of it that "
@@ -197,13 +197,13 @@ def driven(seconds: float) -> Judge:
 
 
 def camera_in_map(seconds_ago: float) -> Judge:
-    """The pose of the camera in the flat so long ago, through four frames."""
+    """Judges the pose of the camera in `map` so long ago, through four frames."""
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
+    def judge(reply: JsonValue, call: CallContext) -> str:
         moment = number(reply, "timestamp")
         back = ns_from_unix(seconds_ago)
-        within("time", moment, (asked.before - back, asked.after - back))
-        t = (ns_from_unix(moment) - asked.timeline.t0) / NS_PER_S
+        within("time", moment, (call.before - back, call.after - back))
+        t = (ns_from_unix(moment) - call.timeline.t0) / NS_PER_S
         truth = robot.pose_in_map(t).then(Planar(robot.CAMERA[0], robot.CAMERA[1], 0.0))
         x, y, z = (number(reply, "translation", axis) for axis in "xyz")
         near("x", x, truth.x, _INTERPOLATED_M)
@@ -218,8 +218,8 @@ def camera_in_map(seconds_ago: float) -> Judge:
     return judge
 
 
-def frames(reply: JsonValue, _asked: Asked) -> str:
-    """The frames and which of them move."""
+def frames(reply: JsonValue, _call: CallContext) -> str:
+    """Judges the frames, and which of them move."""
     rows = items(reply, "transforms")
     pairs = {(text(row, "parent"), text(row, "child")): at(row, "static") for row in rows}
     expected: dict[tuple[str, str], JsonValue] = {
@@ -233,11 +233,11 @@ def frames(reply: JsonValue, _asked: Asked) -> str:
 
 
 def battery(seconds_ago: float) -> Judge:
-    """The charge so long ago."""
+    """Judges the charge so long ago."""
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
+    def judge(reply: JsonValue, call: CallContext) -> str:
         stream = _BY_TOPIC[published_topics.BATTERY]
-        message = told_of(number(reply, "timestamp"), asked.ago(stream, seconds_ago))
+        message = match_time(number(reply, "timestamp"), call.ago(stream, seconds_ago))
         charge = number(reply, "value", "percentage")
         near("charge", charge, robot.battery(message.t), 1e-6)
         return f"{charge:.1%}."
@@ -246,22 +246,22 @@ def battery(seconds_ago: float) -> Judge:
 
 
 def told(seconds: float, at_most: int) -> Judge:
-    """What the robot said it saw in the last so many seconds, thinned to a few samples."""
+    """Judges the descriptions of the last seconds, thinned to a few samples."""
     window = ns_from_unix(seconds)
 
-    def judge(reply: JsonValue, asked: Asked) -> str:
+    def judge(reply: JsonValue, call: CallContext) -> str:
         stream = _BY_TOPIC[published_topics.SCENE_DESCRIPTION]
         samples = items(reply, "samples")
         total = int(number(reply, "total"))
         same("samples", len(samples), min(total, at_most))
-        begun = (asked.before - window, asked.after - window + stream.period + NS_PER_MS)
+        begun = (call.before - window, call.after - window + stream.period + NS_PER_MS)
         within("start", number(samples, 0, "timestamp"), begun)
-        last = told_of(number(samples, -1, "timestamp"), asked.newest_known(stream))
-        first = asked.timeline.message(stream, last.k - total + 1)
-        told_of(number(samples, 0, "timestamp"), [first])
-        between = [asked.timeline.message(stream, k) for k in range(first.k, last.k + 1)]
+        last = match_time(number(samples, -1, "timestamp"), call.newest_known(stream))
+        first = call.timeline.message(stream, last.k - total + 1)
+        match_time(number(samples, 0, "timestamp"), [first])
+        between = [call.timeline.message(stream, k) for k in range(first.k, last.k + 1)]
         for sample in samples:
-            message = told_of(number(sample, "timestamp"), between)
+            message = match_time(number(sample, "timestamp"), between)
             same("words", text(sample, "value", "value"), description(message.t))
         return " ".join(text(sample, "value", "value") for sample in samples[-2:])
 
@@ -269,9 +269,9 @@ def told(seconds: float, at_most: int) -> Judge:
 
 
 def nothing_on(topic: str) -> Judge:
-    """That a topic was never recorded, which is an answer too."""
+    """Judges the reply that a topic was never recorded, which is an answer, too."""
 
-    def judge(reply: JsonValue, _asked: Asked) -> str:
+    def judge(reply: JsonValue, _call: CallContext) -> str:
         same("error", text(reply, "error"), "no_data")
         same("reason", text(reply, "reason"), "topic_not_recorded")
         return f"{topic} was never recorded, and the answer says so."
@@ -291,14 +291,14 @@ def _sees(label: str) -> Callable[[float], bool]:
     return lambda t: any(thing.label == label for thing in robot.seen(t))
 
 
-def _held(reply: JsonValue, asked: Asked, topic: str, match: Message) -> Message:
-    """The message of a topic at or before the match, which the reply must tell of."""
-    newest = asked.timeline.newest(_BY_TOPIC[topic], match.log_time)
-    return told_of(number(reply, "value_timestamp"), [newest] if newest else [])
+def _held(reply: JsonValue, call: CallContext, topic: str, match: Message) -> Message:
+    """Returns the message of a topic at or before the match, which must be that of the reply."""
+    newest = call.timeline.newest(_BY_TOPIC[topic], match.log_time)
+    return match_time(number(reply, "value_timestamp"), [newest] if newest else [])
 
 
 def _at_place(point: JsonValue, message: Message) -> str:
-    """Checks a position in `odom`, and says where in the flat that is."""
+    """Checks a position in `odom`, and returns where in the flat it is."""
     truth = robot.pose(message.t)
     x, y = number(point, "x"), number(point, "y")
     near("x", x, truth.x, METRES)
@@ -325,13 +325,13 @@ def _turn(turning: float) -> str:
     return f"turning {side} at {abs(rate):.0f} degrees/s" if abs(rate) >= 1 else "straight on"
 
 
-def _speeds(asked: Asked, first: Message, last: Message) -> list[float]:
-    moments = (asked.timeline.message(_ODOM, k).t for k in range(first.k, last.k + 1))
+def _speeds(call: CallContext, first: Message, last: Message) -> list[float]:
+    moments = (call.timeline.message(_ODOM, k).t for k in range(first.k, last.k + 1))
     return [abs(robot.twist(t)[0]) for t in moments]
 
 
 def _listed(names: Sequence[str]) -> str:
-    """The names as a sentence has them."""
+    """Formats names for a sentence."""
     if not names:
         return "nothing"
     return " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)

@@ -1,4 +1,4 @@
-"""A moment of the simulated robot as a serialized ROS 2 message, and its type's definition.
+"""Serializes the simulated robot's state as ROS 2 messages, and has the types' definitions.
 
 Types are Jazzy's standard ones and `ros2_vision_interfaces`, whose definitions are below.
 """
@@ -37,7 +37,7 @@ VISION_DEFINITIONS: Final = {
 
 
 class _Build(Protocol):
-    """A message class: made from its fields by name."""
+    """A message class, called with its fields by name."""
 
     def __call__(self, **fields: object) -> object: ...
 
@@ -50,19 +50,19 @@ _UNKNOWN: Final = math.nan
 
 
 def payload(message: Message) -> bytes:
-    """The message in CDR, as it would come over the wire."""
+    """Returns the message in CDR, as it is published."""
     body = _BODIES[message.stream.topic](message)
     return bytes(_typestore().serialize_cdr(body, message.stream.type))
 
 
 @cache
 def definition(type_name: str) -> str:
-    """The type's ros2msg text with all nested definitions, as a bag carries it."""
+    """Returns the type's ros2msg text with all nested definitions, as bags contain it."""
     return _typestore().generate_msgdef(type_name, ros_version=2)[0]
 
 
 def description(t: float) -> str:
-    """What the robot says it sees: "In the hall I see shoes and umbrella."."""
+    """Returns the robot's description of what it sees: "In the hall I see shoes and umbrella."."""
     labels = [thing.label for thing in robot.seen(t)]
     listed = " and ".join([", ".join(labels[:-1]), labels[-1]] if labels[1:] else labels)
     return f"In the {robot.place(t)} I see {listed or 'nothing'}."
@@ -200,7 +200,7 @@ def _battery(message: Message) -> object:
 
 
 def _bounding_box(thing: Thing) -> list[int]:
-    """Pixels (left, top, right, bottom) of a pinhole camera, cut off at the picture's edges."""
+    """Returns the pixels (left, top, right, bottom) in a pinhole camera, clipped to the image."""
     depth = max(thing.point[0] - robot.CAMERA[0], _THING_M)
     across = _CENTRE_PX[0] - _FOCAL_PX * thing.point[1] / depth
     down = _CENTRE_PX[1] - _FOCAL_PX * (thing.point[2] - robot.CAMERA[2]) / depth

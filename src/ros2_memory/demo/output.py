@@ -1,4 +1,4 @@
-"""What the demo prints, as text of at most 100 columns."""
+"""Formats what the demo prints, in at most 100 columns."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _INDENT: Final = "    "
 _JSON_LINES: Final = 4
 
 
-def shown(number: int, exchange: Exchange) -> str:
-    """The question, the tool call, the answer in words, and the reply as it came."""
+def format_exchange(number: int, exchange: Exchange) -> str:
+    """Returns the question, the tool call, the answer in words, and the reply as received."""
     mark = "" if exchange.right else "WRONG: "
     answer = textwrap.fill(
         f"{mark}{exchange.sentence}",
@@ -31,8 +31,8 @@ def shown(number: int, exchange: Exchange) -> str:
     return "\n".join([*lines, *_reply(exchange.reply)])
 
 
-def invitation(sse_url: str, http_url: str) -> str:
-    """How another client asks, while the robot drives on."""
+def connection_hints(sse_url: str, http_url: str) -> str:
+    """Returns how another client connects, while the robot drives on."""
     return "\n".join(
         [
             "The robot drives on, and the server stays up until Ctrl-C. Ask it yourself:",
@@ -62,7 +62,7 @@ def _call(question: Question) -> list[str]:
 
 
 def _reply(text: str) -> Iterator[str]:
-    """The JSON as it came, broken after commas; of a long one the beginning and its length."""
+    """Yields the JSON as received, broken after commas; of a long one the start and its length."""
     lines = [""]
     for piece in re.findall(r"[^,]*,|[^,]+$", text):
         if lines[-1] and len(_INDENT) + len(lines[-1]) + len(piece) > WIDTH:

@@ -1,4 +1,4 @@
-"""Which topic of the simulated robot carries a message when.
+"""The topics of the simulated robot, and when each has a message.
 
 Message k of a stream is published, and stamped, at `t0 + k * period`, and reaches the recorder a
 fraction of a millisecond later, its own fraction for each message. Both times are closed forms, so
@@ -55,7 +55,7 @@ STREAMS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Message `k` of a stream; `t` is the robot's time (s since its start) that it tells of."""
+    """Message `k` of a stream; `t` is the robot's time (s since its start) that it describes."""
 
     stream: Stream
     k: int
@@ -65,8 +65,8 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
-class Timeline:
-    """The messages of a robot that started at `t0`, as heard by a recorder from `start` on.
+class MessageSchedule:
+    """The messages of a robot that started at `t0`, as a recorder receives them from `start` on.
 
     A latched message was published at `t0` and reaches the recorder at `start`.
     """
@@ -75,13 +75,13 @@ class Timeline:
     start: Ns
 
     def message(self, stream: Stream, k: int) -> Message:
-        """Message `k` of the stream."""
+        """Returns message `k` of the stream."""
         published = self.t0 + k * stream.period
         heard = max(published, self.start) + _delay(stream, k)
         return Message(stream, k, heard, published, (published - self.t0) / NS_PER_S)
 
     def messages(self, stream: Stream) -> Iterator[Message]:
-        """The stream's messages from the start on, without end; one if the stream is latched."""
+        """Yields the stream's messages from the start on, without end; one if it is latched."""
         k = self._first(stream)
         yield self.message(stream, k)
         while not stream.latched:
@@ -89,11 +89,11 @@ class Timeline:
             yield self.message(stream, k)
 
     def everything(self) -> Iterator[Message]:
-        """All streams' messages in the order in which the recorder hears them, without end."""
+        """Yields all streams' messages in the order in which they are received, without end."""
         return merge(*map(self.messages, STREAMS), key=lambda message: message.log_time)
 
     def newest(self, stream: Stream, at: Ns) -> Message | None:
-        """The newest message with a log time at or before `at`; None where there is none yet."""
+        """Returns the newest message with a log time at or before `at`; None before the first."""
         first = self._first(stream)
         k = first if stream.latched else max((at - self.t0) // stream.period, first)
         newest = self.message(stream, k)
@@ -102,14 +102,14 @@ class Timeline:
         return newest if newest.log_time <= at else None
 
     def newest_first(self, stream: Stream, at: Ns) -> Iterator[Message]:
-        """The stream's messages with a log time at or before `at`, from the newest backwards."""
+        """Yields the stream's messages with a log time at or before `at`, newest first."""
         newest = self.newest(stream, at)
         if newest is not None:
             for k in range(newest.k, self._first(stream) - 1, -1):
                 yield self.message(stream, k)
 
     def count(self, stream: Stream, at: Ns) -> int:
-        """How many messages the recorder has heard by `at`."""
+        """Returns how many messages the recorder has received by `at`."""
         newest = self.newest(stream, at)
         return 0 if newest is None else newest.k - self._first(stream) + 1
 
@@ -118,5 +118,5 @@ class Timeline:
 
 
 def _delay(stream: Stream, k: int) -> Ns:
-    """From publication to the recorder: 0.06 to 0.46 ms, in a fixed pattern."""
+    """Returns the time from publication to the recorder: 0.06 to 0.46 ms, in a fixed pattern."""
     return (60 + 19 * STREAMS.index(stream) + (k * 7919) % 211) * NS_PER_US

@@ -1,4 +1,4 @@
-"""The questions that the demo asks: in words, as a tool call, and who judges the answer."""
+"""The questions of the demo: in words, as a tool call, and with the judge of the answer."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.answer_checks import Asked
+    from ros2_memory.demo.answer_checks import CallContext
     from ros2_memory.demo.judges import Judge
     from ros2_memory.demo.robot import Planar
 
 LOOK_BACK_S: Final = 60
-"""The longest of the windows that are asked about."""
+"""The longest window that a question is about."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question. Its judge is given the reply and the circumstances of the call."""
+    """One question; its judge takes the reply and the context of the call."""
 
     words: str
     tool: str
@@ -32,7 +32,7 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Exchange:
-    """One question and its answer: as a sentence where it is right, or else what was expected."""
+    """One question and its answer: a sentence if it is right, else what was expected."""
 
     question: Question
     reply: str
@@ -40,12 +40,14 @@ class Exchange:
     right: bool
 
 
-def judged(question: Question, reply: str, asked: Asked, *, is_error: bool = False) -> Exchange:
-    """The reply's text, held against what the robot did."""
+def judge_reply(
+    question: Question, reply: str, call: CallContext, *, is_error: bool = False
+) -> Exchange:
+    """Compares a reply with what the robot did."""
     if is_error:
         return Exchange(question, reply, "expected an answer, not an error", right=False)
     try:
-        return Exchange(question, reply, question.judge(parsed(reply), asked), right=True)
+        return Exchange(question, reply, question.judge(parsed(reply), call), right=True)
     except WrongAnswerError as error:
         return Exchange(question, reply, str(error), right=False)
 

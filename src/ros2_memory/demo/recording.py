@@ -1,4 +1,4 @@
-"""One recording of the simulated robot, laid out as `ros2 bag record` lays it out.
+"""Writes a recording of the simulated robot with the layout of `ros2 bag record`.
 
 A directory with splits `<name>_<i>.mcap` (profile `ros2`, CDR, ros2msg definitions with all nested
 ones, the publishers' QoS on each channel, every channel in every split, zstd chunks small enough
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Clock
-    from ros2_memory.demo.published_topics import Message, Stream, Timeline
+    from ros2_memory.demo.published_topics import Message, MessageSchedule, Stream
 
 _CHUNK_BYTES: Final = 16 * 1024
 _FOR_EVER: Final[dict[str, JsonValue]] = {"sec": 9223372036, "nsec": 854775807}
 _STOP_WITHIN_S: Final = 10.0
 
 
-class Split:
-    """One MCAP file while it is written; `first` and `last` are log times, None while empty."""
+class SplitWriter:
+    """Writes one MCAP file; `first` and `last` are log times, None while empty."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -60,7 +60,7 @@ class Split:
         }
 
     def full(self, log_time: Ns, duration: Ns) -> bool:
-        """Whether a message of this log time belongs into the next split."""
+        """Returns whether a message of this log time belongs into the next split."""
         return self.first is not None and log_time - self.first > duration
 
     def add(self, message: Message) -> None:
@@ -77,7 +77,7 @@ class Split:
         self.count += 1
 
     def flush(self) -> None:
-        """Hands every finished chunk to the operating system."""
+        """Passes every finished chunk to the operating system."""
         self._file.flush()
 
     def close(self) -> None:
@@ -88,7 +88,7 @@ class Split:
             self._file.close()
 
     def as_metadata(self) -> dict[str, JsonValue]:
-        """How metadata.yaml tells of this file."""
+        """Returns the entry of this file in metadata.yaml."""
         first, last = self.first or 0, self.last or 0
         return {
             "path": self.path.name,
@@ -99,7 +99,7 @@ class Split:
 
 
 class DemoRecorder:
-    """Writes what a `Timeline` says into `directory`, first at once up to now, then as it happens.
+    """Writes a `MessageSchedule` into `directory`: at once up to now, then as time passes.
 
     The directory must not exist (as with `ros2 bag record`); its name is the recording's. As a
     context manager it stops at the end of the block, and leaves a cleanly closed recording.
@@ -108,7 +108,7 @@ class DemoRecorder:
     def __init__(
         self,
         directory: Path,
-        timeline: Timeline,
+        timeline: MessageSchedule,
         *,
         split_duration_s: float = 5.0,
         clock: Clock | None = None,
@@ -120,7 +120,7 @@ class DemoRecorder:
         self._clock = clock or WallClock()
         self._due: Iterator[Message] = timeline.everything()
         self._next = next(self._due)
-        self._splits: list[Split] = []
+        self._splits: list[SplitWriter] = []
         self._closed: list[tuple[Ns, Ns]] = []
         self._counts: Counter[str] = Counter()
         self._ending = threading.Event()
@@ -140,16 +140,16 @@ class DemoRecorder:
 
     @property
     def failure(self) -> OSError | None:
-        """What ended the live recording early (a full disk), if something did."""
+        """The error that ended the live recording early, such as a full disk."""
         return self._failure
 
     @property
     def splits(self) -> int:
-        """How many files there are; all but the last are closed until `stop` closes that too."""
+        """The number of files; all but the last are closed, and `stop` closes that."""
         return len(self._splits)
 
     def closed_ends(self, since: Ns, until: Ns) -> tuple[Ns, ...]:
-        """Where the closed splits ended, as log times of their last messages.
+        """Returns the ends of closed splits: the log times of their last messages.
 
         First the end of the newest split that was closed by the wall-clock time `since` (if there
         was one), then that of each that was closed after it up to `until`.
@@ -159,7 +159,7 @@ class DemoRecorder:
         return (*before[-1:], *(end for at, end in closed if since < at <= until))
 
     def write_until(self, now: Ns) -> None:
-        """Writes every message that the recorder has heard by `now`.
+        """Writes every message that is received by `now`.
 
         Raises:
             OSError: the disk does not take it.
@@ -171,7 +171,7 @@ class DemoRecorder:
             self._splits[-1].flush()
 
     def start(self) -> None:
-        """Goes on as time passes, in a thread of its own, until `stop`."""
+        """Continues as time passes, in a thread of its own, until `stop`."""
         self._thread = threading.Thread(target=self._live, name="demo-recorder", daemon=True)
         self._thread.start()
 
@@ -202,13 +202,13 @@ class DemoRecorder:
     def _write(self, message: Message) -> None:
         if not self._splits or self._splits[-1].full(message.log_time, self._duration):
             name = f"{self.directory.name}_{len(self._splits)}.mcap"
-            self._splits.append(Split(self.directory / name))
+            self._splits.append(SplitWriter(self.directory / name))
             if len(self._splits) > 1:
                 self._close(self._splits[-2])
         self._splits[-1].add(message)
         self._counts[message.stream.topic] += 1
 
-    def _close(self, split: Split) -> None:
+    def _close(self, split: SplitWriter) -> None:
         # Noted first: who sees the footer must find the split among the closed ones.
         self._closed.append((self._clock.now(), split.last or self.timeline.start))
         split.close()
@@ -247,7 +247,7 @@ class DemoRecorder:
 
 
 def _qos(stream: Stream) -> dict[str, JsonValue]:
-    """What the publisher offers, in rosbag2's words."""
+    """Returns the QoS that the publisher offers, as rosbag2 records it."""
     return {
         "history": "unknown",
         "depth": 0,

@@ -1,4 +1,4 @@
-"""Where the simulated robot is and what it senses: closed forms of the time t (s) since its start.
+"""The simulated robot's motion and sensors, as closed forms of the time t (s) since its start.
 
 It drives one lap for ever: from its dock in the living room to the front door in the hall, on to
 the kitchen counter, and back. A lap is a chain of legs, each from rest to rest along a curve of
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def wrapped(angle: float) -> float:
-    """The same direction in (-pi, pi]."""
+    """Returns the same direction in (-pi, pi]."""
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
@@ -39,7 +39,7 @@ class Planar(NamedTuple):
     yaw: float
 
     def then(self, step: Planar) -> Planar:
-        """The pose that is `step` when seen from this one."""
+        """Returns the pose that is `step` relative to this one."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return Planar(
             self.x + cos * step.x - sin * step.y,
@@ -48,13 +48,13 @@ class Planar(NamedTuple):
         )
 
     def inverse(self) -> Planar:
-        """The pose of the origin when seen from this one."""
+        """Returns the pose of the origin relative to this one."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return Planar(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, wrapped(-self.yaw))
 
 
 @dataclass(frozen=True, slots=True)
-class Leg:
+class DriveLeg:
     """A motion from rest to rest: `length` (m, negative: backwards) while turning by `turn` (rad).
 
     Without a length it turns on the spot, without a turn it goes straight, without both it waits.
@@ -65,7 +65,7 @@ class Leg:
     turn: float = 0.0
 
     def after(self, progress: float) -> Planar:
-        """The pose, seen from the leg's start, when the fraction `progress` of it is done."""
+        """Returns the pose relative to the leg's start, at the fraction `progress` of the leg."""
         length, turn = self.length * progress, self.turn * progress
         if not self.turn:
             return Planar(length, 0.0, 0.0)
@@ -74,7 +74,7 @@ class Leg:
 
 
 class Thing(NamedTuple):
-    """Something the camera sees; `point` (m) is where it is in `base_link`."""
+    """An object that the camera sees, at `point` (m) in `base_link`."""
 
     label: str
     score: float
@@ -85,29 +85,29 @@ _RIGHT: Final = math.pi / 2
 MAP_TO_ODOM: Final = Planar(1.0, 1.0, _RIGHT)
 CAMERA: Final[Vector3] = (0.15, 0.0, 0.30)
 LASER: Final[Vector3] = (0.10, 0.0, 0.20)
-"""Where the camera and the laser sit in `base_link`; both look straight ahead."""
+"""The positions (m) of the camera and the laser in `base_link`; both look straight ahead."""
 
 FRONT_DOOR: Final = Planar(6.0, 3.2, _RIGHT)
 KITCHEN_COUNTER: Final = Planar(10.0, 3.0, _RIGHT)
 """Two of the places where the robot stops, in `map`."""
 
 LAP: Final = (
-    Leg(4.0, length=_RIGHT, turn=-_RIGHT),  # off the dock, towards the hall
-    Leg(8.0, length=4.0),
-    Leg(2.5, turn=_RIGHT),
-    Leg(3.5, length=1.2),
-    Leg(4.0),  # at the front door
-    Leg(3.5, length=-1.2),  # backs off, eyes on the door
-    Leg(2.5, turn=-_RIGHT),
-    Leg(6.0, length=3.0),
-    Leg(4.0, length=_RIGHT, turn=_RIGHT),
-    Leg(4.0),  # at the kitchen counter
-    Leg(5.0, turn=math.pi),
-    Leg(4.0, length=_RIGHT, turn=-_RIGHT),
-    Leg(12.0, length=7.0),  # through all rooms, home
-    Leg(4.0, length=_RIGHT, turn=_RIGHT),
-    Leg(5.0, turn=-math.pi),
-    Leg(8.0),  # on the dock, charging
+    DriveLeg(4.0, length=_RIGHT, turn=-_RIGHT),  # off the dock, towards the hall
+    DriveLeg(8.0, length=4.0),
+    DriveLeg(2.5, turn=_RIGHT),
+    DriveLeg(3.5, length=1.2),
+    DriveLeg(4.0),  # at the front door
+    DriveLeg(3.5, length=-1.2),  # backs off, eyes on the door
+    DriveLeg(2.5, turn=-_RIGHT),
+    DriveLeg(6.0, length=3.0),
+    DriveLeg(4.0, length=_RIGHT, turn=_RIGHT),
+    DriveLeg(4.0),  # at the kitchen counter
+    DriveLeg(5.0, turn=math.pi),
+    DriveLeg(4.0, length=_RIGHT, turn=-_RIGHT),
+    DriveLeg(12.0, length=7.0),  # through all rooms, home
+    DriveLeg(4.0, length=_RIGHT, turn=_RIGHT),
+    DriveLeg(5.0, turn=-math.pi),
+    DriveLeg(8.0),  # on the dock, charging
 )
 LAP_S: Final = sum(leg.duration for leg in LAP)
 LAP_M: Final = sum(abs(leg.length) for leg in LAP)
@@ -129,18 +129,18 @@ SIGHT_HALF_ANGLE: Final = math.radians(40.0)
 
 
 def pose(t: float) -> Planar:
-    """Where the robot is, in `odom`."""
+    """Returns the robot's pose in `odom`."""
     index, share = _leg(t)
     return _POSES[index].then(LAP[index].after(_eased(share)))
 
 
 def pose_in_map(t: float) -> Planar:
-    """Where the robot is, in `map`."""
+    """Returns the robot's pose in `map`."""
     return MAP_TO_ODOM.then(pose(t))
 
 
 def twist(t: float) -> tuple[float, float]:
-    """Forward speed (m/s) and turning rate (rad/s, left positive), in `base_link`."""
+    """Returns forward speed (m/s) and turning rate (rad/s, left positive) in `base_link`."""
     index, share = _leg(t)
     leg = LAP[index]
     rate = (1.0 - math.cos(2.0 * math.pi * share)) / leg.duration
@@ -148,18 +148,18 @@ def twist(t: float) -> tuple[float, float]:
 
 
 def driven(t: float) -> float:
-    """The length (m) of the way driven from 0 to t, backwards driving counted too."""
+    """Returns the distance (m) driven from 0 to t, backwards driving included."""
     index, share = _leg(t)
     return (t // LAP_S) * LAP_M + _DRIVEN[index] + abs(LAP[index].length) * _eased(share)
 
 
 def place(t: float) -> str:
-    """The name of the room the robot is in."""
+    """Returns the name of the room that the robot is in."""
     return room_at(pose_in_map(t).x)
 
 
 def seen(t: float) -> tuple[Thing, ...]:
-    """What the camera sees, nearest first: near enough, in its field of view, no wall between."""
+    """Returns the objects in the camera's view, nearest first: in range, and behind no wall."""
     here = pose_in_map(t)
     camera = here.then(Planar(CAMERA[0], CAMERA[1], 0.0))
     to_base = here.inverse()
@@ -177,17 +177,17 @@ def seen(t: float) -> tuple[Thing, ...]:
 
 
 def scan(t: float) -> NDArray[np.float64]:
-    """Distance (m) from the laser to the walls for each beam, the first one looking backwards."""
+    """Returns the range (m) from the laser to a wall for each beam; the first looks backwards."""
     return _ranges(t, _BEAMS)
 
 
 def path_clear(t: float) -> bool:
-    """Whether no wall is nearer than `CLEAR_M` to the laser within 15 degrees of straight ahead."""
+    """Returns whether no wall within 15 degrees of straight ahead is nearer than `CLEAR_M`."""
     return bool(_ranges(t, _AHEAD).min() > CLEAR_M)
 
 
 def battery(t: float) -> float:
-    """The charge, 0 to 1: it falls evenly on the way and is regained on the dock."""
+    """Returns the charge, 0 to 1: it falls evenly while driving, and rises on the dock."""
     phase = t % LAP_S
     driving = LAP_S - _CHARGING_S
     spent = phase / driving if phase < driving else (LAP_S - phase) / _CHARGING_S
@@ -200,7 +200,7 @@ def _ranges(t: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _leg(t: float) -> tuple[int, float]:
-    """The leg under way and which share of its duration has passed, in [0, 1]."""
+    """Returns the current leg and the share of its duration that has passed, in [0, 1]."""
     phase = t % LAP_S
     index = max(i for i, start in enumerate(_STARTS[:-1]) if start <= phase)
     return index, (phase - _STARTS[index]) / LAP[index].duration

@@ -1,4 +1,4 @@
-"""Recorder, query server and client together: what `ros2-memory demo` does."""
+"""Runs `ros2-memory demo`: a recorder, the query server and a client together."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from mcp.types import TextContent
 
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, WallClock, ns_from_unix
-from ros2_memory.demo.answer_checks import Asked
-from ros2_memory.demo.output import invitation, shown
-from ros2_memory.demo.published_topics import Timeline
-from ros2_memory.demo.questions import QUESTIONS, Exchange, judged
+from ros2_memory.demo.answer_checks import CallContext
+from ros2_memory.demo.output import connection_hints, format_exchange
+from ros2_memory.demo.published_topics import MessageSchedule
+from ros2_memory.demo.questions import QUESTIONS, Exchange, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.demo.robot import LAP_S
-from ros2_memory.demo.server_process import HOST, free_port, served
+from ros2_memory.demo.server_process import HOST, free_port, running_server
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -37,12 +37,12 @@ _UNDERWAY_S: Final = 22
 """How long the robot has been driving when its recording begins (it leaves the front door)."""
 
 _KNOWN_WITHIN_NS: Final = 3 * NS_PER_S
-"""How soon after it was closed a split must be known: the index refresh, with room."""
+"""The server knows a closed split within this time: the index refresh, with some room."""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
-    """What the command line says.
+    """The options of the command line.
 
     Attributes:
         once: leave after the answers.
@@ -62,7 +62,7 @@ class DemoOptions:
 def run_demo(
     options: DemoOptions, say: Callable[[str], None], questions: Sequence[Question] = QUESTIONS
 ) -> int:
-    """Records, serves, asks, and (unless `once`) goes on until it is interrupted.
+    """Records, serves, asks, and (unless `once`) continues until it is interrupted.
 
     Returns:
         0 where every answer was right, otherwise 1.
@@ -78,16 +78,18 @@ def run_demo(
         bag_dir = _bag_dir(options, stack)
         recorder = stack.enter_context(_recorder(bag_dir, options.duration_s))
         server = stack.enter_context(
-            served(bag_dir, port, split_duration_s=SPLIT_DURATION_S, verbose=options.verbose)
+            running_server(
+                bag_dir, port, split_duration_s=SPLIT_DURATION_S, verbose=options.verbose
+            )
         )
         url = f"http://{HOST}:{port}"
         say(_heading(recorder, options, url))
-        wrong = _asked(f"{url}/sse", recorder, say, questions)
+        wrong = _count_wrong(f"{url}/sse", recorder, say, questions)
         total = len(questions)
         say(f"{total - wrong} of {total} answers are right.")
         if not options.once:
-            say(f"\n{invitation(f'{url}/sse', f'{url}/mcp')}")
-            _stay(server, recorder)
+            say(f"\n{connection_hints(f'{url}/sse', f'{url}/mcp')}")
+            _wait(server, recorder)
     return 1 if wrong else 0
 
 
@@ -114,10 +116,10 @@ def _bag_dir(options: DemoOptions, stack: ExitStack) -> Path:
 
 
 def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
-    """A recorder that has written its history and records on."""
+    """Returns a recorder that has written its history and continues."""
     now = WallClock().now()
     start = now - ns_from_unix(duration_s)
-    timeline = Timeline(t0=start - _UNDERWAY_S * NS_PER_S, start=start)
+    timeline = MessageSchedule(t0=start - _UNDERWAY_S * NS_PER_S, start=start)
     name = time.strftime("flat_%Y_%m_%d-%H_%M_%S")
     recorder = DemoRecorder(bag_dir / name, timeline, split_duration_s=SPLIT_DURATION_S)
     recorder.write_until(now)
@@ -136,7 +138,7 @@ def _heading(recorder: DemoRecorder, options: DemoOptions, url: str) -> str:
     )
 
 
-def _asked(
+def _count_wrong(
     url: str, recorder: DemoRecorder, say: Callable[[str], None], questions: Sequence[Question]
 ) -> int:
     try:
@@ -153,12 +155,12 @@ def _asked(
 async def _ask_all(
     url: str, recorder: DemoRecorder, say: Callable[[str], None], questions: Sequence[Question]
 ) -> int:
-    """Asks every question over one connection; how many answers were wrong."""
+    """Asks every question over one connection; returns how many answers were wrong."""
     wrong = 0
     async with Client(sse_client(url)) as client:
         for number, question in enumerate(questions, start=1):
             exchange = await _ask(client, question, recorder)
-            say(f"{shown(number, exchange)}\n")
+            say(f"{format_exchange(number, exchange)}\n")
             wrong += not exchange.right
     return wrong
 
@@ -172,14 +174,14 @@ async def _ask(client: Client, question: Question, recorder: DemoRecorder) -> Ex
         return Exchange(question, "", f"the call failed: {error}", right=False)
     after = clock.now()
     reply = "".join(part.text for part in result.content if isinstance(part, TextContent))
-    asked = Asked(
+    call = CallContext(
         recorder.timeline, before, after, recorder.closed_ends(before - _KNOWN_WITHIN_NS, after)
     )
-    return judged(question, reply, asked, is_error=result.is_error)
+    return judge_reply(question, reply, call, is_error=result.is_error)
 
 
-def _stay(server: subprocess.Popen[bytes], recorder: DemoRecorder) -> None:
-    """Returns when it is interrupted.
+def _wait(server: subprocess.Popen[bytes], recorder: DemoRecorder) -> None:
+    """Waits until it is interrupted.
 
     Raises:
         EpisodicError: the server or the recording ended by itself.

@@ -1,4 +1,4 @@
-"""The real query server as a child process on the loopback address."""
+"""Runs the real query server as a child process on the loopback address."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LOG_LINES_SHOWN: Final = 8
 
 
 def free_port(wanted: int) -> int:
-    """The port to serve on: `wanted`, or any that is free where that is 0.
+    """Returns the port to serve on: `wanted`, or any free one if that is 0.
 
     Raises:
         ConfigError: the port cannot be had; says why and what to do.
@@ -55,7 +55,7 @@ def server_environment(
     split_duration_s: float,
     cache: str,
 ) -> dict[str, str]:
-    """The environment of a server that serves `bag_dir` and obeys no setting of the caller's."""
+    """Returns the environment of a server of `bag_dir`, without the caller's settings."""
     kept = {name: value for name, value in environment.items() if not name.startswith(_OURS)}
     return kept | {
         "MCP_TRANSPORT": "sse",
@@ -71,10 +71,10 @@ def server_environment(
 
 
 @contextmanager
-def served(
+def running_server(
     bag_dir: Path, port: int, *, split_duration_s: float, verbose: bool = False
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A server that answers, until the end of the block.
+    """Yields a server that answers, and ends it after the block.
 
     Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its catalogue
     into a folder that is removed at the end: nobody else will ask for it.

@@ -15,17 +15,17 @@ from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, unix_rounded_up
 from ros2_memory.demo import judges, robot
 from ros2_memory.demo.answer_checks import (
-    Asked,
+    CallContext,
     WrongAnswerError,
     at,
     items,
+    match_time,
     near,
     near_angle,
     number,
     parsed,
     same,
     text,
-    told_of,
     within,
 )
 from ros2_memory.demo.published_topics import (
@@ -33,16 +33,16 @@ from ros2_memory.demo.published_topics import (
     PATH_CLEAR,
     SCENE_OBJECTS,
     STREAMS,
-    Timeline,
+    MessageSchedule,
 )
-from ros2_memory.demo.questions import QUESTIONS, Question, judged
+from ros2_memory.demo.questions import QUESTIONS, Question, judge_reply
 
 T0 = 1_800_000_000 * NS_PER_S
 START = T0 + 22 * NS_PER_S
 NOW = START + 122 * NS_PER_S + 10 * NS_PER_MS
-TIMELINE = Timeline(T0, START)
+TIMELINE = MessageSchedule(T0, START)
 BY_TOPIC = {stream.topic: stream for stream in STREAMS}
-ASKED = Asked(TIMELINE, NOW, NOW + 5 * NS_PER_MS, (NOW - 7 * NS_PER_S, NOW - 2 * NS_PER_S))
+ASKED = CallContext(TIMELINE, NOW, NOW + 5 * NS_PER_MS, (NOW - 7 * NS_PER_S, NOW - 2 * NS_PER_S))
 
 
 def position_reply(**changes: JsonValue) -> JsonValue:
@@ -83,16 +83,16 @@ def test_the_message_before_the_newest_is_the_wrong_one() -> None:
 def test_an_error_where_an_answer_was_due_is_wrong() -> None:
     question = Question("Where?", "get_position_seconds_ago", {}, judges.position(10))
     reply = json.dumps(position_reply())
-    assert judged(question, reply, ASKED).right
-    assert not judged(question, reply, ASKED, is_error=True).right
-    refusal = judged(question, '{"error":"no_data","reason":"gap","detail":"..."}', ASKED)
+    assert judge_reply(question, reply, ASKED).right
+    assert not judge_reply(question, reply, ASKED, is_error=True).right
+    refusal = judge_reply(question, '{"error":"no_data","reason":"gap","detail":"..."}', ASKED)
     assert not refusal.right
     assert "timestamp" in refusal.sentence
 
 
 @pytest.mark.parametrize("reply", ["", "null", "[]", "{", '{"x": NaN}', "3"])
 def test_a_reply_of_another_shape_is_wrong_to_every_question(reply: str) -> None:
-    assert not any(judged(question, reply, ASKED).right for question in QUESTIONS)
+    assert not any(judge_reply(question, reply, ASKED).right for question in QUESTIONS)
 
 
 def test_a_message_may_be_of_any_moment_between_the_two_readings_of_the_clock() -> None:
@@ -121,7 +121,7 @@ def test_the_last_time_is_searched_backwards_from_the_end() -> None:
 def test_what_never_held_has_no_last_time() -> None:
     assert ASKED.last_where(BY_TOPIC[ODOM], lambda _: False) == []
     with pytest.raises(WrongAnswerError, match="no moment"):
-        told_of(1.0, [])
+        match_time(1.0, [])
 
 
 @given(st.floats(-1e3, 1e3), st.floats(-2.0, 2.0))

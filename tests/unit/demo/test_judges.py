@@ -12,9 +12,9 @@ import pytest
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S, Deadline, WallClock
-from ros2_memory.demo.answer_checks import Asked
-from ros2_memory.demo.published_topics import Timeline
-from ros2_memory.demo.questions import QUESTIONS, judged
+from ros2_memory.demo.answer_checks import CallContext
+from ros2_memory.demo.published_topics import MessageSchedule
+from ros2_memory.demo.questions import QUESTIONS, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
 from ros2_memory.tools.replies import Replies
@@ -69,7 +69,7 @@ class Replied:
     """What the memory answers to every question, and the circumstances."""
 
     texts: dict[str, str]
-    asked: Asked
+    asked: CallContext
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def replied(tmp_path_factory: pytest.TempPathFactory) -> Replied:
     """Every reply at one moment, 123 s into a recording whose last split is open."""
     folder = tmp_path_factory.mktemp("bags")
     now = WallClock().now()
-    timeline = Timeline(now - 145 * NS_PER_S, now - 123 * NS_PER_S)
+    timeline = MessageSchedule(now - 145 * NS_PER_S, now - 123 * NS_PER_S)
     recorder = DemoRecorder(folder / "flat", timeline, clock=FixedClock(now))
     recorder.write_until(now)
     for path in folder.rglob("*.mcap"):
@@ -94,12 +94,12 @@ def replied(tmp_path_factory: pytest.TempPathFactory) -> Replied:
             texts[question.words] = replies.error(error).text
     known = recorder.closed_ends(now, now)
     recorder.stop()
-    return Replied(texts, Asked(timeline, now, now, known))
+    return Replied(texts, CallContext(timeline, now, now, known))
 
 
 @pytest.mark.parametrize("words", BY_WORDS)
 def test_every_answer_of_a_real_memory_is_right(replied: Replied, words: str) -> None:
-    exchange = judged(BY_WORDS[words], replied.texts[words], replied.asked)
+    exchange = judge_reply(BY_WORDS[words], replied.texts[words], replied.asked)
     assert exchange.right, exchange.sentence
 
 
@@ -111,7 +111,7 @@ def test_an_answer_that_differs_in_a_place_that_counts_is_wrong(
     replied: Replied, words: str, path: str
 ) -> None:
     falsified = json.dumps(_changed(json.loads(replied.texts[words]), path.split(".")))
-    assert not judged(BY_WORDS[words], falsified, replied.asked).right
+    assert not judge_reply(BY_WORDS[words], falsified, replied.asked).right
 
 
 def test_each_question_has_places_that_count() -> None:
@@ -123,14 +123,14 @@ def test_each_question_has_places_that_count() -> None:
 def test_a_memory_with_faults_is_wrong(replied: Replied, words: str, kind: str) -> None:
     reply = json.loads(replied.texts[words])
     reply[kind] = [{"file": "x.mcap", "reason": "bad"}]
-    assert not judged(BY_WORDS[words], json.dumps(reply), replied.asked).right
+    assert not judge_reply(BY_WORDS[words], json.dumps(reply), replied.asked).right
     reply[kind] = []
-    assert judged(BY_WORDS[words], json.dumps(reply), replied.asked).right
+    assert judge_reply(BY_WORDS[words], json.dumps(reply), replied.asked).right
 
 
 def test_an_answer_of_a_memory_that_has_fallen_behind_is_wrong(replied: Replied) -> None:
     """The newest known end moves on by a split, and the answers do not."""
-    later = Asked(
+    later = CallContext(
         replied.asked.timeline,
         replied.asked.before,
         replied.asked.after,
@@ -139,7 +139,7 @@ def test_an_answer_of_a_memory_that_has_fallen_behind_is_wrong(replied: Replied)
     stale = {
         words
         for words, question in BY_WORDS.items()
-        if not judged(question, replied.texts[words], later).right
+        if not judge_reply(question, replied.texts[words], later).right
     }
     assert {"How far back do you remember?", "What do you remember?"} <= stale
 

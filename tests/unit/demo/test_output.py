@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from ros2_memory.demo.output import invitation, shown
+from ros2_memory.demo.output import connection_hints, format_exchange
 from ros2_memory.demo.questions import QUESTIONS, Exchange, Question
 
 REPLY = json.dumps(
@@ -18,12 +18,14 @@ REPLY = json.dumps(
 @pytest.mark.parametrize("question", QUESTIONS, ids=lambda question: question.words)
 def test_every_line_fits_a_hundred_columns(question: Question) -> None:
     exchange = Exchange(question, REPLY, "It was in the hall. " * 12, right=True)
-    assert all(len(line) <= 100 for line in shown(12, exchange).splitlines())
+    assert all(len(line) <= 100 for line in format_exchange(12, exchange).splitlines())
 
 
 def test_the_call_is_shown_as_it_was_made() -> None:
     question = next(one for one in QUESTIONS if one.tool == "get_position_seconds_ago")
-    lines = shown(3, Exchange(question, '{"x":1,"y":2}', "There.", right=True)).splitlines()
+    lines = format_exchange(
+        3, Exchange(question, '{"x":1,"y":2}', "There.", right=True)
+    ).splitlines()
     assert lines == [
         " 3. Where was I 10 s ago?",
         "    get_position_seconds_ago(seconds_ago=10)",
@@ -33,21 +35,21 @@ def test_the_call_is_shown_as_it_was_made() -> None:
 
 
 def test_a_wrong_answer_is_called_wrong() -> None:
-    wrong = shown(1, Exchange(QUESTIONS[0], "null", "expected a number", right=False))
+    wrong = format_exchange(1, Exchange(QUESTIONS[0], "null", "expected a number", right=False))
     assert "=> WRONG: expected a number" in wrong
 
 
 def test_a_short_reply_is_shown_to_the_letter() -> None:
     reply = REPLY[:250]
-    lines = shown(1, Exchange(QUESTIONS[0], reply, "Yes.", right=True)).splitlines()[3:]
+    lines = format_exchange(1, Exchange(QUESTIONS[0], reply, "Yes.", right=True)).splitlines()[3:]
     assert "".join(line[4:] for line in lines) == reply
 
 
 def test_a_long_reply_is_cut_and_says_so() -> None:
-    last = shown(1, Exchange(QUESTIONS[0], REPLY, "Yes.", right=True)).splitlines()[-1]
+    last = format_exchange(1, Exchange(QUESTIONS[0], REPLY, "Yes.", right=True)).splitlines()[-1]
     assert f"{len(REPLY):,} characters in all" in last
 
 
 def test_the_invitation_can_be_pasted_into_a_brain() -> None:
-    text = invitation("http://127.0.0.1:9203/sse", "http://127.0.0.1:9203/mcp")
+    text = connection_hints("http://127.0.0.1:9203/sse", "http://127.0.0.1:9203/mcp")
     assert '- name: episodic\n      transport: sse\n      url: "http://127.0.0.1:9203/sse"' in text

@@ -19,13 +19,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
 from ros2_memory.demo import published_topics, robot
 from ros2_memory.demo.messages import VISION_DEFINITIONS, definition, description
-from ros2_memory.demo.published_topics import STREAMS, Stream, Timeline
+from ros2_memory.demo.published_topics import STREAMS, MessageSchedule, Stream
 from ros2_memory.demo.recording import DemoRecorder
 from tests.support.clocks import FixedClock
 
 T0 = 1_800_000_000 * NS_PER_S + 123 * NS_PER_MS
 START = T0 + 22 * NS_PER_S + 7 * NS_PER_MS
-TIMELINE = Timeline(T0, START)
+TIMELINE = MessageSchedule(T0, START)
 BY_TOPIC = {stream.topic: stream for stream in STREAMS}
 MAGIC = b"\x89MCAP0\r\n"
 SECONDS = 13
@@ -252,7 +252,7 @@ def test_the_newest_message_at_a_moment_is_the_last_one_heard_by_then(
 
 @given(st.sampled_from(STREAMS), st.integers(0, 10_000))
 def test_a_message_is_heard_within_a_millisecond_of_its_publication(stream: Stream, k: int) -> None:
-    message = Timeline(T0, T0).message(stream, k)
+    message = MessageSchedule(T0, T0).message(stream, k)
     assert message.publish_time == T0 + k * stream.period
     assert 0 < message.log_time - message.publish_time < NS_PER_MS
 

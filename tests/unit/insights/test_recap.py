@@ -18,7 +18,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.demo import robot as demo_robot
-from ros2_memory.demo.published_topics import Timeline
+from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import TimeRange
@@ -88,7 +88,7 @@ def test_the_demos_robot_stood_where_and_as_long_as_its_lap_says(
     tmp_path: Path, recalls: bool
 ) -> None:
     now = BEGIN + 110 * S
-    recorder = DemoRecorder(tmp_path / "flat", Timeline(BEGIN, BEGIN), clock=FixedClock(now))
+    recorder = DemoRecorder(tmp_path / "flat", MessageSchedule(BEGIN, BEGIN), clock=FixedClock(now))
     recorder.write_until(now)
     recorder.stop()
     memory = memory_of(tmp_path, clock=SettableClock(now))

@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.demo import robot as demo_robot
-from ros2_memory.demo.published_topics import Timeline
+from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
 from ros2_memory.insights.visits import visits
@@ -106,7 +106,7 @@ def test_the_demos_robot_was_at_the_kitchen_counter_when_its_lap_says(
     tmp_path: Path, recalls: bool
 ) -> None:
     now = BEGIN + 200 * S
-    recorder = DemoRecorder(tmp_path / "flat", Timeline(BEGIN, BEGIN), clock=FixedClock(now))
+    recorder = DemoRecorder(tmp_path / "flat", MessageSchedule(BEGIN, BEGIN), clock=FixedClock(now))
     recorder.write_until(now)
     recorder.stop()
     memory = memory_of(tmp_path, clock=SettableClock(now))

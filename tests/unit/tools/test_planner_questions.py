@@ -16,8 +16,8 @@ from mcp.types import TextContent
 from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.demo.answer_checks import Asked, WrongAnswerError
-from ros2_memory.demo.published_topics import Timeline
+from ros2_memory.demo.answer_checks import CallContext, WrongAnswerError
+from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.clocks import FixedClock
@@ -101,7 +101,7 @@ class World:
     """The bags of a robot that is heard still, and what is known of it."""
 
     folder: Path
-    asked: Asked
+    asked: CallContext
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Asking:
 
     replies: dict[str, list[str]]
     tools: str
-    asked: Asked
+    asked: CallContext
 
 
 @pytest.fixture(scope="module")
@@ -119,12 +119,12 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     folder = tmp_path_factory.mktemp("bags")
     start = ns_from_unix(STARTED_S)
     now = ns_from_unix(ASKED_AT_S)
-    timeline = Timeline(start, start + ns_from_unix(HEARD_AFTER_S))
+    timeline = MessageSchedule(start, start + ns_from_unix(HEARD_AFTER_S))
     recorder = DemoRecorder(folder / "flat", timeline, split_duration_s=10.0, clock=FixedClock(now))
     recorder.write_until(now)
     for path in folder.rglob("*.mcap"):
         os.utime(path, ns=(now, now))  # however long it took to write them
-    yield World(folder, Asked(timeline, now, now, recorder.closed_ends(now, now)))
+    yield World(folder, CallContext(timeline, now, now, recorder.closed_ends(now, now)))
     recorder.stop()
 
 
@@ -226,7 +226,7 @@ def falsified(value: JsonValue, path: tuple[str | int, ...]) -> JsonValue:
     return whole
 
 
-def is_right(question: Planned, replies: list[JsonValue], asked: Asked) -> bool:
+def is_right(question: Planned, replies: list[JsonValue], asked: CallContext) -> bool:
     try:
         question.judge(replies, asked)
     except (WrongAnswerError, ValueError):
