@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeAlias
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.recorder.index_manager import IndexManager
     from ros2_memory.retention.foreign import Foreign
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.storage.base import BagReader
@@ -62,6 +61,30 @@ class QuerySettings:
         return Latching(self.tf_static_topics, self.latched_topics, self.never_latched_topics)
 
 
+class SnapshotSource(Protocol):
+    """The index of a bag directory, as queries need it; `IndexManager` is one.
+
+    Attributes:
+        bag_dir: the bag directory.
+        published: the result of the last scan, however old; None before the first.
+    """
+
+    bag_dir: Path
+    published: Snapshot | None
+
+    def snapshot(self, reach: Ns | None = None) -> Snapshot:
+        """Returns a current snapshot, which reaches the log time `reach` if there is data."""
+
+    def refresh(self) -> Snapshot:
+        """Scans now, and returns the result."""
+
+    def heartbeat(self) -> Heartbeat | None:
+        """Returns the last heartbeat of the directory's recorder, if it can be read."""
+
+    def foreign(self, snapshot: Snapshot) -> Foreign | None:
+        """Returns the bags that the directory's recorder did not make; None if not known."""
+
+
 @dataclass(frozen=True, slots=True)
 class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
@@ -69,7 +92,7 @@ class Memory:
     `recall` holds digests of the bags. Every answer is the same with it and without.
     """
 
-    index: IndexManager
+    index: SnapshotSource
     reader: BagReader
     extractor: SchemaExtractor
     clock: Clock

@@ -91,8 +91,8 @@ def unix_text(at: Ns) -> str:
 def is_covered(view: View, window: TimeWindow) -> bool:
     """Whether a search of a window that found nothing read all that closed files hold of it.
 
-    A file that is being written does not count, or a robot that records would never be told that
-    something was not there.
+    A file that is being written does not count: or else no search of a robot that records would be
+    complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
     return view.notes.complete and not lost and all(map(_is_whole, view.snapshot.faulty(window)))

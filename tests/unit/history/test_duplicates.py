@@ -1,4 +1,4 @@
-"""Of copies the same ones are kept, whichever way a stream runs."""
+"""The same duplicates are left out in both directions of a stream."""
 
 from __future__ import annotations
 

@@ -168,7 +168,7 @@ def test_a_log_never_holds_and_is_no_reason_to_say_that_a_topic_fell_silent(
 
 
 def test_static_transforms_hold_in_bags_without_qos(tmp_path: Path) -> None:
-    """As rosbags writes them; however often they are said."""
+    """As rosbags writes them; however often they are published."""
     mounts = [
         tf(T0 + n * S, transform(T0, "base_link", child, (0.1, 0.0, 0.0)), topic="/tf_static")
         for n, child in enumerate(("laser", "camera", "sonar"))
@@ -234,7 +234,7 @@ def test_a_pose_that_is_latched_says_so(tmp_path: Path) -> None:
 def test_retention_carries_the_newest_of_what_is_transient_local_and_no_log(
     tmp_path: Path,
 ) -> None:
-    """However often it is said; and then it is no more latched than before."""
+    """However often it is published; and then it is no more latched than before."""
     telemetry = every(0.01, 7, TELEMETRY)
     messages = [text(T0, "office", MAP), log_line(T0 + S), *telemetry, *drive(T0, T0 + 30 * S)]
     record(tmp_path / "rec", messages)

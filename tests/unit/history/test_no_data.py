@@ -34,7 +34,7 @@ def after(seconds_later: float) -> AtTime:
 
 
 def frames_that_part(bag_dir: Path) -> None:
-    """For ten seconds `map` is told of, for a minute `odom`."""
+    """`map` is known for ten seconds, `odom` for a minute."""
     messages = [
         tf(T0 + tick * NS_PER_S // 2, transform(T0 + tick * NS_PER_S // 2, *pair, (tick, 0.0, 0.0)))
         for tick in range(120)

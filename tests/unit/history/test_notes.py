@@ -1,4 +1,4 @@
-"""What could not be read is told in one note a reason, and cuts nothing into pieces."""
+"""Notes on what could not be read: one for each reason, and no reply cut into pieces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a planner is told when it asks for a moment to be kept, and for those that are."""
+"""What a planner is answered when it asks to save a moment, and for those that are saved."""
 
 from __future__ import annotations
 
