@@ -253,7 +253,8 @@ def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tup
         return
     longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
     reach = None if window is None else max(window.start, snapshot.earliest)
-    for bag in snapshot.overlapping(window or TimeWindow.everything()):
+    # Unlike `bags`, what overlaps a window includes the bag of carried messages.
+    for bag in snapshot.bags if window is None else snapshot.overlapping(window):
         # Carried messages do not show when something was recorded.
         if bag.file in snapshot.dating.misdated or is_carried(bag.path):
             continue
