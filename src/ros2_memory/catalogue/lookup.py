@@ -45,14 +45,12 @@ class SegmentDigests:
         as_of: the state of the catalogue when the entries were looked up.
     """
 
-    def __init__(
-        self, catalogue: Catalogue, segment: Segment, bag_dir: Path, as_of: int, recent: RecordLru
-    ) -> None:
-        self.catalogue = catalogue
-        self._recent = recent
+    def __init__(self, cache: DigestCache, segment: Segment, as_of: int) -> None:
+        self.catalogue = catalogue = cache.catalogue
+        self._cache = cache
         failures = catalogue.failures
         closed = [bag for bag in segment.bags if bag.state is BagState.CLOSED]
-        numbers = catalogue.find([BagKey.of(bag, bag_dir) for bag in closed])
+        numbers = catalogue.find([BagKey.of(bag, cache.bag_dir) for bag in closed])
         self.as_of = as_of if catalogue.failures == failures else _UNKNOWN_STATE
         self.numbers: dict[str, int] = {
             bag.file: number
@@ -109,7 +107,7 @@ class SegmentDigests:
 
         They are many, so they are cached for the segments that were asked for last.
         """
-        self._recent.touch(self)
+        self._cache.touch(self)
         return self._cached(
             self._messages, topic, lambda: self.catalogue.messages(topic, self._entries_with(topic))
         )
@@ -143,30 +141,14 @@ class SegmentDigests:
         return self._with_topic.get(topic, [])
 
 
-class RecordLru:
-    """Bounds how many segments keep their messages in memory. Thread-safe."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._recent: OrderedDict[SegmentDigests, None] = OrderedDict()
-
-    def touch(self, digests: SegmentDigests) -> None:
-        """Marks a segment as used; the least recently used one drops its messages."""
-        with self._lock:
-            self._recent[digests] = None
-            self._recent.move_to_end(digests)
-            if len(self._recent) > _MAX_WITH_MESSAGES:
-                self._recent.popitem(last=False)[0].release_messages()
-
-
 class DigestCache:
     """Caches what the catalogue knows, by segment. Thread-safe."""
 
     def __init__(self, catalogue: Catalogue, bag_dir: Path) -> None:
         self.catalogue = catalogue
-        self._bag_dir = bag_dir
+        self.bag_dir = bag_dir
         self._lock = threading.Lock()
-        self._recent = RecordLru()
+        self._with_messages: OrderedDict[SegmentDigests, None] = OrderedDict()
         self._segments: WeakKeyDictionary[Segment, SegmentDigests] = WeakKeyDictionary()
 
     def as_of(self) -> int:
@@ -178,7 +160,7 @@ class DigestCache:
         with self._lock:
             known = self._segments.get(segment)
         if known is None or not self._is_up_to_date(known, as_of):
-            known = SegmentDigests(self.catalogue, segment, self._bag_dir, as_of, self._recent)
+            known = SegmentDigests(self, segment, as_of)
             with self._lock:
                 self._segments[segment] = known
         return known
@@ -193,6 +175,14 @@ class DigestCache:
         if known is None or not known.whole or not self.catalogue.is_current(known.as_of):
             return None
         return known
+
+    def touch(self, digests: SegmentDigests) -> None:
+        """Marks a segment's messages as used; the least recently used ones are dropped."""
+        with self._lock:
+            self._with_messages[digests] = None
+            self._with_messages.move_to_end(digests)
+            if len(self._with_messages) > _MAX_WITH_MESSAGES:
+                self._with_messages.popitem(last=False)[0].release_messages()
 
     def cached_answer(
         self, question: str, numbers: Sequence[int], parse: Callable[[str], T]
