@@ -99,7 +99,7 @@ def fill_catalogue(
 ) -> Progress:
     """Digests until no bag waits, the newest first, and returns the progress at the end.
 
-    A bag that changed a moment ago is left for a later run.
+    A bag that changed a few seconds ago is left for a later run.
     """
     done = 1
     while done and not is_cancelled():

@@ -82,7 +82,7 @@ def _topic_row(memory: Memory, reply: JsonValue, known: TopicRow) -> JsonValue:
 def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
     """Returns the rate (Hz) of a topic in its newest hour, without the gaps between bags.
 
-    None for a latched topic, and where no bag holds two messages of it.
+    None for a latched topic, and if no bag has two messages of it.
     """
     if latching.is_latched(snapshot, topic):
         return None

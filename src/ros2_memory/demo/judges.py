@@ -1,7 +1,7 @@
 """Judges, one for each kind of answer.
 
-A judge compares a reply with the robot's closed form at the reply's own moment, checks that this
-moment is the right one, and returns the answer as a sentence; `WrongAnswerError` otherwise.
+A judge compares a reply with the robot's closed form at the reply's own time, checks that this time
+is the right one, and returns the answer as a sentence. It raises `WrongAnswerError` otherwise.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def seen_near(place: Planar) -> Judge:
     def judge(reply: JsonValue, call: CallContext) -> str:
         moment = number(reply, "timestamp")
         match = match_time(moment, call.last_where(_ODOM, _near(spot)))
-        then = _held(reply, call, published_topics.SCENE_OBJECTS, match)
+        then = _message_at(reply, call, published_topics.SCENE_OBJECTS, match)
         labels = [text(found, "label") for found in items(reply, "value", "detections")]
         same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(then.t)))
         return f"{_listed(labels).capitalize()}, at {call.when(moment)}."
@@ -165,7 +165,7 @@ def where_seen(label: str) -> Judge:
     def judge(reply: JsonValue, call: CallContext) -> str:
         moment = number(reply, "timestamp")
         sighting = call.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
-        message = _held(reply, call, published_topics.ODOM, match_time(moment, sighting))
+        message = _message_at(reply, call, published_topics.ODOM, match_time(moment, sighting))
         return f"{_at_place(at(reply, 'value', 'position'), message)}, at {call.when(moment)}."
 
     return judge
@@ -245,7 +245,7 @@ def battery(seconds_ago: float) -> Judge:
     return judge
 
 
-def told(seconds: float, at_most: int) -> Judge:
+def descriptions(seconds: float, at_most: int) -> Judge:
     """Judges the descriptions of the last seconds, thinned to a few samples."""
     window = ns_from_unix(seconds)
 
@@ -291,7 +291,7 @@ def _sees(label: str) -> Callable[[float], bool]:
     return lambda t: any(thing.label == label for thing in robot.seen(t))
 
 
-def _held(reply: JsonValue, call: CallContext, topic: str, match: Message) -> Message:
+def _message_at(reply: JsonValue, call: CallContext, topic: str, match: Message) -> Message:
     """Returns the message of a topic at or before the match, which must be that of the reply."""
     newest = call.timeline.newest(_BY_TOPIC[topic], match.log_time)
     return match_time(number(reply, "value_timestamp"), [newest] if newest else [])

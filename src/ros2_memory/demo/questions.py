@@ -150,7 +150,7 @@ QUESTIONS: Final = (
         "What did you say you saw in the last 20 s?",
         "get_topic_in_last",
         {"topic": published_topics.SCENE_DESCRIPTION, "seconds": 20, "max_samples": 4},
-        judges.told(20, 4),
+        judges.descriptions(20, 4),
     ),
     Question(
         "What did the camera's pictures show?",

@@ -135,7 +135,7 @@ class TestTopics:
 
 
 class TestInfo:
-    def test_it_tells_the_range_the_gaps_and_the_bags(self, capsys: Capture) -> None:
+    def test_it_shows_the_range_the_gaps_and_the_bags(self, capsys: Capture) -> None:
         assert cli.main(["info", "--json"]) == 0
         told = json.loads(capsys.readouterr().out)
         assert told["data_time_range"]["earliest"] == 1_700_000_000.0
@@ -281,7 +281,7 @@ class TestTheProgram:
         assert cli.main([command, "--help"]) == 0
         assert " ".join(capsys.readouterr().out.split()).endswith(epilog(command))
 
-    def test_it_tells_its_version(self, capsys: Capture) -> None:
+    def test_it_prints_its_version(self, capsys: Capture) -> None:
         assert cli.main(["--version"]) == 0
         assert capsys.readouterr().out.startswith("ros2-memory ")
 

@@ -134,7 +134,7 @@ def test_a_missing_directory_of_bags_is_an_error_where_nothing_is_recorded(
         ("retention.max_total_gb=1000000.0", 1, "lower retention.max_total_gb"),
     ],
 )
-def test_a_disk_without_the_room_that_is_asked_of_it_is_told(
+def test_a_disk_without_the_room_that_is_asked_of_it_is_reported(
     robot: Path, capsys: Capture, override: str, code: int, words: str
 ) -> None:
     ended, wrong = examined(capsys, override)
@@ -275,7 +275,7 @@ def test_a_missing_setup_file_is_named(robot: Path, capsys: Capture) -> None:
     assert "recorder.setup_files" in wrong["ros"][0]["do"]
 
 
-def test_a_topic_that_is_listed_and_not_recorded_is_told_with_what_is_like_it(
+def test_a_topic_that_is_listed_and_not_recorded_is_reported_with_what_is_like_it(
     robot: Path, capsys: Capture
 ) -> None:
     (robot.parent / "topics.yaml").write_text("topics: [/odom, /odom_, /vision/*/objects]\n")
@@ -299,7 +299,7 @@ class TestTheServer:
         assert code == 2
         assert "another program" in wrong["server"][0]["seen"]
 
-    def test_a_token_that_it_does_not_take_is_told_as_such(
+    def test_a_token_that_it_does_not_take_is_reported_as_such(
         self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
     ) -> None:
         Answering.asks_for = f"Bearer {'s' * 32}"
@@ -310,14 +310,14 @@ class TestTheServer:
         monkeypatch.setenv("MEMORY_API_TOKEN", "s" * 32)
         assert examined(capsys) == (0, {})
 
-    def test_its_problems_are_told(self, robot: Path, capsys: Capture) -> None:
+    def test_its_problems_are_reported(self, robot: Path, capsys: Capture) -> None:
         Answering.reply = b'{"status": "degraded", "problems": ["the bag directory is gone"]}'
         code, wrong = examined(capsys)
         assert code == 1
         assert "the bag directory is gone" in wrong["server"][0]["seen"]
 
 
-def test_runs_that_are_answered_together_are_told(robot: Path, capsys: Capture) -> None:
+def test_runs_that_are_answered_together_are_reported(robot: Path, capsys: Capture) -> None:
     write_mcap(
         robot / "other" / "other_0.mcap",
         [odom(time.time_ns() - (60 - n) * NS_PER_S, 0.0, 0.0) for n in range(50)],
@@ -328,7 +328,7 @@ def test_runs_that_are_answered_together_are_told(robot: Path, capsys: Capture) 
     assert "recordings other and rec overlap from 20" in finding["seen"]
 
 
-def test_a_fresh_file_without_an_end_is_told_until_when_it_counts_as_being_written(
+def test_a_fresh_file_without_an_end_is_reported_until_when_it_counts_as_being_written(
     robot: Path, capsys: Capture
 ) -> None:
     (robot / "recorder.json").unlink()
@@ -355,7 +355,7 @@ def test_a_copy_of_older_data_is_not_being_written_where_nobody_writes(
     assert ("0 damaged and 1 unfinished" in seen) is not is_active
 
 
-def test_a_topic_that_nobody_offers_and_restarts_are_told(robot: Path, capsys: Capture) -> None:
+def test_a_topic_that_nobody_offers_and_restarts_are_reported(robot: Path, capsys: Capture) -> None:
     beat(robot, missing=("/odom", "/gone"), restarts=1, last_error="it died")
     code, wrong = examined(capsys)
     assert code == 1
@@ -384,7 +384,7 @@ class TestExtras:
         pytest.importorskip("prometheus_client")
         assert examined(capsys, "server.metrics=true") == (0, {})
 
-    def test_metrics_without_http_are_told(self, robot: Path, capsys: Capture) -> None:
+    def test_metrics_without_http_are_reported(self, robot: Path, capsys: Capture) -> None:
         pytest.importorskip("prometheus_client")
         code, wrong = examined(capsys, "server.metrics=true", "server.transport=stdio")
         assert code == 2

@@ -131,7 +131,9 @@ class TestMcap:
         assert len(wanted) == 35
         assert "35 messages" in capsys.readouterr().out
 
-    def test_publish_times_definitions_and_what_publishers_offer_stay(self, tmp_path: Path) -> None:
+    def test_publish_times_definitions_and_what_publishers_offer_are_kept(
+        self, tmp_path: Path
+    ) -> None:
         published = T0 - 5 * NS_PER_S
         message = Msg("/word", "std_msgs/msg/String", T0, text(T0, "x").body, published)
         folder = tmp_path / "bags"
@@ -179,7 +181,7 @@ class TestMcap:
         rest = [row for row in read(tmp_path / "with.mcap") if row[0] != "/tf_static"]
         assert rest == read(tmp_path / "without.mcap")
 
-    def test_that_nothing_but_latched_messages_of_before_was_found_is_told(
+    def test_that_nothing_but_latched_messages_of_before_was_found_is_reported(
         self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         mount = tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
@@ -196,7 +198,7 @@ class TestMcap:
         assert {row[0] for row in read(out)} == {"/chatter"}
 
     @pytest.mark.parametrize("profile", ["", "px4", "ros2"])
-    def test_the_profile_stays(self, tmp_path: Path, profile: str) -> None:
+    def test_the_profile_is_kept(self, tmp_path: Path, profile: str) -> None:
         folder = tmp_path / "bags"
         raw_mcap(folder / "rec_0.mcap", things, profile=profile)
         assert profile_of(exported(folder, tmp_path / "out.mcap")) == profile
@@ -326,7 +328,7 @@ class TestMcap:
         assert "no message" in capsys.readouterr().err
         assert not out.exists()
 
-    def test_what_could_not_be_read_is_told_and_the_exit_code_is_1(
+    def test_what_could_not_be_read_is_reported_and_the_exit_code_is_1(
         self, bag_dir: Path, tmp_path: Path, capsys: Capture
     ) -> None:
         source = bag_dir / "rec_0" / "rec_0_0.mcap"
@@ -334,7 +336,7 @@ class TestMcap:
         assert cli.main(["export", "--mcap", str(tmp_path / "out.mcap")]) == 1
         assert "rec_0_0.mcap" in capsys.readouterr().err
 
-    def test_a_file_of_the_window_that_is_not_read_at_all_is_told_and_the_exit_code_is_1(
+    def test_a_file_of_the_window_that_is_not_read_at_all_is_reported_and_the_exit_code_is_1(
         self, bag_dir: Path, tmp_path: Path, capsys: Capture
     ) -> None:
         source = bag_dir / "rec_0" / "rec_0_0.mcap"
@@ -346,7 +348,7 @@ class TestMcap:
 
 
 class TestParquet:
-    def test_duckdb_computes_the_way_that_trajectory_summary_tells(
+    def test_duckdb_computes_the_way_that_trajectory_summary_reports(
         self, bag_dir: Path, tmp_path: Path, capsys: Capture
     ) -> None:
         start, end = T0 / NS_PER_S, T0 / NS_PER_S + 60

@@ -76,13 +76,13 @@ def test_bags_that_lie_wholly_inside_go(bag_dir: Path, capsys: Capture) -> None:
     assert "deleted: 2 bags" in capsys.readouterr().out
 
 
-def test_what_reaches_beyond_the_window_stays_and_is_named(bag_dir: Path, capsys: Capture) -> None:
+def test_what_reaches_beyond_the_window_is_kept_and_named(bag_dir: Path, capsys: Capture) -> None:
     assert forget(25, 55, "--yes") == 1
     assert bags(bag_dir) == ["rec_0.mcap", "rec_1.mcap", "rec_3.mcap"]
     assert "stays: rec_0/rec_1.mcap: it reaches beyond the window" in capsys.readouterr().out
 
 
-def test_a_dry_run_only_tells(bag_dir: Path, capsys: Capture) -> None:
+def test_a_dry_run_only_reports(bag_dir: Path, capsys: Capture) -> None:
     assert forget(20, 35, "--dry-run") == 0
     told = capsys.readouterr().out
     assert "would be deleted: 1 bag" in told
@@ -125,7 +125,7 @@ def test_latched_messages_that_later_answers_need_are_carried_on(
     assert cli.main(["ask", "get_transform_at", asked, "--json"]) == 0
 
 
-def test_what_was_carried_on_from_the_window_is_told(bag_dir: Path, capsys: Capture) -> None:
+def test_what_was_carried_on_from_the_window_is_reported(bag_dir: Path, capsys: Capture) -> None:
     forget(0, 15, "--yes")
     capsys.readouterr()
     assert forget(0, 15, "--yes") == 1
@@ -133,7 +133,9 @@ def test_what_was_carried_on_from_the_window_is_told(bag_dir: Path, capsys: Capt
     assert (bag_dir / "latched" / "carried.mcap").is_file()
 
 
-def test_beside_a_recorder_bags_with_latched_messages_stay(bag_dir: Path, capsys: Capture) -> None:
+def test_beside_a_recorder_bags_with_latched_messages_are_kept(
+    bag_dir: Path, capsys: Capture
+) -> None:
     lock = BagDirLock.acquire(bag_dir)
     try:
         assert forget(0, 35, "--yes") == 1
@@ -143,7 +145,7 @@ def test_beside_a_recorder_bags_with_latched_messages_stay(bag_dir: Path, capsys
     assert "stop it for a moment" in capsys.readouterr().out
 
 
-def test_a_bag_that_is_being_written_stays(bag_dir: Path, capsys: Capture) -> None:
+def test_a_bag_that_is_being_written_is_kept(bag_dir: Path, capsys: Capture) -> None:
     start = T0 + 80 * NS_PER_S
     path = bag_dir / "rec_1" / "rec_4.mcap"
     write_mcap(path, [odom(start, 0.0, 0.0)], McapLayout(finish=False, chunk_size=10))
@@ -152,7 +154,7 @@ def test_a_bag_that_is_being_written_stays(bag_dir: Path, capsys: Capture) -> No
     assert "rec_4.mcap" in capsys.readouterr().out
 
 
-def test_a_bag_with_another_name_is_told(bag_dir: Path, capsys: Capture) -> None:
+def test_a_bag_with_another_name_is_reported(bag_dir: Path, capsys: Capture) -> None:
     (bag_dir / "moments" / "20231114T221320Z-x" / "rec_0").mkdir(parents=True)
     kept = bag_dir / "moments" / "20231114T221320Z-x" / "rec_0" / "rec_1.mcap"
     kept.hardlink_to(bag_dir / "rec_0" / "rec_1.mcap")
@@ -195,7 +197,9 @@ def test_of_an_empty_window_it_says_so(bag_dir: Path, capsys: Capture) -> None:
     assert "no closed bag" in capsys.readouterr().out
 
 
-def test_of_a_recording_that_has_gone_no_metadata_is_told(bag_dir: Path, capsys: Capture) -> None:
+def test_of_a_recording_that_has_gone_no_metadata_is_reported(
+    bag_dir: Path, capsys: Capture
+) -> None:
     (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     assert forget(40, 75, "--yes") == 0
     assert "metadata.yaml" not in capsys.readouterr().out
@@ -204,7 +208,9 @@ def test_of_a_recording_that_has_gone_no_metadata_is_told(bag_dir: Path, capsys:
 class TestForeignBags:
     """Bags that this deployment's recorder did not make."""
 
-    def test_they_stay_and_are_named_with_what_to_do(self, bag_dir: Path, capsys: Capture) -> None:
+    def test_they_are_kept_and_are_named_with_what_to_do(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
         (bag_dir / "rec_0" / "rec_1.mcap").rename(bag_dir / "loose.mcap")
         assert forget(0, 100, "--yes") == 1
@@ -242,7 +248,7 @@ class TestForeignBags:
         assert forget(0, 100, "--yes") == 1
         assert len(bags(bag_dir)) == 4
 
-    def test_a_copy_without_its_list_of_which_one_file_is_damaged_stays(
+    def test_a_copy_without_its_list_of_which_one_file_is_damaged_is_kept(
         self, bag_dir: Path, capsys: Capture
     ) -> None:
         shutil.rmtree(bag_dir / ".episodic")
@@ -263,7 +269,7 @@ class TestForeignBags:
             f"stays: {name}/{path.name}: this recorder did not make it" in capsys.readouterr().out
         )
 
-    def test_one_that_took_the_place_of_another_while_it_was_asked_stays(
+    def test_one_that_took_the_place_of_another_while_it_was_asked_is_kept(
         self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         def meanwhile(*_: object, **__: object) -> None:

@@ -67,7 +67,7 @@ def test_long_times_are_in_a_unit_that_suits_them() -> None:
     assert told[-3:] == ["days", "/b", "12.25"]
 
 
-def test_what_there_is_not_is_said_in_words() -> None:
+def test_what_there_is_not_is_reported_in_words() -> None:
     assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
     assert shown([]) == "none"
 

@@ -92,7 +92,7 @@ class TestMetadata:
         with Reader(tmp_path / "rec") as reader:
             assert (reader.start_time, reader.end_time) == (held.start, held.end + 1)
 
-    def test_is_left_and_that_is_said_while_a_file_is_not_whole(self, tmp_path: Path) -> None:
+    def test_is_left_and_that_is_reported_while_a_file_is_not_whole(self, tmp_path: Path) -> None:
         left_open(tmp_path / "rec/rec_0.mcap")
         (tmp_path / "rec/rec_1.mcap").write_bytes(b"a letter")
         (tmp_path / "rec/metadata.yaml").write_text("as it was\n")
@@ -114,7 +114,7 @@ class TestMetadata:
             ),
         ],
     )
-    def test_of_another_form_stays(self, tmp_path: Path, text: str, reason: str) -> None:
+    def test_of_another_form_is_kept(self, tmp_path: Path, text: str, reason: str) -> None:
         left_open(tmp_path / "rec/rec_0.mcap")
         (tmp_path / "rec/metadata.yaml").write_text(text)
         _, said = recovered(tmp_path)
@@ -167,14 +167,14 @@ def test_a_single_file_is_repaired_whatever_its_name(tmp_path: Path) -> None:
     assert McapReader().summarize(path).complete
 
 
-def test_a_whole_file_is_said_to_be(tmp_path: Path) -> None:
+def test_a_whole_file_is_reported_to_be(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a_0.mcap", MESSAGES)
     outcome, said = recovered(path)
     assert outcome == RecoveryOutcome(whole=1)
     assert said[0].endswith("whole already: there is nothing to repair")
 
 
-def test_what_is_no_mcap_file_is_said_to_be_none_and_stays(tmp_path: Path) -> None:
+def test_what_is_no_mcap_file_is_reported_to_be_none_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "a_0.mcap"
     path.write_bytes(b"a letter")
     outcome, said = recovered(tmp_path)
@@ -183,7 +183,7 @@ def test_what_is_no_mcap_file_is_said_to_be_none_and_stays(tmp_path: Path) -> No
     assert path.read_bytes() == b"a letter"
 
 
-def test_an_empty_file_that_may_be_anything_stays(tmp_path: Path) -> None:
+def test_an_empty_file_that_may_be_anything_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "notes.txt"
     path.write_bytes(b"")
     outcome, said = recovered(path)
@@ -231,7 +231,7 @@ def test_what_is_not_there_cannot_be_repaired(tmp_path: Path) -> None:
         recovered(tmp_path / "gone")
 
 
-def test_on_a_full_disk_the_original_stays(tmp_path: Path) -> None:
+def test_on_a_full_disk_the_original_is_kept(tmp_path: Path) -> None:
     path = left_open(tmp_path / "a_0.mcap")
     before = path.read_bytes()
     with files_limited_to(1000):
