@@ -117,7 +117,7 @@ def warned(logs: Sequence[Mapping[str, object]]) -> list[object]:
 
 
 def trouble_of(filler: Backfill) -> str | None:
-    return filler.trouble
+    return filler.catalogue.trouble
 
 
 def filled_anew(filler: Backfill) -> None:
@@ -228,7 +228,7 @@ def test_a_catalogue_locked_at_the_start_is_gone_back_to(tmp_path: Path) -> None
         fill_up(filler)
         passed[0] += RETRY_S
         filler.look_after()
-        assert filler.in_memory
+        assert filler.catalogue.path is None
     passed[0] += RETRY_S
     filler.look_after()
     assert memory.recall.catalogue.path == path

@@ -64,7 +64,7 @@ def _fill_for_people(settings: Settings, *, verbose: bool) -> None:
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
     backfill = build_backfill(settings, memory)
-    if backfill.in_memory:
+    if backfill.catalogue.path is None:
         raise ConfigError(
             "no catalogue can be written, neither beside the bags nor in the cache folder: "
             "give XDG_CACHE_HOME a folder that can be"

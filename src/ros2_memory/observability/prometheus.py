@@ -156,15 +156,13 @@ class MemoryGauges:
 
 def _index_families(snapshot: Snapshot, now: Ns) -> Iterator[Metric]:
     yield GaugeMetricFamily("ros2_memory_bags", "Bags that answer questions.", len(snapshot.bags))
-    aside = GaugeMetricFamily(
+    yield _by_state(
         "ros2_memory_files_set_aside",
         "Files in the bag directory: still being written, unreadable, or of another storage.",
-        labels=("state",),
+        active=len(snapshot.active),
+        damaged=len(snapshot.damaged),
+        unread=len(snapshot.unread),
     )
-    aside.add_metric(("active",), len(snapshot.active))
-    aside.add_metric(("damaged",), len(snapshot.damaged))
-    aside.add_metric(("unread",), len(snapshot.unread))
-    yield aside
     yield GaugeMetricFamily(
         "ros2_memory_kept_bytes",
         "Size of the bags that answer questions.",
@@ -188,14 +186,11 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
     yield GaugeMetricFamily(
         "ros2_memory_recorder_live", "Whether the recorder is there.", int(heartbeat.is_live(now))
     )
-    states = GaugeMetricFamily(
+    yield _by_state(
         "ros2_memory_recorder_state",
         "1 for what the recorder last said it does.",
-        labels=("state",),
+        **{str(state): int(state is heartbeat.state) for state in RecorderState},
     )
-    for state in RecorderState:
-        states.add_metric((str(state),), int(state is heartbeat.state))
-    yield states
     yield GaugeMetricFamily(
         "ros2_memory_recorder_state_since_timestamp_seconds",
         "When that state began, Unix time.",
@@ -221,3 +216,10 @@ def _recorder_families(heartbeat: Heartbeat, now: Ns, restarts: int) -> Iterator
         "How often another process was found to be the recorder; looked at when scraped.",
         restarts,
     )
+
+
+def _by_state(name: str, documentation: str, **values: int) -> GaugeMetricFamily:
+    family = GaugeMetricFamily(name, documentation, labels=("state",))
+    for state, value in values.items():
+        family.add_metric((state,), value)
+    return family

@@ -75,6 +75,10 @@ class Progress:
 class Backfill:
     """Digests the bags of one memory. Only `progress` may be called from several threads.
 
+    Attributes:
+        catalogue: what is filled.
+        undecodable: by topic, why its messages cannot be decoded, as `precompute` last found.
+
     Raises:
         ValueError: the memory has no catalogue.
     """
@@ -84,12 +88,11 @@ class Backfill:
             raise ValueError("a memory without a catalogue has nothing to fill")
         self._memory = memory
         self._digests = memory.recall
-        self._catalogue = memory.recall.catalogue
+        self.catalogue = memory.recall.catalogue
         self._digester = digester
         self._bag_dir = bag_dir
         self._refused: dict[BagKey, Ns] = {}
         self.undecodable: dict[str, str] = {}
-        """By topic, why its messages cannot be decoded, as `precompute` last found."""
 
     def waiting(self) -> list[BagFile]:
         """Returns the bags to be digested, the newest first."""
@@ -119,7 +122,7 @@ class Backfill:
             return False
         if digest.summary != bag.summary or not self._is_unchanged(bag):
             return False
-        if not self._catalogue.put(self._key(bag), digest):
+        if not self.catalogue.put(self._key(bag), digest):
             return False
         log.debug(
             "bag_digested",
@@ -128,16 +131,6 @@ class Backfill:
         )
         return True
 
-    @property
-    def cannot_write(self) -> bool:
-        """Returns whether the last digest could not be stored."""
-        return self._catalogue.is_failing
-
-    @property
-    def trouble(self) -> str | None:
-        """Returns what is wrong with the catalogue; None if nothing is."""
-        return self._catalogue.trouble
-
     def look_after(self, *, thorough: bool = False) -> None:
         """Returns the catalogue to its file, unless the bag directory itself is missing.
 
@@ -145,12 +138,7 @@ class Backfill:
             thorough: whether the whole file is read to check its integrity.
         """
         if self._memory.index.snapshot().problem is None:
-            self._catalogue.look_after(thorough=thorough)
-
-    @property
-    def in_memory(self) -> bool:
-        """Returns whether the catalogue has no file, so that no other process can fill it."""
-        return self._catalogue.path is None
+            self.catalogue.look_after(thorough=thorough)
 
     def precompute(self) -> None:
         """Computes what overlapping recordings hold together, before a client asks."""
@@ -171,8 +159,8 @@ class Backfill:
         if snapshot.problem is not None or not snapshot.bags:
             return
         present = {self._key(bag).path for segment in snapshot.segments for bag in segment.bags}
-        self._catalogue.forget([path for path in self._catalogue.paths() if path not in present])
-        self._catalogue.forget_older_configurations()
+        self.catalogue.forget([path for path in self.catalogue.paths() if path not in present])
+        self.catalogue.forget_older_configurations()
 
     def _is_unchanged(self, bag: BagFile) -> bool:
         """Returns whether the file and its sidecar are as the index found them, for a while now."""
@@ -213,7 +201,9 @@ async def keep_backfilled(backfill: Backfill, helper: Sequence[str], every_s: fl
             due = time.monotonic() - pruned_s > PRUNE_INTERVAL_S
             await _in_thread(partial(backfill.look_after, thorough=due))
             waiting = await _in_thread(backfill.waiting)
-            if len(waiting) > BACKLOG and not backfill.in_memory and await _run_helper(helper):
+            # A catalogue that is in memory cannot be filled by another process.
+            has_file = backfill.catalogue.path is not None
+            if len(waiting) > BACKLOG and has_file and await _run_helper(helper):
                 # Bags that the helper could not digest are tried here, and refused if they fail.
                 waiting = await _in_thread(backfill.waiting)
             done = await _digest(backfill, waiting[:BACKLOG])
@@ -238,7 +228,7 @@ async def _digest(backfill: Backfill, bags: Sequence[BagFile]) -> int:
     done = 0
     for bag in bags:
         done += await _in_thread(partial(backfill.digest, bag))
-        if backfill.cannot_write:
+        if backfill.catalogue.is_failing:
             break
     return done
 

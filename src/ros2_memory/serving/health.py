@@ -114,8 +114,10 @@ def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObje
             ]
     if backfill is not None:
         shown |= _catalogue(backfill)
-        if backfill.trouble is not None:
-            problems.append(_short(f"the catalogue {backfill.trouble}; no answer depends on it"))
+        if backfill.catalogue.trouble is not None:
+            problems.append(
+                _short(f"the catalogue {backfill.catalogue.trouble}; no answer depends on it")
+            )
     if heartbeat is not None:
         shown["recorder"] = _recorder(heartbeat, now)
     return _status(version, problems, shown)
@@ -129,7 +131,7 @@ def _catalogue(backfill: Backfill) -> JsonObject:
             "bags": progress.closed - progress.waiting - progress.refused,
             "waiting": progress.waiting,
             "refused": progress.refused,
-            "state": state if backfill.trouble is None else "failing",
+            "state": state if backfill.catalogue.trouble is None else "failing",
         }
     }
     if undecodable:

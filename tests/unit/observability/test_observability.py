@@ -185,7 +185,7 @@ def traced() -> EpisodicServer:
     return EpisodicServer(dispatcher, name="episodic", version="1", instructions="")
 
 
-def told(exporter: InMemorySpanExporter, outcome: str) -> ReadableSpan:
+def reply(exporter: InMemorySpanExporter, outcome: str) -> ReadableSpan:
     """The one span that has this outcome."""
     [span] = [
         each
@@ -208,13 +208,13 @@ class TestTraces:
             if each.kind is trace.SpanKind.SERVER and each.name.startswith("tools/call")
         ]
         assert [each.name for each in served] == ["tools/call full", "tools/call empty"]
-        full = told(spans, "ok").attributes or {}
+        full = reply(spans, "ok").attributes or {}
         assert full["gen_ai.tool.name"] == "full"
         assert full["mcp.method.name"] == "tools/call"
         assert float(cast("float", full["ros2_memory.stage.read_ms"])) >= 0
         assert full["ros2_memory.reply_chars"]
         assert full["ros2_memory.correlation_id"]
-        assert told(spans, "no_data: gap").name == "tools/call empty"
+        assert reply(spans, "no_data: gap").name == "tools/call empty"
         assert "s3cret" not in "".join(each.to_json() for each in spans.get_finished_spans())
 
     async def test_what_a_client_calls_a_tool_is_shortened(
@@ -222,7 +222,7 @@ class TestTraces:
     ) -> None:
         async with Client(traced()) as client:
             await client.call_tool("x" * 100_000, {})
-        span = told(spans, "invalid_arguments")
+        span = reply(spans, "invalid_arguments")
         assert len(span.name) == MAX_CHARS
         attributes = span.attributes or {}
         assert attributes["gen_ai.tool.name"] == UNKNOWN_TOOL
@@ -262,13 +262,13 @@ class TestTraces:
         server = traced()
         await server.dispatcher.answer("full", {})
         await server.dispatcher.answer("other", {})
-        span = told(spans, "ok")
+        span = reply(spans, "ok")
         assert span.name == "tools/call full"
         assert span.start_time is not None
         assert span.end_time is not None
         assert span.end_time > span.start_time
         assert span.status.status_code is trace.StatusCode.UNSET
-        refused = told(spans, "invalid_arguments")
+        refused = reply(spans, "invalid_arguments")
         assert refused.status.status_code is trace.StatusCode.ERROR
 
     def test_a_call_that_is_not_sampled_gets_no_other_span(

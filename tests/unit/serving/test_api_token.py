@@ -74,15 +74,15 @@ def test_it_comes_from_the_credentials_of_a_systemd_unit(tmp_path: Path) -> None
 
 def test_two_that_give_it_are_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "memory_api_token").write_text(GOOD)
-    told = refused({"MEMORY_API_TOKEN": GOOD, "CREDENTIALS_DIRECTORY": str(tmp_path)})
-    assert "MEMORY_API_TOKEN and the credential memory_api_token" in told
+    reply = refused({"MEMORY_API_TOKEN": GOOD, "CREDENTIALS_DIRECTORY": str(tmp_path)})
+    assert "MEMORY_API_TOKEN and the credential memory_api_token" in reply
 
 
 @pytest.mark.parametrize("text", UNUSABLE.values(), ids=UNUSABLE)
 def test_one_that_cannot_be_used_is_refused_without_being_shown(tmp_path: Path, text: str) -> None:
-    told = refused({"MEMORY_API_TOKEN": text})
-    assert told.startswith("MEMORY_API_TOKEN: the API token")
-    assert "openssl rand -hex 32" in told
+    reply = refused({"MEMORY_API_TOKEN": text})
+    assert reply.startswith("MEMORY_API_TOKEN: the API token")
+    assert "openssl rand -hex 32" in reply
     file = tmp_path / "token"
     file.write_text(text, encoding="utf-8")
     assert refused({"MEMORY_API_TOKEN_FILE": str(file)}).startswith(
@@ -102,9 +102,9 @@ def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     assert "not a regular file" in refused({"MEMORY_API_TOKEN_FILE": str(pipe)})
     assert "not a regular file" in refused({"MEMORY_API_TOKEN_FILE": str(tmp_path)})
-    told = refused({"MEMORY_API_TOKEN_FILE": str(tmp_path / "none")})
-    assert "No such file" in told
-    assert "none" in told
+    reply = refused({"MEMORY_API_TOKEN_FILE": str(tmp_path / "none")})
+    assert "No such file" in reply
+    assert "none" in reply
 
 
 @pytest.mark.parametrize("shape", [str, repr, "{}".format, "{!r}".format])
@@ -130,8 +130,8 @@ def test_what_is_refused_is_not_shown(text: str) -> None:
 def test_a_server_that_others_can_reach_needs_one() -> None:
     with pytest.raises(ConfigError, match=r"^MEMORY_API_TOKEN: missing") as caught:
         take_token({}, host="robot.lan", loopback=False)
-    for told in ("'robot.lan'", "MEMORY_API_TOKEN_FILE", "LoadCredential", "127.0.0.1"):
-        assert told in str(caught.value)
+    for reply in ("'robot.lan'", "MEMORY_API_TOKEN_FILE", "LoadCredential", "127.0.0.1"):
+        assert reply in str(caught.value)
     token = take_token({"MEMORY_API_TOKEN": GOOD}, host="robot.lan", loopback=False)
     assert token is not None
 

@@ -53,51 +53,51 @@ def recalling(bag_dir: Path, clock: SettableClock | None = None) -> Memory:
     return replace(memory_of(bag_dir, clock=clock), recall=recall)
 
 
-def filler_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -> Backfill:
+def backfill_of(memory: Memory, bag_dir: Path, digester: Digester | None = None) -> Backfill:
     made = digester or Digester(memory.reader, memory.extractor, 10.0)
     return Backfill(memory, made, bag_dir)
 
 
 def test_the_newest_bag_comes_first(tmp_path: Path) -> None:
     paths = [bag(tmp_path, number) for number in range(3)]
-    filler = filler_of(recalling(tmp_path), tmp_path)
-    assert [each.path for each in filler.waiting()] == paths[::-1]
+    backfill = backfill_of(recalling(tmp_path), tmp_path)
+    assert [each.path for each in backfill.waiting()] == paths[::-1]
 
 
 def test_when_all_is_digested_nothing_waits(tmp_path: Path) -> None:
     for number in range(3):
         bag(tmp_path, number)
-    filler = filler_of(recalling(tmp_path), tmp_path)
-    assert filler.progress() == Progress(3, 3, 0)
-    assert fill_catalogue(filler) == Progress(3, 0, 0)
-    assert fill_catalogue(filler_of(recalling(tmp_path), tmp_path)) == Progress(3, 0, 0)
+    backfill = backfill_of(recalling(tmp_path), tmp_path)
+    assert backfill.progress() == Progress(3, 3, 0)
+    assert fill_catalogue(backfill) == Progress(3, 0, 0)
+    assert fill_catalogue(backfill_of(recalling(tmp_path), tmp_path)) == Progress(3, 0, 0)
 
 
 def test_a_bag_that_a_crash_left_open_is_never_digested(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     bag(tmp_path, 1, finish=False)
-    assert fill_catalogue(filler_of(recalling(tmp_path), tmp_path)) == Progress(1, 0, 0)
+    assert fill_catalogue(backfill_of(recalling(tmp_path), tmp_path)) == Progress(1, 0, 0)
 
 
 def test_a_bag_that_changed_a_moment_ago_waits(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     clock = SettableClock(time.time_ns())
-    filler = filler_of(recalling(tmp_path, clock), tmp_path)
-    [waiting] = filler.waiting()
-    assert not filler.digest(waiting)
+    backfill = backfill_of(recalling(tmp_path, clock), tmp_path)
+    [waiting] = backfill.waiting()
+    assert not backfill.digest(waiting)
     clock.at += 3 * NS_PER_S
-    assert filler.digest(waiting)
+    assert backfill.digest(waiting)
 
 
 def test_a_changed_bag_or_sidecar_has_the_bag_digested_again(tmp_path: Path) -> None:
     path = bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    fill_catalogue(filler_of(memory, tmp_path))
+    fill_catalogue(backfill_of(memory, tmp_path))
     write_handover(path.parent, Handover())
-    assert len(filler_of(recalling(tmp_path), tmp_path).waiting()) == 1
-    fill_catalogue(filler_of(recalling(tmp_path), tmp_path))
+    assert len(backfill_of(recalling(tmp_path), tmp_path).waiting()) == 1
+    fill_catalogue(backfill_of(recalling(tmp_path), tmp_path))
     path.write_bytes(bag(tmp_path, 1).read_bytes())
-    assert path in [each.path for each in filler_of(recalling(tmp_path), tmp_path).waiting()]
+    assert path in [each.path for each in backfill_of(recalling(tmp_path), tmp_path).waiting()]
 
 
 class Meddling(Digester):
@@ -117,9 +117,9 @@ class Failing(Digester):
 def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    filler = filler_of(memory, tmp_path, Meddling(memory.reader, memory.extractor, 10.0))
-    [waiting] = filler.waiting()
-    assert not filler.digest(waiting)
+    backfill = backfill_of(memory, tmp_path, Meddling(memory.reader, memory.extractor, 10.0))
+    [waiting] = backfill.waiting()
+    assert not backfill.digest(waiting)
     assert memory.recall is not None
     assert memory.recall.catalogue.paths() == []
 
@@ -127,17 +127,17 @@ def test_what_changed_while_it_was_read_is_not_kept(tmp_path: Path) -> None:
 def test_a_bag_that_cannot_be_digested_is_told_of_and_not_tried_for_ever(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     memory = recalling(tmp_path)
-    filler = filler_of(memory, tmp_path, Failing(memory.reader, memory.extractor, 10.0))
-    assert fill_catalogue(filler) == Progress(1, 0, 1)
+    backfill = backfill_of(memory, tmp_path, Failing(memory.reader, memory.extractor, 10.0))
+    assert fill_catalogue(backfill) == Progress(1, 0, 1)
     assert len(queries.list_recorded_topics(memory, Call())) == 1
 
 
 def test_entries_of_bags_that_are_gone_are_dropped(tmp_path: Path) -> None:
     paths = [bag(tmp_path, number) for number in range(3)]
     memory = recalling(tmp_path)
-    fill_catalogue(filler_of(memory, tmp_path))
+    fill_catalogue(backfill_of(memory, tmp_path))
     paths[0].unlink()
-    filler_of(memory, tmp_path).prune()
+    backfill_of(memory, tmp_path).prune()
     assert memory.recall is not None
     assert sorted(memory.recall.catalogue.paths()) == ["rec/rec_1.mcap", "rec/rec_2.mcap"]
 
@@ -147,22 +147,22 @@ def test_a_bag_directory_that_is_gone_for_a_while_keeps_its_entries(tmp_path: Pa
     bag(bag_dir, 0)
     recall = DigestCache(Catalogue([tmp_path / FILE], "test"), bag_dir)
     memory = replace(memory_of(bag_dir), recall=recall)
-    fill_catalogue(filler_of(memory, bag_dir))
+    fill_catalogue(backfill_of(memory, bag_dir))
     bag_dir.rename(elsewhere)
-    filler_of(memory, bag_dir).prune()
+    backfill_of(memory, bag_dir).prune()
     assert recall.catalogue.paths() == ["rec/rec_0.mcap"]
 
 
 async def test_in_the_background_what_closes_is_digested(tmp_path: Path) -> None:
     bag(tmp_path, 0)
-    filler = filler_of(recalling(tmp_path), tmp_path)
+    backfill = backfill_of(recalling(tmp_path), tmp_path)
     with anyio.fail_after(30):
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_backfilled, filler, ["/no/such/program"], 0.001)
-            while filler.progress().waiting:
+            tasks.start_soon(keep_backfilled, backfill, ["/no/such/program"], 0.001)
+            while backfill.progress().waiting:
                 await anyio.lowlevel.checkpoint()
             bag(tmp_path, 1)
-            while filler.progress() != Progress(2, 0, 0):
+            while backfill.progress() != Progress(2, 0, 0):
                 await anyio.lowlevel.checkpoint()
             tasks.cancel_scope.cancel()
 
@@ -173,11 +173,11 @@ async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
 ) -> None:
     for number in range(BACKLOG + 2):
         bag(tmp_path, number)
-    filler = filler_of(recalling(tmp_path), tmp_path)
+    backfill = backfill_of(recalling(tmp_path), tmp_path)
     with anyio.fail_after(60):
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_backfilled, filler, helper, 0.001)
-            while filler.progress().waiting:
+            tasks.start_soon(keep_backfilled, backfill, helper, 0.001)
+            while backfill.progress().waiting:
                 await anyio.lowlevel.checkpoint()
             tasks.cancel_scope.cancel()
 
@@ -186,10 +186,10 @@ async def test_health_tells_how_far_the_catalogue_is(tmp_path: Path) -> None:
     for number in range(3):
         bag(tmp_path, number)
     memory = recalling(tmp_path)
-    filler = filler_of(memory, tmp_path)
-    filler.digest(filler.waiting()[0])
-    told = await Health(memory, "1.2.3", filler)()
-    assert told["catalogue"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
+    backfill = backfill_of(memory, tmp_path)
+    backfill.digest(backfill.waiting()[0])
+    reply = await Health(memory, "1.2.3", backfill)()
+    assert reply["catalogue"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
 
 
 # The command
@@ -257,15 +257,15 @@ def test_the_command_counts_the_warnings_of_the_log_instead_of_showing_them(
     hour_ago = time.time_ns() - 3600 * NS_PER_S
     os.utime(tmp_path / "rec" / "rec_0.mcap", ns=(hour_ago, hour_ago))
     assert main(["index", "--bag-dir", str(tmp_path)]) == 0
-    told = capsys.readouterr().err
-    assert "1 warning logged (bag_damaged)" in told
-    assert '"event"' not in told
+    reply = capsys.readouterr().err
+    assert "1 warning logged (bag_damaged)" in reply
+    assert '"event"' not in reply
 
 
 def test_texts_of_the_newest_bag_are_found_before_and_after_it_is_digested(tmp_path: Path) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "scissors")])
     memory = recalling(tmp_path)
     before = queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors")
-    fill_catalogue(filler_of(memory, tmp_path))
+    fill_catalogue(backfill_of(memory, tmp_path))
     assert queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors") == before
     assert before.found is not None

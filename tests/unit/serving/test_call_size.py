@@ -78,9 +78,9 @@ async def test_a_message_that_holds_too_much_is_refused_before_it_is_parsed(
     web = app()
     async with running(web), client(web) as http:
         monkeypatch.setattr(json, "loads", lambda *_, **__: pytest.fail("it was parsed"))
-        told = await http.post(path, content=body, headers=MCP_HEADERS)
-    assert told.status_code == 413
-    assert told.text.startswith("The request ")
+        reply = await http.post(path, content=body, headers=MCP_HEADERS)
+    assert reply.status_code == 413
+    assert reply.text.startswith("The request ")
 
 
 @pytest.mark.parametrize("body", [b'"' * MAX_BODY_BYTES, b'"x"' * (MAX_BODY_BYTES // 3)])

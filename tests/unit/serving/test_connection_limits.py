@@ -78,9 +78,9 @@ class Served:
             writer.write(part)
             await writer.drain()
         async with asyncio.timeout(BOUND_S):
-            told = await reader.read()
+            shown = await reader.read()
         writer.close()
-        return told
+        return shown
 
     async def gone(self) -> None:
         async with asyncio.timeout(BOUND_S):
@@ -107,9 +107,9 @@ async def test_headers_that_do_not_come_to_their_end_are_answered_with_timeout(
     sent: list[bytes],
 ) -> None:
     async with serving() as served:
-        told = await served.reply(*sent)
-        assert told.startswith(b"HTTP/1.1 408 Request Timeout\r\n")
-        assert told.endswith(b"did not come to its end in time.\n")
+        shown = await served.reply(*sent)
+        assert shown.startswith(b"HTTP/1.1 408 Request Timeout\r\n")
+        assert shown.endswith(b"did not come to its end in time.\n")
         await served.gone()
 
 
@@ -126,8 +126,8 @@ async def test_headers_that_trickle_win_no_time() -> None:
 
         task = asyncio.create_task(trickle())
         async with asyncio.timeout(BOUND_S):
-            told = await reader.read()
-        assert b" 408 " in told
+            shown = await reader.read()
+        assert b" 408 " in shown
         task.cancel()
         writer.close()
         await served.gone()
@@ -154,9 +154,9 @@ async def test_a_body_that_does_not_come_to_its_end_is_answered_with_timeout(
 @pytest.mark.usefixtures("hurried")
 async def test_what_is_left_of_a_body_that_was_answered_early_is_not_waited_for() -> None:
     async with serving() as served:
-        told = await served.reply(b"POST /early HTTP/1.1\r\ncontent-length: 99\r\nhost: a\r\n\r\n")
-        assert told.count(b"HTTP/1.1 ") == 1
-        assert told.startswith(b"HTTP/1.1 200")
+        shown = await served.reply(b"POST /early HTTP/1.1\r\ncontent-length: 99\r\nhost: a\r\n\r\n")
+        assert shown.count(b"HTTP/1.1 ") == 1
+        assert shown.startswith(b"HTTP/1.1 200")
         await served.gone()
 
 
@@ -179,8 +179,8 @@ async def test_requests_in_time_are_answered_one_after_another_on_one_connection
         for request in (GET, POST + b"0123456789", GET, POST + b"0123456789"):
             writer.write(request)
             async with asyncio.timeout(BOUND_S):
-                told = await reader.readuntil(b"\r\n\r\nok")
-            assert told.startswith(b"HTTP/1.1 200")
+                shown = await reader.readuntil(b"\r\n\r\nok")
+            assert shown.startswith(b"HTTP/1.1 200")
         writer.close()
 
 
@@ -204,9 +204,9 @@ async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
             writer.write(GET)
             async with asyncio.timeout(BOUND_S):
                 await reader.readuntil(b"ok")
-        told = await served.reply()
-        assert told.startswith(b"HTTP/1.1 503 Service Unavailable\r\n")
-        assert told.endswith(b"Too many connections; close some.\n")
+        shown = await served.reply()
+        assert shown.startswith(b"HTTP/1.1 503 Service Unavailable\r\n")
+        assert shown.endswith(b"Too many connections; close some.\n")
         for reader, writer in open_ones:
             writer.write(GET)
             async with asyncio.timeout(BOUND_S):
@@ -231,8 +231,8 @@ async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
 )
 async def test_headers_without_end_and_what_is_no_http_are_refused(head: bytes) -> None:
     async with serving() as served:
-        told = await served.reply(head)
-        assert told == b"" or told.startswith(b"HTTP/1.1 4")  # may be cut by what was left unread
+        shown = await served.reply(head)
+        assert shown == b"" or shown.startswith(b"HTTP/1.1 4")  # may be cut by what was left unread
         await served.gone()
 
 

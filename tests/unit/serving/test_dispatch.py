@@ -65,7 +65,7 @@ def served(*tools: Tool, timeout_s: float = 25.0, max_chars: int = 24_000) -> Ep
     return EpisodicServer(dispatcher, name="episodic", version="1.2.3", instructions="Ask away.")
 
 
-def told(result: CallToolResult) -> Any:
+def sent(result: CallToolResult) -> Any:
     """The reply, held to be one text block and nothing else."""
     [block] = result.content
     assert isinstance(block, TextContent)
@@ -98,7 +98,7 @@ def log() -> Iterator[LogCapture]:
 async def test_a_reply_is_one_text_block_without_structured_content() -> None:
     async with Client(served(tool("ask", lambda _call: value({"x": 1})))) as client:
         result = await client.call_tool("ask", {})
-        assert told(result)["value"] == {"x": 1}
+        assert sent(result)["value"] == {"x": 1}
         assert not result.is_error
         [listed] = (await client.list_tools()).tools
         assert listed.output_schema is None
@@ -137,7 +137,7 @@ async def test_every_error_is_json(
     late = tool("late", raising(QueryTimeoutError("too long")))
     async with Client(served(none, late)) as client:
         result = await client.call_tool(name, given)
-        assert told(result) == error
+        assert sent(result) == error
         assert result.is_error == is_error
 
 
@@ -145,9 +145,9 @@ async def test_an_unknown_tool_is_answered_with_the_nearest_names() -> None:
     async with Client(served(tool("get_position_at", raising(ValueError())))) as client:
         result = await client.call_tool("get_positon", {})
         assert result.is_error
-        assert told(result)["error"] == "invalid_arguments"
-        assert told(result)["detail"].endswith("do you mean get_position_at?")
-        assert "there are: get_position_at" in told(await client.call_tool("qqq", {}))["detail"]
+        assert sent(result)["error"] == "invalid_arguments"
+        assert sent(result)["detail"].endswith("do you mean get_position_at?")
+        assert "there are: get_position_at" in sent(await client.call_tool("qqq", {}))["detail"]
 
 
 @pytest.mark.parametrize("error", [KeyError("secret"), RecursionError(), MemoryError()])
@@ -158,14 +158,14 @@ async def test_a_fault_is_logged_and_told_without_its_inside(
         result = await client.call_tool("ask", {})
         again = await client.call_tool("ask", {"bad": 1})
     assert result.is_error
-    assert told(result)["error"] == "internal"
-    assert "secret" not in told(result)["detail"]
-    assert told(again)["error"] == "invalid_arguments"
+    assert sent(result)["error"] == "internal"
+    assert "secret" not in sent(result)["detail"]
+    assert sent(again)["error"] == "invalid_arguments"
     failed, called, _ = log.entries
     assert failed["event"] == "tool_failed"
     assert failed["exc_info"] is True
     assert failed["correlation_id"] == called["correlation_id"]
-    assert failed["correlation_id"] in told(result)["detail"]
+    assert failed["correlation_id"] in sent(result)["detail"]
 
 
 class BrokenReplies(Replies):
@@ -225,7 +225,7 @@ async def test_a_query_that_takes_too_long_gives_up_by_itself() -> None:
     async with Client(served(tool("slow", until_given_up), timeout_s=1.0)) as client:
         result = await client.call_tool("slow", {})
         assert result.is_error
-        assert told(result) == {"error": "timeout", "detail": "the question needs more than 0.9 s"}
+        assert sent(result) == {"error": "timeout", "detail": "the question needs more than 0.9 s"}
 
 
 async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> None:
@@ -239,8 +239,8 @@ async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> No
         result = await client.call_tool("stuck", {})
         released.set()
     assert result.is_error
-    assert told(result)["error"] == "timeout"
-    assert told(result)["detail"].startswith("stuck needs more than 0.05 s")
+    assert sent(result)["error"] == "timeout"
+    assert sent(result)["detail"].startswith("stuck needs more than 0.05 s")
 
 
 async def test_tools_are_listed_while_queries_run_and_wait() -> None:
@@ -270,7 +270,7 @@ async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
         for _ in range(BLOCKING_AT_ONCE + QUICK_AT_ONCE):
             tasks.start_soon(client.call_tool, "slow", {})
         await anyio.wait_all_tasks_blocked()
-        assert told(await client.call_tool("quick", {}))["value"] == 2
+        assert sent(await client.call_tool("quick", {}))["value"] == 2
         assert not released.is_set()
         released.set()
 
@@ -342,9 +342,9 @@ async def test_a_call_that_waits_for_all_of_its_time_is_told_that_the_server_is_
         for _ in range(BLOCKING_AT_ONCE + 2):
             tasks.start_soon(call)
     held.released.set()
-    told = [json.loads(text) for text in replies]
-    assert sorted(each["error"] for each in told) == ["busy", "busy", "timeout", "timeout"]
-    [detail] = {each["detail"] for each in told if each["error"] == "busy"}
+    sent = [json.loads(text) for text in replies]
+    assert sorted(each["error"] for each in sent) == ["busy", "busy", "timeout", "timeout"]
+    [detail] = {each["detail"] for each in sent if each["error"] == "busy"}
     assert detail == (
         "slow waited 0.05 s behind other questions and was not begun; ask again, and fewer at once"
     )
@@ -368,26 +368,26 @@ async def test_a_timeout_after_a_wait_says_how_long_the_wait_was(
     monkeypatch.setattr("ros2_memory.serving.dispatch._REPORTED_WAIT_S", 0.0)
     late = tool("late", raising(QueryTimeoutError("too long", 5)))
     reply = await served(late).dispatcher.answer("late", {})
-    told = json.loads(reply.text)
-    assert told["detail"] == "too long (it waited 0.0 s of its time behind other questions)"
-    assert "searched_back_to" in told
+    sent = json.loads(reply.text)
+    assert sent["detail"] == "too long (it waited 0.0 s of its time behind other questions)"
+    assert "searched_back_to" in sent
 
 
 async def test_more_calls_than_may_wait_are_told_so() -> None:
     held = Held()
     dispatcher = served(tool("slow", held.ask, blocking=True)).dispatcher
-    told: list[Any] = []
+    sent: list[Any] = []
 
     async def call() -> None:
-        told.append(json.loads((await dispatcher.answer("slow", {}, "flood")).text))
+        sent.append(json.loads((await dispatcher.answer("slow", {}, "flood")).text))
 
     async with anyio.create_task_group() as tasks:
         for _ in range(MOST_WAITING + BLOCKING_AT_ONCE + 5):
             tasks.start_soon(call)
         await anyio.wait_all_tasks_blocked()
-        assert [each["error"] for each in told] == ["busy"] * 5
+        assert [each["error"] for each in sent] == ["busy"] * 5
         held.released.set()
-    assert len(told) == MOST_WAITING + BLOCKING_AT_ONCE + 5
+    assert len(sent) == MOST_WAITING + BLOCKING_AT_ONCE + 5
 
 
 async def test_stopping_has_running_queries_give_up() -> None:
@@ -407,7 +407,7 @@ async def test_stopping_has_running_queries_give_up() -> None:
         tasks.start_soon(call, client)
         await anyio.to_thread.run_sync(started.wait)
         server.dispatcher.stop()
-    assert told(results[0])["error"] == "timeout"
+    assert sent(results[0])["error"] == "timeout"
 
 
 async def test_a_reply_stays_below_the_cap() -> None:
@@ -415,4 +415,4 @@ async def test_a_reply_stays_below_the_cap() -> None:
     async with Client(server) as client:
         result = await client.call_tool("ask", {})
     assert len(cast("TextContent", result.content[0]).text) <= 1500
-    assert told(result)["notes"]
+    assert sent(result)["notes"]

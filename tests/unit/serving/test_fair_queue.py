@@ -44,26 +44,26 @@ async def until(what: Callable[[], bool]) -> None:
             await asyncio.sleep(0.001)
 
 
-def started(lane: FairQueue, gates: Gates, client: str, count: int) -> list[asyncio.Task[str]]:
-    return [asyncio.create_task(lane.run(client, gates.ask(f"{client}{n}"))) for n in range(count)]
+def started(queue: FairQueue, gates: Gates, client: str, count: int) -> list[asyncio.Task[str]]:
+    return [asyncio.create_task(queue.run(client, gates.ask(f"{client}{n}"))) for n in range(count)]
 
 
 async def test_so_many_run_at_once_and_the_others_wait() -> None:
-    lane, gates = FairQueue("test", 2), Gates()
-    tasks = started(lane, gates, "a", 5)
+    queue, gates = FairQueue("test", 2), Gates()
+    tasks = started(queue, gates, "a", 5)
     await until(lambda: len(gates.begun) == 2)
-    assert (lane.running, lane.waiting) == (2, 3)
+    assert (queue.running, queue.waiting) == (2, 3)
     gates.release()
     assert await asyncio.gather(*tasks) == [f"a{n}" for n in range(5)]
-    await until(lambda: (lane.running, lane.waiting) == (0, 0))
+    await until(lambda: (queue.running, queue.waiting) == (0, 0))
 
 
 async def test_a_client_that_floods_the_queue_does_not_hold_up_another() -> None:
-    lane, gates = FairQueue("test", 2), Gates()
-    flood = started(lane, gates, "flood", 64)
+    queue, gates = FairQueue("test", 2), Gates()
+    flood = started(queue, gates, "flood", 64)
     await until(lambda: len(gates.begun) == 2)
-    [other] = started(lane, gates, "other", 1)
-    await until(lambda: lane.waiting == 63)
+    [other] = started(queue, gates, "other", 1)
+    await until(lambda: queue.waiting == 63)
     gates.release("flood0", "other0")
     assert await other == "other0"
     assert gates.begun[2] == "other0"
@@ -72,21 +72,21 @@ async def test_a_client_that_floods_the_queue_does_not_hold_up_another() -> None
 
 
 async def test_clients_take_turns_and_each_keeps_its_own_order() -> None:
-    lane, gates = FairQueue("test", 1), Gates()
+    queue, gates = FairQueue("test", 1), Gates()
     tasks = [
-        *started(lane, gates, "a", 4),
-        *started(lane, gates, "b", 2),
-        *started(lane, gates, "c", 1),
+        *started(queue, gates, "a", 4),
+        *started(queue, gates, "b", 2),
+        *started(queue, gates, "c", 1),
     ]
-    await until(lambda: lane.waiting == 6)
+    await until(lambda: queue.waiting == 6)
     gates.release()
     await asyncio.gather(*tasks)
     assert gates.begun == ["a0", "a1", "b0", "c0", "a2", "b1", "a3"]
 
 
 async def test_the_next_place_goes_to_whoever_has_the_fewest() -> None:
-    lane, gates = FairQueue("test", 3), Gates()
-    tasks = [*started(lane, gates, "a", 4), *started(lane, gates, "b", 3)]
+    queue, gates = FairQueue("test", 3), Gates()
+    tasks = [*started(queue, gates, "a", 4), *started(queue, gates, "b", 3)]
     await until(lambda: len(gates.begun) == 3)
     gates.release("a0")  # a has two left running, b has none
     await until(lambda: len(gates.begun) == 4)
@@ -98,35 +98,35 @@ async def test_the_next_place_goes_to_whoever_has_the_fewest() -> None:
 
 
 async def test_a_question_whose_caller_leaves_gives_its_place_in_the_queue_back() -> None:
-    lane, gates = FairQueue("test", 1), Gates()
-    tasks = started(lane, gates, "a", 3)
-    await until(lambda: lane.waiting == 2)
+    queue, gates = FairQueue("test", 1), Gates()
+    tasks = started(queue, gates, "a", 3)
+    await until(lambda: queue.waiting == 2)
     tasks[1].cancel()
-    await until(lambda: lane.waiting == 1)
+    await until(lambda: queue.waiting == 1)
     gates.release()
     assert await tasks[2] == "a2"
     assert gates.begun == ["a0", "a2"]
 
 
 async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -> None:
-    lane, gates = FairQueue("test", 1), Gates()
-    stuck, following = started(lane, gates, "a", 2)
+    queue, gates = FairQueue("test", 1), Gates()
+    stuck, following = started(queue, gates, "a", 2)
     await until(lambda: gates.begun == ["a0"])
     stuck.cancel()
     await until(stuck.done)
-    assert (lane.running, lane.waiting) == (1, 1)
+    assert (queue.running, queue.waiting) == (1, 1)
     gates.release()
     assert await following == "a1"
-    await until(lambda: lane.running == 0)
+    await until(lambda: queue.running == 0)
 
 
 @pytest.mark.parametrize("has_turn", [True, False])
 async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn: bool) -> None:
-    lane, gates = FairQueue("test", 1), Gates()
-    first, leaving, last = started(lane, gates, "a", 3)
-    await until(lambda: lane.waiting == 2)
+    queue, gates = FairQueue("test", 1), Gates()
+    first, leaving, last = started(queue, gates, "a", 3)
+    await until(lambda: queue.waiting == 2)
     gates.release("a0")
-    lane._threads.submit(int).result(BOUND_S)  # so the first is done, which the loop learns next
+    queue._threads.submit(int).result(BOUND_S)  # so the first is done, which the loop learns next
     if has_turn:
         asyncio.get_running_loop().call_soon(leaving.cancel)
     else:
@@ -135,43 +135,43 @@ async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn:
     assert [await first, await last] == ["a0", "a2"]
     assert leaving.cancelled()
     assert gates.begun == ["a0", "a2"]
-    await until(lambda: (lane.running, lane.waiting) == (0, 0))
+    await until(lambda: (queue.running, queue.waiting) == (0, 0))
 
 
 async def test_a_full_queue_refuses_the_newest_of_whoever_fills_it() -> None:
-    lane, gates = FairQueue("test", 1, most_waiting=4), Gates()
-    flood = started(lane, gates, "flood", 6)
-    await until(lambda: lane.waiting == 4)
+    queue, gates = FairQueue("test", 1, most_waiting=4), Gates()
+    flood = started(queue, gates, "flood", 6)
+    await until(lambda: queue.waiting == 4)
     with pytest.raises(BusyError, match="4 questions wait already"):
         await flood[5]
-    [other] = started(lane, gates, "other", 1)
+    [other] = started(queue, gates, "other", 1)
     with pytest.raises(BusyError, match="fewer at once"):
         await flood[4]
-    assert lane.waiting == 4
+    assert queue.waiting == 4
     gates.release()
     assert await other == "other0"
     assert await asyncio.gather(*flood[:4]) == [f"flood{n}" for n in range(4)]
 
 
 async def test_what_a_question_raises_reaches_its_caller_and_frees_the_place() -> None:
-    lane = FairQueue("test", 1)
+    queue = FairQueue("test", 1)
 
     def ask() -> None:
         raise KeyError("inside")
 
     for _ in range(3):
         with pytest.raises(KeyError, match="inside"):
-            await lane.run("a", ask)
-    await until(lambda: lane.running == 0)
+            await queue.run("a", ask)
+    await until(lambda: queue.running == 0)
 
 
 async def test_a_stopped_lane_takes_no_more_and_lets_its_threads_go() -> None:
-    lane, gates = FairQueue("stopping", 2), Gates()
-    [running] = started(lane, gates, "a", 1)
+    queue, gates = FairQueue("stopping", 2), Gates()
+    [running] = started(queue, gates, "a", 1)
     await until(lambda: gates.begun == ["a0"])
-    lane.stop()
+    queue.stop()
     with pytest.raises(BusyError, match="stopping"):
-        await lane.run("a", gates.ask("never"))
+        await queue.run("a", gates.ask("never"))
     gates.release()
     assert await running == "a0"
     await until(

@@ -64,17 +64,17 @@ async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
 
 async def test_the_span_of_the_memory_is_told(tmp_path: Path) -> None:
     write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a"), text(T0 + NS_PER_S, "b")])
-    told = await Health(memory_at(tmp_path), "1")()
-    assert (told["bags"], told["earliest"], told["latest"]) == (1, 1784023200.0, 1784023201.0)
+    reply = await Health(memory_at(tmp_path), "1")()
+    assert (reply["bags"], reply["earliest"], reply["latest"]) == (1, 1784023200.0, 1784023201.0)
 
 
 async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
     (tmp_path / "torn.mcap").write_bytes(b"no bag at all, but not empty")
-    told = await Health(memory_at(tmp_path, seconds=3600), "1")()
-    assert told["status"] == "degraded"
-    assert told["damaged"] == 1
-    assert told["problems"] == ["1 damaged bag file; data_time_range lists what does not answer"]
-    assert told["damaged_files"] == [
+    reply = await Health(memory_at(tmp_path, seconds=3600), "1")()
+    assert reply["status"] == "degraded"
+    assert reply["damaged"] == 1
+    assert reply["problems"] == ["1 damaged bag file; data_time_range lists what does not answer"]
+    assert reply["damaged_files"] == [
         {
             "file": f"{tmp_path.name}/torn.mcap",
             "reason": "not an MCAP file: it does not begin as one",
@@ -90,34 +90,34 @@ async def test_everything_that_does_not_answer_is_counted_and_the_last_of_it_nam
     (tmp_path / "r" / "r_1.db3").write_bytes(b"of another storage")
     for number in range(5):
         write_mcap(tmp_path / "boot" / f"boot_{number}.mcap", [text(number, "a")])
-    told = await Health(memory_of(tmp_path), "1")()
-    assert told["status"] == "ok"
-    counts = {what: told[what] for what in ("damaged", "incomplete", "unread", "clock_faults")}
+    reply = await Health(memory_of(tmp_path), "1")()
+    assert reply["status"] == "ok"
+    counts = {what: reply[what] for what in ("damaged", "incomplete", "unread", "clock_faults")}
     assert counts == {"damaged": 0, "incomplete": 1, "unread": 1, "clock_faults": 5}
-    assert told["earliest"] == T0 / NS_PER_S
-    lists = [told[name] for name in ("incomplete_files", "unread_files", "clock_fault_files")]
+    assert reply["earliest"] == T0 / NS_PER_S
+    lists = [reply[name] for name in ("incomplete_files", "unread_files", "clock_fault_files")]
     assert [len(each) for each in lists if isinstance(each, list)] == [1, 1, NAMED]
 
 
 async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) -> None:
     write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
-    told = await Health(memory_at(tmp_path, seconds=-3600), "1")()
-    assert told["problems"] == [
+    reply = await Health(memory_at(tmp_path, seconds=-3600), "1")()
+    assert reply["problems"] == [
         "every bag is dated after now: the clock of this machine is behind, or theirs ahead"
     ]
 
 
 async def test_a_missing_bag_directory_is_told(tmp_path: Path) -> None:
-    told = await Health(memory_at(tmp_path / "later"), "1")()
-    assert told["bags"] == 0
-    assert told["status"] == "degraded"
+    reply = await Health(memory_at(tmp_path / "later"), "1")()
+    assert reply["bags"] == 0
+    assert reply["status"] == "degraded"
 
 
 async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
     write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), restarts=2, missing=("/c",)))
-    told = await Health(memory_at(tmp_path, seconds=3), "1")()
-    assert told["status"] == "ok"
-    assert told["recorder"] == {
+    reply = await Health(memory_at(tmp_path, seconds=3), "1")()
+    assert reply["status"] == "ok"
+    assert reply["recorder"] == {
         "state": "recording",
         "live": True,
         "heartbeat_age_s": 3.0,
@@ -131,10 +131,10 @@ async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
 
 async def test_age_that_is_held_is_shown_and_degrades_nothing(tmp_path: Path) -> None:
     write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), age_held="2 bags stay"))
-    told = await Health(memory_at(tmp_path, seconds=3), "1")()
-    assert told["status"] == "ok"
-    assert isinstance(told["recorder"], dict)
-    assert told["recorder"]["age_held"] == "2 bags stay"
+    reply = await Health(memory_at(tmp_path, seconds=3), "1")()
+    assert reply["status"] == "ok"
+    assert isinstance(reply["recorder"], dict)
+    assert reply["recorder"]["age_held"] == "2 bags stay"
 
 
 @pytest.mark.parametrize(
@@ -152,9 +152,9 @@ async def test_a_recorder_that_does_not_record_degrades_it(
     tmp_path: Path, heartbeat: Heartbeat, seconds: int, problem: str
 ) -> None:
     write_heartbeat(tmp_path, heartbeat)
-    told = await Health(memory_at(tmp_path, seconds=seconds), "1")()
-    assert told["status"] == "degraded"
-    assert told["problems"] == [problem]
+    reply = await Health(memory_at(tmp_path, seconds=seconds), "1")()
+    assert reply["status"] == "degraded"
+    assert reply["problems"] == [problem]
 
 
 async def test_a_recorder_that_was_stopped_is_no_problem(tmp_path: Path) -> None:
@@ -176,12 +176,12 @@ async def test_health_answers_while_the_first_scan_runs(tmp_path: Path) -> None:
 
     memory = memory_at(tmp_path)
     slow = Slow(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
-    told = await Health(replace(memory, index=slow), "1", timeout_s=0.01)()
+    reply = await Health(replace(memory, index=slow), "1", timeout_s=0.01)()
     released.set()
     # On a busy machine patience may end before it is even begun.
     assert not begun.is_set() or ended.wait(10)
-    assert told["status"] == "degraded"
-    assert told["problems"] == ["the bag directory is being looked through"]
+    assert reply["status"] == "degraded"
+    assert reply["problems"] == ["the bag directory is being looked through"]
 
 
 async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
@@ -200,11 +200,11 @@ async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
     index = Hanging(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
     health = Health(replace(memory, index=index), "1", timeout_s=0.001)
     before = threading.active_count()
-    told = [await health() for _ in range(10)]
+    reply = [await health() for _ in range(10)]
     during = threading.active_count()
     released.set()
     health.stop()
-    assert {str(each["status"]) for each in told} == {"degraded"}
+    assert {str(each["status"]) for each in reply} == {"degraded"}
     assert during <= before + 1
     assert len(looks) <= 1
 
@@ -250,8 +250,8 @@ async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> 
     for number in range(50):
         (tmp_path / f"{'x' * 200}{number}.mcap").write_bytes(b"no bag at all, but not empty")
     names = tuple(f"/topic_{n}/{'y' * 300}" for n in range(1000))
-    told = beat(RecorderState.PAUSED, updated=T0 + 3600 * NS_PER_S, last_error="z" * 100_000)
-    write_heartbeat(tmp_path, replace(told, silent=names, subscribed=names, missing=names))
+    reply = beat(RecorderState.PAUSED, updated=T0 + 3600 * NS_PER_S, last_error="z" * 100_000)
+    write_heartbeat(tmp_path, replace(reply, silent=names, subscribed=names, missing=names))
     said = await Health(memory_at(tmp_path, seconds=3600), "1")()
     assert len(json.dumps(said)) < 10_000
     assert said["damaged"] == 50

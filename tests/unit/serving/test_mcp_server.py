@@ -57,11 +57,11 @@ async def test_the_fields_of_a_type_are_a_resource(tmp_path: Path) -> None:
     async with Client(server(tmp_path)) as client:
         [template] = (await client.list_resource_templates()).resource_templates
         assert template.uri_template == "episodic://schema/{type}"
-        told = await read(client, "episodic://schema/nav_msgs/msg/Odometry")
-        assert told["topics"] == ["/odom"]
-        assert told["fields"]["position.x"] == "number"
+        reply = await read(client, "episodic://schema/nav_msgs/msg/Odometry")
+        assert reply["topics"] == ["/odom"]
+        assert reply["fields"]["position.x"] == "number"
         again = await read(client, "episodic://schema/nav_msgs%2Fmsg%2FOdometry")
-        assert again == told
+        assert again == reply
         seen = await read(
             client, "episodic://schema/ros2_vision_interfaces/msg/VisionDetectionArray"
         )
@@ -71,8 +71,8 @@ async def test_the_fields_of_a_type_are_a_resource(tmp_path: Path) -> None:
 async def test_a_type_that_was_not_recorded_is_no_data(tmp_path: Path) -> None:
     write_run(tmp_path)
     async with Client(server(tmp_path)) as client:
-        told = await read(client, "episodic://schema/x/msg/Y")
-        assert (told["error"], told["reason"]) == ("no_data", "topic_not_recorded")
+        reply = await read(client, "episodic://schema/x/msg/Y")
+        assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
 
 
 @pytest.mark.parametrize("uri", ["episodic://nothing", "episodic://schema/", "file:///etc/passwd"])

@@ -36,15 +36,15 @@ async def test_only_the_root_is_the_page_and_only_to_be_read() -> None:
 async def test_its_policy_allows_its_own_script_and_style_and_nothing_else() -> None:
     async with client(app()) as http:
         headers = (await http.get("/")).headers
-    told = dict(each.split(" ", 1) for each in headers["content-security-policy"].split("; "))
+    reply = dict(each.split(" ", 1) for each in headers["content-security-policy"].split("; "))
     for kind in ("script", "style"):
         [body] = re.findall(f"<{kind}>(.*?)</{kind}>", HTML, re.DOTALL)
         digest = base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
-        assert told[f"{kind}-src"] == f"'sha256-{digest}'"
+        assert reply[f"{kind}-src"] == f"'sha256-{digest}'"
     for what in ("default-src", "base-uri", "form-action", "frame-ancestors"):
-        assert told[what] == "'none'"
-    assert told["connect-src"] == "'self'"
-    assert told["require-trusted-types-for"] == "'script'"
+        assert reply[what] == "'none'"
+    assert reply["connect-src"] == "'self'"
+    assert reply["require-trusted-types-for"] == "'script'"
     assert "unsafe" not in headers["content-security-policy"]
     assert headers["x-content-type-options"] == "nosniff"
     assert headers["referrer-policy"] == "no-referrer"

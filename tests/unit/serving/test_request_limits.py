@@ -63,7 +63,7 @@ class Client:
         return int(self.sent[0]["status"])
 
     @property
-    def told(self) -> str:
+    def reply(self) -> str:
         return b"".join(each.get("body", b"") for each in self.sent).decode()
 
 
@@ -90,13 +90,13 @@ async def asked(app: Any, client: Client) -> Client:
 )
 async def test_a_body_is_passed_on_whole(parts: list[bytes]) -> None:
     client = await asked(RequestLimits(echo), Client(*parts))
-    assert (client.status, client.told) == (200, str(sum(map(len, parts))))
+    assert (client.status, client.reply) == (200, str(sum(map(len, parts))))
 
 
 async def test_a_body_too_large_is_refused_by_what_is_counted() -> None:
     client = await asked(RequestLimits(echo), Client(*[b"x" * MIB] * 1000, content_length="5"))
     assert client.status == 413
-    assert client.told == f"The request is larger than {MAX_BODY_BYTES} bytes.\n"
+    assert client.reply == f"The request is larger than {MAX_BODY_BYTES} bytes.\n"
     assert client.taken == MAX_BODY_BYTES // MIB + 1
 
 
@@ -279,7 +279,7 @@ async def test_messages_are_bounded_however_their_session_is_spelt(query: str) -
 
 async def test_a_message_for_what_is_no_session_is_left_to_the_application() -> None:
     for query in ("", "session_id=", "session_id=none"):
-        assert (await asked(RequestLimits(echo), message(query))).told == "2"
+        assert (await asked(RequestLimits(echo), message(query))).reply == "2"
 
 
 async def test_other_scopes_and_requests_without_a_body_are_left_alone() -> None:

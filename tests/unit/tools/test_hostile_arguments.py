@@ -50,11 +50,11 @@ def held(reply: Reply) -> Any:
     """The reply as JSON, held to what every reply promises."""
     assert len(reply.text) <= LONGEST_REPLY
     reply.text.encode()
-    told = json.loads(reply.text, parse_constant=pytest.fail)
-    if isinstance(told, dict) and "error" in told:
-        assert told["error"] in CODES, told
-        assert 0 < len(told["detail"]) <= LONGEST_DETAIL
-    return told
+    shown = json.loads(reply.text, parse_constant=pytest.fail)
+    if isinstance(shown, dict) and "error" in shown:
+        assert shown["error"] in CODES, shown
+        assert 0 < len(shown["detail"]) <= LONGEST_DETAIL
+    return shown
 
 
 @settings(
@@ -76,15 +76,15 @@ def test_every_argument_stands_every_hostile_value(
 ) -> None:
     good = next((given for tool, given, _ in ANSWERED if tool == name), {"label": "here"})
     for value in (*NUMBERS, *TEXTS, *OTHERS):
-        told = held(asked(dispatcher, name, {**good, argument: value}))
-        if isinstance(told, dict) and told.get("error") == "invalid_arguments":
-            assert argument in told["detail"] or "start" in told["detail"], (value, told)
+        shown = held(asked(dispatcher, name, {**good, argument: value}))
+        if isinstance(shown, dict) and shown.get("error") == "invalid_arguments":
+            assert argument in shown["detail"] or "start" in shown["detail"], (value, shown)
 
 
 def test_a_thousand_unknown_arguments_are_told_in_few_words(dispatcher: Dispatcher) -> None:
-    told = held(asked(dispatcher, "list_frames", {f"x{n}": n for n in range(1000)}))
-    assert told["error"] == "invalid_arguments"
-    assert "995 more" in told["detail"]
+    shown = held(asked(dispatcher, "list_frames", {f"x{n}": n for n in range(1000)}))
+    assert shown["error"] == "invalid_arguments"
+    assert "995 more" in shown["detail"]
 
 
 @pytest.mark.parametrize(
@@ -100,26 +100,26 @@ def test_too_many_arguments_are_told_before_any_is_looked_at(
     dispatcher: Dispatcher, given: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Signature, "parse", lambda *_: pytest.fail("it was looked at"))
-    told = held(asked(dispatcher, "find_last_match", given))
-    assert told["error"] == "invalid_arguments"
-    assert re.search(r"^(topic|more than) .*(values|levels|arguments)", told["detail"])
+    shown = held(asked(dispatcher, "find_last_match", given))
+    assert shown["error"] == "invalid_arguments"
+    assert re.search(r"^(topic|more than) .*(values|levels|arguments)", shown["detail"])
 
 
 @pytest.mark.parametrize("name", ["x" * MEGABYTE, "\ud800", "", "\x00", "get_position_at\x00"])
 def test_an_unknown_tool_is_told_in_few_words(dispatcher: Dispatcher, name: str) -> None:
-    told = held(asked(dispatcher, name, {}))
-    assert told["error"] == "invalid_arguments"
-    assert "there is no tool" in told["detail"]
+    shown = held(asked(dispatcher, name, {}))
+    assert shown["error"] == "invalid_arguments"
+    assert "there is no tool" in shown["detail"]
 
 
 def test_a_reversed_window_is_told(dispatcher: Dispatcher) -> None:
     for start, end in ((2, 1), (1e9, 0), (1.5, 1.4999)):
-        told = held(asked(dispatcher, "trajectory_summary", {"start": start, "end": end}))
-        assert (told["error"], "start" in told["detail"]) == ("invalid_arguments", True)
+        shown = held(asked(dispatcher, "trajectory_summary", {"start": start, "end": end}))
+        assert (shown["error"], "start" in shown["detail"]) == ("invalid_arguments", True)
 
 
 def test_deep_values_are_refused_wherever_they_stand(dispatcher: Dispatcher) -> None:
     for value in (nested(DEEP), nested(DEEP, kind="object")):
         given = {"topic": "/odom", "condition_type": "near_position", "value": {"x": value}}
-        told = held(asked(dispatcher, "find_last_match", given))
-        assert (told["error"], "value" in told["detail"]) == ("invalid_arguments", True)
+        shown = held(asked(dispatcher, "find_last_match", given))
+        assert (shown["error"], "value" in shown["detail"]) == ("invalid_arguments", True)

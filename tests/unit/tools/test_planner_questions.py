@@ -171,10 +171,10 @@ def test_forty_questions_take_few_calls_and_few_characters(asking: Asking) -> No
     chars = {words: sum(map(len, texts)) for words, texts in asking.replies.items()}
     calls = sum(map(len, asking.replies.values()))
     longest = sorted(chars.items(), key=lambda each: -each[1])
-    told = f"{len(QUESTIONS)} questions, {calls} calls, {sum(chars.values())} characters: {longest}"
+    text = f"{len(QUESTIONS)} questions, {calls} calls, {sum(chars.values())} characters: {longest}"
     assert len(QUESTIONS) >= 40
-    assert calls <= MOST_CALLS_FOR_FORTY * forty, told
-    assert sum(chars.values()) <= MOST_CHARS_FOR_FORTY * forty, told
+    assert calls <= MOST_CALLS_FOR_FORTY * forty, text
+    assert sum(chars.values()) <= MOST_CHARS_FOR_FORTY * forty, text
 
 
 def test_the_forty_longest_alone_pass_the_bar(asking: Asking) -> None:
@@ -194,10 +194,10 @@ def test_what_a_planner_reads_of_the_writing_tool_is_short_too(world: World) -> 
     settings = load_settings(("server.write_tools=true",), {"MEMORY_BAG_DIR": str(world.folder)})
     server = build_server(settings, memory_of(world.folder))
     listed = server._listed
-    told: JsonValue = [
+    shown: JsonValue = [
         tool.model_dump(mode="json", by_alias=True, exclude_none=True) for tool in listed
     ]
-    assert len(to_json_text(told)) < MOST_CHARS_OF_TOOLS
+    assert len(to_json_text(shown)) < MOST_CHARS_OF_TOOLS
 
 
 def leaves(value: JsonValue, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:

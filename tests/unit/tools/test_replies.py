@@ -132,10 +132,10 @@ def test_topics_are_always_a_list_of_rows_of_five_keys_with_the_busiest_first(
     if len(listed) == len(rows) and not (listed and listed[-1]["type"] == ""):
         assert [each["count"] for each in listed] == [count for _, count, _ in topics]
         return
-    *told, rest = listed
-    left_out = sorted(rows, key=lambda row: -row.count)[len(told) :]
-    assert [each["count"] for each in told] == sorted((row.count for row in rows), reverse=True)[
-        : len(told)
+    *shown, rest = listed
+    left_out = sorted(rows, key=lambda row: -row.count)[len(shown) :]
+    assert [each["count"] for each in shown] == sorted((row.count for row in rows), reverse=True)[
+        : len(shown)
     ]
     assert (rest["topic"], rest["type"]) == (f"({len(left_out)} more: use pattern)", "")
     assert rest["first_ts"] == unix_rounded_up(min(row.first for row in left_out))
@@ -170,24 +170,24 @@ def test_a_topic_value_has_no_age_and_no_notes_unless_there_are_some() -> None:
         "timestamp": 1784023200.0,
         "value": 1.5,
     }
-    told = said(value(age=1_234_567_890, notes=("thinned",)))
-    assert told["age_s"] == 1.235
-    assert told["notes"] == ["thinned"]
+    shown = said(value(age=1_234_567_890, notes=("thinned",)))
+    assert shown["age_s"] == 1.235
+    assert shown["notes"] == ["thinned"]
 
 
 def test_an_empty_memory_has_nulls_for_its_span() -> None:
     empty = results.DataTimeRange(None, None, T0, 0, (), (), (), (), (), 0, ("there is nothing",))
-    told = said(empty)
-    assert [told[key] for key in ("earliest", "latest", "earliest_local", "latest_local")] == [
+    shown = said(empty)
+    assert [shown[key] for key in ("earliest", "latest", "earliest_local", "latest_local")] == [
         None
     ] * 4
-    assert told["now"] == 1784023200.0
-    assert told["bags"] == 0
-    assert told["notes"] == ["there is nothing"]
+    assert shown["now"] == 1784023200.0
+    assert shown["bags"] == 0
+    assert shown["notes"] == ["there is nothing"]
 
 
 def test_the_span_lists_gaps_and_files_below_the_bag_directory() -> None:
-    told = said(
+    shown = said(
         results.DataTimeRange(
             T0,
             T0 + 90 * NS_PER_S,
@@ -202,32 +202,32 @@ def test_the_span_lists_gaps_and_files_below_the_bag_directory() -> None:
         )
     )
     gap = {"start": 1784023210.0, "end": 1784023270.0, "duration_s": 60.0}
-    assert told["gaps"] == [gap]
-    assert told["incomplete"] == [{"file": "r1/r1_2.mcap", "reason": "left open"}]
-    assert told["active"] == [{"file": "r2/r2_0.mcap", "reason": "being written"}]
-    assert told["damaged"] == [{"file": "where.mcap", "reason": "no bag"}]
-    assert told["unread"] == []
-    assert told["silent_topics"] == 4
-    assert told["latest_local"].startswith("2026-07-1")
-    assert "notes" not in told
+    assert shown["gaps"] == [gap]
+    assert shown["incomplete"] == [{"file": "r1/r1_2.mcap", "reason": "left open"}]
+    assert shown["active"] == [{"file": "r2/r2_0.mcap", "reason": "being written"}]
+    assert shown["damaged"] == [{"file": "where.mcap", "reason": "no bag"}]
+    assert shown["unread"] == []
+    assert shown["silent_topics"] == 4
+    assert shown["latest_local"].startswith("2026-07-1")
+    assert "notes" not in shown
 
 
 def test_long_lists_of_files_show_the_last_ones_and_their_number() -> None:
     damaged = tuple(SetAside(BAGS / f"{n:03}.mcap", "torn") for n in range(50))
-    told = said(results.DataTimeRange(T0, T0, T0, 1, (), (), (), damaged, (), 0))
-    assert [each["file"] for each in told["damaged"]] == [f"{n:03}.mcap" for n in range(30, 50)]
-    assert told["damaged_count"] == 50
-    assert told["notes"] == ["damaged: the last 20 of 50 are listed"]
+    shown = said(results.DataTimeRange(T0, T0, T0, 1, (), (), (), damaged, (), 0))
+    assert [each["file"] for each in shown["damaged"]] == [f"{n:03}.mcap" for n in range(30, 50)]
+    assert shown["damaged_count"] == 50
+    assert shown["notes"] == ["damaged: the last 20 of 50 are listed"]
 
 
 def test_a_hundred_samples_of_odometry_stay_below_20_000_characters() -> None:
     whole = [odom(-1.2345 * n / 50, 2.3456 - n / 70) for n in range(100)]
     reply = REPLIES.answer(of_samples(whole))
     assert len(reply.text) < 20_000
-    told = json.loads(reply.text)
-    assert len(told["samples"]) == 100
-    assert told["samples"][1]["value"]["orientation"] == {"yaw_deg": 123.45}
-    assert "0 in every sample and left out: position.z, orientation.roll_deg" in told["notes"][0]
+    shown = json.loads(reply.text)
+    assert len(shown["samples"]) == 100
+    assert shown["samples"][1]["value"]["orientation"] == {"yaw_deg": 123.45}
+    assert "0 in every sample and left out: position.z, orientation.roll_deg" in shown["notes"][0]
 
 
 def test_a_hundred_positions_stay_below_8_000_characters() -> None:
@@ -238,18 +238,18 @@ def test_a_hundred_positions_stay_below_8_000_characters() -> None:
 
 
 def test_a_short_range_keeps_its_zeros() -> None:
-    told = said(of_samples([odom(1.0, 2.0), odom(2.0, 2.0)], ("5000 in all",)))
-    assert told["samples"][0] == {"timestamp": 1784023200.0, "value": odom(1.0, 2.0)}
-    assert told["total"] == 5000
-    assert told["notes"] == ["5000 in all"]
+    shown = said(of_samples([odom(1.0, 2.0), odom(2.0, 2.0)], ("5000 in all",)))
+    assert shown["samples"][0] == {"timestamp": 1784023200.0, "value": odom(1.0, 2.0)}
+    assert shown["total"] == 5000
+    assert shown["notes"] == ["5000 in all"]
 
 
 def test_a_range_beyond_the_cap_is_thinned_and_keeps_its_ends() -> None:
     values = [{"text": f"{n} " + "x" * 900} for n in range(100)]
-    told = said(of_samples(values))
-    assert told["samples"][0]["value"] == values[0]
-    assert told["samples"][-1]["value"] == values[-1]
-    assert "of 100 kept, evenly spaced" in told["notes"][0]
+    shown = said(of_samples(values))
+    assert shown["samples"][0]["value"] == values[0]
+    assert shown["samples"][-1]["value"] == values[-1]
+    assert "of 100 kept, evenly spaced" in shown["notes"][0]
 
 
 def test_a_position_is_in_metres_and_degrees_with_null_for_what_is_not_known() -> None:
@@ -268,9 +268,9 @@ def test_a_position_is_in_metres_and_degrees_with_null_for_what_is_not_known() -
 
 @pytest.mark.parametrize("orientation", [None, (0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0)])
 def test_a_position_without_a_rotation_has_no_yaw(orientation: Any) -> None:
-    told = said(results.Position("/gps", T0, Pose((1.0, 2.0, 3.0), orientation)))
-    assert told["yaw_deg"] is None
-    assert told["frame_id"] is None
+    shown = said(results.Position("/gps", T0, Pose((1.0, 2.0, 3.0), orientation)))
+    assert shown["yaw_deg"] is None
+    assert shown["frame_id"] is None
 
 
 def test_a_velocity_has_a_linear_and_an_angular_part() -> None:
@@ -351,9 +351,9 @@ def test_a_value_when_another_matched_has_both() -> None:
 
 
 def test_a_topic_that_held_nothing_yet_gives_a_null_value() -> None:
-    told = said(results.ValueWhen(value(), None, ("/odom held no message yet",)))
-    assert told["value"] is None
-    assert told["value_timestamp"] is None
+    shown = said(results.ValueWhen(value(), None, ("/odom held no message yet",)))
+    assert shown["value"] is None
+    assert shown["value_timestamp"] is None
 
 
 def test_a_trajectory_is_rounded_to_sense() -> None:
@@ -387,18 +387,18 @@ def test_a_trajectory_says_what_was_left_out_and_how_it_was_measured() -> None:
 
 def test_a_jump_is_marked_at_the_waypoint_it_led_to() -> None:
     waypoints = (Waypoint(T0, (0, 0, 0), None), Waypoint(T0 + 1, (90, 0, 0), None, jump=True))
-    told = said(trajectory(waypoints=waypoints, jumps=1, jumped_m=90.0))
-    assert [point.get("jump") for point in told["waypoints"]] == [None, True]
-    assert told["notes"] == [
+    shown = said(trajectory(waypoints=waypoints, jumps=1, jumped_m=90.0))
+    assert [point.get("jump") for point in shown["waypoints"]] == [None, True]
+    assert shown["notes"] == [
         ("1 jump of 90.00 m in all, faster than is plausible, left out of distance and speed"),
         "of the jumps each leads to a waypoint with jump: true; no way was driven there",
     ]
-    told = said(trajectory(waypoints=waypoints, jumps=9, jumped_m=99.0))
-    assert told["notes"][1].startswith("of the jumps the longest lead to a waypoint")
+    shown = said(trajectory(waypoints=waypoints, jumps=9, jumped_m=99.0))
+    assert shown["notes"][1].startswith("of the jumps the longest lead to a waypoint")
 
 
 def test_without_a_single_valid_pose_nothing_is_said_of_the_way() -> None:
-    told = said(
+    shown = said(
         trajectory(
             poses=0,
             invalid=1,
@@ -409,10 +409,10 @@ def test_without_a_single_valid_pose_nothing_is_said_of_the_way() -> None:
             max_speed_from="positions",
         )
     )
-    assert [told[key] for key in ("distance_m", "avg_speed", "max_speed", "duration_s")] == [
+    assert [shown[key] for key in ("distance_m", "avg_speed", "max_speed", "duration_s")] == [
         None
     ] * 4
-    assert told["notes"] == ["1 pose left out: the coordinates are no place (NaN or beyond)"]
+    assert shown["notes"] == ["1 pose left out: the coordinates are no place (NaN or beyond)"]
 
 
 def test_a_mean_above_the_highest_speed_is_told() -> None:
@@ -423,8 +423,8 @@ def test_a_mean_above_the_highest_speed_is_told() -> None:
 
 def test_no_data_tells_what_could_not_be_read() -> None:
     error = NoDataError(NoDataReason.GAP, "nothing", ("1 bag file could not be read",))
-    told = json.loads(REPLIES.error(error).text)
-    assert told["notes"] == ["1 bag file could not be read"]
+    shown = json.loads(REPLIES.error(error).text)
+    assert shown["notes"] == ["1 bag file could not be read"]
 
 
 def test_what_is_no_answer_is_refused() -> None:

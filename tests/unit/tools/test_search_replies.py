@@ -205,8 +205,8 @@ def test_a_search_that_could_not_read_a_closed_bag_says_which(
     reply = never(recalling(memory, bag_dir) if recalls else memory, bag_dir, tool)
     assert [*reply] == ["timestamp", "value", "notes"]
     assert (reply["timestamp"], reply["value"]) == (None, None)
-    told = "could not be decoded" if fault == "undecodable" else "rec/rec_1.mcap"
-    assert any(told in note for note in reply["notes"])
+    shown = "could not be decoded" if fault == "undecodable" else "rec/rec_1.mcap"
+    assert any(shown in note for note in reply["notes"])
 
 
 HOUR = 3600 * S
@@ -361,8 +361,8 @@ def test_a_question_that_runs_out_of_time_says_how_far_the_catalogue_is(
     call = Call(Deadline.after(0.0))
     with pytest.raises(QueryTimeoutError) as late:
         queries.find_last_match(memory, call, "/*", "contains", "never")
-    told = f"has {known} of 3 bags so far: wait for it, or ask about a shorter window"
-    assert (told in str(late.value)) == (known < 3)
+    shown = f"has {known} of 3 bags so far: wait for it, or ask about a shorter window"
+    assert (shown in str(late.value)) == (known < 3)
     assert "ask about a shorter window or a single topic" in str(late.value)
 
 

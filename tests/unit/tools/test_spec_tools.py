@@ -205,14 +205,14 @@ def test_a_misspelt_argument_is_answered_with_the_right_one() -> None:
 
 
 def test_all_faults_are_told_at_once() -> None:
-    told = refusal("get_topic_in_last", topic=7, seconds=-1, max_samples=0)
-    assert "topic was 7; expected a text" in told
-    assert "seconds was -1; expected a number of more than 0" in told
-    assert "max_samples was 0; expected a whole number of at least 1 and at most 10000" in told
+    reply = refusal("get_topic_in_last", topic=7, seconds=-1, max_samples=0)
+    assert "topic was 7; expected a text" in reply
+    assert "seconds was -1; expected a number of more than 0" in reply
+    assert "max_samples was 0; expected a whole number of at least 1 and at most 10000" in reply
 
 
 @pytest.mark.parametrize(
-    ("value", "told"),
+    ("value", "reply"),
     [
         (-5, "-5"),
         ("10", '"10"'),
@@ -224,16 +224,16 @@ def test_all_faults_are_told_at_once() -> None:
         (10**400, '"a number of 400 digits"'),
     ],
 )
-def test_seconds_must_be_a_finite_number_of_at_least_zero(value: Any, told: str) -> None:
+def test_seconds_must_be_a_finite_number_of_at_least_zero(value: Any, reply: str) -> None:
     assert refusal("get_position_seconds_ago", seconds_ago=value).startswith(
-        f"seconds_ago was {told}"
+        f"seconds_ago was {reply}"
     )
 
 
 @pytest.mark.parametrize("value", [1784023200500, 1784023200500000000])
 def test_milliseconds_and_nanoseconds_are_recognised(value: int) -> None:
-    told = refusal("get_position_at", timestamp=value)
-    assert "too large for Unix seconds; is it in milliseconds or nanoseconds?" in told
+    reply = refusal("get_position_at", timestamp=value)
+    assert "too large for Unix seconds; is it in milliseconds or nanoseconds?" in reply
 
 
 @pytest.mark.parametrize("topic", ["", "   "])
@@ -242,14 +242,14 @@ def test_a_topic_must_have_a_name(topic: str) -> None:
 
 
 def test_the_condition_type_must_be_a_known_one() -> None:
-    told = refusal("find_last_match", topic="/a", condition_type="like", value="x")
-    assert 'expected one of "contains", "equals", "above", "below", "near_position"' in told
+    reply = refusal("find_last_match", topic="/a", condition_type="like", value="x")
+    assert 'expected one of "contains", "equals", "above", "below", "near_position"' in reply
 
 
 @pytest.mark.parametrize("value", [None, math.nan, {"x": math.inf, "y": 0.0}])
 def test_a_condition_value_must_be_something_finite(value: Any) -> None:
-    told = refusal("find_last_match", topic="/a", condition_type="equals", value=value)
-    assert told.startswith("value was ")
+    reply = refusal("find_last_match", topic="/a", condition_type="equals", value=value)
+    assert reply.startswith("value was ")
 
 
 def test_a_long_value_is_cut_in_the_refusal() -> None:
