@@ -43,7 +43,7 @@ Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
 
 
-class Extent(NamedTuple):
+class TopicExtent(NamedTuple):
     """A bag, and the log times (inclusive) of the first and last message of a topic in it.
 
     A bag in which the topic has two types has two extents.
@@ -223,13 +223,13 @@ class Segment:
                 bag = self.bags[row]
                 yield bag, bag.summary.at(position)
 
-    def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[Extent]:
+    def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
         """Yields what `with_topic` yields, but only the first and last times; that is faster."""
         column = _columns(self).of(topic, window)
         if column is not None:
             rows = zip(*(each.tolist() for each in column[:3]), strict=True)
             for row, first, last in rows:
-                yield Extent(self.bags[row], first, last)
+                yield TopicExtent(self.bags[row], first, last)
 
     def bags_with(self, topic: str) -> tuple[BagFile, ...]:
         """Returns the bags that hold the topic, in order; `bags` itself where all do."""

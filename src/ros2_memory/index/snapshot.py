@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.clock_faults import ClockFault, Dating
     from ros2_memory.index.segment import (
-        Extent,
         Pace,
         Segment,
         Span,
+        TopicExtent,
         TopicInBag,
         TopicTotals,
     )
@@ -188,7 +188,7 @@ class Snapshot:
         """
         return self._timeline.with_topic(topic, window)
 
-    def extents(self, topic: str, window: TimeWindow) -> Iterator[Extent]:
+    def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Returns what `with_topic` returns, but only the first and last times; that is faster."""
         return self._timeline.extents(topic, window)
 

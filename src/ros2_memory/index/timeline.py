@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.segment import Extent, Span, TopicInBag
+    from ros2_memory.index.segment import Span, TopicExtent, TopicInBag
 
 SEGMENT_BAGS: Final = 256
 """The most bags in a segment: few enough to compute in a millisecond; a week has 240 segments."""
@@ -184,7 +184,7 @@ class Timeline:
             )
         )
 
-    def extents(self, topic: str, window: TimeWindow) -> Iterator[Extent]:
+    def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Returns what `with_topic` returns, but only the first and last times; that is faster."""
         return chain.from_iterable(
             segment.extents(topic, window) for segment in self._with_topic(topic, window)
