@@ -81,7 +81,7 @@ def test_a_disk_that_fills_while_a_bag_is_unpacked_leaves_nothing_behind(tmp_pat
 
     with (
         pytest.raises(UnreachableError, match="TMPDIR"),
-        scratch.holding("key", fill),
+        scratch.use("key", fill),
     ):
         pytest.fail("there is nothing to hold")
     assert not made[0].exists()

@@ -71,10 +71,10 @@ class Channel:
     @property
     def memory_bytes(self) -> int:
         """About how much memory its texts take, in bytes."""
-        held = len(self.topic) + len(self.schema.name) + len(self.schema.text)
+        size = len(self.topic) + len(self.schema.name) + len(self.schema.text)
         for name, text in self.metadata:
-            held += len(name) + len(text)
-        return held
+            size += len(name) + len(text)
+        return size
 
 
 class Record(NamedTuple):
@@ -248,7 +248,7 @@ class BagWriter(ABC):
     def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
         """Writes a bag that holds these messages, in the order given, and nothing else.
 
-        Payloads, both times, definitions and the metadata of channels stay as they are; ROS 2
+        Payloads, both times, definitions and the metadata of channels are unchanged; ROS 2
         types are named `package/msg/Name`, as every reader knows them. `profile` is MCAP's. The bag
         is on the disk when this returns. There must be no file of that name.
 
@@ -262,7 +262,7 @@ class BagWriter(ABC):
     ) -> Rewritten:
         """Writes all that can be read of a file that was cut short into one that is whole.
 
-        Schemas, channels, metadata, attachments, both times and sequence numbers stay as they are,
+        Schemas, channels, metadata, attachments, both times and sequence numbers are unchanged,
         and so does the order; what makes no whole record is left out. The target was read back and
         compared with the source, and is on the disk, when this returns. There must be no file of
         its name; the source is only read. `progress` is called with the bytes read so far.

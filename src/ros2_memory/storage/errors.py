@@ -168,9 +168,9 @@ MAX_COMPRESSION_RATIO: Final = 100
 _ALWAYS_ALLOWED: Final = 32 << 20
 
 
-def max_decompressed_bytes(packed: int) -> int:
+def max_decompressed_bytes(compressed: int) -> int:
     """Returns the most bytes that so many compressed bytes may decompress to."""
-    return _ALWAYS_ALLOWED + MAX_COMPRESSION_RATIO * packed
+    return _ALWAYS_ALLOWED + MAX_COMPRESSION_RATIO * compressed
 
 
 def too_large(what: str, max_bytes: int) -> str:

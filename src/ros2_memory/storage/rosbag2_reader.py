@@ -85,5 +85,5 @@ class Rosbag2Reader(FileReader):
         for source in sources:
             with OpenFile(source) as file:
                 keys.append(file.key)
-        with self._scratch.holding(tuple(keys), fill) as (copy, note):
+        with self._scratch.use(tuple(keys), fill) as (copy, note):
             yield OpenedBag(bags, copy, note)

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.file_io import FileKey
 
 JOURNALS: Final = ("-wal", "-journal")
-_KEPT_BYTES: Final = 16 << 20
+_CACHE_BYTES: Final = 16 << 20
 _PROOF_BYTES: Final = 200
 _TOTALS: Final = """
     SELECT topic_id, count(*), min(timestamp), max(timestamp),
@@ -131,9 +131,9 @@ class SqliteBags:
 
     def __init__(self, max_message_mb: int = MAX_CHUNK_MB) -> None:
         self._max_message_bytes = max_message_mb << 20
-        self._known: ByteLru[_Topics] = ByteLru(_KEPT_BYTES)
+        self._known: ByteLru[_Topics] = ByteLru(_CACHE_BYTES)
         # Whether the indexes of a file agree with its table.
-        self._proven: ByteLru[bool] = ByteLru(_KEPT_BYTES)
+        self._proven: ByteLru[bool] = ByteLru(_CACHE_BYTES)
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
@@ -146,18 +146,18 @@ class SqliteBags:
                 "damaged: messages without an integer timestamp or a binary payload"
             )
         rows = [row for row in found if not row[5]]
-        held = [
+        totals = [
             ChannelTotal(topics.channels[number], count, first, last)
             for number, count, first, last, *_ in rows
             if number in topics.channels
         ]
-        orphans = sum(row[1] for row in rows) - sum(each.messages for each in held)
+        orphans = sum(row[1] for row in rows) - sum(each.messages for each in totals)
         notes = [] if right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"{orphans} messages belong to no topic and were left out")
         if impossible := sum(row[1] for row in found if row[5]):
             notes.append(f"{impossible} messages bear no possible log time")
-        return summarize_channels(held, topics.channels.values(), notes=tuple(notes))
+        return summarize_channels(totals, topics.channels.values(), notes=tuple(notes))
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the topics declared in the file."""

@@ -47,7 +47,7 @@ class Scratch:
         self._lock = threading.Lock()
 
     @contextmanager
-    def holding(
+    def use(
         self, key: Hashable, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]
     ) -> Iterator[tuple[Path, str]]:
         """Yields the file that is made of the content `key`; it is not deleted inside the block.

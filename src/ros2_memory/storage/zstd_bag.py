@@ -75,8 +75,8 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
 
 def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
     """Writes what can be decompressed; returns what is wrong with the rest, or an empty text."""
-    with os.fdopen(open_regular(path), "rb") as packed, target.open("wb") as out:
-        reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+    with os.fdopen(open_regular(path), "rb") as source, target.open("wb") as out:
+        reader = zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)
         left = max_decompressed_bytes(path.stat().st_size)
         while True:
             try:
@@ -104,23 +104,23 @@ class _Own(threading.local):
 _OWN: Final = _Own()
 
 
-def decompress_zstd(packed: bytes, max_bytes: int) -> bytes:
+def decompress_zstd(compressed: bytes, max_bytes: int) -> bytes:
     """Decompresses one zstd frame.
 
     Raises:
-        UnreadableError: it holds, or states to hold, more than `max_bytes`, or states more than
-            its blocks can hold.
+        UnreadableError: it decompresses to more than `max_bytes`, or states more than its blocks
+            can decompress to.
     """
-    stated = zstandard.frame_content_size(packed)
+    stated = zstandard.frame_content_size(compressed)
     if stated > max_bytes:
         raise UnreadableError(too_large("compressed data", max_bytes))
     # zstandard allocates the stated size, so it must be possible: no block takes fewer bytes, or
     # decompresses to more (RFC 8878, 3.1.1.2).
-    if stated > (len(packed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES:
+    if stated > (len(compressed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES:
         raise UnreadableError("damaged: compressed data states more than it can hold")
     if stated >= 0:
-        return _OWN.decompressor.decompress(packed)
-    with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
+        return _OWN.decompressor.decompress(compressed)
+    with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
         data = stream.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise UnreadableError(too_large("compressed data", max_bytes))

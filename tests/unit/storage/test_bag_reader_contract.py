@@ -1,4 +1,4 @@
-"""What `storage/base.py` promises of a `BagReader`, held against the fake and every adapter."""
+"""What `storage/base.py` promises of a `BagReader`, checked with the fake and every adapter."""
 
 from __future__ import annotations
 
@@ -234,7 +234,7 @@ def test_publish_times_are_kept_where_the_format_keeps_them(shelf: Shelf, tmp_pa
 
 
 @on_every_shelf
-def test_a_payload_that_does_not_fit_is_undecodable_and_says_so(
+def test_a_payload_that_does_not_fit_is_undecodable_and_is_reported(
     shelf: Shelf, tmp_path: Path
 ) -> None:
     broken = Msg("/odom", "nav_msgs/msg/Odometry", 1, b"\x00\x01\x00\x00short")
@@ -280,7 +280,7 @@ def test_a_bag_that_is_gone_has_vanished_for_every_question(shelf: Shelf, tmp_pa
 
 
 @on_every_shelf
-def test_what_is_no_bag_counts_as_closed_and_says_what_is_wrong(
+def test_what_is_no_bag_counts_as_closed_and_its_fault_is_reported(
     shelf: Shelf, tmp_path: Path
 ) -> None:
     stocked = shelf.stocked(tmp_path, [text(1, "x")])

@@ -35,7 +35,7 @@ def test_a_replaced_value_counts_once() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 15))))
-def test_what_is_held_never_passes_the_bound(puts: list[tuple[int, int]]) -> None:
+def test_what_is_cached_never_passes_the_bound(puts: list[tuple[int, int]]) -> None:
     cache: ByteLru[int] = ByteLru(20)
     for key, size in puts:
         cache.put(key, size, size)

@@ -1,4 +1,4 @@
-"""What bags declare is held for as long as they lie there, so it is bounded by its length."""
+"""What bags declare stays in memory as long as they exist, so it is bounded by its length."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TOO_LONG = "a" * MAX_NAMES_CHARS
 
 
 def bag(path: Path, topic: str = "/a", type_name: str = "a/msg/B", comment: int = 0) -> Path:
-    """A bag whose declarations stand, compressed to nearly nothing, in its chunk alone."""
+    """A bag whose declarations are, compressed to nearly nothing, in its chunk alone."""
     with path.open("wb") as out:
         writer = Writer(
             out,
@@ -50,7 +50,7 @@ def test_names_longer_than_any_are_refused(tmp_path: Path, topic: str, type_name
         McapReader().summarize(path)
 
 
-def test_of_a_definition_larger_than_any_no_more_is_held_than_shows_it(tmp_path: Path) -> None:
+def test_of_a_definition_larger_than_any_no_more_is_kept_than_shows_it(tmp_path: Path) -> None:
     path = bag(tmp_path / "a.mcap", comment=LONG)
     reader = McapReader()
     [channel] = reader.channels(path)

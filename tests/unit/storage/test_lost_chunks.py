@@ -1,6 +1,6 @@
-"""A damaged chunk costs its own messages, and is told where these were looked for.
+"""A damaged chunk costs its own messages, and is reported where these were looked for.
 
-A damaged index costs none, and is told too.
+A damaged index costs none, and is reported too.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ EVERYTHING = TimeWindow.everything()
 
 
 def damaged_bag(path: Path) -> tuple[Path, range]:
-    """A bag of 40 messages at 0, 1, 2 ... ns, and which of them stand in a damaged chunk."""
+    """A bag of 40 messages at 0, 1, 2 ... ns, and which of them are in a damaged chunk."""
     write_mcap(path, chatter(40), SMALL)
     lost = chunks_of(path)[3]
     spoil_chunk(path, 3)
@@ -66,9 +66,9 @@ def test_reading_goes_on_behind_a_damaged_chunk(
     path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
     records = made(tmp_path).records(path, ["/chatter"], EVERYTHING, newest_first=newest_first)
     before: list[int] = []
-    with pytest.raises(BagError) as told:
+    with pytest.raises(BagError) as caught:
         before.extend(each.log_time for each in iter(partial(next, records), None))
-    assert told.value.lost == (lost[0], lost[-1])
+    assert caught.value.lost == (lost[0], lost[-1])
     whole = [time for time in range(40) if time not in lost]
     if newest_first:
         whole.reverse()
@@ -83,12 +83,12 @@ def test_what_of_a_damaged_chunk_is_outside_of_the_window_is_not_lost(tmp_path: 
     assert [
         each.log_time for each in reader.records(path, ["/chatter"], TimeWindow(0, lost[0]))
     ] == [*range(lost[0])]
-    with pytest.raises(BagError) as told:
+    with pytest.raises(BagError) as caught:
         list(reader.records(path, ["/chatter"], TimeWindow(lost[0], lost[0] + 1)))
-    assert told.value.lost == (lost[0], lost[0])
+    assert caught.value.lost == (lost[0], lost[0])
 
 
-def test_the_newest_message_stands_before_the_damaged_chunk_where_that_is_the_last(
+def test_the_newest_message_is_before_the_damaged_chunk_where_that_is_the_last(
     tmp_path: Path,
 ) -> None:
     path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
@@ -96,8 +96,8 @@ def test_the_newest_message_stands_before_the_damaged_chunk_where_that_is_the_la
     found = view.stream.newest("/chatter", TimeWindow.until(lost[-1]))
     assert found is not None
     assert found.time == lost[0] - 1
-    [told] = view.notes.sentences()
-    assert told.startswith(f"rec/{path.name} could not be read whole: ")
+    [notes] = view.notes.sentences()
+    assert notes.startswith(f"rec/{path.name} could not be read whole: ")
 
 
 def overlapping(folder: Path) -> Memory:
@@ -113,7 +113,7 @@ def asked(memory: Memory, pattern: str, wanted: str) -> Match:
     return queries.find_last_match(memory, Call(), pattern, "contains", wanted)
 
 
-def test_a_match_behind_a_damaged_chunk_is_found_and_the_chunk_is_told(tmp_path: Path) -> None:
+def test_a_match_behind_a_damaged_chunk_is_found_and_the_chunk_is_reported(tmp_path: Path) -> None:
     damaged_bag(tmp_path / "rec" / "rec_0.mcap")
     found = asked(memory_of(tmp_path), "/chatter", f"{3:0100d}")
     assert found.found is not None
@@ -121,7 +121,7 @@ def test_a_match_behind_a_damaged_chunk_is_found_and_the_chunk_is_told(tmp_path:
     assert any("rec_0.mcap could not be read whole" in note for note in found.notes)
 
 
-def test_a_chunk_damaged_before_the_match_is_told_neither_with_a_catalogue_nor_without(
+def test_a_chunk_damaged_before_the_match_is_reported_neither_with_a_catalogue_nor_without(
     tmp_path: Path,
 ) -> None:
     """What overlaps has the search look further back for copies than it was asked to."""
@@ -132,11 +132,11 @@ def test_a_chunk_damaged_before_the_match_is_told_neither_with_a_catalogue_nor_w
     recalled = recalling(plain, tmp_path)
     again = queries.find_last_match(recalled, Call(), "/*", "contains", "person", before_s=10.0)
     assert repr(again) == repr(found)
-    # Asked for what may stand in it, it is told.
+    # A query of what may be in it reports it.
     assert "a_0.mcap could not be read whole" in asked(plain, "/*", "hello").notes[0]
 
 
-def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_told(
+def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_reported(
     tmp_path: Path,
 ) -> None:
     dock = text(10 * S, "docked", "/dock")
@@ -154,7 +154,7 @@ def test_where_the_first_reception_of_a_latched_match_cannot_be_read_is_told(
 
 
 @pytest.mark.parametrize("newest_first", [False, True])
-def test_what_is_read_for_copies_alone_is_not_told_when_it_is_damaged(
+def test_what_is_read_for_copies_alone_is_not_reported_when_it_is_damaged(
     tmp_path: Path, newest_first: bool
 ) -> None:
     memory = overlapping(tmp_path)
@@ -166,7 +166,7 @@ def test_what_is_read_for_copies_alone_is_not_told_when_it_is_damaged(
     assert len(view.notes.sentences()) == 1
 
 
-def test_sightings_tell_what_is_damaged_in_the_time_that_they_span(tmp_path: Path) -> None:
+def test_sightings_report_what_is_damaged_in_the_time_that_they_span(tmp_path: Path) -> None:
     memory = overlapping(tmp_path)
     for each in (memory, recalling(memory, tmp_path)):
         ask = partial(find_matches, each, Call(), "/*", "contains", "person")
@@ -177,18 +177,18 @@ def test_sightings_tell_what_is_damaged_in_the_time_that_they_span(tmp_path: Pat
         assert ask(limit=1).notes == ()
 
 
-def test_damaged_bags_are_told_in_one_order_whichever_was_found_first(tmp_path: Path) -> None:
+def test_damaged_bags_are_reported_in_one_order_whichever_was_found_first(tmp_path: Path) -> None:
     for name in ("a", "b"):
         path = write_mcap(tmp_path / name / f"{name}_0.mcap", [text(ord(name) * S, "hello")])
         spoil_chunk(path, 0)
-    told = []
+    notes = []
     for newest_first in (False, True):
         view = View(memory_of(tmp_path), Call())
         list(view.stream.messages(["/chatter"], EVERYTHING, newest_first=newest_first))
-        told.append(view.notes.sentences())
-    assert told[0] == told[1]
-    [told_once] = told[0]
-    assert told_once.startswith("2 bags could not be read whole: a/a_0.mcap (")
+        notes.append(view.notes.sentences())
+    assert notes[0] == notes[1]
+    [once] = notes[0]
+    assert once.startswith("2 bags could not be read whole: a/a_0.mcap (")
 
 
 class TestAnIndexThatContradictsItsMessages:
@@ -223,16 +223,16 @@ class TestAnIndexThatContradictsItsMessages:
         for storage in ("mcap", "rosbag2"):
             memory = memory_of(tmp_path, storage=storage)
             at_s = self.at / S
-            told = asked_tool(memory, tmp_path, "get_position_at", topic="/odom", timestamp=at_s)
-            assert told["x"] == pytest.approx(true, abs=1e-6)
-            assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+            reply = asked_tool(memory, tmp_path, "get_position_at", topic="/odom", timestamp=at_s)
+            assert reply["x"] == pytest.approx(true, abs=1e-6)
+            assert any("rec_0.mcap contradicts itself" in note for note in reply["notes"])
             frames = {"parent": "odom", "child": "base"}
-            told = asked_tool(memory, tmp_path, "get_transform_at", timestamp=at_s, **frames)
-            assert told["translation"]["x"] == pytest.approx(true, abs=1e-6)
-            told = asked_tool(
+            reply = asked_tool(memory, tmp_path, "get_transform_at", timestamp=at_s, **frames)
+            assert reply["translation"]["x"] == pytest.approx(true, abs=1e-6)
+            reply = asked_tool(
                 memory, tmp_path, "get_topic_in_range", topic="/odom", start=at_s, end=at_s + 0.15
             )
-            assert [sample["timestamp"] for sample in told["samples"]] == [
+            assert [sample["timestamp"] for sample in reply["samples"]] == [
                 pytest.approx(at_s + n / 10, abs=1e-5) for n in range(2)
             ]
 
@@ -278,11 +278,11 @@ class TestASummarySectionThatDeclaresOtherThanItsChunks:
         plain = memory_of(tmp_path, storage=storage)
         for memory in (plain, recalling(plain, tmp_path)):
             for topic, sign in (("/odom", 1), ("/ghost", -1)):
-                told = asked_tool(
+                reply = asked_tool(
                     memory, tmp_path, "get_position_at", topic=topic, timestamp=T0 / S + 5
                 )
-                assert told["x"] == pytest.approx(sign * 5.0, abs=1e-6)
-                assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+                assert reply["x"] == pytest.approx(sign * 5.0, abs=1e-6)
+                assert any("rec_0.mcap contradicts itself" in note for note in reply["notes"])
 
     def test_a_topic_that_the_summary_section_calls_otherwise_is_found(
         self, tmp_path: Path
@@ -294,8 +294,8 @@ class TestASummarySectionThatDeclaresOtherThanItsChunks:
             lambda body: body.__setitem__(slice(None), body.replace(b"/chatter", b"/chattes")),
         )
         asks = {"topic": "/chatter", "condition_type": "contains", "value": "dock"}
-        told = asked_tool(memory_of(tmp_path), tmp_path, "find_last_match", **asks)
-        assert told["timestamp"] == pytest.approx(T0 / S)
-        assert any("rec_0.mcap contradicts itself" in note for note in told["notes"])
+        reply = asked_tool(memory_of(tmp_path), tmp_path, "find_last_match", **asks)
+        assert reply["timestamp"] == pytest.approx(T0 / S)
+        assert any("rec_0.mcap contradicts itself" in note for note in reply["notes"])
         topics = asked_tool(memory_of(tmp_path), tmp_path, "list_recorded_topics")
         assert [each["topic"] for each in topics] == ["/chatter"]

@@ -519,7 +519,7 @@ class TestWhatAWriterMayDo:
         with pytest.raises(UndecodableError, match="compressed payload is damaged"):
             reader.decode(record)
 
-    def test_times_that_no_clock_shows_are_left_out_and_told(self, tmp_path: Path) -> None:
+    def test_times_that_no_clock_shows_are_left_out_and_reported(self, tmp_path: Path) -> None:
         def fill(writer: Writer) -> None:
             channel = writer.register_channel("/t", "json", 0)
             for time in (5, 2**63 + 1, 2**64 - 1):
@@ -533,7 +533,7 @@ class TestWhatAWriterMayDo:
             assert "2 messages bear no possible log time" in summary.notes
             assert times(read(reader, path, "/t")) == [5]
 
-    def test_messages_without_a_channel_are_left_out_and_told(self, tmp_path: Path) -> None:
+    def test_messages_without_a_channel_are_left_out_and_reported(self, tmp_path: Path) -> None:
         def fill(writer: Writer) -> None:
             channel = writer.register_channel("/t", "json", 0)
             writer.add_message(channel, 1, b"{}", 1)

@@ -207,7 +207,7 @@ def test_stamps_days_off_are_recognised_and_log_time_counts_instead() -> None:
         queries.transform(asked, Call(), "enu", "coug2.robot", AtTime(at_s=1743805390.0))
 
 
-def test_positions_that_are_not_numbers_are_said_to_be_so() -> None:
+def test_positions_that_are_not_numbers_are_reported() -> None:
     asked = memory("cougars_auv_mcap")
     answer = queries.position(
         asked, Call(), AtTime(at_s=1744320618.5), topic="/coug2/odom", tolerance_s=60.0

@@ -93,7 +93,7 @@ every_recorded_file = pytest.mark.parametrize(
 
 @needs_real
 @every_set
-def test_each_file_holds_what_is_expected(name: str) -> None:
+def test_each_file_has_what_is_expected(name: str) -> None:
     files = expectations()[name]["expected"].get("files", {})
     for path in files_of(name):
         if path.name not in files:
@@ -112,7 +112,7 @@ def test_each_file_holds_what_is_expected(name: str) -> None:
 @pytest.mark.parametrize(
     "name", [name for name, what in expectations().items() if "topics" in what["expected"]]
 )
-def test_each_topic_holds_what_is_expected(name: str) -> None:
+def test_each_topic_has_what_is_expected(name: str) -> None:
     expected = expectations()[name]["expected"]
     found: dict[str, list[TopicSummary]] = {}
     silent: set[str] = set()
@@ -267,7 +267,7 @@ def test_a_text_file_with_a_bags_name_is_refused_by_name_and_reason() -> None:
 
 
 @needs_real
-def test_statistics_that_are_wrong_are_told_and_not_believed() -> None:
+def test_statistics_that_are_wrong_are_reported_and_not_believed() -> None:
     (path,) = files_of("rosbag2_time0_mcap")
     summary = mcap().summarize(path)
     assert summary.start == 0
@@ -275,7 +275,7 @@ def test_statistics_that_are_wrong_are_told_and_not_believed() -> None:
 
 
 @needs_real
-def test_the_truncated_file_holds_its_whole_chunk() -> None:
+def test_the_truncated_file_has_its_whole_chunk() -> None:
     path = REAL / "tiryoh_small_and_truncated" / "test_sample_truncated.mcap"
     whole = path.with_name("test_sample.mcap")
     assert all_records(mcap(), path) == all_records(mcap(), whole)
@@ -289,7 +289,7 @@ SESSIONS = ("session_mcap", "session_sqlite3", "session_zstd", "session_zstd_fil
 
 @needs_recorded
 @pytest.mark.parametrize("session", SESSIONS)
-def test_a_session_holds_what_was_published(session: str) -> None:
+def test_a_session_has_what_was_published(session: str) -> None:
     truth = json.loads((RECORDED / f"{session}.truth.json").read_text(encoding="utf-8"))
     counts: Counter[str] = Counter()
     latched: set[str] = set()
@@ -328,7 +328,7 @@ def test_a_killed_session_is_read_as_far_as_it_reached_the_disk() -> None:
 
 @needs_recorded
 @every_recorded_file
-def test_every_recorded_file_is_read_or_says_why_not(path: Path) -> None:
+def test_every_recorded_file_is_read_or_reports_why_not(path: Path) -> None:
     for reader in readers_of(path):
         if not path.stat().st_size:
             with pytest.raises(BagError):

@@ -155,7 +155,7 @@ class TestSqliteSchemas:
             assert found == sorted(range(1000, 1200), reverse=newest_first)
         assert list(reader.log_times(path, "/chatter", upto)) == [*range(1000, 1200)]
 
-    def test_a_time_that_no_clock_shows_is_left_out_and_told(self, tmp_path: Path) -> None:
+    def test_a_time_that_no_clock_shows_is_left_out_and_reported(self, tmp_path: Path) -> None:
         path = write_db3(tmp_path / "a.db3", chatter(3))
         change(path, "UPDATE messages SET timestamp = 9223372036854775807 WHERE id = 2")
         summary = Rosbag2Reader().summarize(path)
@@ -210,7 +210,7 @@ class TestSqliteSchemas:
         with pytest.raises(BagError, match="not a rosbag2 file"):
             Rosbag2Reader().summarize(path)
 
-    def test_messages_of_no_topic_are_left_out_and_told(self, tmp_path: Path) -> None:
+    def test_messages_of_no_topic_are_left_out_and_reported(self, tmp_path: Path) -> None:
         path = change(
             write_db3(tmp_path / "a.db3", chatter(3)),
             "UPDATE messages SET topic_id = 99 WHERE id = 2",
@@ -269,7 +269,7 @@ class TestJournals:
         journal.write_bytes(b"\0")
         assert Rosbag2Reader().closing(path) is Closing.OPEN
 
-    def test_what_stands_in_the_wal_is_read_and_the_folder_left_as_it_was(
+    def test_what_is_in_the_wal_is_read_and_the_folder_left_as_it_was(
         self, live: tuple[Path, sqlite3.Connection], tmp_path: Path
     ) -> None:
         left = tmp_path / "left"
@@ -371,7 +371,7 @@ class TestCompressedFiles:
         with pytest.raises(BagError, match=r"a\.mcap\.zstd: nothing of it can be decompressed"):
             Rosbag2Reader().summarize(path)
 
-    def test_unpacked_files_stay_within_their_bound(
+    def test_decompressed_files_stay_within_their_bound(
         self, tmp_path: Path, scratch_root: Path
     ) -> None:
         paths = [
@@ -444,7 +444,7 @@ def _block_starts(data: bytes) -> list[int]:
 
 
 class TestKinds:
-    def test_one_reader_tells_all_four_kinds(self, tmp_path: Path) -> None:
+    def test_one_reader_recognises_all_four_kinds(self, tmp_path: Path) -> None:
         messages = [text(1, "x"), boolean(2, True)]
         paths = [
             write_mcap(tmp_path / "a.mcap", messages),

@@ -58,7 +58,7 @@ EVERYTHING = TimeWindow.everything()
 STRINGS = [schema(1, "std_msgs/msg/String", "ros2msg", b"string data\n"), channel(1, 1, "/chatter")]
 
 
-def said(name: str = "x", time: int = 5) -> Piece:
+def string_message(name: str = "x", time: int = 5) -> Piece:
     return message(1, time, text(0, name).payload)
 
 
@@ -80,7 +80,7 @@ def bag(folder: Path, *records: Piece, name: str = "run/run_0.mcap") -> Path:
 
 class TestChunks:
     def test_a_chunk_larger_than_allowed_is_left_out_and_named(self, tmp_path: Path) -> None:
-        whole = chunk_of(bytes_of([*STRINGS, said()]))
+        whole = chunk_of(bytes_of([*STRINGS, string_message()]))
         summary = McapReader(max_chunk_mb=1).summarize(bag(tmp_path, whole, bomb(2 * MB)))
         assert summary.count == 1
         assert "larger than the 1 MiB allowed" in summary.notes[0]
@@ -91,14 +91,14 @@ class TestChunks:
             decompress_zstd(rle_frame(10, stated=50 * MB), 64 * MB)
 
     @pytest.mark.parametrize("size", [0, 1, 131_072, 131_073, MB])
-    def test_a_frame_that_holds_what_it_states_is_read_however_small_it_is(self, size: int) -> None:
+    def test_a_frame_that_has_what_it_states_is_read_however_small_it_is(self, size: int) -> None:
         assert decompress_zstd(rle_frame(size, stated=size), 64 * MB) == bytes(size)
         assert decompress_zstd(zstandard.compress(bytes(size)), 64 * MB) == bytes(size)
 
     def test_chunks_that_together_unpack_to_far_more_than_the_file_end_the_look_into_it(
         self, tmp_path: Path
     ) -> None:
-        whole = chunk_of(bytes_of([*STRINGS, said()]))
+        whole = chunk_of(bytes_of([*STRINGS, string_message()]))
         many = [bomb(30 * MB)] * 5
         summary = McapReader().summarize(bag(tmp_path, whole, *many, whole))
         assert summary.count == 1
@@ -119,7 +119,7 @@ class TestChunks:
     def test_a_message_outside_of_chunks_that_is_larger_than_allowed_is_left_out(
         self, tmp_path: Path
     ) -> None:
-        path = bag(tmp_path, *STRINGS, said("x" * 2 * MB), said("y", 9))
+        path = bag(tmp_path, *STRINGS, string_message("x" * 2 * MB), string_message("y", 9))
         reader = McapReader(max_chunk_mb=1)
         summary = reader.summarize(path)
         assert (summary.count, summary.start) == (1, 9)
@@ -127,21 +127,21 @@ class TestChunks:
         assert [each.log_time for each in reader.records(path, ["/chatter"], EVERYTHING)] == [9]
 
     def test_repairing_a_bag_of_bombs_counts_them_as_lost(self, tmp_path: Path) -> None:
-        whole = chunk_of(bytes_of([*STRINGS, said()]))
+        whole = chunk_of(bytes_of([*STRINGS, string_message()]))
         path = bag(tmp_path, whole, *[bomb(30 * MB)] * 6)
         path.write_bytes(path.read_bytes()[: -len(MAGIC)])
         rewritten = McapWriter().rewrite(path, tmp_path / "repaired.mcap")
         assert rewritten.messages == 1
         assert rewritten.lost_bytes
 
-    def test_large_chunks_that_overlap_in_time_are_not_all_held_at_once(
+    def test_large_chunks_that_overlap_in_time_are_not_all_in_memory_at_once(
         self, tmp_path: Path
     ) -> None:
         count, size = 8, 9 * MB
         noise = random.Random(1).randbytes(size)
         chunks = [
             chunk_of(
-                bytes_of([*STRINGS, message(1, time, noise), said("b", 100 + time)]),
+                bytes_of([*STRINGS, message(1, time, noise), string_message("b", 100 + time)]),
                 "zstd",
                 span=(time, 100 + time),
             )
@@ -162,11 +162,17 @@ class TestChunks:
     def test_a_bag_of_more_topics_than_any_robot_has_is_not_read(self, tmp_path: Path) -> None:
         many = [channel(n, 1, f"/t{n}") for n in range(1, MAX_CHANNELS + 2)]
         with pytest.raises(BagError, match="declares more than 5000 topics"):
-            McapReader().summarize(bag(tmp_path, STRINGS[0], *many, said()))
-        assert McapReader().summarize(bag(tmp_path, STRINGS[0], *many[:-1], said())).count == 1
+            McapReader().summarize(bag(tmp_path, STRINGS[0], *many, string_message()))
+        assert (
+            McapReader().summarize(bag(tmp_path, STRINGS[0], *many[:-1], string_message())).count
+            == 1
+        )
 
     def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(self, tmp_path: Path) -> None:
-        first, each = chunk_of(bytes_of([*STRINGS, said()])), chunk_of(said().data)
+        first, each = (
+            chunk_of(bytes_of([*STRINGS, string_message()])),
+            chunk_of(string_message().data),
+        )
         summary = McapReader().summarize(bag(tmp_path, first, *[each] * (MAX_CHUNKS + 1)))
         assert summary.count == MAX_CHUNKS
         assert "more than 150000 chunks" in summary.notes[0]
@@ -192,7 +198,7 @@ class TestMessages:
         self, tmp_path: Path
     ) -> None:
         large = message(1, 5, zstandard.compress(text(0, "x" * 2 * MB).payload))
-        path = bag(tmp_path, *STRINGS, large, said("y", 9))
+        path = bag(tmp_path, *STRINGS, large, string_message("y", 9))
         reader = McapReader(max_chunk_mb=1)
         first, second = reader.records(path, ["/chatter"], EVERYTHING)
         with pytest.raises(UndecodableError, match="damaged or too large"):
@@ -231,7 +237,9 @@ class TestMessages:
         with pytest.raises(UndecodableError, match="longer than the 4 MiB"):
             Decoding().decode(Record(known, 1, 1, payload))
 
-    def test_an_array_of_more_numbers_than_anybody_looks_for_is_told_by_its_length(self) -> None:
+    def test_an_array_of_too_many_numbers_is_reported_by_its_length(
+        self,
+    ) -> None:
         def exact(count: int) -> object:
             numbers = np.zeros(count, dtype=np.uint16)
             layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)

@@ -50,7 +50,7 @@ def test_of_uncompressed_files_every_message_that_reached_the_disk_is_read(
         path.unlink()
 
 
-def test_the_note_says_how_much_could_not_be_read(tmp_path: Path) -> None:
+def test_the_note_states_how_much_could_not_be_read(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", chatter(5))
     whole = path.read_bytes()
     third = whole.index(chatter(5)[2].payload)
@@ -99,7 +99,7 @@ def test_of_a_compressed_chunk_that_is_cut_what_can_be_decompressed_counts(
     assert [r.payload for r in found] == [m.payload for m in messages[: summary.count]]
 
 
-def test_a_cut_behind_the_messages_has_lost_none_and_says_so(tmp_path: Path) -> None:
+def test_a_cut_behind_the_messages_has_lost_none_and_is_reported(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", chatter(5))
     path.write_bytes(path.read_bytes()[:-20])
     summary = McapReader().summarize(path)
@@ -115,7 +115,7 @@ def test_a_few_bytes_are_no_bag_yet(tmp_path: Path) -> None:
         McapReader().summarize(path)
 
 
-def test_one_damaged_chunk_of_an_unfinished_file_is_left_out_and_told(tmp_path: Path) -> None:
+def test_one_damaged_chunk_of_an_unfinished_file_is_left_out_and_reported(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
     lost = chunks_of(path)[1]
     spoil_chunk(path, 1)

@@ -225,10 +225,10 @@ class Extent(NamedTuple):
 def extents_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> dict[int, Extent]:
     """Returns what `columns_from_index` would amount to, for channels with messages."""
     extents: dict[int, Extent] = {}
-    held = 0
+    messages = 0
     for channel, offset in offsets.items():
         pairs_at, count = _index_at(region, channel, offset - base)
-        held += count
+        messages += count
         if count > _FEW:
             column = np.ndarray(count, _UINT64, region, pairs_at, _EVERY_PAIR)
             first, last = int(column.min()), int(column.max())
@@ -240,7 +240,7 @@ def extents_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> 
         if last >= MAX_NS:
             raise UnreadableError(_IMPOSSIBLE_TIMES)
         extents[channel] = Extent(count, first, last)
-    if index_bytes(len(offsets), held) != len(region):
+    if index_bytes(len(offsets), messages) != len(region):
         raise UnreadableError("damaged: a chunk has message indexes that its chunk index lacks")
     return extents
 
@@ -363,7 +363,7 @@ CHUNK_HEAD_BYTES: Final = 96
 _SMALL_BYTES: Final = 48 << 10
 
 
-def read_packed_chunk(
+def read_compressed_chunk(
     file: OpenFile, body_at: int, body_size: int, max_bytes: int
 ) -> tuple[ChunkHead, bytes]:
     """Reads the fields of a chunk record, and its data as far as the body reaches.
@@ -381,15 +381,11 @@ def read_packed_chunk(
     whole = file.read(body_at, body_size if body_size <= _SMALL_BYTES else CHUNK_HEAD_BYTES)
     head = chunk_head(whole)
     if head.data_size > max_bytes:
-        raise _too_large(max_bytes)
-    held = min(body_size - head.data_at, head.data_size)
-    if head.data_at + held <= len(whole):
-        return head, whole[head.data_at : head.data_at + held]
-    return head, file.read(body_at + head.data_at, held)
-
-
-def _too_large(max_bytes: int) -> UnreadableError:
-    return UnreadableError(too_large("a chunk", max_bytes))
+        raise UnreadableError(too_large("a chunk", max_bytes))
+    in_file = min(body_size - head.data_at, head.data_size)
+    if head.data_at + in_file <= len(whole):
+        return head, whole[head.data_at : head.data_at + in_file]
+    return head, file.read(body_at + head.data_at, in_file)
 
 
 def chunk_head(body: bytes) -> ChunkHead:
@@ -410,7 +406,7 @@ def chunk_head(body: bytes) -> ChunkHead:
     return ChunkHead(crc, name.decode(), int.from_bytes(body[at - 8 : at], "little"), at)
 
 
-def decompressed_chunk(head: ChunkHead, packed: bytes, max_bytes: int) -> bytes:
+def decompressed_chunk(head: ChunkHead, compressed: bytes, max_bytes: int) -> bytes:
     """Decompresses a whole chunk, and verifies its checksum if it has one.
 
     Nothing is allocated by the size that the chunk states.
@@ -418,30 +414,30 @@ def decompressed_chunk(head: ChunkHead, packed: bytes, max_bytes: int) -> bytes:
     Raises:
         UnreadableError: it is damaged, larger than `max_bytes`, or its compression is unknown.
     """
-    if len(packed) != head.data_size:
+    if len(compressed) != head.data_size:
         raise UnreadableError("damaged: a chunk is shorter than it states")
-    data = _decompressed(head.compression, packed, max_bytes)
+    data = _decompressed(head.compression, compressed, max_bytes)
     if len(data) > max_bytes:
-        raise _too_large(max_bytes)
+        raise UnreadableError(too_large("a chunk", max_bytes))
     if head.crc and zlib.crc32(data) != head.crc:
         raise UnreadableError("damaged: a chunk does not match its checksum")
     return data
 
 
-def decompressed_prefix(head: ChunkHead, packed: bytes, max_bytes: int) -> bytes:
+def decompressed_prefix(head: ChunkHead, compressed: bytes, max_bytes: int) -> bytes:
     """Decompresses the front of a chunk that its file ends in."""
     if head.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(packed) as stream:
+        with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
             return stream.read(max_bytes)
-    return _decompressed(head.compression, packed, max_bytes)[:max_bytes]
+    return _decompressed(head.compression, compressed, max_bytes)[:max_bytes]
 
 
-def _decompressed(compression: str, packed: bytes, max_bytes: int) -> bytes:
+def _decompressed(compression: str, compressed: bytes, max_bytes: int) -> bytes:
     """Returns at most one byte more than `max_bytes`, so that the caller sees the excess."""
     if not compression:
-        return packed
+        return compressed
     if compression == "zstd":
-        return decompress_zstd(packed, max_bytes)
+        return decompress_zstd(compressed, max_bytes)
     if compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_bytes + 1))
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, max_bytes + 1))
     raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")

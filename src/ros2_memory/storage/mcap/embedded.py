@@ -10,11 +10,12 @@ import re
 from typing import TYPE_CHECKING, Final
 
 import yaml
+from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, Opcode
+from ros2_memory.storage.mcap.records import MAGIC_SIZE
 from ros2_memory.storage.mcap.salvage import decode_records
 from ros2_memory.storage.mcap.walk import file_records
 

@@ -14,6 +14,8 @@ from operator import attrgetter, itemgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from mcap.opcode import Opcode
+
 from ros2_memory.core.bag_summary import (
     MESSAGES_MISSING,
     OUT_OF_ORDER_NS,
@@ -30,14 +32,12 @@ from ros2_memory.storage.mcap.chunk import (
     extents_from_index,
     index_bytes,
     indexed_channels,
-    read_packed_chunk,
+    read_compressed_chunk,
 )
 from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
     RECORD,
     Declarations,
-    Opcode,
-    Statistics,
 )
 from ros2_memory.storage.mcap.summary import (
     INDEX_OFFSET_BYTES,
@@ -49,6 +49,8 @@ from ros2_memory.storage.mcap.summary import (
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
+    from mcap.records import Statistics
+
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel
     from ros2_memory.storage.file_io import OpenFile
@@ -57,6 +59,7 @@ _CHUNK: Final = int(Opcode.CHUNK)
 _INDEXED: Final = frozenset((_CHUNK, int(Opcode.MESSAGE_INDEX)))
 _OTHER_CHUNKS: Final = "its chunk indexes do not agree with its chunks"
 OTHER_DECLARED: Final = "its summary section declares other channels or types than its messages"
+_OUTSIDE: Final = "damaged: a chunk holds messages outside its stated times"
 _STATED: Final = struct.Struct("<BQQQ")
 """A chunk record up to its times: opcode, length, first and last log time."""
 _STATED_BYTES: Final = _STATED.size
@@ -122,7 +125,7 @@ def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict
     columns = columns_from_index(_index_region(file, chunk), offsets, chunk.offset + chunk.length)
     for times, _ in columns.values():
         if times.size and not chunk.start <= int(times[0]) <= int(times[-1]) <= chunk.end:
-            raise _outside()
+            raise UnreadableError(_OUTSIDE)
     return columns
 
 
@@ -145,7 +148,7 @@ def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
     start, end = chunk.start, chunk.end
     for _, first, last in extents.values():
         if not start <= first <= last <= end:
-            raise _outside()
+            raise UnreadableError(_OUTSIDE)
     return extents
 
 
@@ -182,10 +185,6 @@ def _index_region(file: OpenFile, chunk: Chunk) -> bytes:
     return file.read(chunk.offset + chunk.length, chunk.index_length)
 
 
-def _outside() -> UnreadableError:
-    return UnreadableError("damaged: a chunk holds messages outside its stated times")
-
-
 def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
     """Returns the decompressed records of a chunk.
 
@@ -193,10 +192,10 @@ def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
         UnreadableError: the chunk is damaged or larger than `max_bytes`.
     """
     body_at, body_size = chunk.offset + RECORD.size, chunk.length - RECORD.size
-    head, packed = read_packed_chunk(file, body_at, body_size, max_bytes)
+    head, compressed = read_compressed_chunk(file, body_at, body_size, max_bytes)
     if chunk.usable is not None:
-        return decompressed_prefix(head, packed, max_bytes)[: chunk.usable]
-    return decompressed_chunk(head, packed, max_bytes)
+        return decompressed_prefix(head, compressed, max_bytes)[: chunk.usable]
+    return decompressed_chunk(head, compressed, max_bytes)
 
 
 def index_from_summary(file: OpenFile) -> McapIndex:
@@ -233,7 +232,7 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
     if not _indexes_all(filled, stated.message_count):
         raise DoubtError("its message indexes do not hold what its statistics state")
     totals = _totals_of(file, filled, counts)
-    if totals.keys() != counts.keys():
+    if totals.keys() != counts.keys() or any(each.first == _NEVER for each in totals.values()):
         raise DoubtError
     notes = disagreements(stated, totals)
     back = _set_back(file, filled)
@@ -322,11 +321,11 @@ def _totals_of(
         chunks: its chunks that hold messages.
         counts: the messages of each channel that has some.
     """
-    totals: dict[int, Total] = {}
+    totals = {channel: Total(0, _NEVER, -1) for channel in counts}
     read: set[int] = set()
     unknown = list(counts)
     for chunk in sorted(chunks, key=attrgetter("start")):
-        unknown = [each for each in unknown if _first(totals, each) > chunk.start]
+        unknown = [each for each in unknown if totals[each].first > chunk.start]
         if not unknown:
             break
         if not chunk.channels.isdisjoint(unknown):
@@ -334,7 +333,7 @@ def _totals_of(
             read.add(chunk.offset)
     unknown = list(counts)
     for chunk in sorted(chunks, key=attrgetter("end"), reverse=True):
-        unknown = [each for each in unknown if _last(totals, each) < chunk.end]
+        unknown = [each for each in unknown if totals[each].last < chunk.end]
         if not unknown:
             break
         if chunk.offset not in read and not chunk.channels.isdisjoint(unknown):
@@ -347,14 +346,6 @@ def _totals_of(
 def _add_extents(file: OpenFile, chunk: Chunk, totals: dict[int, Total]) -> None:
     for channel, extent in _chunk_extents(file, chunk).items():
         _add(totals, channel, extent)
-
-
-def _first(totals: Mapping[int, Total], channel: int) -> Ns:
-    return totals[channel].first if channel in totals else _NEVER
-
-
-def _last(totals: Mapping[int, Total], channel: int) -> Ns:
-    return totals[channel].last if channel in totals else -1
 
 
 def add_column(totals: dict[int, Total], channel: int, column: Column) -> None:

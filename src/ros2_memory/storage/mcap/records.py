@@ -35,22 +35,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.storage.file_io import OpenFile
 
-__all__ = [
-    "CHUNK_TIMES",
-    "FOOTER",
-    "MAGIC",
-    "MAGIC_SIZE",
-    "MESSAGE",
-    "MESSAGE_FIELDS",
-    "RECORD",
-    "Declarations",
-    "Opcode",
-    "Statistics",
-    "offered_as_latched",
-    "section_records",
-    "statistics",
-]
-
 MAGIC: Final = MCAP0_MAGIC
 MAGIC_SIZE: Final = len(MAGIC)
 RECORD: Final = struct.Struct("<BQ")

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import MAX_SECTION_BYTES, UnreadableError, as_unreadable
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, Opcode, section_records
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, section_records
 from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:

@@ -35,7 +35,6 @@ from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
     MESSAGE,
     Declarations,
-    Statistics,
     closing_of,
     statistics,
 )
@@ -43,6 +42,8 @@ from ros2_memory.storage.mcap.summary import Chunk
 from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
+    from mcap.records import Statistics
+
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.file_io import OpenFile
     from ros2_memory.storage.mcap.chunk import ChunkContent

@@ -21,7 +21,7 @@ from ros2_memory.storage.errors import (
 from ros2_memory.storage.mcap.chunk import (
     decompressed_chunk,
     decompressed_prefix,
-    read_packed_chunk,
+    read_compressed_chunk,
     walk_chunk,
 )
 from ros2_memory.storage.mcap.records import (
@@ -115,7 +115,6 @@ class ChunkOpener:
     def __init__(self, file: OpenFile, max_chunk_bytes: int) -> None:
         self._file = file
         self._max_chunk_bytes = max_chunk_bytes
-        self._max_bytes = max_decompressed_bytes(file.size)
         self._bytes = 0
         self._chunks = 0
 
@@ -127,17 +126,17 @@ class ChunkOpener:
         """
         if self._chunks >= MAX_CHUNKS:
             raise UnreadableError(f"it has more than {MAX_CHUNKS} chunks")
-        if self._bytes > self._max_bytes:
+        if self._bytes > max_decompressed_bytes(self._file.size):
             raise UnreadableError(
                 f"its chunks hold more than {MAX_COMPRESSION_RATIO} times what the file does"
             )
         in_file = min(record.end, self._file.size) - record.body_at
         decompress = decompressed_chunk if record.end <= self._file.size else decompressed_prefix
         with as_unreadable():
-            head, packed = read_packed_chunk(
+            head, compressed = read_compressed_chunk(
                 self._file, record.body_at, in_file, self._max_chunk_bytes
             )
-            data = decompress(head, packed, self._max_chunk_bytes)
+            data = decompress(head, compressed, self._max_chunk_bytes)
             self._bytes += len(data)
             content = walk_chunk(data)
         self._bytes += MESSAGE_BYTES * content.messages

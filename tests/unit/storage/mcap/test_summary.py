@@ -1,4 +1,4 @@
-"""What is read of a summary section, held against what the MCAP library reads of it."""
+"""What is read of a summary section, compared with what the MCAP library reads."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_chunks_are_those_that_the_library_reads(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("more", [1, 30, 1 << 30])
-def test_a_record_that_states_more_than_it_holds_is_not_believed(
+def test_a_record_that_states_more_than_it_has_is_not_believed(
     tmp_path: Path, opcode: Opcode, size_at: int, reason: str, more: int
 ) -> None:
     path = bag(tmp_path / "a.mcap")

@@ -159,10 +159,10 @@ class TestRewriting:
 
     def test_progress_ends_at_the_last_whole_record(self, tmp_path: Path) -> None:
         source = write_mcap(tmp_path / "a.mcap", messages(), McapLayout(chunk_size=2000))
-        told: list[int] = []
-        McapWriter().rewrite(source, tmp_path / "b.mcap", told.append)
-        assert told == sorted(told)
-        assert 0.9 * source.stat().st_size < told[-1] <= source.stat().st_size
+        progress: list[int] = []
+        McapWriter().rewrite(source, tmp_path / "b.mcap", progress.append)
+        assert progress == sorted(progress)
+        assert 0.9 * source.stat().st_size < progress[-1] <= source.stat().st_size
 
     def test_what_is_no_mcap_file_is_refused_and_leaves_nothing(self, tmp_path: Path) -> None:
         source = tmp_path / "a.mcap"
@@ -171,7 +171,7 @@ class TestRewriting:
             McapWriter().rewrite(source, tmp_path / "b.mcap")
         assert sorted(tmp_path.iterdir()) == [source]
 
-    def test_a_source_that_is_gone_is_said_to_be(self, tmp_path: Path) -> None:
+    def test_a_source_that_is_gone_is_reported(self, tmp_path: Path) -> None:
         with pytest.raises(BagVanishedError):
             McapWriter().rewrite(tmp_path / "a.mcap", tmp_path / "b.mcap")
         assert not list(tmp_path.iterdir())
@@ -250,7 +250,7 @@ class TestWriting:
         with pytest.raises(BagError, match="cannot be made: No such file"):
             McapWriter().write(tmp_path / "gone" / "b.mcap", [])
 
-    def test_a_disk_that_takes_no_more_is_said_to_be_so_and_nothing_is_left(
+    def test_a_disk_that_takes_no_more_is_reported_and_nothing_is_left(
         self, tmp_path: Path
     ) -> None:
         channel = Channel("/a", "cdr", Schema("std_msgs/msg/String"))
