@@ -210,7 +210,7 @@ def _split_variable(given: Mapping[str, str]) -> list[str]:
 
 
 def _names_token(text: str) -> bool:
-    """Whether somebody took a secret for a setting; the text must not be shown then."""
+    """Returns whether a text sets a token as if it were a setting; it must not be shown then."""
     return re.search(r"token\w*\s*=", text, re.IGNORECASE) is not None
 
 

@@ -41,7 +41,7 @@ class Signature:
 
     @cached_property
     def _properties(self) -> dict[str, JsonObject]:
-        """The JSON schema of each argument."""
+        """Returns the JSON schema of each argument."""
         properties: dict[str, JsonObject] = {}
         for name, schema in _properties(self._arguments).items():
             if self._when is not None and name == self._when.replaces:
