@@ -34,13 +34,9 @@ _ROOT: Final = "rosbag2_bagfile_information"
 _BAG_NAME: Final = re.compile(
     r"^[ \t]*(?:- )?(?:- |path:)[ \t]*['\"]?([^'\"\r\n]+?)['\"]?\s*$", re.MULTILINE
 )
-_FILE_ENTRY: Final = re.compile(
-    r"^[ ]*- path:[ ]*['\"]?([^'\"\r\n]+?)['\"]?[ \r]*\n"
-    r"(?:(?![ ]*- ).*\n)*?"
-    r"[ ]*message_count:[ ]*(\d+)",
-    re.MULTILINE,
-)
-_MESSAGE_COUNT: Final = re.compile(r"^ {2,4}message_count:\s*(\d+)\s*$", re.MULTILINE)
+_LIST_ITEM: Final = re.compile(r"^[ ]*- ", re.MULTILINE)
+_PATH_KEY: Final = re.compile(r"^[ ]*path:[ ]*['\"]?([^'\"\r\n]+?)['\"]?[ \r]*$", re.MULTILINE)
+_COUNT_KEY: Final = re.compile(r"^([ ]*)message_count:[ ]*(\d+)", re.MULTILINE)
 _NAMED_POLICY: Final = re.compile(r"reliability:\s*[a-z]")
 _FIRST_OF_FILES: Final = 5
 _FIRST_OF_TYPE_HASHES: Final = 7
@@ -67,10 +63,16 @@ class Listing(NamedTuple):
 
 def parse_listing(text: str) -> Listing:
     """Returns what a metadata.yaml lists; nothing where it is none."""
-    total = _MESSAGE_COUNT.search(text)
+    totals = _COUNT_KEY.findall(text)  # indented least: that of the whole recording
+    total = min(totals, key=lambda each: len(each[0]), default=None)
+    messages = {}
+    for item in _LIST_ITEM.split(text):  # of any order of keys: not only rosbag2 writes YAML
+        path, count = _PATH_KEY.search(item), _COUNT_KEY.search(item)
+        if path and count:
+            messages[bare_name(path[1])] = int(count[2])
     return Listing(
         tuple(PurePosixPath(name).name for name in _BAG_NAME.findall(text) if bag_kind(name)),
-        {bare_name(path): int(count) for path, count in _FILE_ENTRY.findall(text)},
+        messages,
         None if total is None else int(total[1]),
     )
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from rosbags.rosbag2 import Reader
 
-from ros2_memory.bag_dir.metadata_yaml import take_out, without
+from ros2_memory.bag_dir.metadata_yaml import Listing, parse_listing, take_out, without
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.shared_bags import RECORDED, needs_recorded
 
@@ -52,6 +52,15 @@ def left(given: object, gone: dict[str, dict[str, int]]) -> dict[str, Any]:
     assert text is not None
     info: dict[str, Any] = yaml.safe_load(text)[ROOT]
     return info
+
+
+@pytest.mark.parametrize("sort_keys", [True, False])
+def test_a_listing_is_read_in_any_order_of_keys(sort_keys: bool) -> None:
+    text = yaml.safe_dump(content(), sort_keys=sort_keys)
+    names = ("r_0.mcap", "r_1.mcap")
+    listing = parse_listing(text)
+    assert set(listing.names) == {*names}
+    assert listing == Listing(listing.names, dict(zip(names, (5, 3), strict=True)), 8)
 
 
 def test_it_lists_what_is_left_and_counts_it() -> None:
