@@ -8,10 +8,10 @@ format is rosbag2's (rosbag2_storage, `yaml.hpp`), from version 5 on, which desc
 
 from __future__ import annotations
 
+import posixpath
 import re
 from collections import Counter
 from contextlib import suppress
-from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import yaml
@@ -71,7 +71,7 @@ def parse_listing(text: str) -> Listing:
         if path and count:
             messages[bare_name(path[1])] = int(count[2])
     return Listing(
-        tuple(PurePosixPath(name).name for name in _BAG_NAME.findall(text) if bag_kind(name)),
+        tuple(posixpath.basename(name) for name in _BAG_NAME.findall(text) if bag_kind(name)),
         messages,
         None if total is None else int(total[1]),
     )
@@ -298,7 +298,7 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
 
 def bare_name(path: object) -> str:
     """Returns the name of a bag file without the suffix of its compressed form."""
-    return PurePosixPath(str(path)).name.removesuffix(COMPRESSED)
+    return posixpath.basename(str(path)).removesuffix(COMPRESSED)
 
 
 def _span(start: int, end: int) -> dict[str, object]:

@@ -136,7 +136,7 @@ def _compare(path: str, folder: _Folder, bags: int, messages: int, *, is_own: bo
     listing = folder.listing
     if not listing.names:
         return Absent(path, unreadable=True)
-    names = [*dict.fromkeys(map(bare_name, listing.names))]
+    names = listing.names
     deleted = takewhile(lambda name: name not in folder.present, names) if is_own else ()
     expected = names[len([*deleted]) :]
     missing = [name for name in expected if name not in folder.present]
@@ -174,4 +174,6 @@ def _read_folder(bag_dir: Path, folder: Path, _stamp: tuple[int, int, int]) -> _
         with open_plain(METADATA_FILE, descriptor) as stream:
             text = stream.read(_MAX_BYTES).decode("utf-8", errors="replace")
     present = frozenset(bare_name(name) for name in names if bag_kind(name))
-    return _Folder(parse_listing(text), present, HANDOVER_FILE in names)
+    listing = parse_listing(text)
+    unique = tuple(dict.fromkeys(map(bare_name, listing.names)))
+    return _Folder(listing._replace(names=unique), present, HANDOVER_FILE in names)
