@@ -29,7 +29,7 @@ from ros2_memory.serving.backfill import (
 )
 from tests.faults.world import NOW, fill_up, plainly, served, told, write_bag, write_bags
 from tests.support.clocks import SettableClock
-from tests.support.waiting import PATIENCE_S
+from tests.support.processes import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -23,7 +23,7 @@ import pytest
 from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.faults.running import children_of, is_alive, load, serving, start, stop
 from tests.faults.world import write_bags
-from tests.support.waiting import until
+from tests.support.processes import until
 
 if TYPE_CHECKING:
     from pathlib import Path

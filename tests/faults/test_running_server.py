@@ -21,7 +21,7 @@ from tests.faults import test_catalogue_faults as faults
 from tests.faults.running import Running, serving
 from tests.faults.small_disk import filled, mount, needs_mounts, small_disk, unmount
 from tests.faults.world import write_bag, write_bags
-from tests.support.waiting import until
+from tests.support.processes import until
 
 COUNT = 12
 FAULTS = (

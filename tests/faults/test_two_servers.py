@@ -11,7 +11,7 @@ from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.faults.running import load, serving
 from tests.faults.test_catalogue_faults import assert_sound
 from tests.faults.world import write_bag, write_bags
-from tests.support.waiting import until
+from tests.support.processes import until
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory.demo.questions import QUESTIONS
 from ros2_memory.demo.run import DemoOptions, run_demo
-from tests.support.waiting import PATIENCE_S, until
+from tests.support.processes import PATIENCE_S, until
 
 PROGRAM = [str(Path(sys.executable).with_name("ros2-memory")), "demo"]
 

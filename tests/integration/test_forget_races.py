@@ -27,7 +27,7 @@ from ros2_memory.bag_dir.request_queue import PendingRequest
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import size_of
 from tests.support.memories import ROOT
-from tests.support.waiting import until
+from tests.support.processes import until
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.request_queue import Outcome

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 from tests.soak.clients import hostile_bodies, opening
 from tests.soak.wire import call
+from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import T0_S, write_run
-from tests.support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from pathlib import Path

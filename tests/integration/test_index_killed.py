@@ -24,7 +24,7 @@ from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.housekeepers import recorded_before
 from tests.support.memories import memory_of
-from tests.support.waiting import until
+from tests.support.processes import until
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

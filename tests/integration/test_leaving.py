@@ -20,7 +20,7 @@ from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Replies
 from tests.soak.clients import modern, opening
 from tests.soak.wire import call, connected, head, posted
-from tests.support.webserver import BOUND_S, listening
+from tests.support.processes import BOUND_S, listening
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

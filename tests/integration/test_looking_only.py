@@ -20,8 +20,8 @@ from tests.integration.test_retention_process import state
 from tests.integration.test_server_process import serving
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.housekeepers import recorded_before
+from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import T0, ask_everything, write_run
-from tests.support.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -21,7 +21,7 @@ from ros2_memory.recorder.process.child import (
     end_all,
     run_bounded,
 )
-from tests.support.waiting import PATIENCE_S, until
+from tests.support.processes import PATIENCE_S, until
 
 ENV = {"PATH": os.environ["PATH"], "ONLY": "this"}
 PATIENT = Patience(interrupt_s=PATIENCE_S, terminate_s=PATIENCE_S, kill_s=PATIENCE_S)

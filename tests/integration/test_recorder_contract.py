@@ -14,7 +14,7 @@ from ros2_memory.recorder.null import NullRecorder
 from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
-from tests.support.waiting import until
+from tests.support.processes import until
 
 if TYPE_CHECKING:
     from ros2_memory.recorder.base import Recorder

@@ -28,7 +28,7 @@ from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
 from tests.support.bags import odom, write_mcap
-from tests.support.waiting import PATIENCE_S, until
+from tests.support.processes import PATIENCE_S, until
 from tests.timing import in_time
 
 PERIOD_NS = 10_000_000

@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from tests.integration.test_recorder_daemon import Site, at_a_site, sited
 from tests.integration.test_server_process import serving
 from tests.support.live_recorder import answer
-from tests.support.waiting import until
+from tests.support.processes import until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -30,13 +30,12 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving
 from tests.support.bags import McapLayout, odom, write_mcap
-from tests.support.housekeepers import keeper_of, size_of
+from tests.support.housekeepers import keeper_of, own_all, size_of
 from tests.support.live_recorder import answer
 from tests.support.memories import memory_of
-from tests.support.own_recordings import own_all
+from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ask_everything, write_run
 from tests.support.split_writer import DOCK
-from tests.support.waiting import PATIENCE_S, until
 from tests.unit.core.test_deep_directories import DEEP, within
 
 if TYPE_CHECKING:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 import pytest
 from rosbags.highlevel import AnyReader
 
+from tests.support.bags import RECORDED, needs_recorded
+from tests.support.processes import PATIENCE_S, until
 from tests.support.ros_processes import (
     SHARED_MEMORY,
     needs_ros,
@@ -31,8 +33,6 @@ from tests.support.ros_recordings import (
     records,
     summary_of,
 )
-from tests.support.shared_bags import RECORDED, needs_recorded
-from tests.support.waiting import PATIENCE_S, until
 from tests.timing import in_time
 
 if TYPE_CHECKING:

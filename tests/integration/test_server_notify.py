@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.support.waiting import PATIENCE_S
+from tests.support.processes import PATIENCE_S
 
 
 def test_it_is_ready_when_it_listens_and_says_when_it_stops(tmp_path: Path) -> None:

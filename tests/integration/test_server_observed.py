@@ -22,8 +22,8 @@ from tests.integration.test_server_process import (
     environment,
     serving,
 )
+from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import ask, write_run
-from tests.support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -19,8 +19,8 @@ from mcp import Client
 from mcp.client.sse import sse_client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
+from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ANSWERED, REFUSED, T0_S, ask, ask_everything, write_run
-from tests.support.waiting import PATIENCE_S, until
 from tests.timing import in_time
 
 if TYPE_CHECKING:

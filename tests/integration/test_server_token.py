@@ -14,8 +14,8 @@ from mcp.client.sse import sse_client
 from mcp.client.streamable_http import streamable_http_client
 
 from tests.integration.test_server_process import Served, command, environment, serving
+from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import ask, write_run
-from tests.support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from pathlib import Path

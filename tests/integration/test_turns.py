@@ -17,8 +17,7 @@ from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.serving.web_app import web_app
 from ros2_memory.tools.replies import Replies, Reply
 from tests.soak.wire import call, posted
-from tests.support.waiting import PATIENCE_S
-from tests.support.webserver import listening
+from tests.support.processes import PATIENCE_S, listening
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Hashable, Mapping

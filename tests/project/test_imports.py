@@ -12,7 +12,7 @@ import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
-from tests.support.own_recordings import own_all
+from tests.support.housekeepers import own_all
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,8 +12,8 @@ from ros2_memory import cli
 from ros2_memory.cli import app
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
+from tests.support.housekeepers import own_all
 from tests.support.memories import ROOT
-from tests.support.own_recordings import own_all
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,7 +15,7 @@ from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.mcp_server import SCHEMA, STATUS, TOPICS
 from ros2_memory.tools.spec_tools import build_tools
-from tests.support import reference_tables as reference
+from tests.project import reference_tables as reference
 from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
 from tests.support.memories import ROOT
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from tests.soak import clients
 from tests.soak.server import Held
-from tests.support.waiting import PATIENCE_S
+from tests.support.processes import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from tests.support.waiting import until
+from tests.support.processes import until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

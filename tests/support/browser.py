@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import httpx2
 import pytest
 
-from tests.support.waiting import PATIENCE_S, until
+from tests.support.processes import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

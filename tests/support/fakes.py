@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -152,3 +154,14 @@ class FakeReader(BagReader):
             raise BagError(str(path), bag.damage)
         self.opened.append(path)
         return bag
+
+
+@contextmanager
+def files_limited_to(size: int) -> Iterator[None]:
+    """Within the block writing past so many bytes of a file fails, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import threading
 import time
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from mcap.writer import Writer
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.directory_identity import identity_of
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.layout import LIST_FILE, MOMENT_FILE
+from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags
+from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.clocks import SettableClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
+    from ros2_memory.bag_dir.request_queue import Outcome
     from ros2_memory.core.timebase import Clock
+    from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.storage.base import BagReader, BagWriter
 
 PLENTY = 10**15
@@ -127,3 +137,101 @@ def copied(source: Path, target: Path) -> Path:
     for path in (target, *target.rglob("*")):
         path.chmod(0o755 if path.is_dir() else 0o644)
     return target
+
+
+S = 10**9
+OURS = {"recorded_by": "ros2-memory"}
+
+
+def own_all(bag_dir: Path) -> OwnRecordings:
+    """Lists every directory that holds bags now."""
+    own = OwnRecordings(bag_dir)
+    found = {own.name_of(path): identity_of(path) for path in folders_with_bags(bag_dir)}
+    own.adopt({name: identity for name, identity in found.items() if name and identity})
+    return own
+
+
+def lines(bag_dir: Path) -> list[dict[str, Any]]:
+    """What the list says, line by line."""
+    return [json.loads(line) for line in (bag_dir / LIST_FILE).read_text().splitlines()]
+
+
+def embedding(
+    path: Path, custom: Mapping[str, str] | None, *, start: int = 1_790_000_000 * S, size: int = 20
+) -> Path:
+    """A split as rosbag2 writes it since Iron: its metadata right behind the header."""
+    listed = "\n".join(f"  {key}: {value}" for key, value in (custom or {}).items())
+    said = f"custom_data:\n{listed}" if custom else "custom_data: ~"
+    text = (
+        "version: 9\nstorage_identifier: mcap\nrelative_file_paths:\n"
+        f"  - {path.name}\n{said}\nros_distro: jazzy\n"
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=400)
+        writer.start("ros2", "libmcap 1.3.0")
+        if custom is not None:
+            writer.add_metadata("rosbag2", {"serialized_metadata": text})
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
+        channel = writer.register_channel("/chatter", "cdr", schema, {})
+        for number in range(size):
+            at = start + number * S // 4
+            writer.add_message(channel, at, b"\0\1\0\0\2\0\0\0x\0", at, number)
+        writer.finish()
+    return path
+
+
+S = 10**9
+T0 = 1_790_000_000 * S
+NOW = T0 + 4 * 3600 * S
+A, B = "rec_20260921T101320Z", "rec_20260921T102320Z"
+
+
+def bag(path: Path, start: int, layout: McapLayout | None = None) -> Path:
+    """A split of ten seconds; where the robot is tells the time."""
+    times = [T0 + (start + n) * S for n in range(10)]
+    return write_mcap(path, [odom(at, (at - T0) / S, 2.0) for at in times], layout)
+
+
+def recording(bag_dir: Path, name: str, start: int, splits: int = 6) -> list[Path]:
+    made = [bag(bag_dir / name / f"{name}_{n}.mcap", start + n * 10) for n in range(splits)]
+    (bag_dir / name / "handover.json").write_text('{"format": 1}')
+    return made
+
+
+def asked(
+    bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW
+) -> PendingRequest:
+    """Asks for what was recorded in these seconds."""
+    pending = PendingRequest(bag_dir, label, T0 + start * S, T0 + end * S, at)
+    pending.post()
+    return pending
+
+
+def kept(
+    house: Housekeeping, bag_dir: Path, start: int, end: int, label: str = "here", at: int = NOW
+) -> Outcome:
+    pending = asked(bag_dir, start, end, label, at)
+    house.keep_moments()
+    outcome = pending.outcome()
+    pending.close()
+    assert outcome is not None
+    return outcome
+
+
+def house_of(bag_dir: Path, **limits: Any) -> Housekeeping:
+    return keeper_of(bag_dir, **{"clock": SettableClock(NOW), **limits})
+
+
+def in_moments(bag_dir: Path) -> list[str]:
+    """The bags that are kept, each as moment and name."""
+    return [
+        path.relative_to(bag_dir / "moments").as_posix()
+        for path in sorted((bag_dir / "moments").rglob("*.mcap"))
+    ]
+
+
+def told_of(bag_dir: Path) -> dict[str, Any]:
+    [path] = (bag_dir / "moments").glob(f"*/{MOMENT_FILE}")
+    reported: dict[str, Any] = json.loads(path.read_text())
+    return reported

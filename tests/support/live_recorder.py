@@ -35,9 +35,9 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_server_process import Served, serving
+from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ask
 from tests.support.ros_processes import wait_for
-from tests.support.waiting import PATIENCE_S, until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

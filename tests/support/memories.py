@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+import json
 import time
+from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from ros2_memory.catalogue.digest import Digester
+from ros2_memory.catalogue.lookup import DigestCache, bags_without_entry
+from ros2_memory.catalogue.store import FILE, FOLDER, BagKey, Catalogue
+from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
-from ros2_memory.history.context import Memory, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.tools.replies import Replies, Reply
+from ros2_memory.tools.spec_tools import build_tools
 from tests.support.clocks import SettableClock
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
     from ros2_memory.storage.base import BagReader
 
 LAST_WRITTEN = 1_800_000_000 * NS_PER_S
@@ -58,3 +71,52 @@ def memory_of(
         include_active=include_active,
     )
     return Memory(index, reader, extractor(), timed, limits or QuerySettings())
+
+
+SCHEMA_FILE = Path(__file__).resolve().parents[2] / "config" / "message_schemas.yaml"
+
+
+@cache
+def shipped_schemas() -> dict[str, dict[str, str]]:
+    schemas: dict[str, dict[str, str]] = yaml.safe_load(SCHEMA_FILE.read_text("utf-8"))["schemas"]
+    return schemas
+
+
+def shipped_extractor(max_array_length: int = 50) -> SchemaExtractor:
+    return SchemaExtractor(shipped_schemas(), max_array_length)
+
+
+def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
+    """The memory with a catalogue that knows the first `part` of the closed bags."""
+    catalogue = Catalogue([bag_dir / FOLDER / FILE], "test")
+    recall = DigestCache(catalogue, bag_dir)
+    limit = memory.limits.max_plausible_speed_mps
+    digester = Digester(memory.reader, memory.extractor, limit)
+    bags = bags_without_entry(memory.index.snapshot().segments, recall)
+    for bag in bags[: round(part * len(bags))]:
+        with suppress(BagError):  # one that is damaged inside stays without an entry
+            assert catalogue.put(BagKey.of(bag, bag_dir), digester.digest(bag.path))
+    return replace(memory, recall=recall)
+
+
+def asked(memory: Memory, bag_dir: Path, name: str, **given: object) -> Any:
+    """The JSON of the reply, be it an error."""
+    return json.loads(replied(memory, bag_dir, name, given).text)
+
+
+def replied(
+    memory: Memory,
+    bag_dir: Path,
+    name: str,
+    given: Mapping[str, object],
+    *,
+    max_chars: int = 24_000,
+) -> Reply:
+    """The reply itself."""
+    [tool] = [each for each in build_tools(memory.limits, 25.0) if each.name == name]
+    replies, call = Replies(bag_dir, max_chars), Call()
+    try:
+        answer = tool.question(given)(memory, call)
+    except EpisodicError as error:
+        return replies.error(error)
+    return replies.answer(answer, from_active=call.used_active)

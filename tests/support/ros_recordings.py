@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 
+from tests.support.processes import PATIENCE_S
 from tests.support.ros_processes import end, wait_for
-from tests.support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

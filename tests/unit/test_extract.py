@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.extract import SchemaExtractor
 from tests.support import bags
-from tests.support.schemas import shipped_extractor
+from tests.support.memories import shipped_extractor
 
 EXTRACTOR = shipped_extractor()
 ODOMETRY = "nav_msgs/msg/Odometry"

@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.core import geometry
 from ros2_memory.core.model import Pose, Twist
 from tests.support import bags
-from tests.support.schemas import shipped_extractor
+from tests.support.memories import shipped_extractor
 
 EXTRACTOR = shipped_extractor()
 ODOMETRY = "nav_msgs/msg/Odometry"

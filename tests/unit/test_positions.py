@@ -21,9 +21,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import memory_of
-from tests.support.tool_calls import asked
-from tests.support.with_catalogue import recalling
+from tests.support.memories import asked, memory_of, recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -29,8 +29,7 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, write_mcap
-from tests.support.memories import memory_of
-from tests.support.with_catalogue import recalling
+from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

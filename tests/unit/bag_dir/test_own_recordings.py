@@ -22,7 +22,7 @@ from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.mcap.embedded import custom_data
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.own_recordings import OURS, embedding, lines, own_all
+from tests.support.housekeepers import OURS, embedding, lines, own_all
 from tests.support.simulated_recorders import World
 
 if TYPE_CHECKING:

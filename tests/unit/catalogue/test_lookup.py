@@ -13,8 +13,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from tests.support.bags import odom, write_mcap
-from tests.support.memories import memory_of
-from tests.support.with_catalogue import recalling
+from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -25,9 +25,8 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
-from tests.support.memories import memory_of
+from tests.support.memories import memory_of, recalling
 from tests.support.random_histories import S, write_history
-from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -21,7 +21,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.support.own_recordings import OURS, embedding, own_all
+from tests.support.housekeepers import OURS, embedding, own_all
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -12,9 +12,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from tests.support.bags import McapLayout, Msg, boolean, detections, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import memory_of
-from tests.support.tool_calls import asked
-from tests.support.with_catalogue import recalling
+from tests.support.memories import asked, memory_of, recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

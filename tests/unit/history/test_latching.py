@@ -33,8 +33,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import keeper_of
-from tests.support.memories import memory_of
-from tests.support.with_catalogue import recalling
+from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,8 +19,7 @@ from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import render
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import memory_of
-from tests.support.with_catalogue import recalling
+from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,9 +14,7 @@ from mcap.writer import Writer
 from ros2_memory.core.text import Reason
 from tests.support.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import memory_of
-from tests.support.tool_calls import asked
-from tests.support.with_catalogue import recalling
+from tests.support.memories import asked, memory_of, recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -25,8 +25,7 @@ from ros2_memory.queries import (
 )
 from tests.support.bags import Msg, detections, make, odom, tf, write_mcap
 from tests.support.bags import transform as stamped
-from tests.support.memories import memory_of
-from tests.support.with_catalogue import recalling
+from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,12 +8,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 
 from ros2_memory.history.context import QuerySettings
-from tests.support.bags import boolean, detections, odom, write_mcap
+from tests.support.bags import REAL, boolean, detections, needs_real, odom, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import memory_of
-from tests.support.shared_bags import REAL, needs_real
-from tests.support.tool_calls import asked, replied
-from tests.support.with_catalogue import recalling
+from tests.support.memories import asked, memory_of, recalling, replied
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

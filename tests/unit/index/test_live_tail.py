@@ -36,8 +36,7 @@ from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import McapLayout, Msg, odom, write_db3, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import memory_of
-from tests.support.with_catalogue import recalling
+from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -9,8 +9,7 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.errors import RecorderError
-from tests.support.simulated_recorders import World
-from tests.support.supervisor_checks import assert_each_counts_once, events
+from tests.support.simulated_recorders import World, assert_each_counts_once, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 

@@ -14,8 +14,12 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.recorder.handover.recovery import recover_handovers
 from ros2_memory.storage.base import Closing
-from tests.support.simulated_recorders import World
-from tests.support.supervisor_checks import PlayedHousekeeper, assert_each_counts_once, events
+from tests.support.simulated_recorders import (
+    PlayedHousekeeper,
+    World,
+    assert_each_counts_once,
+    events,
+)
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 

@@ -8,8 +8,12 @@ from pathlib import Path
 import pytest
 from structlog.testing import capture_logs
 
-from tests.support.simulated_recorders import World
-from tests.support.supervisor_checks import PlayedHousekeeper, assert_each_counts_once, events
+from tests.support.simulated_recorders import (
+    PlayedHousekeeper,
+    World,
+    assert_each_counts_once,
+    events,
+)
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 

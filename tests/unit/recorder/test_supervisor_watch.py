@@ -9,8 +9,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
-from tests.support.simulated_recorders import World
-from tests.support.supervisor_checks import events
+from tests.support.simulated_recorders import World, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 

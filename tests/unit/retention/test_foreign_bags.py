@@ -25,10 +25,24 @@ from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
 from tests.support.bags import McapLayout, boolean, odom, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import PLENTY, files_in, keeper_of, recording_now, size_of
+from tests.support.housekeepers import (
+    NOW,
+    PLENTY,
+    A,
+    B,
+    embedding,
+    files_in,
+    house_of,
+    in_moments,
+    keeper_of,
+    kept,
+    lines,
+    own_all,
+    recording,
+    recording_now,
+    size_of,
+)
 from tests.support.memories import memory_of
-from tests.support.own_recordings import embedding, lines, own_all
-from tests.support.saved_moments import NOW, A, B, house_of, in_moments, kept, recording
 
 if TYPE_CHECKING:
     from pathlib import Path

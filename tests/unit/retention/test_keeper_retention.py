@@ -15,9 +15,21 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.time_arguments import AtTime, TimeRange
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import PLENTY, size_of
+from tests.support.housekeepers import (
+    NOW,
+    PLENTY,
+    T0,
+    A,
+    B,
+    S,
+    bag,
+    house_of,
+    in_moments,
+    kept,
+    recording,
+    size_of,
+)
 from tests.support.memories import memory_of
-from tests.support.saved_moments import NOW, T0, A, B, S, bag, house_of, in_moments, kept, recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -35,22 +35,24 @@ from ros2_memory.retention.saved_moments import (
 )
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import PLENTY, files_in, recording_now
-from tests.support.memories import LAST_WRITTEN, memory_of
-from tests.support.saved_moments import (
+from tests.support.housekeepers import (
     NOW,
+    PLENTY,
     T0,
     A,
     B,
     S,
     asked,
     bag,
+    files_in,
     house_of,
     in_moments,
     kept,
     recording,
+    recording_now,
     told_of,
 )
+from tests.support.memories import LAST_WRITTEN, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path

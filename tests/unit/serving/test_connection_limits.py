@@ -17,7 +17,7 @@ from structlog.testing import capture_logs
 from ros2_memory.core.logging_setup import LogThrottle
 from ros2_memory.serving import connection_limits
 from ros2_memory.serving.auth import admit
-from tests.support.webserver import BOUND_S, listening
+from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_web_app import GOOD, MCP_HEADERS, SHOWN, app, call_tool
 
 if TYPE_CHECKING:

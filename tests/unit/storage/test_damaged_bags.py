@@ -11,7 +11,7 @@ from ros2_memory.core.errors import BagError, EpisodicError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.errors import UnreadableError, reading
 from tests.support.bags import Msg, detections, odom, text, tf, transform
-from tests.support.damage import damaged
+from tests.support.mcap_surgery import damaged
 from tests.support.reader_cases import FILES, Shelf
 
 if TYPE_CHECKING:

@@ -24,9 +24,8 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, edit_summary, spoil_chunk
-from tests.support.memories import memory_of
-from tests.support.tool_calls import asked as asked_tool
-from tests.support.with_catalogue import recalling
+from tests.support.memories import asked as asked_tool
+from tests.support.memories import memory_of, recalling
 
 if TYPE_CHECKING:
     from collections.abc import Callable

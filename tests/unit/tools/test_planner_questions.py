@@ -21,10 +21,9 @@ from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.clocks import FixedClock
-from tests.support.memories import memory_of
+from tests.support.memories import memory_of, recalling
 from tests.support.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S
 from tests.support.planner_questions import QUESTIONS, Planned
-from tests.support.with_catalogue import recalling
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,21 +17,20 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
 from tests.support.bags import (
+    REAL,
     McapLayout,
     Msg,
     boolean,
     detections,
     make,
+    needs_real,
     stamp,
     write_db3,
     write_mcap,
 )
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
-from tests.support.memories import memory_of
-from tests.support.shared_bags import REAL, needs_real
-from tests.support.tool_calls import asked
-from tests.support.with_catalogue import recalling
+from tests.support.memories import asked, memory_of, recalling
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,11 +1,12 @@
-"""An application behind the server's own connections, on a real socket, within a test."""
+"""Waiting for something that a process is about to do: for as long as it takes, up to a bound."""
 
 from __future__ import annotations
 
 import asyncio
 import socket
+import time
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 import uvicorn
 
@@ -13,10 +14,34 @@ from ros2_memory.serving.connection_limits import (
     ACCEPTED_AT_ONCE,
     BoundedConnection,
 )
-from tests.support.waiting import PATIENCE_S
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
+
+T = TypeVar("T")
+
+PATIENCE_S: Final = 180.0
+"""How long any condition is waited for, and any program to end, before it counts as vain.
+
+No promise of the product: where all is well nobody waits for so long, and a machine that has more
+to do than it has processors may need most of it to start one program.
+"""
+
+
+def until(what: Callable[[], T | None], *, timeout_s: float = PATIENCE_S) -> T:
+    """The first result of `what` that is neither None nor False.
+
+    Raises:
+        AssertionError: there was none within the timeout.
+    """
+    give_up = time.monotonic() + timeout_s
+    while True:
+        found = what()
+        if found is not None and found is not False:
+            return found
+        assert time.monotonic() < give_up, f"{what} did not come about within {timeout_s:g} s"
+        time.sleep(0.01)
+
 
 BOUND_S: Final = PATIENCE_S
 """No test waits longer for what it expects."""
