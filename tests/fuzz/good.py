@@ -16,8 +16,6 @@ from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import (
-    REAL,
-    RECORDED,
     McapLayout,
     Msg,
     boolean,
@@ -32,6 +30,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.reader_cases import LAYOUTS
+from tests.support.shared_bags import REAL, RECORDED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

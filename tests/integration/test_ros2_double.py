@@ -16,7 +16,6 @@ from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema, Summ
 from mcap.stream_reader import breakup_chunk
 from rosbags.highlevel import AnyReader
 
-from tests.support.bags import RECORDED, needs_recorded
 from tests.support.ros_processes import needs_ros, publishing_robot, ros_environment, wait_for
 from tests.support.ros_recordings import (
     Recording,
@@ -28,6 +27,7 @@ from tests.support.ros_recordings import (
     records,
     summary_of,
 )
+from tests.support.shared_bags import RECORDED, needs_recorded
 from tests.timing import in_time
 
 if TYPE_CHECKING:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import pytest
 from rosbags.highlevel import AnyReader
 
-from tests.support.bags import RECORDED, needs_recorded
 from tests.support.processes import PATIENCE_S, until
 from tests.support.ros_processes import (
     SHARED_MEMORY,
@@ -33,6 +32,7 @@ from tests.support.ros_recordings import (
     records,
     summary_of,
 )
+from tests.support.shared_bags import RECORDED, needs_recorded
 from tests.timing import in_time
 
 if TYPE_CHECKING:

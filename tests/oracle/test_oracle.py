@@ -11,7 +11,7 @@ import pytest
 from tests.oracle.exam import Server, examine
 from tests.oracle.truth import History
 from tests.oracle.worlds import WORLDS, World
-from tests.support.bags import REAL, RECORDED, needs_real, needs_recorded
+from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path

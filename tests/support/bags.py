@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -329,15 +328,3 @@ def detections(
         ],
     )
     return Msg(topic, "ros2_vision_interfaces/msg/VisionDetectionArray", ns, body)
-
-
-BAGS = Path(__file__).resolve().parents[3] / "shared" / "bags"
-RECORDED = BAGS / "recorded"
-REAL = BAGS / "real"
-
-needs_recorded = pytest.mark.skipif(
-    not RECORDED.is_dir(), reason="the folder of recorded sessions is not beside this checkout"
-)
-needs_real = pytest.mark.skipif(
-    not REAL.is_dir(), reason="the folder of public robots' bags is not beside this checkout"
-)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from tests.support.bags import RECORDED
 from tests.support.memories import ROOT
+from tests.support.shared_bags import RECORDED
 
 TURN_RATE: Final = 0.25  # rad/s
 RADIUS: Final = 2.0  # m

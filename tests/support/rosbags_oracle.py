@@ -9,7 +9,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from ros2_memory.core.model import StampedTransform, Transform
-from tests.support.bags import REAL
+from tests.support.shared_bags import REAL
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ros2_memory.messages.fields import names_of
-from tests.support.bags import REAL, needs_real
 from tests.support.memories import shipped_extractor, shipped_schemas
+from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -14,7 +14,7 @@ from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.time_arguments import AtTime, TimeRange
-from tests.support.bags import RECORDED, needs_recorded, typestore
+from tests.support.bags import typestore
 from tests.support.closed_form import (
     CAMERA,
     LASER,
@@ -28,6 +28,7 @@ from tests.support.closed_form import (
     yaw_deg,
 )
 from tests.support.memories import memory_of
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

@@ -19,8 +19,8 @@ from ros2_memory.analysis.trajectory import (
 )
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
-from tests.support.bags import REAL, needs_real
 from tests.support.rosbags_oracle import messages
+from tests.support.shared_bags import REAL, needs_real
 from tests.support.strategies import points
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.geometry import IDENTITY, invert
 from ros2_memory.core.model import StampedTransform, Transform
 from ros2_memory.core.timebase import NS_PER_S, ns_from_unix
-from tests.support.bags import REAL, needs_real
 from tests.support.rosbags_oracle import stamped_transforms
+from tests.support.shared_bags import REAL, needs_real
 from tests.support.strategies import transforms
 
 S = NS_PER_S

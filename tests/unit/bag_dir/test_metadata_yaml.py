@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory.bag_dir.metadata_yaml import Listing, parse_listing, take_out, without
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import RECORDED, needs_recorded
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -27,13 +27,9 @@ from ros2_memory.history.view import View
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import (
-    REAL,
-    RECORDED,
     McapLayout,
     Msg,
     boolean,
-    needs_real,
-    needs_recorded,
     odom,
     text,
     tf,
@@ -44,6 +40,7 @@ from tests.support.bags import (
 )
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import memory_of
+from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

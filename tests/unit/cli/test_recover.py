@@ -14,17 +14,10 @@ from ros2_memory import cli
 from ros2_memory.cli.recover import RecoveryOutcome, recover_files
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import (
-    RECORDED,
-    McapLayout,
-    needs_recorded,
-    odom,
-    typestore,
-    write_db3,
-    write_mcap,
-)
+from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
 from tests.support.fakes import files_limited_to
 from tests.support.housekeepers import copied, files_in, later, recording_now
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path

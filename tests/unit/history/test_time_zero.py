@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import pytest
 
 from ros2_memory.history.context import QuerySettings
-from tests.support.bags import REAL, boolean, detections, needs_real, odom, write_mcap
+from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, recalling, replied
+from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -14,17 +14,9 @@ from ros2_memory.core.timebase import Ns
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import (
-    REAL,
-    RECORDED,
-    McapLayout,
-    needs_real,
-    needs_recorded,
-    text,
-    write_db3,
-    write_mcap,
-)
+from tests.support.bags import McapLayout, text, write_db3, write_mcap
 from tests.support.clocks import FixedClock
+from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -27,21 +27,12 @@ from ros2_memory.queries import trajectory_summary
 from ros2_memory.results import Event, Recap
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import (
-    STATUS_FLAGS,
-    Msg,
-    boolean,
-    detections,
-    make,
-    needs_recorded,
-    odom,
-    stamp,
-    write_mcap,
-)
+from tests.support.bags import STATUS_FLAGS, Msg, boolean, detections, make, odom, stamp, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS, SPEED
 from tests.support.memories import memory_of, recalling
 from tests.support.random_histories import write_history
+from tests.support.shared_bags import needs_recorded
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

@@ -28,11 +28,12 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import boolean, detections, needs_recorded, odom, tf, transform, write_mcap
+from tests.support.bags import boolean, detections, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
 from tests.support.memories import memory_of, recalling
 from tests.support.random_histories import write_history
+from tests.support.shared_bags import needs_recorded
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

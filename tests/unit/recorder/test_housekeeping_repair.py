@@ -7,9 +7,10 @@ import structlog
 from ros2_memory import queries
 from ros2_memory.history.context import Call
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import RECORDED, McapLayout, needs_recorded, odom, write_mcap
+from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.housekeepers import copied, files_in, keeper_of, later, recording_now
 from tests.support.memories import memory_of
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from collections.abc import MutableMapping

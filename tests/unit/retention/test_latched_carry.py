@@ -14,20 +14,10 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.time_arguments import AtTime
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import (
-    RECORDED,
-    McapLayout,
-    Msg,
-    needs_recorded,
-    odom,
-    text,
-    tf,
-    transform,
-    write_db3,
-    write_mcap,
-)
+from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.housekeepers import copied, files_in, keeper_of, reader_of_both
 from tests.support.memories import memory_of
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator

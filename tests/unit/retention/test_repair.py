@@ -13,9 +13,10 @@ from ros2_memory.retention.repair import Repairer, open_files
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import RECORDED, McapLayout, needs_recorded, odom, write_mcap
+from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.fakes import files_limited_to
 from tests.support.housekeepers import copied, files_in
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,8 +16,8 @@ from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.time_arguments import AtTime, TimeRange
-from tests.support.bags import REAL, needs_real
 from tests.support.memories import memory_of
+from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

@@ -17,7 +17,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import BAGS, REAL, RECORDED, needs_real, needs_recorded
+from tests.support.shared_bags import BAGS, REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,13 +17,11 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
 from tests.support.bags import (
-    REAL,
     McapLayout,
     Msg,
     boolean,
     detections,
     make,
-    needs_real,
     stamp,
     write_db3,
     write_mcap,
@@ -31,6 +29,7 @@ from tests.support.bags import (
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
 from tests.support.memories import asked, memory_of, recalling
+from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.recorder.process.output import LineKind, parse_line
-from tests.support.bags import RECORDED, needs_recorded
+from tests.support.shared_bags import RECORDED, needs_recorded
 
 ROBOTS_TOPICS = {
     "/battery_state",

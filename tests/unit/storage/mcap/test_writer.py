@@ -17,22 +17,10 @@ from ros2_memory.storage.base import Channel, Closing, Record, Schema
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import (
-    REAL,
-    RECORDED,
-    McapLayout,
-    Msg,
-    needs_real,
-    needs_recorded,
-    odom,
-    text,
-    tf,
-    transform,
-    write_db3,
-    write_mcap,
-)
+from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.fakes import files_limited_to
 from tests.support.reader_cases import LAYOUTS
+from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path
