@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, cast
 
 import typer
@@ -178,11 +177,7 @@ def epilog(command: str) -> str:
 @contextmanager
 def _as_keyboard_interrupt(*signals: signal.Signals) -> Iterator[None]:
     """Raises KeyboardInterrupt for these signals within the block, so that files are closed."""
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in signals}
+    before = {number: signal.signal(number, signal.default_int_handler) for number in signals}
     try:
         yield
     finally:

@@ -7,7 +7,7 @@ Typer reads annotations at run time, so modules with commands do without `annota
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -169,15 +169,10 @@ def reported_errors(command: str) -> Iterator[None]:
             )
 
 
-@contextmanager
-def spinner(activity: str) -> Iterator[None]:
+def spinner(activity: str) -> AbstractContextManager[object]:
     """Shows on a terminal, and nowhere else, what the block is doing."""
     console = Console(stderr=True)
-    if not console.is_terminal:
-        yield
-        return
-    with console.status(activity):
-        yield
+    return console.status(activity) if console.is_terminal else nullcontext()
 
 
 def stdout_console() -> Console:
