@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from enum import IntEnum
 from importlib.util import find_spec
@@ -24,7 +24,7 @@ from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.bootstrap import build_recorder, query_settings_of
-from ros2_memory.cli.info import assumed_active, overlaps
+from ros2_memory.cli.info import assumed_active
 from ros2_memory.cli.options import (
     AsJson,
     BagDir,
@@ -47,6 +47,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
+from ros2_memory.index.overlaps import overlapping_recordings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here, odd_bags
 from ros2_memory.queries import data_time_range
@@ -90,16 +91,7 @@ class Finding:
     level: Level
     about: str
     seen: str
-    do: str = ""
-
-    def as_json(self) -> dict[str, JsonValue]:
-        """Returns the finding for programs."""
-        return {
-            "level": self.level.name.lower(),
-            "about": self.about,
-            "seen": self.seen,
-            "do": self.do or None,
-        }
+    do: str | None = None
 
 
 def _ok(about: str, seen: str) -> Finding:
@@ -128,7 +120,7 @@ def doctor(
         findings = [*_examine(bag_dir, overrides, verbose=verbose)]
     worst = max(each.level for each in findings)
     if as_json:
-        rows = [each.as_json() for each in findings]
+        rows = [asdict(each) | {"level": each.level.name.lower()} for each in findings]
         print_line(json.dumps({"status": worst.name.lower(), "findings": rows}))
     else:
         _print(stdout_console(), findings)
@@ -153,9 +145,13 @@ def _examine(
         yield from check_clock(snapshot, now)
         yield from check_bags(settings, memory)
         yield from check_recordings(memory, snapshot)
-        yield from check_ros(settings, memory.reader)
-        yield from check_recorder(settings, now)
-        yield from check_topics(settings, snapshot, now)
+        recorder = settings.recorder
+        if isinstance(recorder, NullRecorderNode):
+            yield _ok("recorder", "recorder=none: nothing is recorded here")
+        else:
+            yield from check_ros(settings, recorder.setup_files, memory.reader)
+            yield from check_recorder(settings, now)
+            yield from check_topics(settings, snapshot, now)
         yield from check_extras(settings)
         yield from check_server(settings)
 
@@ -168,7 +164,7 @@ def _print(console: Console, findings: Sequence[Finding]) -> None:
             escape(each.seen),
         )
         console.print(line, soft_wrap=True)
-        if each.do and each.level is not Level.OK:
+        if each.do:
             console.print(Text(f"{'':17}-> {escape(each.do)}"), soft_wrap=True)
 
 
@@ -329,10 +325,11 @@ def _is_repairable(path: Path, reader: BagReader) -> bool:
 
 def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
     """Checks that the recordings are one history, and that no file counts as active by mistake."""
-    pairs = overlaps(snapshot)
+    pairs = overlapping_recordings(snapshot)
     for pair in pairs[:MAX_NAMED]:
+        first, second = pair.names
         seen = (
-            f"recordings {pair.first} and {pair.second} overlap from {iso_local(pair.start)} to "
+            f"recordings {first} and {second} overlap from {iso_local(pair.start)} to "
             f"{iso_local(pair.end)}, and are answered together"
         )
         do = "give the bags of each robot or run a folder of their own, and a server each"
@@ -351,9 +348,6 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
 
 def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
     """Checks what the recorder's heartbeat reports."""
-    if isinstance(settings.recorder, NullRecorderNode):
-        yield _ok("recorder", "recorder=none: nothing is recorded here")
-        return
     heartbeat, reason = read_heartbeat(settings.recording.bag_dir)
     if heartbeat is None:
         yield _error("recorder", str(reason), _START_RECORDER)
@@ -391,24 +385,22 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
         yield _warning("recorder", seen, "its log has more of it")
 
 
-def check_ros(settings: Settings, reader: BagReader) -> Iterator[Finding]:
+def check_ros(
+    settings: Settings, setup_files: Sequence[Path], reader: BagReader
+) -> Iterator[Finding]:
     """Checks that `ros2 bag record` runs in the environment that the recorder gives it."""
-    if isinstance(settings.recorder, NullRecorderNode):
-        return
     try:
         build_recorder(settings, reader=reader).check()
     except EpisodicError as error:
         reason, _, do = str(error).partition("; ")
         yield _error("ros", reason, do or "correct recorder.setup_files")
     else:
-        files = ", ".join(str(each) for each in settings.recorder.setup_files)
+        files = ", ".join(map(str, setup_files))
         yield _ok("ros", f"ros2 bag record can be run{f' after {files}' if files else ''}")
 
 
 def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
     """Checks that the topics of `topics.yaml` have been recorded lately."""
-    if isinstance(settings.recorder, NullRecorderNode):
-        return
     file = settings.recording.topics_file
     try:
         selection = load_topics(file)

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import typer
 
@@ -25,7 +25,7 @@ from ros2_memory.cli.output import format_value, print_reply
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
-from ros2_memory.index.overlaps import overlapping_recordings, pair_names
+from ros2_memory.index.overlaps import overlapping_recordings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
@@ -116,12 +116,12 @@ def info(
         lists: dict[str, list[JsonValue]] = {
             "overlapping_recordings": [
                 {
-                    "recording": each.first,
-                    "and": each.second,
+                    "recording": each.names[0],
+                    "and": each.names[1],
                     "from": unix_from_ns(each.start),
                     "to": unix_from_ns(each.end),
                 }
-                for each in overlaps(snapshot)
+                for each in overlapping_recordings(snapshot)
             ],
             "counted_as_active": [
                 {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
@@ -140,27 +140,6 @@ def info(
                 print_reply(console, {name: rows})
     if not snapshot.bags:
         raise typer.Exit(EXIT_NEGATIVE)
-
-
-class OverlappingPair(NamedTuple):
-    """Two recordings by name, and when they overlap (log times, inclusive)."""
-
-    first: str
-    second: str
-    start: Ns
-    end: Ns
-
-
-def overlaps(snapshot: Snapshot) -> list[OverlappingPair]:
-    """Returns the recordings that overlap although neither continues the other.
-
-    Answers mix their messages.
-    """
-    pairs = overlapping_recordings(snapshot)
-    return [
-        OverlappingPair(first, second, pair.start, pair.end)
-        for pair, (first, second) in zip(pairs, pair_names(pairs), strict=True)
-    ]
 
 
 def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, Ns]]:

@@ -16,8 +16,6 @@ from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
     from ros2_memory.index.snapshot import Snapshot
 
 LONG_NS: Final[Ns] = 30 * NS_PER_S
@@ -36,6 +34,13 @@ class Overlapping(NamedTuple):
     second: Path
     start: Ns
     end: Ns
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """The names of the two folders, with those of their parents where these are equal."""
+        depth = 1 if self.first.name != self.second.name else 2
+        first, second = ("/".join(each.parts[-depth:]) for each in (self.first, self.second))
+        return first, second
 
 
 def overlapping_recordings(snapshot: Snapshot) -> tuple[Overlapping, ...]:
@@ -100,12 +105,3 @@ def _took_over(pair: Overlapping) -> bool:
         if names & {handover.previous, handover.next}:
             return True
     return False
-
-
-def pair_names(pairs: Sequence[Overlapping]) -> Iterator[tuple[str, str]]:
-    """Yields the names of each pair: of their folders, with the parents where those are equal."""
-    for first, second, *_ in pairs:
-        if first.name != second.name:
-            yield first.name, second.name
-        else:
-            yield "/".join(first.parts[-2:]), "/".join(second.parts[-2:])

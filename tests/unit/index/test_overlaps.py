@@ -9,7 +9,7 @@ import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.index.overlaps import Overlapping, overlapping_recordings, pair_names
+from ros2_memory.index.overlaps import Overlapping, overlapping_recordings
 from ros2_memory.index.snapshot import Snapshot
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of
@@ -77,4 +77,4 @@ def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
 def test_folders_of_one_name_are_told_apart() -> None:
     pair = Overlapping(Path("/bags/robin/run"), Path("/bags/wren/run"), 0, 1)
     other = Overlapping(Path("/bags/a"), Path("/bags/b"), 0, 1)
-    assert [*pair_names([pair, other])] == [("robin/run", "wren/run"), ("a", "b")]
+    assert [pair.names, other.names] == [("robin/run", "wren/run"), ("a", "b")]
