@@ -11,15 +11,16 @@ Modules at the top::
     config          the configuration: models, loading, errors, sources
     queries         one function for each tool of the specification
     results         what queries and insights return
-    extract         dot-paths from decoded messages to plain values
+    extract         the fields, poses and transforms that the schema map names
     typestore       message definitions
 
 Rooms, from the bottom up. A room imports only from rooms below it::
 
-    core            errors, time, the domain model, geometry, text, logging
+    core            errors, time, the domain model, geometry, text, logging, telemetry port
     storage         bag readers and writers; storage.mcap: the MCAP format
-    messages        decoded message -> fields -> plain values
-    bag_dir         the contract between the two programs: file names, heartbeat, handover, lock
+    messages        a decoded message as JSON: its fields, conversions, detections
+    bag_dir         the contract between the two programs: file names, heartbeat, handover, lock,
+                    own recordings, saved moments, requests
     analysis        pure mathematics: transform tree, odometry, paths, intervals, conditions
     index           directory scan -> file state -> bag table -> timeline -> snapshot
     retention       garbage collection, latched carry-forward, repair, saved moments

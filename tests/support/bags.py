@@ -6,7 +6,6 @@ import math
 import sqlite3
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
