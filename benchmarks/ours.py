@@ -51,8 +51,8 @@ def counts(memory: Memory) -> list[tuple[str, int]]:
     """Messages by topic, having indexed the folder."""
     snapshot = memory.index.refresh()
     return [
-        (topic, sum(each.messages for each in snapshot.totals(topic).values()))
-        for topic in snapshot.topics()
+        (topic, sum(each.messages for each in snapshot.timeline.totals(topic).values()))
+        for topic in snapshot.timeline.topics()
     ]
 
 

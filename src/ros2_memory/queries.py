@@ -307,7 +307,7 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
         require_bags(view)
     notes = _notes_by_topic(view.snapshot)
     rows = []
-    for topic in view.snapshot.topics():
+    for topic in view.snapshot.timeline.topics():
         reasons = undecodable_types(view, topic)
         for type_name, census in sorted(view.census(topic).items()):
             rows.append(
@@ -460,7 +460,7 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
 
 def _note_robots(view: View, found: StoredMessage) -> None:
     """Notes recordings of several robots around a message; a single recording is of one."""
-    if len(view.snapshot.recordings(found.record.channel.topic)) > 1:
+    if len(view.snapshot.timeline.recordings(found.record.channel.topic)) > 1:
         note_robots_near(view, found)
 
 
@@ -524,7 +524,7 @@ def _age(found: StoredMessage, now: Ns | None) -> Ns | None:
 def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
     """Returns, for topics with odd or misdated bags, the sentences on these."""
     odd: dict[str, list[BagFile]] = {}
-    for bag in snapshot.faulty(TimeWindow.everything()):
+    for bag in snapshot.timeline.faulty(TimeWindow.everything()):
         for topic in _topics_of(bag):
             odd.setdefault(topic, []).append(bag)
     misdated: dict[str, list[ClockFault]] = {}

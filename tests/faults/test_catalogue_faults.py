@@ -271,7 +271,7 @@ def test_what_could_not_be_asked_once_is_asked_again(tmp_path: Path) -> None:
     opened = base._opened
     assert opened is not None
     recall = DigestCache(memory.recall.catalogue, tmp_path)
-    [run] = memory.index.snapshot().segments
+    [run] = memory.index.snapshot().timeline.segments
     as_of = recall.as_of()
     base._opened = replace(opened, connection=Busy(":memory:"))
     assert not recall.digests_for(run, as_of).numbers
@@ -349,7 +349,7 @@ def test_entries_that_another_program_makes_anew_are_not_taken_for_the_lost_ones
         base.execute("UPDATE held SET poses = x'00' WHERE poses IS NOT NULL")
         base.commit()
     # It is noticed by the next question about the way driven, which has other bounds.
-    [run] = memory.index.snapshot().segments
+    [run] = memory.index.snapshot().timeline.segments
     notes = memory.recall.digests_for(run, memory.recall.as_of())
     notes.catalogue.poses("/odom", [*notes.numbers.values()])
     _, other = served(tmp_path)

@@ -92,7 +92,7 @@ def recalling(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
     recall = DigestCache(catalogue, bag_dir)
     limit = memory.limits.max_plausible_speed_mps
     digester = Digester(memory.reader, memory.extractor, limit)
-    bags = bags_without_entry(memory.index.snapshot().segments, recall)
+    bags = bags_without_entry(memory.index.snapshot().timeline.segments, recall)
     for bag in bags[: round(part * len(bags))]:
         with suppress(BagError):  # one that is damaged inside stays without an entry
             assert catalogue.put(BagKey.of(bag, bag_dir), digester.digest(bag.path))

@@ -437,14 +437,14 @@ def _unheard_entries(
         return {}
     latest = snapshot.dating.latest
     heard = []
-    for topic in snapshot.topics():
-        last = max(each.last for each in snapshot.totals(topic).values())
+    for topic in snapshot.timeline.topics():
+        last = max(each.last for each in snapshot.timeline.totals(topic).values())
         # Nobody expects a latched topic or a log to have a message in every hour.
-        is_seldom = latching.is_latched(snapshot, topic) or snapshot.is_log(topic)
+        is_seldom = latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic)
         if latest is None or is_seldom or last > latest - _RECENT_NS:
             heard.append(topic)
     return {
-        entry: get_close_matches(entry, snapshot.topics(), n=2)
+        entry: get_close_matches(entry, snapshot.timeline.topics(), n=2)
         for entry in selection.entries
         if not any(TopicSelection((entry,)).matches(topic) for topic in heard)
     }

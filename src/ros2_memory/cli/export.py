@@ -120,7 +120,7 @@ def _topics(view: View, globs: Sequence[str]) -> list[str]:
     Raises:
         NoDataError: no topic matches.
     """
-    names = view.snapshot.topics()
+    names = view.snapshot.timeline.topics()
     chosen = {name for glob in globs or ("*",) for name in match_topics(names, glob)}
     if not chosen:
         asked = f"no recorded topic matches {', '.join(globs)}" if globs else "nothing is recorded"
@@ -140,7 +140,7 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
     for topic in topics:
         if not latching.may_hold(view.snapshot, topic):
             continue
-        if any(each.endswith("/TFMessage") for each in view.snapshot.types_of(topic)):
+        if any(each.endswith("/TFMessage") for each in view.snapshot.timeline.types_of(topic)):
             if latching.is_latched(view.snapshot, topic):
                 for each in view.stream.messages([topic], before):
                     frames = _child_frames(view.memory, each)
@@ -168,7 +168,7 @@ def _profile(
 ) -> str:
     """Returns the MCAP profile of all bags that hold the messages; empty if they differ."""
     chosen = frozenset(topics)
-    within = view.snapshot.overlapping(window)
+    within = view.snapshot.timeline.overlapping(window)
     bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.schema.positions)}
     bags.update(each.bag.path for each in earlier)
     profiles: set[str] = set()
@@ -244,7 +244,7 @@ def _reported(
 @contextmanager
 def _progress(view: View, window: TimeWindow) -> Iterator[Callable[[Ns], None]]:
     """Shows a progress bar along the window; yields what takes the time that is reached."""
-    bags = view.snapshot.overlapping(window)
+    bags = view.snapshot.timeline.overlapping(window)
     first = max(window.start, min((bag.start for bag in bags), default=0))
     last = min(window.stop, max((bag.end for bag in bags), default=0) + 1)
     with progress_bar() as bar:

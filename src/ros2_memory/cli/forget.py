@@ -133,7 +133,7 @@ def plan_deletion(settings: Settings, snapshot: Snapshot, window: TimeWindow) ->
     own = supposed_own(bag_dir) if settings.retention.foreign == "keep" else None
     to_delete: list[BagFile] = []
     kept: list[str] = []
-    for bag in snapshot.overlapping(window):
+    for bag in snapshot.timeline.overlapping(window):
         reason = _reason_to_keep(bag, window, bag_dir, own)
         if reason is None:
             to_delete.append(bag)

@@ -86,12 +86,14 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     """
     if latching.is_latched(snapshot, topic):
         return None
-    stated = [*snapshot.totals(topic).values()]
+    stated = [*snapshot.timeline.totals(topic).values()]
     if not stated:
         return None
     last = max(each.last for each in stated)
     intervals, duration = 0, 0
-    for _, part in snapshot.with_topic(topic, TimeWindow(last - _RATE_WINDOW_NS, last + 1)):
+    for _, part in snapshot.timeline.with_topic(
+        topic, TimeWindow(last - _RATE_WINDOW_NS, last + 1)
+    ):
         intervals += part.count - 1
         duration += part.last - part.first
     return round(intervals / unix_from_ns(duration), 2) if intervals and duration else None

@@ -200,10 +200,10 @@ def _rates(memory: Memory, snapshot: Snapshot) -> Iterator[TopicRate]:
         return
     window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
     latching = memory.limits.latching
-    for topic in snapshot.topics():
+    for topic in snapshot.timeline.topics():
         if latching.is_latched(snapshot, topic):
             continue
-        last = max(each.last for each in snapshot.totals(topic).values())
+        last = max(each.last for each in snapshot.timeline.totals(topic).values())
         rate = _count(memory, snapshot, topic, window) / unix_from_ns(WINDOW_NS)
         age_s = max(unix_from_ns(latest - last), 0.0)
         yield TopicRate(topic, rate, usual_rate(snapshot, topic, latching), age_s)
@@ -212,7 +212,7 @@ def _rates(memory: Memory, snapshot: Snapshot) -> Iterator[TopicRate]:
 def _count(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -> int:
     """Counts the messages of a topic in a window, as far as they can be read."""
     count = 0
-    for bag in dict.fromkeys(bag for bag, *_ in snapshot.extents(topic, window)):
+    for bag in dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window)):
         # Of a bag that was deleted, or is not complete yet, the next observation sees more.
         with suppress(BagError):
             count += len(memory.reader.log_times(bag.path, topic, window))

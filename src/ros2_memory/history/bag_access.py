@@ -81,7 +81,7 @@ class BagAccess:
         closed = sum(bag.state is BagState.CLOSED for bag in self.snapshot.bags)
         if cache is None or not closed:
             return ""
-        missing = len(bags_without_entry(self.snapshot.segments, cache))
+        missing = len(bags_without_entry(self.snapshot.timeline.segments, cache))
         if missing * 100 <= closed:
             return ""
         return (
@@ -104,7 +104,7 @@ class BagAccess:
 
     def entry(self, bag: BagFile) -> tuple[SegmentDigests, int] | None:
         """Returns the digests that include a bag, and its number in them; None without an entry."""
-        digests = self.digests_of(self.snapshot.segment_of(bag))
+        digests = self.digests_of(self.snapshot.timeline.segment_of(bag))
         number = None if digests is None else digests.numbers.get(bag.file)
         return None if digests is None or number is None else (digests, number)
 
@@ -252,7 +252,7 @@ class BagAccess:
             return None
         [topic] = topics
         static = topic in self.memory.limits.tf_static_topics
-        if not static and not self.snapshot.is_transient_local(topic):
+        if not static and not self.snapshot.timeline.is_transient_local(topic):
             return None
         if is_carried(bag.path):
             return None  # its channels say which recording each message is of, the catalogue not

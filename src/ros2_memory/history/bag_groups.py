@@ -209,7 +209,7 @@ class StoredDigests(Generic[T]):
         self._view.bags.check_deadline()
         self._segment, number = entry
         numbers = self._segment.numbers
-        segment = self._view.snapshot.segment_of(span.bag)
+        segment = self._view.snapshot.timeline.segment_of(span.bag)
         inside = [each.bag.file for each in segment.extents(self._topic, self._window)]
         among = [numbers[file] for file in dict.fromkeys(inside) if file in numbers]
         self._known = self._kind.look_up(self._segment, self._topic, among)

@@ -183,18 +183,18 @@ class Latching:
     def may_hold(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether some message of a topic may be latched."""
         configured = self._configured(topic)
-        return snapshot.is_transient_state(topic) if configured is None else configured
+        return snapshot.timeline.is_transient_state(topic) if configured is None else configured
 
     def holds(self, snapshot: Snapshot, found: StoredMessage) -> bool:
         """Whether a message is latched, by the pace of its topic in its own recording."""
         channel = found.record.channel
         configured = self._configured(channel.topic)
-        if configured is not None or not snapshot.is_transient_state(channel.topic):
+        if configured is not None or not snapshot.timeline.is_transient_state(channel.topic):
             return bool(configured)
         if is_carried(found.bag.path):
             origin = origin_of(channel)
             return origin is None or not origin.often
-        return snapshot.pace(channel.topic, found.bag.recording).is_rare
+        return snapshot.timeline.pace(channel.topic, found.bag.recording).is_rare
 
     def is_latched(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether a topic is latched, by its pace in the newest recording that holds it.
@@ -202,13 +202,13 @@ class Latching:
         Carried messages count as a recording only where there is no other.
         """
         configured = self._configured(topic)
-        if configured is not None or not snapshot.is_transient_state(topic):
+        if configured is not None or not snapshot.timeline.is_transient_state(topic):
             return bool(configured)
-        last = {path: span[1] for path, span in snapshot.recordings(topic).items()}
+        last = {path: span[1] for path, span in snapshot.timeline.recordings(topic).items()}
         newest = max(
             last, key=lambda path: (path.name != CARRY_FOLDER, last[path], str(path)), default=None
         )
-        return newest is not None and snapshot.pace(topic, newest).is_rare
+        return newest is not None and snapshot.timeline.pace(topic, newest).is_rare
 
     def _configured(self, topic: str) -> bool | None:
         """Returns what the configuration has of a topic; None where it has nothing."""

@@ -58,7 +58,7 @@ def note_unread(
     if window.empty:
         return
     absent = _absent(view) if nothing or search else ()
-    odd = [bag for bag in view.snapshot.faulty(window) if not _is_noted(view, bag)]
+    odd = [bag for bag in view.snapshot.timeline.faulty(window) if not _is_noted(view, bag)]
     for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
         view.notes.add(sentence)
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
@@ -95,7 +95,11 @@ def is_covered(view: View, window: TimeWindow) -> bool:
     complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-    return view.notes.complete and not lost and all(map(_is_whole, view.snapshot.faulty(window)))
+    return (
+        view.notes.complete
+        and not lost
+        and all(map(_is_whole, view.snapshot.timeline.faulty(window)))
+    )
 
 
 def _is_noted(view: View, bag: BagFile) -> bool:
@@ -142,7 +146,7 @@ def unread_spans(
     ]
     if faults and not nothing:
         yield describe_misdated(faults)
-    yield from describe_odd(snapshot.faulty(window) if odd is None else odd)
+    yield from describe_odd(snapshot.timeline.faulty(window) if odd is None else odd)
 
 
 def lost_in(
@@ -254,7 +258,7 @@ def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tup
     longest = 2 * ns_from_unix(view.memory.limits.split_duration_s)
     reach = None if window is None else max(window.start, snapshot.earliest)
     # Unlike `bags`, what overlaps a window includes the bag of carried messages.
-    for bag in snapshot.bags if window is None else snapshot.overlapping(window):
+    for bag in snapshot.bags if window is None else snapshot.timeline.overlapping(window):
         # Carried messages do not show when something was recorded.
         if bag.file in snapshot.dating.misdated or is_carried(bag.path):
             continue

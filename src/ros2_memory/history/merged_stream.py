@@ -49,7 +49,7 @@ class MergedStream:
 
     def __init__(self, bags: BagAccess) -> None:
         self.bags = bags
-        self._snapshot = bags.snapshot
+        self._timeline = bags.snapshot.timeline
         self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
         self._searches: Counter[str] = Counter()
 
@@ -59,15 +59,15 @@ class MergedStream:
         Each with the times of its first and last message of these topics, in the window or not.
         """
         names = tuple(topics)
-        if len(names) == 1 and len(self._snapshot.types_of(names[0])) == 1:
+        if len(names) == 1 and len(self._timeline.types_of(names[0])) == 1:
             # The entry of a bag is then all that it holds of these topics.
-            extents = self._snapshot.extents(names[0], window)
+            extents = self._timeline.extents(names[0], window)
             return sorted(
                 [BagSpan(first, last, bag) for bag, first, last in extents], key=_in_order
             )
         found: dict[str, BagSpan] = {}
         for topic in names:
-            for bag, *_ in self._snapshot.extents(topic, window):
+            for bag, *_ in self._timeline.extents(topic, window):
                 if bag.file not in found:
                     found[bag.file] = bag_span_of(bag, names)
         return sorted(found.values(), key=_in_order)
@@ -124,7 +124,7 @@ class MergedStream:
 
     def duplicate_spans(self, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
         """Returns where in a window two recordings may hold a topic's messages, widened."""
-        recordings = self._snapshot.recordings(topic)
+        recordings = self._timeline.recordings(topic)
         if len(recordings) < 2:
             return []
         # First by whole recordings, which are few; then by bags, where these overlap.
@@ -138,7 +138,7 @@ class MergedStream:
 
     def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """Returns the window cut where segments begin, to hold few bags at a time."""
-        segments = self._snapshot.segments
+        segments = self._timeline.segments
         begin = bisect_right(segments, window.start, key=_begins)
         end = bisect_left(segments, window.stop, begin, key=_begins)
         cuts = [
@@ -174,7 +174,7 @@ class MergedStream:
     def may_be_relatched(self, topics: Iterable[str]) -> bool:
         """Whether two recordings may have received one latched message of these topics."""
         return any(
-            self._snapshot.is_transient_local(topic) and len(self._snapshot.recordings(topic)) > 1
+            self._timeline.is_transient_local(topic) and len(self._timeline.recordings(topic)) > 1
             for topic in topics
         )
 

@@ -37,7 +37,7 @@ def resolve_topic(view: View, name: str) -> str:
     Raises:
         NoDataError: `topic_not_recorded` with the nearest names, or `empty_memory`.
     """
-    topics = view.snapshot.topics()
+    topics = view.snapshot.timeline.topics()
     for candidate in (name, f"/{name}", name.removeprefix("/")):
         if candidate in topics:
             return candidate
@@ -96,8 +96,8 @@ def topics_with(view: View, what: str) -> list[str]:
     kinds_of = view.memory.extractor.kinds_of
     return [
         f"{topic} ({type_name})"
-        for topic in view.snapshot.topics()
-        for type_name in sorted(view.snapshot.types_of(topic))
+        for topic in view.snapshot.timeline.topics()
+        for type_name in sorted(view.snapshot.timeline.types_of(topic))
         if what in kinds_of(type_name)
     ]
 
@@ -110,7 +110,7 @@ def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
     """
     if not any(mark in pattern for mark in "*?["):
         return (resolve_topic(view, pattern),)
-    matched = tuple(match_topics(view.snapshot.topics(), pattern))
+    matched = tuple(match_topics(view.snapshot.timeline.topics(), pattern))
     if not matched:
         raise not_recorded(view, pattern)
     return matched
@@ -155,10 +155,10 @@ def not_recorded(view: View, name: str) -> NoDataError:
         detail = f"{name} is declared in the bags, but not one message of it was recorded"
     else:
         detail = f"no topic {name} is recorded"
-    close = get_close_matches(name, snapshot.topics(), n=5, cutoff=0.6)
+    close = get_close_matches(name, snapshot.timeline.topics(), n=5, cutoff=0.6)
     if not close:
         stem = name.rstrip("/").rpartition("/")[2].strip("*")
-        close = [topic for topic in snapshot.topics() if stem and stem in topic][:5]
+        close = [topic for topic in snapshot.timeline.topics() if stem and stem in topic][:5]
     hint = f"similar: {', '.join(close)}" if close else "list_recorded_topics names all"
     note_unread(view, TimeWindow.everything(), nothing=True)
     return NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{detail}; {hint}", view.notes.sentences())

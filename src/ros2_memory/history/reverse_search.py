@@ -233,7 +233,7 @@ class CandidateBags:
         """
         segments = [
             (-segment.spans[topic][1], -rank, order, topic, segment)
-            for rank, segment in enumerate(self._view.snapshot.segments)
+            for rank, segment in enumerate(self._view.snapshot.timeline.segments)
             for order, topic in enumerate(self._topics)
             if topic in segment.spans and segment.spans[topic][0] < self._until
         ]

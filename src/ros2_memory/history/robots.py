@@ -34,7 +34,7 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
     Nothing is noted of latched topics, which each recording receives anew, and where the time for
     the answer is over before it is known.
     """
-    if view.snapshot.is_transient_local(topic):
+    if view.snapshot.timeline.is_transient_local(topic):
         return
     apart: set[Path] = set()
     noted_before = view.notes.keys()
@@ -65,7 +65,7 @@ def _overlapping_pairs(
 ) -> Iterator[tuple[tuple[Path, Path], TimeWindow]]:
     """Yields pairs of recordings that hold a topic at the same time, and when."""
     open_spans: list[tuple[Ns, Path]] = []
-    spans = [(*span, path) for path, span in view.snapshot.recordings(topic).items()]
+    spans = [(*span, path) for path, span in view.snapshot.timeline.recordings(topic).items()]
     for first, last, path in sorted(each for each in spans if window.overlaps(each[0], each[1])):
         open_spans = [each for each in open_spans if each[0] >= first]
         for until, other in open_spans:

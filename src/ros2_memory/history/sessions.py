@@ -181,7 +181,7 @@ class Sessions:
 
     def _folders_around(self, moment: Ns) -> set[str]:
         """Returns the folders of the recordings that went on at a moment."""
-        bags = self._view.snapshot.overlapping(TimeWindow.around(moment, _AROUND_NS))
+        bags = self._view.snapshot.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS))
         return {self.folder(bag.recording) for bag in bags} - {self._carried}
 
     def _of(self, folder: str) -> Session:
@@ -192,7 +192,7 @@ class Sessions:
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
         spans: dict[str, tuple[Ns, Ns]] = {}
         for topic in topics:
-            for recording, (first, last) in self._view.snapshot.recordings(topic).items():
+            for recording, (first, last) in self._view.snapshot.timeline.recordings(topic).items():
                 folder = self.folder(recording)
                 known = spans.get(folder, (first, last))
                 spans[folder] = min(first, known[0]), max(last, known[1])
@@ -201,15 +201,14 @@ class Sessions:
     def _chains(self, poses: str) -> Mapping[str, Session]:
         """Returns, by folder, the recordings with transforms or poses joined by handovers."""
         timeline = self._view.snapshot.timeline
-        known = None if timeline is None else _JOINED.get(timeline)
+        known = _JOINED.get(timeline)
         if known is None:
             every = [topic for topics in self._topics.values() for topic in topics]
-            recordings = [self._view.snapshot.recordings(topic) for topic in (*every, poses)]
+            recordings = [timeline.recordings(topic) for topic in (*every, poses)]
             paths = {self.folder(path): path for some in recordings for path in some}
             chains = _joined(paths) if len(paths) > 1 else {}
             known = {folder: chain | {self._carried} for folder, chain in chains.items()}
-            if timeline is not None:
-                _JOINED[timeline] = known
+            _JOINED[timeline] = known
         return known
 
 

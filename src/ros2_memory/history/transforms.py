@@ -238,7 +238,7 @@ def session_bags(
     """
     sessions = sessions_of(view)
     own = sessions.of(recording)
-    if not any(sessions.folder(each) in own for each in view.snapshot.recordings(topic)):
+    if not any(sessions.folder(each) in own for each in view.snapshot.timeline.recordings(topic)):
         return None
     return _bags_of(view, (topic,), window, own)
 
@@ -286,7 +286,7 @@ def _pairs(
     recorded = _recorded(view, topics)
     unknown: list[tuple[Ns, Ns]] = []
     for topic in recorded:
-        for segment in view.snapshot.segments:
+        for segment in view.snapshot.timeline.segments:
             known, spans = _stored_pairs(
                 view, segment, topic, window or TimeWindow.everything(), among
             )
@@ -439,7 +439,7 @@ def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]
 
 
 def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
-    known = set(view.snapshot.topics())
+    known = set(view.snapshot.timeline.topics())
     return tuple(topic for topic in topics if topic in known)
 
 

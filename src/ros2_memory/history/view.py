@@ -79,7 +79,8 @@ class View:
         if self.stream.may_be_relatched([topic]):
             return _counted(self.stream.messages([topic], everything))
         counted = {
-            type_name: Census(*stated) for type_name, stated in self.snapshot.totals(topic).items()
+            type_name: Census(*stated)
+            for type_name, stated in self.snapshot.timeline.totals(topic).items()
         }
         for span in self.stream.duplicate_spans(topic, everything):
             for type_name, (stored, once) in self._overlap_census(topic, TimeWindow(*span)).items():

@@ -132,7 +132,7 @@ class BagTable:
                 empty += 1
                 silent.update(each.silent)
         return Snapshot(
-            bags=timeline.recorded,
+            timeline=timeline,
             active=_by_path(aside.get(FileState.ACTIVE, ())),
             damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *scanned.damaged]),
             unread=_by_path([*aside.get(FileState.UNREAD, ()), *scanned.links]),
@@ -141,7 +141,6 @@ class BagTable:
             scanned_at=now,
             problem=scanned.problem,
             metadata_folders=tuple(sorted(scanned.metadata_folders)),
-            timeline=timeline,
         )
 
     def known(self, named: Collection[str], now: Ns) -> KnownBags:

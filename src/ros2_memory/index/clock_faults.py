@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.core.model import BagFile
+    from ros2_memory.index.segment import Segment
     from ros2_memory.index.split_order import StepBack
 
 FIRST_BAGS_NS: Final[Ns] = 1_483_228_800 * NS_PER_S
@@ -112,20 +113,13 @@ class Dating:
         return frozenset(fault.bag.file for fault in self.faults if fault.misleads)
 
 
-class DatedBags(NamedTuple):
-    """Some bags, sorted by their start, and the latest end among them."""
-
-    bags: Sequence[BagFile]
-    latest: Ns
-
-
 def max_plausible(now: Ns) -> Ns:
     """Returns the latest plausible date of a message."""
     return MAX_NS if now < FIRST_BAGS_NS else min(now + FUTURE_NS, MAX_NS)
 
 
 def check_dates(
-    parts: Sequence[DatedBags],
+    parts: Sequence[Segment],
     steps: Sequence[StepBack],
     now: Ns,
     around: Callable[[Ns, Ns], Sequence[BagFile]],
@@ -163,7 +157,7 @@ def check_dates(
     return replace(dating, earliest=earliest, latest=latest)
 
 
-def _unset(parts: Iterable[DatedBags]) -> Iterator[BagFile]:
+def _unset(parts: Iterable[Segment]) -> Iterator[BagFile]:
     for part in parts:
         for bag in part.bags:
             if bag.start >= FIRST_BAGS_NS:
@@ -195,7 +189,7 @@ def _step_faults(
                 yield ClockFault(bag, FaultyClock.STRAY)
 
 
-def _span(parts: Sequence[DatedBags], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
+def _span(parts: Sequence[Segment], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
     """Returns the first start and the last end of the bags that are not left out."""
     starts = sorted(bag.start for bag in left_out)
     files = {bag.file for bag in left_out}

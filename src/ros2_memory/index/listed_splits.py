@@ -71,7 +71,7 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
     own = OwnRecordings(bag_dir)
     bags: Counter[str] = Counter()
     messages: Counter[str] = Counter()
-    for segment in snapshot.segments:
+    for segment in snapshot.timeline.segments:
         for name, tally in segment.tallies.items():
             bags[name] += tally.bags
             messages[name] += tally.messages

@@ -118,22 +118,24 @@ class Segment:
         return max([bag.end for bag in self.bags])
 
     @cached_property
-    def recorded(self) -> tuple[BagFile, ...]:
-        """The bags without that of carried messages."""
-        if any(bag.file.endswith(CARRY_FILE) for bag in self.bags):
-            return tuple(bag for bag in self.bags if not is_carried(bag.path))
-        return self.bags
+    def recorded(self) -> Segment | None:
+        """The bags without that of carried messages: mostly itself; None where no other is left."""
+        if not any(bag.file.endswith(CARRY_FILE) for bag in self.bags):
+            return self
+        rest = [bag for bag in self.bags if not is_carried(bag.path)]
+        return Segment(rest) if rest else None
 
     @cached_property
     def disk_use(self) -> tuple[int, int]:
-        """The bytes of the recorded bags, and how many of them a crash left open."""
-        return disk_use(self.recorded)
+        """The bytes of the bags, and how many of them a crash left open."""
+        left_open = [bag.state is BagState.INCOMPLETE for bag in self.bags]
+        return sum([bag.size for bag in self.bags]), sum(left_open)
 
     @cached_property
     def bytes_in(self) -> dict[str, int]:
-        """The bytes of the recorded bags, by folder."""
+        """The bytes of the bags, by folder."""
         sizes: dict[str, int] = {}
-        for bag in self.recorded:
+        for bag in self.bags:
             folder = _folder_of(bag)
             sizes[folder] = sizes.get(folder, 0) + bag.size
         return sizes
@@ -170,7 +172,7 @@ class Segment:
     @cached_property
     def set_back(self) -> tuple[BagFile, ...]:
         """The bags in which log times go back."""
-        return tuple(bag for bag in self.recorded if bag.summary.schema.set_back)
+        return tuple(bag for bag in self.bags if bag.summary.schema.set_back)
 
     @cached_property
     def _schemas(self) -> tuple[SummarySchema, ...]:
@@ -286,12 +288,6 @@ class Segment:
 def is_log(type_name: str) -> bool:
     """Returns whether messages of a type are lines of a log."""
     return type_name in {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}
-
-
-def disk_use(bags: Sequence[BagFile]) -> tuple[int, int]:
-    """Returns the bytes of bags, and how many of them a crash left open."""
-    left_open = [bag.state is BagState.INCOMPLETE for bag in bags]
-    return sum([bag.size for bag in bags]), sum(left_open)
 
 
 def wider(known: Span | None, span: Span) -> Span:

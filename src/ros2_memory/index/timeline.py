@@ -12,15 +12,17 @@ from functools import cached_property, reduce
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.core.model import BagState
 from ros2_memory.index.segment import (
     Pace,
     Segment,
     TopicTotals,
     add_totals,
-    disk_use,
     in_time,
+    is_log,
     wider,
 )
+from ros2_memory.index.unreadable_span import MAX_FILE_NS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -122,18 +124,23 @@ class Timeline:
         return tuple(chain.from_iterable(segment.bags for segment in self.segments))
 
     @cached_property
-    def recorded(self) -> tuple[BagFile, ...]:
-        """The bags that show when there was a recording, in order.
+    def recorded_segments(self) -> tuple[Segment, ...]:
+        """The bags that show when there was a recording, in order, some at a time.
 
-        The bag of carried messages does not: it holds what is left of deleted bags. It stands for
-        itself where there is no other.
+        The bag of carried messages does not: it holds what is left of deleted bags. It is among
+        them only where there is no other.
         """
-        return tuple(chain.from_iterable(each.recorded for each in self.segments)) or self.bags
+        return tuple(filter(None, (each.recorded for each in self.segments))) or self.segments
+
+    @cached_property
+    def recorded(self) -> tuple[BagFile, ...]:
+        """The bags of `recorded_segments`."""
+        return tuple(chain.from_iterable(each.bags for each in self.recorded_segments))
 
     @property
     def disk_use(self) -> tuple[int, int]:
         """The bytes of the recorded bags, and how many of them a crash left open."""
-        parts = [each.disk_use for each in self.segments if each.recorded] or [disk_use(self.bags)]
+        parts = [each.disk_use for each in self.recorded_segments]
         return sum(size for size, _ in parts), sum(left_open for _, left_open in parts)
 
     @cached_property
@@ -149,6 +156,29 @@ class Timeline:
     def transient_local(self) -> frozenset[str]:
         """The topics that some publisher offered as transient local."""
         return frozenset(chain.from_iterable(each.transient_local for each in self.segments))
+
+    def topics(self) -> tuple[str, ...]:
+        """Returns the topics of which some bag holds a message, sorted."""
+        return tuple(self.types)
+
+    def types_of(self, topic: str) -> tuple[str, ...]:
+        """Returns the message types of the topic, sorted; empty where it has no message."""
+        return self.types.get(topic, ())
+
+    def is_transient_local(self, topic: str) -> bool:
+        """Returns whether some publisher offered the topic as transient local.
+
+        Then a subscriber may receive its last messages again, long after they were published.
+        """
+        return topic in self.transient_local
+
+    def is_transient_state(self, topic: str) -> bool:
+        """Returns whether the topic is transient local, and no log as `/rosout` is everywhere."""
+        return self.is_transient_local(topic) and not self.is_log(topic)
+
+    def is_log(self, topic: str) -> bool:
+        """Returns whether the topic is a log, whose lines come when something happens."""
+        return all(map(is_log, self.types_of(topic)))
 
     def pace(self, topic: str, recording: Path) -> Pace:
         """Returns how often a recording has messages of a topic; it must hold some."""
@@ -176,6 +206,24 @@ class Timeline:
             if window.overlaps(bag.start, bag.end)
         )
 
+    def faulty(self, window: TimeWindow) -> list[BagFile]:
+        """Returns the bags whose faults may bear on the window, in order.
+
+        Those of a bag that a crash left open reach to the last time that its file was written to,
+        if that was within a day.
+        """
+        return [
+            bag
+            for segment in self._faulty_segments
+            if segment.bags[0].start < window.stop
+            for bag in segment.faulty
+            if window.overlaps(bag.start, _lost_until(bag))
+        ]
+
+    @cached_property
+    def _faulty_segments(self) -> list[Segment]:
+        return [segment for segment in self.segments if segment.faulty]
+
     def with_topic(self, topic: str, window: TimeWindow | None = None) -> tuple[TopicInBag, ...]:
         """Returns the bags that hold the topic (in a window), in order, once for each type."""
         return tuple(
@@ -198,6 +246,17 @@ class Timeline:
             span = segment.spans.get(topic)
             if span is not None and (window is None or window.overlaps(*span)):
                 yield segment
+
+    def first_with(self, topic: str, type_name: str) -> BagFile:
+        """Returns the first bag that holds the topic under a type; there must be one."""
+        segment = next(each for each in self.segments if type_name in each.types.get(topic, ()))
+        return next(bag for bag, held in segment.with_topic(topic) if held.type == type_name)
+
+
+def _lost_until(bag: BagFile) -> Ns:
+    """Returns until when (inclusive) a bag may have recorded what cannot be read of it."""
+    is_cut = bag.state is BagState.INCOMPLETE and bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
+    return bag.mtime_ns if is_cut else bag.end
 
 
 def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:

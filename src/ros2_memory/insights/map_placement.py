@@ -116,7 +116,7 @@ class MapPlacement:
             return True
         found = [
             self._fixed(recording, first)
-            for recording, (first, _) in self.view.snapshot.recordings(topic).items()
+            for recording, (first, _) in self.view.snapshot.timeline.recordings(topic).items()
         ]
         return None not in found and all(
             one is not None and other is not None and alike(one, other)
@@ -198,7 +198,7 @@ def _map_or_own(view: View, topic: str, own: MapPlacement) -> MapPlacement:
     target, pose_frame = view.memory.limits.map_frame, own.pose_frame
     if not target or target == pose_frame or not connected(view, (target, pose_frame)):
         return own
-    recordings = view.snapshot.recordings(topic).items()
+    recordings = view.snapshot.timeline.recordings(topic).items()
     lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
     if any(connected(view, (target, pose_frame), among=each) for each in lending):
         return MapPlacement(view, target, pose_frame)

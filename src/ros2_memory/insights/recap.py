@@ -193,8 +193,8 @@ def _topic_events(view: View, window: TimeWindow) -> tuple[list[Event], int, set
     visible: list[IntervalTable] = []
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
-    for topic in view.snapshot.topics():
-        if not any(map(has_events, view.snapshot.types_of(topic))):
+    for topic in view.snapshot.timeline.topics():
+        if not any(map(has_events, view.snapshot.timeline.types_of(topic))):
             continue
         found = _events_in(view, topic, window)
         if found is None or found.is_empty:

@@ -48,7 +48,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         never_heard=() if heartbeat is None else heartbeat.silent,
         fell_silent=tuple(_fallen_silent(snapshot, memory.limits.latching)),
         damaged=len(snapshot.damaged),
-        incomplete=snapshot.disk_use[1],
+        incomplete=snapshot.timeline.disk_use[1],
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot, heartbeat, wall),
         problems=(*problems_of(snapshot, heartbeat, wall), *lacking_in(view)),
@@ -85,7 +85,7 @@ def lacking_in(view: View) -> Iterator[str]:
     snapshot = view.snapshot
     if snapshot.problem is None and not snapshot.bags:
         yield nothing_here(snapshot)
-    if left_open := snapshot.disk_use[1]:
+    if left_open := snapshot.timeline.disk_use[1]:
         bags = counted(left_open, "bag was", "bags were")
         yield f"{bags} left open by a crash: what did not reach the disk is lost"
     if snapshot.unread:
@@ -111,10 +111,10 @@ def _fallen_silent(snapshot: Snapshot, latching: Latching) -> Iterator[SilentTop
     latest = snapshot.dating.latest
     if latest is None:
         return
-    for topic in snapshot.topics():
-        if snapshot.is_log(topic) or latching.is_latched(snapshot, topic):
+    for topic in snapshot.timeline.topics():
+        if snapshot.timeline.is_log(topic) or latching.is_latched(snapshot, topic):
             continue
-        stated = [*snapshot.totals(topic).values()]
+        stated = [*snapshot.timeline.totals(topic).values()]
         messages = sum(each.messages for each in stated)
         first, last = min(each.first for each in stated), max(each.last for each in stated)
         if messages < _MIN_MESSAGES:
@@ -131,7 +131,7 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     budget either.
     """
     kept, latest = memory.limits.kept, snapshot.dating.latest
-    used, _ = snapshot.disk_use
+    used, _ = snapshot.timeline.disk_use
     if kept is None:
         return Budget(used, None, None, None)
     foreign = memory.foreign(snapshot)
@@ -162,14 +162,14 @@ def left_open(snapshot: Snapshot) -> tuple[SetAside, ...]:
     """Returns the bags that a crash left open, each with what is lost of it."""
     return tuple(
         SetAside(bag.path, "; ".join(bag.summary.remarks) or "left open by a crash")
-        for bag in snapshot.faulty(TimeWindow.everything())
+        for bag in snapshot.timeline.faulty(TimeWindow.everything())
         if bag.state is BagState.INCOMPLETE
     )
 
 
 def odd_bags(snapshot: Snapshot) -> list[BagFile]:
     """Returns the bags with remarks other than on a crash or a clock, in bag order."""
-    bags = snapshot.faulty(TimeWindow.everything())
+    bags = snapshot.timeline.faulty(TimeWindow.everything())
     return [bag for bag in bags if bag.state is not BagState.INCOMPLETE and bag.summary.notes]
 
 
@@ -195,7 +195,7 @@ def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
     """Returns the topics with messages that cannot be decoded, with type and reason."""
     return tuple(
         Undecodable(topic, type_name, reason)
-        for topic in view.snapshot.topics()
+        for topic in view.snapshot.timeline.topics()
         for type_name, reason in sorted(undecodable_types(view, topic).items())
     )
 
@@ -203,7 +203,7 @@ def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
 def undecodable_types(view: View, topic: str) -> dict[str, str]:
     """Returns why messages of a topic cannot be decoded, by type; from one bag for each type."""
     reasons: dict[str, str] = {}
-    for type_name in view.snapshot.types_of(topic):
+    for type_name in view.snapshot.timeline.types_of(topic):
         reason = _why_undecodable(view, topic, type_name)
         if reason:
             reasons[type_name] = reason
@@ -211,7 +211,7 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
-    bag = view.snapshot.first_with(topic, type_name)
+    bag = view.snapshot.timeline.first_with(topic, type_name)
     entry = view.bags.entry(bag)
     known = None if entry is None else entry[0].undecodable(topic, entry[1])
     if known is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
@@ -27,10 +28,10 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     """
     view = View(memory, call, memory.clock.now())
     require_bags(view)
-    snapshot = view.snapshot
-    topics = [topic for topic in snapshot.topics() if type_name in snapshot.types_of(topic)]
+    timeline = view.snapshot.timeline
+    topics = [topic for topic, types in timeline.types.items() if type_name in types]
     if not topics:
-        known = sorted({each for topic in snapshot.topics() for each in snapshot.types_of(topic)})
+        known = sorted(set(chain.from_iterable(timeline.types.values())))
         more = f" and {len(known) - MAX_FIELDS} more" if len(known) > MAX_FIELDS else ""
         names = ", ".join(known[:MAX_FIELDS]) + more
         raise NoDataError(

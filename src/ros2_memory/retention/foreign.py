@@ -62,7 +62,7 @@ class ForeignBags:
 
     def _measured(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
         sizes: dict[str, int] = {}
-        for run in snapshot.segments:
+        for run in snapshot.timeline.segments:
             for folder, size in run.bytes_in.items():
                 sizes[folder] = sizes.get(folder, 0) + size
         asides = [

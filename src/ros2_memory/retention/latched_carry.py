@@ -153,7 +153,7 @@ class Carrier:
         wanted = {str(path) for path in paths}
         everything = TimeWindow.everything()
         for topic in self._topics(snapshot):
-            extents = snapshot.extents(topic, everything)
+            extents = snapshot.timeline.extents(topic, everything)
             found.update((bag.file, bag) for bag, *_ in extents if bag.file in wanted)
         return tuple(found.values())
 
@@ -197,8 +197,8 @@ class Carrier:
         """Returns the latched topics, also frequent ones: their last message may still be valid."""
         return tuple(
             topic
-            for topic in snapshot.topics()
-            if topic in self._static_topics or snapshot.is_transient_state(topic)
+            for topic in snapshot.timeline.topics()
+            if topic in self._static_topics or snapshot.timeline.is_transient_state(topic)
         )
 
     def _carried(self, topics: Collection[str]) -> Iterator[tuple[Latched, Origin | None]]:
@@ -236,9 +236,9 @@ class Carrier:
 
     def _is_frequent(self, snapshot: Snapshot, topic: str, recording: Path) -> bool:
         """Whether a recording has frequent messages of a topic; never if they are transforms."""
-        if topic in self._static_topics or any(map(_is_tf, snapshot.types_of(topic))):
+        if topic in self._static_topics or any(map(_is_tf, snapshot.timeline.types_of(topic))):
             return False
-        return not snapshot.pace(topic, recording).is_rare
+        return not snapshot.timeline.pace(topic, recording).is_rare
 
     def _folder(self, bag: Path) -> str:
         """Returns the directory of a bag's recording, relative to the bag directory."""
@@ -300,7 +300,7 @@ class Carrier:
         found: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
         for topic in topics:
             seen: set[Path] = set()
-            for bag, *_ in snapshot.extents(topic, TimeWindow.everything()):
+            for bag, *_ in snapshot.timeline.extents(topic, TimeWindow.everything()):
                 if bag.recording in seen or bag.path in to_delete or is_carried(bag.path):
                     continue
                 seen.add(bag.recording)

@@ -275,7 +275,7 @@ class MomentKeeper:
     def _needed(self, moment: SaveRequest, snapshot: Snapshot) -> NeededBags:
         window = window_of(moment.start, moment.end)
         open_files = [snapshot.unread_spans[aside] for aside in snapshot.active]
-        bags = snapshot.overlapping(window)
+        bags = snapshot.timeline.overlapping(window)
         return needed_bags(window, moment.asked, bags, open_files, self._clock.now())
 
     def _open_bytes(self, request: SaveRequest, snapshot: Snapshot) -> int:

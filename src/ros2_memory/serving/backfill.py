@@ -96,7 +96,7 @@ class Backfill:
 
     def waiting(self) -> list[BagFile]:
         """Returns the bags to be digested, the newest first."""
-        missing = bags_without_entry(self._memory.index.snapshot().segments, self._digests)
+        missing = bags_without_entry(self._memory.index.snapshot().timeline.segments, self._digests)
         return [bag for bag in reversed(missing) if not self._is_refused(self._key(bag))]
 
     def progress(self) -> Progress:
@@ -158,7 +158,7 @@ class Backfill:
         snapshot = self._memory.index.snapshot()
         if snapshot.problem is not None or not snapshot.bags:
             return
-        present = {self._key(bag).path for segment in snapshot.segments for bag in segment.bags}
+        present = {self._key(bag).path for bag in snapshot.timeline.bags}
         self.catalogue.forget([path for path in self.catalogue.paths() if path not in present])
         self.catalogue.forget_older_configurations()
 

@@ -28,7 +28,7 @@ def recorded(bag_dir: Path, bags: int = 2) -> tuple[Memory, Segment]:
     for n in range(bags):
         write_mcap(bag_dir / "rec" / f"rec_{n}.mcap", [odom(T0 + n, 0.0, 0.0)])
     memory = memory_of(bag_dir)
-    [run] = memory.index.snapshot().segments
+    [run] = memory.index.snapshot().timeline.segments
     return memory, run
 
 

@@ -211,8 +211,8 @@ def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed
             start = draw.choice([MIN_NS, stop - draw.choice([1, 10**8, 3 * 10**9, 10**11])])
             for memory in (plain, recalled):
                 asked = View(memory, Call())
-                assume(asked.snapshot.topics())  # not where each bag was spoilt
-                topic = draw.choice(asked.snapshot.topics())
+                assume(asked.snapshot.timeline.topics())  # not where each bag was spoilt
+                topic = draw.choice(asked.snapshot.timeline.topics())
                 window = TimeWindow(start, stop)
                 first = View(memory, Call()).stream.first([topic], window, newest_first=True)
                 assert asked.stream.newest(topic, window) == first, (seed, topic, window)

@@ -17,6 +17,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.time_arguments import TimeRange
 from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import Timeline
 from tests.support.bags import detections, odom, tf, transform
 from tests.support.clocks import FixedClock
 from tests.support.fakes import FakeReader
@@ -95,7 +96,7 @@ def week() -> tuple[Memory, FakeReader]:
         bags.append(BagFile(str(path), 1, T0, BagState.CLOSED, summary, summary.start, summary.end))
         entries.append((BagKey.of(bags[-1], BAG_DIR), digest))
     assert catalogue.put_all(entries)
-    index = cast("IndexManager", Still(Snapshot(tuple(bags))))
+    index = cast("IndexManager", Still(Snapshot(Timeline.of(bags))))
     reader = FakeReader()
     clock = FixedClock(T0 + BAGS * SPLIT)
     recall = DigestCache(catalogue, BAG_DIR)

@@ -19,6 +19,7 @@ from ros2_memory.core.model import (
 from ros2_memory.core.text import counted, listed
 from ros2_memory.history.coverage import unread_spans
 from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import Timeline
 
 S = 10**9
 T0 = 1_784_023_200 * S
@@ -43,7 +44,9 @@ def told(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False
     return list(unread_spans(snapshot, window, nothing=nothing))
 
 
-LOST_SPLIT = Snapshot(bags=(split(0), split(2), split(3)), damaged=(torn(1),), scanned_at=T0 + DAY)
+LOST_SPLIT = Snapshot(
+    Timeline.of((split(0), split(2), split(3))), damaged=(torn(1),), scanned_at=T0 + DAY
+)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +61,9 @@ def test_a_split_that_could_not_be_read_is_reported_in_windows_that_may_touch_it
 
 
 def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found() -> None:
-    snapshot = Snapshot(bags=(split(0),), damaged=(torn(7, None, "alone"),), scanned_at=T0 + DAY)
+    snapshot = Snapshot(
+        Timeline.of((split(0),)), damaged=(torn(7, None, "alone"),), scanned_at=T0 + DAY
+    )
     assert told(snapshot, 0, 9) == []
     assert told(snapshot, 0, 9, nothing=True) == [
         "1 bag file could not be read and may hold more: alone/alone_7.mcap (torn)"
@@ -67,7 +72,7 @@ def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found
 
 def test_an_old_file_that_nobody_removes_is_not_part_of_every_answer() -> None:
     old = torn(0, T0 - 30 * DAY, "old")
-    snapshot = Snapshot(bags=(split(0), split(1)), damaged=(old,), scanned_at=T0 + DAY)
+    snapshot = Snapshot(Timeline.of((split(0), split(1))), damaged=(old,), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 20) == []
     assert told(snapshot, 0, 20, nothing=True) == []
     assert len(told(snapshot, -30 * 86400 - 5, 20)) == 1
@@ -75,7 +80,7 @@ def test_an_old_file_that_nobody_removes_is_not_part_of_every_answer() -> None:
 
 def test_files_that_are_not_read_here_count_too() -> None:
     other = SetAside(Path("/b/rec/rec_1.db3"), "choose storage=rosbag2", T0 + DAY)
-    snapshot = Snapshot(bags=(split(0), split(2)), unread=(other,), scanned_at=T0 + DAY)
+    snapshot = Snapshot(Timeline.of((split(0), split(2))), unread=(other,), scanned_at=T0 + DAY)
     assert told(snapshot, 11, 12) == [
         "1 bag file could not be read and may hold more: rec/rec_1.db3 (choose storage=rosbag2)"
     ]
@@ -83,7 +88,7 @@ def test_files_that_are_not_read_here_count_too() -> None:
 
 def test_many_files_are_counted_and_the_last_ones_named() -> None:
     lost = tuple(torn(number) for number in range(1, 9))
-    snapshot = Snapshot(bags=(split(0), split(9)), damaged=lost, scanned_at=T0 + DAY)
+    snapshot = Snapshot(Timeline.of((split(0), split(9))), damaged=lost, scanned_at=T0 + DAY)
     assert told(snapshot, 0, 100) == [
         (
             "8 bag files could not be read and may hold more: rec/rec_6.mcap (torn), "
@@ -94,7 +99,7 @@ def test_many_files_are_counted_and_the_last_ones_named() -> None:
 
 def test_the_split_being_written_is_reported_from_the_end_of_the_one_before_it_on() -> None:
     active = SetAside(Path("/b/rec/rec_1.mcap"), "still being written")
-    snapshot = Snapshot(bags=(split(0),), active=(active,), scanned_at=T0 + 15 * S)
+    snapshot = Snapshot(Timeline.of((split(0),)), active=(active,), scanned_at=T0 + 15 * S)
     assert told(snapshot, 0, 9) == []
     assert told(snapshot, 5, 12) == [
         "the split being written is not included: nothing after 1784023209.000000"
@@ -103,13 +108,13 @@ def test_the_split_being_written_is_reported_from_the_end_of_the_one_before_it_o
 
 def test_a_file_that_is_written_beside_closed_ones_is_named() -> None:
     active = SetAside(Path("/b/other/other_0.mcap"), "still being written")
-    snapshot = Snapshot(bags=(split(0), split(1)), active=(active,), scanned_at=T0 + 25 * S)
+    snapshot = Snapshot(Timeline.of((split(0), split(1))), active=(active,), scanned_at=T0 + 25 * S)
     assert told(snapshot, 0, 9) == ["still being written and not included: other/other_0.mcap"]
 
 
 def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it() -> None:
     cut = split(1, state=BagState.INCOMPLETE, notes=("the last 41 bytes could not be read",))
-    snapshot = Snapshot(bags=(split(0), cut), scanned_at=T0 + DAY)
+    snapshot = Snapshot(Timeline.of((split(0), cut)), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 9) == []
     assert told(snapshot, 5, 15) == [
         (
@@ -121,7 +126,7 @@ def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it() -> N
 
 def test_a_closed_bag_that_contradicts_itself_is_reported() -> None:
     odd = [split(number, notes=("its own statistics are wrong",)) for number in range(5)]
-    snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
+    snapshot = Snapshot(Timeline.of(tuple(odd)), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 5) == ["rec/rec_0.mcap: its own statistics are wrong"]
     named = "rec/rec_4.mcap, rec/rec_3.mcap, rec/rec_2.mcap and 2 more"
     assert told(snapshot, 0, 60) == [f"5 bags ({named}): its own statistics are wrong"]
@@ -129,7 +134,7 @@ def test_a_closed_bag_that_contradicts_itself_is_reported() -> None:
 
 def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_reported() -> None:
     odd = [split(number, notes=(f"way {number}",)) for number in range(5)]
-    snapshot = Snapshot(bags=tuple(odd), scanned_at=T0 + DAY)
+    snapshot = Snapshot(Timeline.of(tuple(odd)), scanned_at=T0 + DAY)
     assert told(snapshot, 0, 60) == [
         "rec/rec_2.mcap: way 2",
         "rec/rec_3.mcap: way 3",
@@ -149,7 +154,7 @@ def test_what_is_reported_stays_short_however_much_was_lost(
 ) -> None:
     asides = tuple(SetAside(Path(f"/b/rec/rec_{n}.mcap"), reason, T0) for n in sorted(lost))
     bags = tuple(split(n, notes=(reason,)) for n in range(41) if n not in lost)
-    snapshot = Snapshot(bags=bags, damaged=asides, scanned_at=T0 + DAY)
+    snapshot = Snapshot(Timeline.of(bags), damaged=asides, scanned_at=T0 + DAY)
     sentences = told(snapshot, *sorted(window), nothing=nothing)
     assert len(sentences) <= 5
     assert sum(map(len, sentences)) < 2000

@@ -10,12 +10,12 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import (
     FIRST_BAGS_NS,
     FUTURE_NS,
-    DatedBags,
     Dating,
     FaultyClock,
     check_dates,
     max_plausible,
 )
+from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import StepBack
 
 S = 10**9
@@ -35,7 +35,7 @@ def dating(
 ) -> Dating:
     ordered = sorted(bags, key=lambda each: (each.start, each.end, each.file))
     groups = [ordered[at : at + size] for at in range(0, len(ordered), size)]
-    parts = [DatedBags(group, max(each.end for each in group)) for group in groups]
+    parts = [Segment(group) for group in groups]
     return check_dates(
         parts,
         steps,

@@ -203,11 +203,12 @@ def test_an_index_that_followed_every_change_knows_what_a_fresh_one_finds(
 
 def _views(snapshot: Snapshot) -> tuple[object, ...]:
     return (
+        snapshot.bags,
         snapshot.earliest,
         snapshot.latest,
-        snapshot.topics(),
-        [snapshot.with_topic(topic) for topic in snapshot.topics()],
-        [snapshot.types_of(topic) for topic in snapshot.topics()],
-        [snapshot.is_transient_local(topic) for topic in snapshot.topics()],
-        snapshot.overlapping(TimeWindow(20, 60)),
+        snapshot.timeline.topics(),
+        [snapshot.timeline.with_topic(topic) for topic in snapshot.timeline.topics()],
+        [snapshot.timeline.types_of(topic) for topic in snapshot.timeline.topics()],
+        [snapshot.timeline.is_transient_local(topic) for topic in snapshot.timeline.topics()],
+        snapshot.timeline.overlapping(TimeWindow(20, 60)),
     )

@@ -46,12 +46,12 @@ def _states(snapshot: Snapshot) -> list[tuple[str, BagState]]:
 def test_the_splits_of_a_real_recording_are_found_in_order() -> None:
     snapshot = _scan(RECORDED / "session_mcap", McapReader())
     assert _states(snapshot) == [(f"session_mcap_{n}.mcap", BagState.CLOSED) for n in range(7)]
-    assert sum(held.count for _, held in snapshot.with_topic("/odom")) == 1300
-    assert [bag.path.name for bag, _ in snapshot.with_topic("/tf_static")] == [
+    assert sum(held.count for _, held in snapshot.timeline.with_topic("/odom")) == 1300
+    assert [bag.path.name for bag, _ in snapshot.timeline.with_topic("/tf_static")] == [
         "session_mcap_0.mcap"
     ]
-    assert snapshot.is_transient_local("/tf_static")
-    assert not snapshot.is_transient_local("/tf")
+    assert snapshot.timeline.is_transient_local("/tf_static")
+    assert not snapshot.timeline.is_transient_local("/tf")
 
 
 @needs_recorded

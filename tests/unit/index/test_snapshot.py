@@ -50,9 +50,9 @@ def test_ties_are_broken_by_end_and_then_by_path() -> None:
 
 def test_an_empty_timeline_has_neither_beginning_nor_end() -> None:
     empty = Snapshot()
-    assert (empty.earliest, empty.latest, empty.topics()) == (None, None, ())
-    assert empty.with_topic("/odom") == ()
-    assert empty.overlapping(TimeWindow.everything()) == ()
+    assert (empty.earliest, empty.latest, empty.timeline.topics()) == (None, None, ())
+    assert empty.timeline.with_topic("/odom") == ()
+    assert empty.timeline.overlapping(TimeWindow.everything()) == ()
 
 
 def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> None:
@@ -64,16 +64,16 @@ def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> No
     ]
     carried = _bag(f"{CARRY_FOLDER}/{CARRY_FILE}", ("/tf_static", -5, -5))._replace(size=7)
     whole = Timeline.of([carried, *bags])
-    snapshot = Snapshot(bags=whole.recorded, timeline=whole)
+    snapshot = Snapshot(whole)
     left_open = sum(bag.state is BagState.INCOMPLETE for bag in snapshot.bags)
-    assert snapshot.disk_use == (sum(bag.size for bag in snapshot.bags), left_open)
+    assert snapshot.timeline.disk_use == (sum(bag.size for bag in snapshot.bags), left_open)
     assert len(snapshot.bags) == len(bags)
     assert Timeline.of([carried]).disk_use == (7, 0)
-    assert Snapshot().disk_use == (0, 0)
+    assert Timeline().disk_use == (0, 0)
 
 
 def test_the_latest_message_may_stand_in_a_bag_that_began_earlier() -> None:
-    snapshot = Snapshot(bags=(_bag("a", ("/odom", 0, 100)), _bag("b", ("/odom", 10, 20))))
+    snapshot = Snapshot(Timeline.of((_bag("a", ("/odom", 0, 100)), _bag("b", ("/odom", 10, 20)))))
     assert (snapshot.earliest, snapshot.latest) == (0, 100)
 
 
@@ -82,26 +82,28 @@ def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> No
     second = replace(both.summary.topics[0], type="std_msgs/msg/String")
     both = both._replace(summary=BagSummary((*both.summary.topics, second)))
     first = _bag("a", ("/x", 0, 9))
-    snapshot = Snapshot(bags=(first, both))
-    assert snapshot.with_topic("/x") == (
+    snapshot = Snapshot(Timeline.of((first, both)))
+    assert snapshot.timeline.with_topic("/x") == (
         (first, first.summary.topics[0]),
         (both, both.summary.topics[0]),
         (both, second),
     )
-    assert snapshot.types_of("/x") == (ODOM, "std_msgs/msg/String")
-    assert snapshot.types_of("/nothing") == ()
+    assert snapshot.timeline.types_of("/x") == (ODOM, "std_msgs/msg/String")
+    assert snapshot.timeline.types_of("/nothing") == ()
 
 
 def test_a_topic_is_transient_local_where_any_bag_says_so() -> None:
-    snapshot = Snapshot(bags=(_bag("a", ("/tf_static", 0, 0), ("/tf", 0, 9)),))
-    assert snapshot.is_transient_local("/tf_static")
-    assert not snapshot.is_transient_local("/tf")
-    assert not snapshot.is_transient_local("/nothing")
+    snapshot = Snapshot(Timeline.of((_bag("a", ("/tf_static", 0, 0), ("/tf", 0, 9)),)))
+    assert snapshot.timeline.is_transient_local("/tf_static")
+    assert not snapshot.timeline.is_transient_local("/tf")
+    assert not snapshot.timeline.is_transient_local("/nothing")
 
 
 def test_heard_topics_come_sorted_without_the_silent_ones() -> None:
-    snapshot = Snapshot(bags=(_bag("a", ("/tf", 0, 9), ("/odom", 0, 9), silent=("/scan",)),))
-    assert snapshot.topics() == ("/odom", "/tf")
+    snapshot = Snapshot(
+        Timeline.of((_bag("a", ("/tf", 0, 9), ("/odom", 0, 9), silent=("/scan",)),))
+    )
+    assert snapshot.timeline.topics() == ("/odom", "/tf")
 
 
 @pytest.mark.parametrize(
@@ -120,16 +122,16 @@ def test_heard_topics_come_sorted_without_the_silent_ones() -> None:
 def test_a_window_overlaps_the_bags_that_have_a_moment_in_it(
     window: tuple[int, int], names: list[str]
 ) -> None:
-    snapshot = Snapshot(bags=(_bag("a", ("/odom", 0, 9)), _bag("b", ("/odom", 10, 19))))
-    assert [bag.path.name for bag in snapshot.overlapping(TimeWindow(*window))] == names
-    held = snapshot.with_topic("/odom", TimeWindow(*window))
+    snapshot = Snapshot(Timeline.of((_bag("a", ("/odom", 0, 9)), _bag("b", ("/odom", 10, 19)))))
+    assert [bag.path.name for bag in snapshot.timeline.overlapping(TimeWindow(*window))] == names
+    held = snapshot.timeline.with_topic("/odom", TimeWindow(*window))
     assert [bag.path.name for bag, _ in held] == names
 
 
 def test_a_window_counts_for_a_topic_by_the_times_of_that_topic_alone() -> None:
-    snapshot = Snapshot(bags=(_bag("a", ("/odom", 0, 99), ("/tf_static", 3, 3)),))
-    assert len(snapshot.with_topic("/tf_static", TimeWindow(3, 4))) == 1
-    assert snapshot.with_topic("/tf_static", TimeWindow(4, 99)) == ()
+    snapshot = Snapshot(Timeline.of((_bag("a", ("/odom", 0, 99), ("/tf_static", 3, 3)),)))
+    assert len(snapshot.timeline.with_topic("/tf_static", TimeWindow(3, 4))) == 1
+    assert snapshot.timeline.with_topic("/tf_static", TimeWindow(4, 99)) == ()
 
 
 def test_removing_a_bag_that_is_not_there_is_refused() -> None:
@@ -173,7 +175,7 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
     held = [(bag, topic) for bag in ordered for topic in bag.summary.topics]
     names = sorted({topic.topic for _, topic in held})
     assert timeline.bags == tuple(ordered)
-    snapshot = Snapshot(timeline=timeline)
+    snapshot = Snapshot(timeline)
     assert snapshot.earliest == min((bag.start for bag in bags), default=None)
     assert snapshot.latest == max((bag.end for bag in bags), default=None)
     assert timeline.silent == {name for bag in bags for name in bag.summary.silent}

@@ -16,7 +16,7 @@ from ros2_memory.core.model import (
     TopicSummary,
 )
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.index.timeline import SEGMENT_BAGS
+from ros2_memory.index.timeline import SEGMENT_BAGS, Timeline
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, text, write_mcap
@@ -137,13 +137,13 @@ def test_what_is_amiss_in_a_window_reaches_on_to_the_end_of_an_open_file(
         bag("/r/odd", T0 + 40 * S, T0 + 41 * S, written=T0 + DAY, notes=("torn",)),
     )
     window = TimeWindow(T0 + start * S, T0 + stop * S)
-    assert [each.path.name for each in Snapshot(bags=bags).faulty(window)] == found
+    assert [each.path.name for each in Snapshot(Timeline.of(bags)).timeline.faulty(window)] == found
 
 
 def test_neighbours_are_found_across_the_parts_of_a_long_history() -> None:
     numbers = [n for n in range(3 * SEGMENT_BAGS) if n != SEGMENT_BAGS]
     bags = tuple(bag(f"/b/rec/rec_{n}.mcap", T0 + n * S, T0 + n * S + 5) for n in numbers)
     lost = SetAside(Path(f"/b/rec/rec_{SEGMENT_BAGS}.mcap"), "torn", T0)
-    snapshot = Snapshot(bags=bags, damaged=(lost,), scanned_at=T0 + DAY)
+    snapshot = Snapshot(Timeline.of(bags), damaged=(lost,), scanned_at=T0 + DAY)
     window = TimeWindow(T0 + (SEGMENT_BAGS - 1) * S + 5, T0 + (SEGMENT_BAGS + 1) * S + 1)
     assert snapshot.unread_spans[lost] == window

@@ -87,9 +87,12 @@ def test_several_recordings_are_indexed_in_the_order_of_their_times(yard: Yard) 
     snapshot = yard.index.snapshot()
     assert _names(snapshot.bags) == [*(f"rec_b_{n}.mcap" for n in range(12)), "rec_a_0.mcap"]
     assert (snapshot.earliest, snapshot.latest) == (0, 209)
-    assert snapshot.topics() == ("/odom",)
-    assert _names(snapshot.overlapping(TimeWindow(109, 111))) == ["rec_b_10.mcap", "rec_b_11.mcap"]
-    assert len(snapshot.with_topic("/odom")) == 13
+    assert snapshot.timeline.topics() == ("/odom",)
+    assert _names(snapshot.timeline.overlapping(TimeWindow(109, 111))) == [
+        "rec_b_10.mcap",
+        "rec_b_11.mcap",
+    ]
+    assert len(snapshot.timeline.with_topic("/odom")) == 13
     assert (snapshot.problem, snapshot.scanned_at) == (None, NOW)
 
 
@@ -186,9 +189,9 @@ def test_a_changed_file_is_read_again_and_a_vanished_one_leaves(yard: Yard) -> N
     second.unlink()
     after = yard.scan_after()
     assert [(bag.path.name, bag.end) for bag in after.bags] == [("rec_0.mcap", 5)]
-    assert after.topics() == ("/odom",)
+    assert after.timeline.topics() == ("/odom",)
     assert _names(before.bags) == ["rec_0.mcap", "rec_1.mcap"]
-    assert before.topics() == ("/odom", "/scan")
+    assert before.timeline.topics() == ("/odom", "/scan")
 
 
 def test_a_renamed_split_is_known_under_its_name_of_today(yard: Yard) -> None:
@@ -306,10 +309,11 @@ def test_a_bag_directory_that_is_unmounted_takes_its_bags_along(yard: Yard) -> N
     before = yard.scan_after()
     yard.bag_dir.rename(yard.bag_dir.with_name("elsewhere"))
     gone = yard.scan_after()
-    assert replace(gone, problem=None) == Snapshot(scanned_at=NOW)
+    assert (gone.bags, replace(gone, problem=None)) == ((), Snapshot(scanned_at=NOW))
     assert gone.problem
     yard.bag_dir.with_name("elsewhere").rename(yard.bag_dir)
-    assert yard.scan_after() == before
+    after = yard.scan_after()
+    assert (after.bags, after) == (before.bags, before)
 
 
 def test_a_snapshot_is_kept_until_it_is_older_than_refresh_s(yard: Yard) -> None:
@@ -422,7 +426,7 @@ def test_nothing_is_written_into_the_bag_directory(yard: Yard) -> None:
     yard.age()
     before = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
     for _ in range(3):
-        yard.scan_after(5).with_topic("/odom")
+        yard.scan_after(5).timeline.with_topic("/odom")
     after = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
     assert {path: (stat.st_size, stat.st_mtime_ns) for path, stat in after.items()} == {
         path: (stat.st_size, stat.st_mtime_ns) for path, stat in before.items()
