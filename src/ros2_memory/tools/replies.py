@@ -16,7 +16,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.timebase import unix_rounded_up
 from ros2_memory.tools import reply_json_motion  # noqa: F401 - registers its replies
-from ros2_memory.tools.reply_json import render
+from ros2_memory.tools.reply_json import render, with_notes
 from ros2_memory.tools.reply_json_memory import file_name, time_range
 from ros2_memory.tools.reply_json_topics import fit_topics
 from ros2_memory.tools.reply_size import fit_reply, to_json_text
@@ -89,7 +89,7 @@ class Replies:
 
     def _no_data(self, reason: NoDataReason, detail: str, notes: tuple[str, ...] = ()) -> Reply:
         reply: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
-        return Reply(fit_reply({**reply, "notes": [*notes]} if notes else reply, self.max_chars))
+        return Reply(fit_reply(with_notes(reply, notes), self.max_chars))
 
     def _failure(self, code: str, detail: str, **more: JsonValue) -> Reply:
         reply: JsonObject = {"error": code, **more, "detail": detail}

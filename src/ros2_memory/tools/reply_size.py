@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from bisect import bisect_left
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -299,10 +300,4 @@ def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int | None:
     """
     if not fits(low):
         return None
-    while low < high:
-        middle = (low + high + 1) // 2
-        if fits(middle):
-            low = middle
-        else:
-            high = middle - 1
-    return low
+    return low + bisect_left(range(low + 1, high + 1), True, key=lambda number: not fits(number))
