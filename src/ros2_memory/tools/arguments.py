@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-from abc import ABC, abstractmethod
 from functools import partial
 from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
@@ -169,59 +168,54 @@ class Arguments(BaseModel):
     model_config = ConfigDict(frozen=True, defer_build=True)
 
 
-class TimeArgument(Arguments, ABC):
-    """The arguments that replace a placeholder: `replaces` is `moment` or `span`."""
+class TimeArgument(Arguments):
+    """The arguments that replace a placeholder, whose fields have the same names as theirs.
+
+    Attributes:
+        replaces: the placeholder, `moment` or `span`.
+        text: what a tool's description says for {when}.
+        extra_reply: the keys that a reply has in addition.
+    """
 
     replaces: ClassVar[str]
-
-    @abstractmethod
-    def to_query_time(self) -> AtTime | TimeRange:
-        """Returns the value of the placeholder."""
+    text: ClassVar[str]
+    extra_reply: ClassVar[str] = ""
 
 
 class At(TimeArgument):
     """A moment in Unix seconds."""
 
     replaces = "moment"
-    timestamp: Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023200.5])]
-
-    def to_query_time(self) -> AtTime:
-        """Returns the moment."""
-        return AtTime(at_s=self.timestamp)
+    text = "at a Unix time"
+    at_s: Annotated[_UnixBound, Field(examples=[1784023200.5], alias="timestamp")]
 
 
 class Ago(TimeArgument):
     """A moment counted back from now."""
 
     replaces = "moment"
-    seconds_ago: Annotated[_Duration, Field(description="Seconds before now.", examples=[10])]
-
-    def to_query_time(self) -> AtTime:
-        """Returns the moment, relative to now."""
-        return AtTime(ago_s=self.seconds_ago)
+    text = "some seconds ago"
+    extra_reply = "age_s (before now)"
+    ago_s: Annotated[
+        _Duration, Field(description="Seconds before now.", examples=[10], alias="seconds_ago")
+    ]
 
 
 class Between(TimeArgument):
     """A window in Unix seconds."""
 
     replaces = "span"
-    start: Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023200])]
-    end: Annotated[_Unix, Field(description="Unix seconds.", examples=[1784023260])]
-
-    def to_query_time(self) -> TimeRange:
-        """Returns the window."""
-        return TimeRange(start_s=self.start, end_s=self.end)
+    text = "between two Unix times"
+    start_s: Annotated[_UnixBound, Field(examples=[1784023200], alias="start")]
+    end_s: Annotated[_UnixBound, Field(examples=[1784023260], alias="end")]
 
 
 class Last(TimeArgument):
     """A window that ends now."""
 
     replaces = "span"
-    seconds: Annotated[_Positive, Field(description="Before now.", examples=[60])]
-
-    def to_query_time(self) -> TimeRange:
-        """Returns the window, relative to now."""
-        return TimeRange(last_s=self.seconds)
+    text = "in the last seconds"
+    last_s: Annotated[_Positive, Field(description="Before now.", examples=[60], alias="seconds")]
 
 
 class NoArguments(Arguments):

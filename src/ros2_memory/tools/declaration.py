@@ -56,17 +56,11 @@ class Tool:
 
 @dataclass(frozen=True, slots=True)
 class ToolName:
-    """One name of a query.
-
-    `when_text` replaces {when} in the description. `extra_reply` names the keys that its reply has
-    in addition to that of the query's first name.
-    """
+    """One name of a query, and the arguments that replace its moment or span."""
 
     name: str
     title: str
     when: type[TimeArgument] | None = None
-    when_text: str = ""
-    extra_reply: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +98,11 @@ class ToolDeclaration:
 
     def _description(self, name: ToolName, defaults: Mapping[str, object]) -> str:
         """Returns the full description for the first name, and a reference to it for the others."""
-        first = self.names[0]
-        if name is first:
-            return self.description.format(when=name.when_text, **defaults)
-        extra = f" Reply: the same, {name.extra_reply}." if name.extra_reply else ""
-        return f"As {first.name}, {name.when_text}.{extra}"
+        first, when = self.names[0], name.when
+        if name is first or when is None:
+            return self.description.format(when=when.text if when else "", **defaults)
+        extra = f" Reply: the same, {when.extra_reply}." if when.extra_reply else ""
+        return f"As {first.name}, {when.text}.{extra}"
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
         arguments = dict(signature.parse(given))

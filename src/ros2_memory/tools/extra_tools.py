@@ -31,8 +31,8 @@ _SIGHTINGS = ToolDeclaration(
 )
 _RECAP = ToolDeclaration(
     (
-        ToolName("recap", "What happened", Between, "between two Unix times"),
-        ToolName("recap_last", "What happened lately", Last, "in the last seconds"),
+        ToolName("recap", "What happened", Between),
+        ToolName("recap_last", "What happened lately", Last),
     ),
     "What happened {when}: way, stops, things in view, flips of booleans, errors, gaps. Reply: "
     "{{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, duration_s, text}}], counts}}.",

@@ -94,7 +94,7 @@ class Signature:
         values = dict(present)
         if self._when is not None:
             try:
-                values[self._when.replaces] = self._when.model_validate(present).to_query_time()
+                values[self._when.replaces] = dict(self._when.model_validate(present))
             except ValidationError as error:
                 problems += self._wrong(error, given)
         try:

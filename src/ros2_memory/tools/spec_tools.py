@@ -81,14 +81,8 @@ def _list_topics(
 
 def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
     return (
-        ToolName(f"get_{name}_{at}", f"{title} at a time", At, "at a Unix time"),
-        ToolName(
-            f"get_{name}_seconds_ago",
-            f"{title} some seconds ago",
-            Ago,
-            "some seconds ago",
-            "age_s (before now)",
-        ),
+        ToolName(f"get_{name}_{at}", f"{title} at a time", At),
+        ToolName(f"get_{name}_seconds_ago", f"{title} some seconds ago", Ago),
     )
 
 
@@ -118,8 +112,8 @@ _TOPIC_AT = ToolDeclaration(
 )
 _TOPIC_RANGE = ToolDeclaration(
     (
-        ToolName("get_topic_in_range", "A topic over a window", Between, "between two Unix times"),
-        ToolName("get_topic_in_last", "A topic over the last seconds", Last, "in the last seconds"),
+        ToolName("get_topic_in_range", "A topic over a window", Between),
+        ToolName("get_topic_in_last", "A topic over the last seconds", Last),
     ),
     "What a topic said {when}: up to max_samples messages, evenly spaced over the window, first "
     "and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; with "
@@ -185,13 +179,8 @@ _VALUE_WHEN = ToolDeclaration(
 )
 _TRAJECTORY = ToolDeclaration(
     (
-        ToolName("trajectory_summary", "Way driven", Between, "between two Unix times"),
-        ToolName(
-            "recent_trajectory_summary",
-            "Way driven lately",
-            Last,
-            "in the last seconds",
-        ),
+        ToolName("trajectory_summary", "Way driven", Between),
+        ToolName("recent_trajectory_summary", "Way driven lately", Last),
     ),
     "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, avg_speed, "
     "max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], ...}}.",

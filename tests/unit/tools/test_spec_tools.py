@@ -11,9 +11,15 @@ import pytest
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.history.time_arguments import AtTime
+from ros2_memory.history.time_arguments import AtTime, TimeRange
 from ros2_memory.tools import extra_tools, spec_tools
-from ros2_memory.tools.arguments import At, LastMatchArguments
+from ros2_memory.tools.arguments import (
+    At,
+    Last,
+    LastMatchArguments,
+    MotionArguments,
+    WindowArguments,
+)
 from ros2_memory.tools.declaration import Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions
 from ros2_memory.tools.schema import Signature
@@ -279,7 +285,13 @@ def test_a_whole_number_may_be_written_with_a_point() -> None:
 
 
 def test_a_time_argument_replaces_the_moment() -> None:
-    assert At(timestamp=5.0).to_query_time() == AtTime(at_s=5.0)
+    arguments = Signature(MotionArguments, At).parse({"timestamp": 5.0})
+    assert dict(arguments)["moment"] == AtTime(at_s=5.0)
+
+
+def test_a_time_argument_replaces_the_span() -> None:
+    arguments = Signature(WindowArguments, Last).parse({"seconds": 60})
+    assert dict(arguments)["span"] == TimeRange(last_s=60.0)
 
 
 DECLARATIONS = (*spec_tools._DECLARATIONS, *extra_tools.DECLARATIONS, extra_tools.TYPE)
