@@ -11,12 +11,14 @@ import fcntl
 import os
 import stat
 import struct
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 _GETVERSION: Final = 0x80087601  # _IOR('v', 1, long), linux/fs.h
+_MOST_KNOWN: Final = 1 << 14
 _GENERATION: Final = struct.Struct("=I4x")  # the first 4 bytes of that long, on every architecture
 
 
@@ -48,6 +50,23 @@ def identity_of(directory: Path | str) -> Identity | None:
         return identity_at(descriptor)
     finally:
         os.close(descriptor)
+
+
+def known_identity(directory: str) -> Identity | None:
+    """Returns the identity of a directory as `identity_of` does; None if it cannot be opened.
+
+    It is opened again only after its entries or its attributes changed.
+    """
+    try:
+        status = os.stat(directory, follow_symlinks=False)  # noqa: PTH116 - called for many
+        return _identity_as_of(directory, status.st_ino, status.st_ctime_ns)
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=_MOST_KNOWN)
+def _identity_as_of(directory: str, _inode: int, _ctime_ns: int) -> Identity | None:
+    return identity_of(directory)
 
 
 def identity_at(descriptor: int) -> Identity:

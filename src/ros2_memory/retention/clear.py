@@ -28,13 +28,12 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.core import directories
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.retention.delete import is_journal
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 MOST_FAULTS: Final = 100
-
-_SQLITE_COMPANIONS: Final = (".db3-wal", ".db3-shm", ".db3-journal")
 
 
 @dataclass(slots=True)
@@ -187,5 +186,5 @@ def _is_worthless(entry: os.DirEntry[str]) -> bool:
 
 
 def _is_bag(entry: os.DirEntry[str]) -> bool:
-    named = bag_kind(entry.name) or entry.name.endswith(_SQLITE_COMPANIONS)
-    return bool(named) and entry.is_file(follow_symlinks=False)
+    named = bag_kind(entry.name) is not None or is_journal(entry.name)
+    return named and entry.is_file(follow_symlinks=False)

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 REPAIR_SUFFIX: Final = ".repair"
 _LEFTOVER: Final = re.compile(r"\.(?P<target>.+)\.tmp|\.(?P<bag>.+)" + re.escape(REPAIR_SUFFIX))
-_COMPANION: Final = re.compile(r"(?P<bag>.+\.db3)-(wal|shm|journal)", re.IGNORECASE)
+_JOURNALS: Final = ("-wal", "-shm", "-journal")
+_JOURNAL: Final = re.compile(rf".+\.db3({'|'.join(_JOURNALS)})", re.IGNORECASE)
 
 
 def repair_name(name: str) -> str:
@@ -42,7 +43,12 @@ def goes_with_bags(name: str) -> bool:
     left = _LEFTOVER.fullmatch(name)
     if left is not None:
         return left["target"] in RECORDING_FILES or left_by_repair(name)
-    return name in RECORDING_FILES or _COMPANION.fullmatch(name) is not None
+    return name in RECORDING_FILES or is_journal(name)
+
+
+def is_journal(name: str) -> bool:
+    """Whether a file is one that SQLite writes beside a bag."""
+    return _JOURNAL.fullmatch(name) is not None
 
 
 def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
@@ -62,9 +68,9 @@ def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
         if not stat.S_ISREG(status.st_mode) or (status.st_dev, status.st_ino) != inode:
             raise OSError(f"{path} is not the file that was looked at")
         os.unlink(path.name, dir_fd=directory)
-        for name in _companions(directory, path.name):
-            with suppress(FileNotFoundError):
-                os.unlink(name, dir_fd=directory)
+        for suffix in _JOURNALS if path.suffix.lower() == ".db3" else ():
+            with suppress(FileNotFoundError, IsADirectoryError):
+                os.unlink(path.name + suffix, dir_fd=directory)
         return status.st_size
 
 
@@ -108,10 +114,9 @@ def beside_bags(recording: Path) -> int:
     return size
 
 
-def _companions(directory: int, bag: str) -> list[str]:
-    if not bag.lower().endswith(".db3"):
-        return []
-    with os.scandir(directory) as entries:
-        names = [entry.name for entry in entries if entry.is_file(follow_symlinks=False)]
-    found = ((name, _COMPANION.fullmatch(name)) for name in names)
-    return [name for name, match in found if match and match["bag"] == bag]
+def size_of(path: Path) -> int:
+    """Returns the bytes of a regular file; 0 for anything else, and for what cannot be read."""
+    with suppress(OSError):
+        status = path.lstat()
+        return status.st_size if stat.S_ISREG(status.st_mode) else 0
+    return 0

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import stat
-from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.bag_dir.directory_identity import identity_of
+from ros2_memory.bag_dir.directory_identity import known_identity
 from ros2_memory.bag_dir.layout import is_kept_apart
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.retention.delete import size_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection
     from pathlib import Path
 
-    from ros2_memory.bag_dir.directory_identity import Identity
-    from ros2_memory.core.model import SetAside
     from ros2_memory.index.snapshot import Snapshot
 
 
@@ -40,7 +36,6 @@ class ForeignBags:
 
     def __init__(self, bag_dir: Path) -> None:
         self._own = OwnRecordings(bag_dir)
-        self._identities: dict[str, tuple[int, Identity | None]] = {}
         self._known: tuple[tuple[object, ...], Foreign] | None = None
 
     def measured(self, snapshot: Snapshot, recording: Collection[str]) -> Foreign | None:
@@ -71,33 +66,13 @@ class ForeignBags:
             if not aside.answers
         ]
         folders = {str(aside.path.parent) for aside in asides} | sizes.keys()
-        self._identities = {
-            folder: known for folder, known in self._identities.items() if folder in folders
-        }
         foreign = frozenset(each for each in folders if not self._is_own(each, recording))
         bag_bytes = sum(size for folder, size in sizes.items() if folder in foreign)
-        beside = sum(_size(each) for each in asides if str(each.path.parent) in foreign)
+        beside = sum(size_of(each.path) for each in asides if str(each.path.parent) in foreign)
         return Foreign(foreign, bag_bytes, bag_bytes + beside)
 
     def _is_own(self, folder: str, recording: frozenset[str]) -> bool:
         name = self._own.name_of(folder)
         if name in recording or is_kept_apart(name):
             return True
-        return self._own.lists(name, self._identity(folder))
-
-    def _identity(self, folder: str) -> Identity | None:
-        try:
-            changed = os.stat(folder, follow_symlinks=False).st_ctime_ns  # noqa: PTH116 - many
-            known = self._identities.get(folder)
-            if known is None or known[0] != changed:
-                known = self._identities[folder] = (changed, identity_of(folder))
-        except OSError:
-            return None
-        return known[1]
-
-
-def _size(aside: SetAside) -> int:
-    with suppress(OSError):
-        status = aside.path.lstat()
-        return status.st_size if stat.S_ISREG(status.st_mode) else 0
-    return 0
+        return self._own.lists(name, known_identity(folder))

@@ -7,13 +7,12 @@ one. Only what changed is worked out again, since a week has 60,000 bags.
 
 from __future__ import annotations
 
-import stat
 from contextlib import suppress
 from enum import Enum, auto
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.directory_identity import identity_of
+from ros2_memory.bag_dir.directory_identity import known_identity
 from ros2_memory.bag_dir.layout import (
     LOCK_FILE,
     MOMENT_FILE,
@@ -27,13 +26,12 @@ from ros2_memory.bag_dir.layout import (
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.file_state import FileState
 from ros2_memory.index.segment import Pace, TopicTotals
-from ros2_memory.retention.delete import beside_bags
+from ros2_memory.retention.delete import beside_bags, size_of
 from ros2_memory.retention.policy import RetentionStock, Span, StoredBag, StoredFile
 
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from ros2_memory.bag_dir.directory_identity import Identity
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.index.bag_table import KnownBags
@@ -76,17 +74,12 @@ class _Entry(NamedTuple):
 
 
 class _Folder(NamedTuple):
-    """A recording's directory: its device, and the size of what goes with its last bag.
-
-    `identity` is that of the directory itself, as of `ctime_ns`.
-    """
+    """A recording's directory: its device, and the size of what goes with its last bag."""
 
     mtime_ns: Ns
     is_complete: bool
     device: int
     size: int
-    ctime_ns: Ns = 0
-    identity: Identity | None = None
 
 
 class Inventory:
@@ -146,7 +139,7 @@ class Inventory:
             deletable, bag = entry.deletable, entry.bag
             own = owned.get(bag.recording)
             if own is None:
-                own = owned[bag.recording] = self._is_own(bag.recording, known.now)
+                own = owned[bag.recording] = self._is_own(bag.recording)
             # A recording is listed as own some moments after its directory appears.
             ours = own or bag.recording in named or is_carried(Path(path))
             if not ours and deletable is not Deletable.SAVED:
@@ -170,11 +163,9 @@ class Inventory:
             bags, known.now, sidecars, others, saved=saved, foreign_bytes=elsewhere
         )
 
-    def _is_own(self, recording: str, now: Ns) -> bool:
-        if self._own is None:
-            return True
-        name = self._own.name_of(recording)
-        return self._own.lists(name, self._folder(recording, now).identity)
+    def _is_own(self, recording: str) -> bool:
+        own = self._own
+        return own is None or own.lists(own.name_of(recording), known_identity(recording))
 
     def _counts(self, deletable: Deletable, bag: StoredBag) -> bool:
         """Whether a bag that is kept counts among the other bytes."""
@@ -245,13 +236,6 @@ class Inventory:
             size = beside_bags(Path(path))
             known = _Folder(status.st_mtime_ns, since >= COMPLETE_AFTER_NS, status.st_dev, size)
             self._folders[path] = known
-        if known.ctime_ns != status.st_ctime_ns or known.identity is None:
-            identity = None
-            if self._own is not None:
-                with suppress(OSError):
-                    identity = identity_of(path)
-            known = known._replace(ctime_ns=status.st_ctime_ns, identity=identity)
-            self._folders[path] = known
         return known
 
     def _forget(self, known: KnownBags) -> None:
@@ -270,12 +254,7 @@ class Inventory:
         for folder in OWN_FOLDERS:
             with suppress(OSError):
                 own += (self._root / folder).iterdir()
-        size = 0
-        for path in own:
-            with suppress(OSError):
-                status = path.lstat()
-                size += status.st_size if stat.S_ISREG(status.st_mode) else 0
-        return size
+        return sum(map(size_of, own))
 
 
 def _deletable(classification: Classification, bag: StoredBag) -> Deletable:

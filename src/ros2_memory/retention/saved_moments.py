@@ -32,6 +32,7 @@ from ros2_memory.bag_dir.request_queue import Outcome, RequestQueue
 from ros2_memory.core import directories
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
+from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:
@@ -280,12 +281,12 @@ class MomentKeeper:
 
     def _open_bytes(self, request: SaveRequest, snapshot: Snapshot) -> int:
         """Returns the present size of the open files that may belong to the moment, in bytes."""
-        window, size = window_of(request.start, request.end), 0
-        for aside in snapshot.active:
-            if _may_overlap(snapshot.unread_spans[aside], window):
-                with suppress(OSError):
-                    size += aside.path.lstat().st_size
-        return size
+        window = window_of(request.start, request.end)
+        return sum(
+            size_of(aside.path)
+            for aside in snapshot.active
+            if _may_overlap(snapshot.unread_spans[aside], window)
+        )
 
     def _link(
         self, folder: Path, bags: Sequence[BagFile], stored: dict[int, int] | None
