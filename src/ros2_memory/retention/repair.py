@@ -11,7 +11,7 @@ import os
 import shutil
 import stat
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,7 +36,6 @@ class Repaired:
     recovered; it is None for an empty file, which was removed.
     """
 
-    path: Path
     was_bytes: int
     is_bytes: int = 0
     rewritten: Rewritten | None = None
@@ -79,7 +78,7 @@ class Repairer:
             with directories.opened(self._root, path.parent.absolute()) as folder:
                 # The open directory itself, even if something else takes its name meanwhile.
                 here = Path(f"/proc/self/fd/{folder}", path.name)
-                repaired = self._repair(here, path, progress)
+                return self._repair(here, path, progress)
         except BagVanishedError as error:
             raise BagVanishedError(str(path), error.reason) from error
         except BagError as error:
@@ -90,7 +89,6 @@ class Repairer:
             raise BagError(
                 str(path), f"it cannot be repaired: {error.strerror or error}"
             ) from error
-        return None if repaired is None else replace(repaired, path=path)
 
     def correct_metadata(self, recording: Path) -> bool:
         """Rewrites metadata.yaml from the files' contents; returns whether it had to be."""
@@ -104,7 +102,7 @@ class Repairer:
         if not before.st_size:
             here.unlink()
             flush(here.parent)
-            return Repaired(path, 0)
+            return Repaired(0)
         if self._reader.closing(path) is Closing.CLOSED:
             return None
         return self._rewrite(here, before, progress)
@@ -124,7 +122,7 @@ class Repairer:
                 beside.unlink(missing_ok=True)
             raise
         flush(path.parent)
-        return Repaired(path, before.st_size, path.stat().st_size, rewritten)
+        return Repaired(before.st_size, path.stat().st_size, rewritten)
 
 
 def open_files() -> frozenset[tuple[int, int]]:
