@@ -81,11 +81,6 @@ def latched_message(record: Record, frames: Collection[str]) -> Latched:
     return Latched(record.log_time, MessageIdentity(topic, record.publish_time, digest), subjects)
 
 
-def is_late(message: Latched) -> bool:
-    """Whether an earlier recording may have received it before."""
-    return message.log_time - message.identity.publish_time > RECEIVED_AGAIN_NS
-
-
 def worth_carrying(
     messages: Iterable[Latched],
     recorded_in: Callable[[Ns, Ns], bool],
@@ -98,14 +93,16 @@ def worth_carrying(
         recorded_in: whether anything is kept that was recorded in `[start, stop)`.
         repeated: late messages in kept bags, and their earliest log time there.
     """
-    missing = [
+    # Of the copies of a message the earliest comes last, and remains.
+    earliest = {each.identity: each for each in sorted(messages, reverse=True)}
+    missing = sorted(
         each
-        for each in _earliest_copies(messages)
-        if repeated.get(each.identity, MAX_NS) > each.log_time
-    ]
+        for identity, each in earliest.items()
+        if repeated.get(identity, MAX_NS) > each.log_time
+    )
     needed = {each for each in missing if each.identity in repeated}
     by_subject: defaultdict[tuple[str, str], list[Latched]] = defaultdict(list)
-    for each in sorted(missing):
+    for each in missing:
         for subject in each.subjects:
             by_subject[subject].append(each)
     for (_, frame), held in by_subject.items():
@@ -117,15 +114,6 @@ def worth_carrying(
                 needed.add(message)
             since = following.log_time
     return needed
-
-
-def _earliest_copies(messages: Iterable[Latched]) -> Collection[Latched]:
-    earliest: dict[MessageIdentity, Latched] = {}
-    for each in messages:
-        known = earliest.get(each.identity)
-        if known is None or each.log_time < known.log_time:
-            earliest[each.identity] = each
-    return earliest.values()
 
 
 class Carrier:
@@ -175,7 +163,10 @@ class Carrier:
         topics = self._topics(snapshot)
         gone = {*to_delete} - {*saved}
         kept = [bag for bag in snapshot.bags if bag.path not in gone and not is_carried(bag.path)]
-        carried = dict(self._carried(topics))
+        carried = {
+            latched_message(record, self._frames(record)): origin_of(record.channel)
+            for record in self._records(self.path, topics)
+        }
         origins = dict(carried)
         remaining = {self._folder(bag.path) for bag in kept}
         for bag in with_messages:
@@ -201,11 +192,6 @@ class Carrier:
             if topic in self._static_topics or snapshot.timeline.is_transient_state(topic)
         )
 
-    def _carried(self, topics: Collection[str]) -> Iterator[tuple[Latched, Origin | None]]:
-        """Yields the messages that are carried already."""
-        for record in self._records(self.path, topics):
-            yield latched_message(record, self._frames(record)), origin_of(record.channel)
-
     def _read(
         self, snapshot: Snapshot, bag: BagFile, topics: Collection[str]
     ) -> Iterator[tuple[Latched, Origin]]:
@@ -226,11 +212,9 @@ class Carrier:
         """Yields the newest readable message of a topic, if any."""
         try:
             newest = self._reader.newest(path, topic, TimeWindow.everything())
-        except BagVanishedError:
-            return
         except BagError:
-            found = {each.log_time: each for each in self._records(path, (topic,))}
-            newest = found[max(found)] if found else None
+            readable = self._records(path, (topic,))
+            newest = max(readable, key=lambda each: each.log_time, default=None)
         if newest is not None:
             yield newest
 
@@ -315,10 +299,9 @@ class Carrier:
     def _late_in(self, path: Path, topic: str) -> dict[MessageIdentity, Ns]:
         late: dict[MessageIdentity, Ns] = {}
         for record in self._records(path, (topic,)):
-            message = latched_message(record, ())
-            if not is_late(message):
+            if record.log_time - record.publish_time <= RECEIVED_AGAIN_NS:
                 break
-            late.setdefault(message.identity, message.log_time)
+            late.setdefault(latched_message(record, ()).identity, record.log_time)
         return late
 
     def _write(self, records: Sequence[Record]) -> None:
