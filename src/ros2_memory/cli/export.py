@@ -225,9 +225,8 @@ def _write_parquet(
             f"Parquet needs the optional part of this package (no {error.name}): "
             "pip install 'ros2-memory[parquet]'"
         ) from error
-    with Dataset(path, memory.reader, memory.extractor, robot) as dataset:
-        for each in messages:
-            dataset.add(each)
+    dataset = Dataset(path, memory.reader, memory.extractor, robot)
+    dataset.write(messages)
     return f"{counted(dataset.rows, 'message')} in {counted(dataset.files, 'file')} below {path}"
 
 

@@ -11,9 +11,11 @@ a pose `frame_id`, `x`, `y`, `z` (m) and `qx`, `qy`, `qz`, `qw`, unrounded.
 from __future__ import annotations
 
 import json
-from collections import Counter, OrderedDict
+from collections import OrderedDict
+from contextlib import ExitStack
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, Self
+from itertools import chain
+from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
 import pyarrow as pa
@@ -23,8 +25,8 @@ from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
-    from types import TracebackType
 
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
@@ -58,22 +60,22 @@ class _PartFile:
         self.temporary = path.with_name(f".{path.name}.tmp")
         self.rows: list[Row] = []
         self.temporary.unlink(missing_ok=True)  # or a link there would be written through
-        self._writer = pq.ParquetWriter(self.temporary, SCHEMA, compression="zstd")
+        self.writer = pq.ParquetWriter(self.temporary, SCHEMA, compression="zstd")
 
     def flush(self) -> None:
         """Writes the buffered rows as a row group."""
         if self.rows:
-            self._writer.write_table(pa.Table.from_pylist(self.rows, schema=SCHEMA))
+            self.writer.write_table(pa.Table.from_pylist(self.rows, schema=SCHEMA))
             self.rows.clear()
 
     def close(self) -> None:
         """Writes the buffered rows, and ends the file."""
         self.flush()
-        self._writer.close()
+        self.writer.close()
 
 
 class Dataset:
-    """Writes messages as rows; all files appear at the end of a `with` block, or none.
+    """Writes messages as rows, and counts the rows and the files.
 
     Args:
         root: the folder; partitions that exist already are refused.
@@ -89,38 +91,27 @@ class Dataset:
         self._reader = reader
         self._extractor = extractor
         self._open: OrderedDict[Path, _PartFile] = OrderedDict()
-        self._closed: list[_PartFile] = []
-        self._parts: Counter[Path] = Counter()
+        self._parts: dict[Path, list[_PartFile]] = {}
+        self._cleanup = ExitStack()
         self.rows = 0
         self.files = 0
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        parts = [*self._closed, *self._open.values()]
-        try:
-            for part in self._open.values():
-                part.close()
-            if kind is None:
-                for part in parts:
-                    part.temporary.replace(part.path)
-                self.files = len(parts)
-        finally:
-            for part in parts:
-                part.temporary.unlink(missing_ok=True)
-
-    def add(self, stored: StoredMessage) -> None:
-        """Adds one message.
+    def write(self, messages: Iterable[StoredMessage]) -> None:
+        """Writes all messages; the files appear at the end, or none where it fails.
 
         Raises:
-            InvalidArgumentsError: its partition existed before.
+            InvalidArgumentsError: the partition of a message existed before.
         """
+        with self._cleanup:
+            for each in messages:
+                self._add(each)
+            for part in self._open.values():
+                part.close()
+            for part in chain.from_iterable(self._parts.values()):
+                part.temporary.replace(part.path)
+                self.files += 1
+
+    def _add(self, stored: StoredMessage) -> None:
         part = self._part_for(stored)
         part.rows.append(self._row(stored))
         self.rows += 1
@@ -138,7 +129,6 @@ class Dataset:
         if len(self._open) > _MAX_OPEN_FILES:
             _, oldest = self._open.popitem(last=False)
             oldest.close()
-            self._closed.append(oldest)
         return self._open[folder]
 
     def _new_part(self, folder: Path) -> _PartFile:
@@ -148,8 +138,11 @@ class Dataset:
                 f"{folder} has rows already, which would stand there twice; export whole days (UTC)"
                 ", name another folder, or delete this one"
             )
-        part = _PartFile(folder / f"part-{self._parts[folder]}.parquet")
-        self._parts[folder] += 1
+        parts = self._parts.setdefault(folder, [])
+        part = _PartFile(folder / f"part-{len(parts)}.parquet")
+        self._cleanup.callback(part.temporary.unlink, missing_ok=True)
+        self._cleanup.enter_context(part.writer)
+        parts.append(part)
         return part
 
     def _row(self, stored: StoredMessage) -> Row:
