@@ -21,7 +21,6 @@ from ros2_memory.cli.options import (
     Sets,
     load_for,
     print_line,
-    reported_errors,
 )
 from ros2_memory.config import NullRecorderNode
 from ros2_memory.core.errors import (
@@ -49,25 +48,24 @@ def adopt(
     programs. From then on retention counts them in its budget and deletes them by its limits, and
     `forget` deletes them too. Nothing is deleted or changed here.
     """
-    with reported_errors("adopt"):
-        settings = load_for(bag_dir, sets)
-        if isinstance(settings.recorder, NullRecorderNode):
-            raise ConfigError(
-                "recorder=none: nothing is deleted here, so there is nothing to adopt; choose the "
-                "deployment that records here, such as deployment=robot"
-            )
-        root = settings.recording.bag_dir
-        own = OwnRecordings(root)
-        given = [_below(root, each) for each in directories]
-        found = {
-            name: path
-            for directory in given
-            for path in folders_with_bags(directory)
-            if (name := own.name_of(path)) and not is_kept_apart(name)
-        }
-        _require_list(root, own)
-        new = {name: path for name, path in found.items() if not own.owns(path)}
-        own.adopt({name: _identity(path) for name, path in new.items()})
+    settings = load_for(bag_dir, sets)
+    if isinstance(settings.recorder, NullRecorderNode):
+        raise ConfigError(
+            "recorder=none: nothing is deleted here, so there is nothing to adopt; choose the "
+            "deployment that records here, such as deployment=robot"
+        )
+    root = settings.recording.bag_dir
+    own = OwnRecordings(root)
+    given = [_below(root, each) for each in directories]
+    found = {
+        name: path
+        for directory in given
+        for path in folders_with_bags(directory)
+        if (name := own.name_of(path)) and not is_kept_apart(name)
+    }
+    _require_list(root, own)
+    new = {name: path for name, path in found.items() if not own.owns(path)}
+    own.adopt({name: _identity(path) for name, path in new.items()})
     for name, path in new.items():
         files, size = _count_bags(path)
         print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size / MB:.1f} MB)")

@@ -164,7 +164,11 @@ class LazyCommand(TyperCommand):
         if isinstance(loaded, typer.Typer):
             parent.add_typer(loaded, name=self._name, epilog=epilog(self._name))
         elif callable(loaded):
-            parent.command(self._name, epilog=epilog(self._name))(loaded)
+            # Imported here, as the command is, since it imports much itself.
+            from ros2_memory.cli.options import reported_errors  # noqa: PLC0415
+
+            reporting = reported_errors(self._name)(loaded)
+            parent.command(self._name, epilog=epilog(self._name))(reporting)
         return get_group(parent).commands[self._name]
 
 
@@ -224,12 +228,11 @@ def demo(
     Every answer is held against what the robot did. Needs no ROS and no configuration.
     """
     # Imported here, so that no other command waits for the demo's libraries.
-    from ros2_memory.cli.options import print_line, reported_errors  # noqa: PLC0415
+    from ros2_memory.cli.options import print_line  # noqa: PLC0415
     from ros2_memory.demo.run import DemoOptions, run_demo  # noqa: PLC0415
 
     options = DemoOptions(
         once=once, port=port, bag_dir=bag_dir, duration_s=duration, verbose=verbose
     )
-    with reported_errors("demo"):
-        code = run_demo(options, print_line)
+    code = run_demo(options, print_line)
     raise typer.Exit(code)

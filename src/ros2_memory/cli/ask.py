@@ -18,7 +18,6 @@ from ros2_memory.cli.options import (
     open_memory,
     present,
     print_line,
-    reported_errors,
     spinner,
     stdout_console,
 )
@@ -63,19 +62,18 @@ def ask(
     Values are JSON where they read as such (seconds_ago=10, value=true), else text. With --json
     the reply is exactly what an MCP client receives.
     """
-    with reported_errors("ask"):
-        loaded = load_for(bag_dir, settings)
-        memory = open_memory(loaded, verbose=verbose)
-        dispatcher = build_dispatcher(loaded, memory)
-        tools = {each.name: each for each in dispatcher.tools}
-        if tool is None:
-            rows: list[JsonValue] = [_tool_row(each.name, each.schema) for each in dispatcher.tools]
-            print_reply(stdout_console(), rows)
-            return
-        schema = tools[tool].schema if tool in tools else {}
-        arguments = parse_arguments(given or (), schema)
-        with spinner(f"asking {tool}"):
-            (reply,) = call_tools(dispatcher, {tool: arguments})
+    loaded = load_for(bag_dir, settings)
+    memory = open_memory(loaded, verbose=verbose)
+    dispatcher = build_dispatcher(loaded, memory)
+    tools = {each.name: each for each in dispatcher.tools}
+    if tool is None:
+        rows: list[JsonValue] = [_tool_row(each.name, each.schema) for each in dispatcher.tools]
+        print_reply(stdout_console(), rows)
+        return
+    schema = tools[tool].schema if tool in tools else {}
+    arguments = parse_arguments(given or (), schema)
+    with spinner(f"asking {tool}"):
+        (reply,) = call_tools(dispatcher, {tool: arguments})
     answer: JsonValue = json.loads(reply.text)
     if as_json:
         print_line(reply.text)

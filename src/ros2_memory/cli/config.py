@@ -32,6 +32,7 @@ config = typer.Typer(
 
 
 @config.command("show", epilog=epilog("config"))
+@reported_errors("config show")
 def config_show(
     overrides: Overrides = None,
     bag_dir: BagDir = None,
@@ -41,8 +42,7 @@ def config_show(
 
     Whether there is a token for the server is told in a comment, never what it is.
     """
-    with reported_errors("config show"):
-        settings, source = load_with_sources(bag_dir, overrides)
+    settings, source = load_with_sources(bag_dir, overrides)
     if sources:
         for line in _lines_with_sources(settings, source):
             print_line(line)

@@ -33,7 +33,6 @@ from ros2_memory.cli.options import (
     load_for,
     open_memory,
     print_line,
-    reported_errors,
     spinner,
     stdout_console,
 )
@@ -116,8 +115,7 @@ def doctor(
 
     Each finding says what to do.
     """
-    with reported_errors("doctor"):
-        findings = [*_examine(bag_dir, overrides, verbose=verbose)]
+    findings = [*_examine(bag_dir, overrides, verbose=verbose)]
     worst = max(each.level for each in findings)
     if as_json:
         rows = [asdict(each) | {"level": each.level.name.lower()} for each in findings]

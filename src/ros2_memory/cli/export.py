@@ -20,7 +20,6 @@ from ros2_memory.cli.options import (
     open_memory,
     parse_window,
     print_line,
-    reported_errors,
 )
 from ros2_memory.cli.progress import progress_bar
 from ros2_memory.core.errors import (
@@ -85,28 +84,25 @@ def export(
     MCAP has the original messages, definitions, log and publish times. Parquet has one row for a
     message: what it says as JSON, and its pose in columns. Needs ros2-memory[parquet].
     """
-    with reported_errors("export"):
-        if (mcap is None) == (parquet is None):
-            raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
-        settings = load_for(bag_dir, overrides)
-        memory = open_memory(settings, verbose=verbose)
-        view = View(memory, Call())
-        window = parse_window(memory, start, end, last)
-        topics = _topics(view, topic or ())
-        note_unread(view, window)
-        with _progress(view, window) as report:
-            earlier = _latched_before(view, topics, window.start) if latched else []
-            within = view.stream.messages(topics, window)
-            first = list(islice(within, 1))
-            if earlier and not first:
-                view.notes.add(
-                    "no message lies in the window: what latched ones held is all there is"
-                )
-            messages = _reported(chain(earlier, first, within), report)
-            if mcap is not None:
-                done = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
-            elif parquet is not None:
-                done = _write_parquet(parquet, messages, memory, robot)
+    if (mcap is None) == (parquet is None):
+        raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
+    settings = load_for(bag_dir, overrides)
+    memory = open_memory(settings, verbose=verbose)
+    view = View(memory, Call())
+    window = parse_window(memory, start, end, last)
+    topics = _topics(view, topic or ())
+    note_unread(view, window)
+    with _progress(view, window) as report:
+        earlier = _latched_before(view, topics, window.start) if latched else []
+        within = view.stream.messages(topics, window)
+        first = list(islice(within, 1))
+        if earlier and not first:
+            view.notes.add("no message lies in the window: what latched ones held is all there is")
+        messages = _reported(chain(earlier, first, within), report)
+        if mcap is not None:
+            done = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
+        elif parquet is not None:
+            done = _write_parquet(parquet, messages, memory, robot)
     print_line(done)
     for note in view.notes.sentences():
         typer.echo(f"note: {note}", err=True)

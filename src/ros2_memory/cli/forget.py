@@ -33,7 +33,6 @@ from ros2_memory.cli.options import (
     open_memory,
     parse_window,
     print_line,
-    reported_errors,
     spinner,
 )
 from ros2_memory.cli.output import format_time
@@ -76,36 +75,35 @@ def forget(
     Latched messages (maps, static transforms) that later answers need are carried on. Only where
     this deployment records.
     """
-    with reported_errors("forget"):
-        settings = load_for(bag_dir, overrides)
-        if isinstance(settings.recorder, NullRecorderNode):
-            raise ConfigError(
-                "recorder=none: bags that another program records are not deleted here; choose the "
-                "deployment that records them, such as deployment=robot"
-            )
-        if last is None and (start is None or end is None):
-            raise InvalidArgumentsError("say what to forget: --start and --end, or --last")
-        memory = open_memory(settings, verbose=verbose)
-        snapshot = memory.index.snapshot()
-        if snapshot.problem:
-            raise RecorderError(snapshot.problem)
-        window = parse_window(memory, start, end, last)
-        plan = plan_deletion(settings, snapshot, window)
-        carrier = Carrier(plan.bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics)
-        kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
-        _print_kept(kept)
-        if not plan.to_delete:
-            print_line("no closed bag lies wholly inside the window")
-        elif dry_run:
-            print_line(f"would be deleted: {_describe(plan)}")
-            for bag in plan.to_delete:
-                print_line(f"  {plan.name_of(bag.path)}")
-        else:
-            print_line(f"to be deleted: {_describe(plan)}")
-            if not yes:
-                typer.confirm("Delete them? This cannot be undone.", abort=True)
-            counts = _message_counts(build_reader(settings), plan.to_delete)
-            kept += _delete(memory, plan, carrier, counts)
+    settings = load_for(bag_dir, overrides)
+    if isinstance(settings.recorder, NullRecorderNode):
+        raise ConfigError(
+            "recorder=none: bags that another program records are not deleted here; choose the "
+            "deployment that records them, such as deployment=robot"
+        )
+    if last is None and (start is None or end is None):
+        raise InvalidArgumentsError("say what to forget: --start and --end, or --last")
+    memory = open_memory(settings, verbose=verbose)
+    snapshot = memory.index.snapshot()
+    if snapshot.problem:
+        raise RecorderError(snapshot.problem)
+    window = parse_window(memory, start, end, last)
+    plan = plan_deletion(settings, snapshot, window)
+    carrier = Carrier(plan.bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics)
+    kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
+    _print_kept(kept)
+    if not plan.to_delete:
+        print_line("no closed bag lies wholly inside the window")
+    elif dry_run:
+        print_line(f"would be deleted: {_describe(plan)}")
+        for bag in plan.to_delete:
+            print_line(f"  {plan.name_of(bag.path)}")
+    else:
+        print_line(f"to be deleted: {_describe(plan)}")
+        if not yes:
+            typer.confirm("Delete them? This cannot be undone.", abort=True)
+        counts = _message_counts(build_reader(settings), plan.to_delete)
+        kept += _delete(memory, plan, carrier, counts)
     if kept:
         raise typer.Exit(EXIT_NEGATIVE)
 

@@ -22,7 +22,6 @@ from ros2_memory.cli.options import (
     Verbose,
     load_for,
     open_memory,
-    reported_errors,
 )
 from ros2_memory.cli.progress import progress_bar
 from ros2_memory.config import Settings
@@ -51,12 +50,11 @@ def index(
     Fills the catalogue of the bags at once, with the settings of the server. The server does the
     same by itself, in the background; no answer depends on it.
     """
-    with reported_errors("index"):
-        settings = load_for(bag_dir, overrides)
-        if for_server is None:
-            _fill_for_people(settings, verbose=verbose)
-        else:
-            _fill_for_server(settings, for_server)
+    settings = load_for(bag_dir, overrides)
+    if for_server is None:
+        _fill_for_people(settings, verbose=verbose)
+    else:
+        _fill_for_server(settings, for_server)
 
 
 def _fill_for_people(settings: Settings, *, verbose: bool) -> None:

@@ -18,7 +18,6 @@ from ros2_memory.cli.options import (
     load_for,
     open_memory,
     print_line,
-    reported_errors,
     stdout_console,
 )
 from ros2_memory.cli.output import format_value, print_reply
@@ -46,16 +45,15 @@ def topics(
 
     The rate is that of the topic's newest hour, without the gaps between bags.
     """
-    with reported_errors("topics"):
-        settings = load_for(bag_dir, [*(overrides or ()), _WHOLE_REPLY])
-        memory = open_memory(settings, verbose=verbose)
-        dispatcher = build_dispatcher(settings, memory)
-        (answer,) = call_tools(dispatcher, {"list_recorded_topics": {}})
-        reply: JsonValue = json.loads(answer.text)
-        rows: list[JsonValue] = []
-        if isinstance(reply, list) and reply:
-            known = list_recorded_topics(memory, Call())
-            rows = [_topic_row(memory, *each) for each in zip(reply, known, strict=True)]
+    settings = load_for(bag_dir, [*(overrides or ()), _WHOLE_REPLY])
+    memory = open_memory(settings, verbose=verbose)
+    dispatcher = build_dispatcher(settings, memory)
+    (answer,) = call_tools(dispatcher, {"list_recorded_topics": {}})
+    reply: JsonValue = json.loads(answer.text)
+    rows: list[JsonValue] = []
+    if isinstance(reply, list) and reply:
+        known = list_recorded_topics(memory, Call())
+        rows = [_topic_row(memory, *each) for each in zip(reply, known, strict=True)]
     if as_json:
         print_line(json.dumps(rows) if rows else answer.text)
     elif rows:
@@ -106,30 +104,27 @@ def info(
     verbose: Verbose = False,
 ) -> None:
     """What the memory covers: range, gaps, damaged files, the budget, and how long it lasts."""
-    with reported_errors("info"):
-        settings = load_for(bag_dir, [*(overrides or ()), _WHOLE_REPLY, "server.tools=all"])
-        memory = open_memory(settings, verbose=verbose)
-        dispatcher = build_dispatcher(settings, memory)
-        tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
-        replies: list[JsonValue] = [
-            json.loads(answer.text) for answer in call_tools(dispatcher, tools)
-        ]
-        snapshot = memory.index.snapshot()
-        lists: dict[str, list[JsonValue]] = {
-            "overlapping_recordings": [
-                {
-                    "recording": each.names[0],
-                    "and": each.names[1],
-                    "from": unix_from_ns(each.start),
-                    "to": unix_from_ns(each.end),
-                }
-                for each in overlapping_recordings(snapshot)
-            ],
-            "counted_as_active": [
-                {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
-                for path, until in assumed_active(memory, snapshot)
-            ],
-        }
+    settings = load_for(bag_dir, [*(overrides or ()), _WHOLE_REPLY, "server.tools=all"])
+    memory = open_memory(settings, verbose=verbose)
+    dispatcher = build_dispatcher(settings, memory)
+    tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
+    replies: list[JsonValue] = [json.loads(answer.text) for answer in call_tools(dispatcher, tools)]
+    snapshot = memory.index.snapshot()
+    lists: dict[str, list[JsonValue]] = {
+        "overlapping_recordings": [
+            {
+                "recording": each.names[0],
+                "and": each.names[1],
+                "from": unix_from_ns(each.start),
+                "to": unix_from_ns(each.end),
+            }
+            for each in overlapping_recordings(snapshot)
+        ],
+        "counted_as_active": [
+            {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
+            for path, until in assumed_active(memory, snapshot)
+        ],
+    }
     if as_json:
         print_line(json.dumps(dict(zip(tools, replies, strict=True)) | lists))
     else:

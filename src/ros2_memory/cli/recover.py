@@ -18,7 +18,7 @@ from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE
 from ros2_memory.bootstrap import build_repairer
-from ros2_memory.cli.options import EXIT_NEGATIVE, print_line, reported_errors
+from ros2_memory.cli.options import EXIT_NEGATIVE, print_line
 from ros2_memory.cli.progress import progress_bar
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, RecorderError
@@ -50,8 +50,7 @@ def recover(
     Rewrites each from all that can be read of it, in place: the original stays until the whole one
     has been read back and is on the disk. Files of 0 bytes are removed.
     """
-    with reported_errors("recover"):
-        outcome = recover_files(path, print_line, force=force)
+    outcome = recover_files(path, print_line, force=force)
     if outcome.failed:
         raise typer.Exit(EXIT_NEGATIVE)
 

@@ -23,7 +23,6 @@ from ros2_memory.cli.options import (
     load_for,
     open_memory,
     print_line,
-    reported_errors,
     stdout_console,
 )
 from ros2_memory.cli.output import escape, format_duration, format_time
@@ -141,22 +140,21 @@ def watch(
     Ages count as in the tools' answers (data.now). Rates are judged only while data comes in.
     On a terminal a table that is kept up to date, elsewhere a line for each look. Ends with Ctrl-C.
     """
-    with reported_errors("watch"):
-        if not every > 0 or (count is not None and count < 1):
-            raise InvalidArgumentsError("--every and --count must be more than 0")
-        settings = load_for(bag_dir, ["reader.include_active=true", *(overrides or ())])
-        memory = open_memory(settings, verbose=verbose)
-        console = stdout_console()
-        try:
-            if console.is_terminal:
-                with Live(console=console, auto_refresh=False) as live:
-                    for each in _observations(memory, every, count):
-                        live.update(Group(*as_screen(each)), refresh=True)
-            else:
+    if not every > 0 or (count is not None and count < 1):
+        raise InvalidArgumentsError("--every and --count must be more than 0")
+    settings = load_for(bag_dir, ["reader.include_active=true", *(overrides or ())])
+    memory = open_memory(settings, verbose=verbose)
+    console = stdout_console()
+    try:
+        if console.is_terminal:
+            with Live(console=console, auto_refresh=False) as live:
                 for each in _observations(memory, every, count):
-                    print_line(as_line(each))
-        except KeyboardInterrupt:
-            raise typer.Exit from None
+                    live.update(Group(*as_screen(each)), refresh=True)
+        else:
+            for each in _observations(memory, every, count):
+                print_line(as_line(each))
+    except KeyboardInterrupt:
+        raise typer.Exit from None
 
 
 def _observations(memory: Memory, every_s: float, count: int | None) -> Iterator[Observation]:
