@@ -14,7 +14,6 @@ import threading
 import time
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.core.logging_setup import get_logger
@@ -39,20 +38,6 @@ _ROW_ID_BITS: Final = 40
 
 So the number of an entry in a file that was lost never means a row of the file that replaced it.
 """
-_TRANSIENT: Final = frozenset(
-    {
-        sqlite3.SQLITE_BUSY,
-        sqlite3.SQLITE_LOCKED,
-        sqlite3.SQLITE_FULL,
-        sqlite3.SQLITE_IOERR,
-        sqlite3.SQLITE_CANTOPEN,
-        sqlite3.SQLITE_READONLY,
-        sqlite3.SQLITE_PERM,
-        sqlite3.SQLITE_NOMEM,
-        sqlite3.SQLITE_PROTOCOL,
-    }
-)
-"""Errors of the machine or of the moment: the file itself may be intact."""
 _SUFFIXES: Final = ("-wal", "-shm")
 """The files that SQLite keeps beside one in WAL mode: the write-ahead log and its index."""
 _FIRST_ROWS: Final = """
@@ -115,10 +100,8 @@ class OpenDatabase:
 
         What several programs write to such files is no database.
         """
-        if self.path is None:
-            return False
-        file, *log_files = _identities(self.path)
-        return file == self.identities[0] and log_files != [*self.identities[1:]]
+        now = () if self.path is None else _identities(self.path)
+        return now[:1] == self.identities[:1] and now != self.identities
 
 
 class CatalogueDatabase:
@@ -177,15 +160,11 @@ class CatalogueDatabase:
     def row_ids(self, numbers: Sequence[int]) -> Sequence[int]:
         """Returns the row ids of these entries, without those of a database that was lost."""
         offset = self.offset
-        return [number - offset for number in numbers if self.is_same_database(number, offset)]
-
-    def is_same_database(self, number: int, other: int) -> bool:
-        """Returns whether two entries are of one database."""
-        return number >> _ROW_ID_BITS == other >> _ROW_ID_BITS
+        return [number - offset for number in numbers if self.is_current(number)]
 
     def is_current(self, number: int) -> bool:
         """Returns whether an entry is of the open database, and of none that was lost."""
-        return self.is_same_database(number, self.offset)
+        return number >> _ROW_ID_BITS == self._databases
 
     def close(self) -> None:
         """Closes the connection for good; afterwards nothing is known."""
@@ -460,8 +439,14 @@ def _in_memory() -> OpenDatabase:
 
 
 def is_transient(error: Exception) -> bool:
-    """Returns whether the database may work again as it is."""
-    return isinstance(error, MemoryError) or _code(error) in _TRANSIENT
+    """Returns whether the database may work again as it is.
+
+    Operational errors are those of the machine or of the moment, such as a full disk. Only a table
+    that is missing (`SQLITE_ERROR`) and text that is not UTF-8 (no code) are faults of the content.
+    """
+    operational = isinstance(error, sqlite3.OperationalError)
+    of_content = _code(error) in {0, sqlite3.SQLITE_ERROR}
+    return isinstance(error, MemoryError) or (operational and not of_content)
 
 
 def is_busy(error: Exception) -> bool:
@@ -540,26 +525,18 @@ def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
     connection.execute("COMMIT")
     if tables and version != VERSION:
         return f"it is of version {version}, and {VERSION} is what is known"
-    if tables and _declared_tables(connection) != _expected_tables():
+    # SQLite keeps the statement that declared a table; tables of its own are named sqlite_*.
+    declared = "SELECT sql FROM sqlite_master WHERE type = 'table' AND name NOT GLOB 'sqlite_*'"
+    statements = [str(sql) for (sql,) in connection.execute(declared).fetchall()]
+    if tables and _without_spacing(statements) != _without_spacing(_TABLES.split(";")):
         return "its tables are not those of this version"
     connection.execute(_FIRST_ROWS).fetchall()
     return None
 
 
-def _declared_tables(connection: sqlite3.Connection) -> dict[str, str]:
-    """Returns the SQL that each table was declared with."""
-    query = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
-    return {
-        name: " ".join(str(sql).split())
-        for name, sql in connection.execute(query).fetchall()
-        if not name.startswith("sqlite_")
-    }
-
-
-@cache
-def _expected_tables() -> dict[str, str]:
-    with closing(_in_memory().connection) as connection:
-        return _declared_tables(connection)
+def _without_spacing(statements: Sequence[str]) -> set[str]:
+    """Returns the statements with single spaces between words, without empty ones."""
+    return {" ".join(each.split()) for each in statements} - {""}
 
 
 def _is_used_elsewhere(connection: sqlite3.Connection) -> bool:

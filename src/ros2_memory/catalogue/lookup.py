@@ -71,6 +71,11 @@ class SegmentDigests:
         self._pairs: dict[str, frozenset[tuple[str, str]] | None] = {}
         self._messages: dict[str, dict[int, tuple[Record, ...]]] = {}
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether no later state of the catalogue adds to this."""
+        return self.whole and self.catalogue.is_current(self.as_of)
+
     def zone_map(self, topic: str) -> ZoneMap:
         """Returns what can be in any message of the topic in the bags with an entry."""
         return self._cached(self._zone_map, topic, lambda: united(self.zone_maps(topic).values()))
@@ -159,7 +164,7 @@ class DigestCache:
         """Returns what is known of a segment, at that state of the catalogue or a later one."""
         with self._lock:
             known = self._segments.get(segment)
-        if known is None or not self._is_up_to_date(known, as_of):
+        if known is None or not (known.as_of == as_of or known.is_complete):
             known = SegmentDigests(self, segment, as_of)
             with self._lock:
                 self._segments[segment] = known
@@ -172,9 +177,7 @@ class DigestCache:
         """
         with self._lock:
             known = self._segments.get(segment)
-        if known is None or not known.whole or not self.catalogue.is_current(known.as_of):
-            return None
-        return known
+        return known if known is not None and known.is_complete else None
 
     def touch(self, digests: SegmentDigests) -> None:
         """Marks a segment's messages as used; the least recently used ones are dropped."""
@@ -194,12 +197,6 @@ class DigestCache:
         # A damaged file can hold anything.
         except (ValueError, TypeError, LookupError, AttributeError):
             return None
-
-    def _is_up_to_date(self, known: SegmentDigests, as_of: int) -> bool:
-        """Whether a new look-up would find no more."""
-        if known.as_of == as_of:
-            return True
-        return known.whole and self.catalogue.is_same_database(known.as_of, as_of)
 
 
 def bags_without_entry(segments: Sequence[Segment], cache: DigestCache) -> list[BagFile]:

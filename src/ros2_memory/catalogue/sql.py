@@ -39,6 +39,7 @@ ZONE_MAP: Final = "flags, words, low, high, numbers, min_x, max_x, min_y, max_y,
 EVENTS: Final = f"""coalesce((
   SELECT story FROM tales WHERE tales.topic = held.topic AND tales.bag = held.bag), {QUIET})"""
 EDGES: Final = "(SELECT pairs FROM edges WHERE id = held.edges), first_stamp, last_stamp"
+STANDSTILLS: Final = "rests"
 UNDECODABLE: Final = "coalesce(undecodable, '{}')"
 
 
@@ -56,18 +57,9 @@ def topic_rows(
     connection: sqlite3.Connection, columns: str, topic: str, row_ids: Sequence[int]
 ) -> list[sqlite3.Row]:
     """Returns the row id and these columns of what entries hold of a topic."""
+    table = "tales" if columns == STANDSTILLS else "held"
     return connection.execute(
-        f"SELECT bag, {columns} FROM held WHERE topic = {_TOPIC} AND bag {_AMONG}",
-        (topic, json.dumps(row_ids)),
-    ).fetchall()
-
-
-def standstill_rows(
-    connection: sqlite3.Connection, topic: str, row_ids: Sequence[int]
-) -> list[sqlite3.Row]:
-    """Returns the row id and the encoded standstills of entries that have any."""
-    return connection.execute(
-        f"SELECT bag, rests FROM tales WHERE topic = {_TOPIC} AND bag {_AMONG}",
+        f"SELECT bag, {columns} FROM {table} WHERE topic = {_TOPIC} AND bag {_AMONG}",
         (topic, json.dumps(row_ids)),
     ).fetchall()
 

@@ -28,13 +28,13 @@ from ros2_memory.catalogue.sql import (
     EDGES,
     EVENTS,
     QUIET,
+    STANDSTILLS,
     UNDECODABLE,
     ZONE_MAP,
     delete_entries,
     entry_rows,
     insert_entry,
     message_rows,
-    standstill_rows,
     topic_rows,
     zone_map,
 )
@@ -175,13 +175,7 @@ class Catalogue(CatalogueDatabase):
 
     def standstills(self, topic: str, numbers: Sequence[int]) -> dict[int, StandstillDigest]:
         """Returns the standstills among the topic's poses; not where some message has no pose."""
-
-        def ask(connection: sqlite3.Connection) -> dict[int, StandstillDigest]:
-            offset = self.offset
-            rows = standstill_rows(connection, topic, self.row_ids(numbers))
-            return {offset + row[0]: decode_standstills(row[1]) for row in rows if row[1]}
-
-        return self.read(ask, {})
+        return self._of_topic(topic, numbers, STANDSTILLS, lambda row: decode_standstills(row[1]))
 
     def topic_events(self, topic: str, numbers: Sequence[int]) -> dict[int, TopicEvents | None]:
         """Returns the events on the topic: `NO_EVENTS`, or None where none can be decoded."""
