@@ -32,7 +32,10 @@ from ros2_memory.messages.conversions import (
     euler,
     kind_of,
     nanoseconds,
+    number,
+    quadruple,
     rotation,
+    triple,
     unit,
     view,
     xyz,
@@ -80,7 +83,7 @@ class _PointPose:
         found, turned = self.position.of(message), self.orientation.of(message)
         position, turn = xyz(found), rotation(turned)
         if self.arrays:
-            position = _triple(found) if position is None else position
+            position = triple(found) if position is None else position
             turn = _px4_rotation(turned) if turn is None else turn
         return None if position is None else (position, turn)
 
@@ -95,10 +98,10 @@ class _PlanarPose:
     heading: Route
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
-        x, y = _number(self.x.of(message)), _number(self.y.of(message))
+        x, y = number(self.x.of(message)), number(self.y.of(message))
         if x is None or y is None:
             return None
-        z, heading = _number(self.z.of(message)), _number(self.heading.of(message))
+        z, heading = number(self.z.of(message)), number(self.heading.of(message))
         if heading is None or not math.isfinite(heading):
             return (x, y, z or 0.0), None
         return (x, y, z or 0.0), (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
@@ -232,7 +235,7 @@ class SchemaExtractor:
         routes = self._plan(type_name).geodetic
         if routes is None:
             return None
-        latitude, longitude, altitude = (_number(route.of(message)) for route in routes)
+        latitude, longitude, altitude = (number(route.of(message)) for route in routes)
         if latitude is None or longitude is None:
             return None
         above = math.nan if altitude is None else altitude
@@ -374,45 +377,23 @@ def _planar_pose(message: object) -> Pose | None:
     return None if found is None else Pose(*found, _text(_FRAME.of(message)))
 
 
-def _number(node: object) -> float | None:
-    if isinstance(node, bool) or not isinstance(node, int | float | np.number):
-        return None
-    try:
-        return float(node)
-    except (OverflowError, TypeError):
-        return None
-
-
-def _numbers(node: object, count: int) -> list[float] | None:
-    """Returns the numbers of an array of this length; None for any other."""
-    if not isinstance(node, list | np.ndarray) or len(node) != count:
-        return None
-    numbers = [_number(part) for part in node]
-    return [part for part in numbers if part is not None] if None not in numbers else None
-
-
-def _triple(node: object) -> Vector3 | None:
-    numbers = _numbers(node, 3)
-    return None if numbers is None else (numbers[0], numbers[1], numbers[2])
-
-
 def _px4_rotation(node: object) -> Quaternion | None:
     """Returns the unit quaternion of an array in PX4's order: w, x, y, z."""
-    numbers = _numbers(node, 4)
-    return None if numbers is None else unit((numbers[1], numbers[2], numbers[3], numbers[0]))
+    numbers = quadruple(node)
+    return None if numbers is None else unit((*numbers[1:], numbers[0]))
 
 
 def _velocity(node: object, axis: int) -> Vector3 | None:
     """Returns a velocity that is an array, or one number: along or about this axis."""
-    one = _number(node)
+    one = number(node)
     if one is None:
-        return _triple(node)
+        return triple(node)
     return (one, 0.0, 0.0) if axis == 0 else (0.0, 0.0, one)
 
 
 def _px4_frame(route: Route | None, message: object, named: Mapping[int, str]) -> str:
-    number = None if route is None else _number(route.of(message))
-    return "" if number is None else named.get(int(number), "")
+    found = None if route is None else number(route.of(message))
+    return "" if found is None else named.get(int(found), "")
 
 
 def _converted(name: str, node: object) -> object:
@@ -420,7 +401,7 @@ def _converted(name: str, node: object) -> object:
     if not isinstance(node, np.ndarray):
         return node
     if name in _POINTS:
-        point = _triple(node)
+        point = triple(node)
         return node if point is None else dict(zip("xyz", map(Metric, point), strict=True))
     if name == "orientation" and len(node) == 4:
         turn = _px4_rotation(node)

@@ -147,8 +147,9 @@ class Typestores:
         finished: set[str] = set()
         members = unrolled = 0
 
-        def enter(name: str, trail: tuple[str, ...]) -> Iterator[FieldDesc]:
-            nonlocal members
+        # Depth first: the trail to a type is what names a definition that contains itself.
+        def visit(name: str, trail: tuple[str, ...]) -> None:
+            nonlocal members, unrolled
             if name in trail:
                 raise _UnusableError(f"its definition contains itself: {' > '.join(trail)}")
             if len(trail) > MAX_NESTING:
@@ -159,14 +160,7 @@ class Typestores:
                 if members > MAX_MEMBERS:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
                 found.update(definition)
-            return (field for _, field in found[name][1])
-
-        # Depth first: the trail to a type is what names a definition that contains itself.
-        nowhere: tuple[str, ...] = ()
-        waiting = [(root, nowhere, enter(root, nowhere))]
-        while waiting:
-            name, trail, fields = waiting[-1]
-            for field in fields:
+            for _, field in found[name][1]:
                 unrolled += _unrolled(field)
                 if unrolled > MAX_UNROLLED:
                     raise _UnusableError(
@@ -175,12 +169,10 @@ class Typestores:
                     )
                 nested = _nested_type(field)
                 if nested is not None and nested not in finished:
-                    inside = (*trail, name)
-                    waiting.append((nested, inside, enter(nested, inside)))
-                    break
-            else:
-                finished.add(name)
-                waiting.pop()
+                    visit(nested, (*trail, name))
+            finished.add(name)
+
+        visit(root, ())
         return {name: found[name] for name in finished}
 
     def _definition(

@@ -106,8 +106,7 @@ def xyz(node: object) -> Vector3 | None:
         x, y, z = (field_of(node, name) for name in "xyz")
     if type(x) is type(y) is type(z) is float:
         return (x, y, z)
-    numbers = _floats(x, y, z)
-    return (numbers[0], numbers[1], numbers[2]) if numbers else None
+    return triple((x, y, z))
 
 
 def xyzw(node: object) -> Quaternion | None:
@@ -118,17 +117,37 @@ def xyzw(node: object) -> Quaternion | None:
         x, y, z, w = (field_of(node, name) for name in "xyzw")
     if type(x) is type(y) is type(z) is type(w) is float:
         return (x, y, z, w)
-    numbers = _floats(x, y, z, w)
-    return (numbers[0], numbers[1], numbers[2], numbers[3]) if numbers else None
+    return quadruple((x, y, z, w))
 
 
-def _floats(*values: object) -> list[float] | None:
-    if not all(isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values):
+def number(node: object) -> float | None:
+    """Returns a number as a float; None for anything else, and for what no float can hold."""
+    if isinstance(node, bool) or not isinstance(node, int | float | np.number):
         return None
     try:
-        return [float(value) for value in values if isinstance(value, int | float | np.number)]
+        return float(node)
     except (OverflowError, TypeError):
         return None
+
+
+def triple(node: object) -> Vector3 | None:
+    """Returns three numbers in an array or tuple; None for anything else."""
+    found = _numbers(node, 3)
+    return (found[0], found[1], found[2]) if found else None
+
+
+def quadruple(node: object) -> Quaternion | None:
+    """Returns four numbers in an array or tuple; None for anything else."""
+    found = _numbers(node, 4)
+    return (found[0], found[1], found[2], found[3]) if found else None
+
+
+def _numbers(node: object, count: int) -> list[float]:
+    """Returns the numbers of an array or tuple of this length; none where it holds others."""
+    if not isinstance(node, list | tuple | np.ndarray) or len(node) != count:
+        return []
+    found = [number(part) for part in node]
+    return [part for part in found if part is not None] if None not in found else []
 
 
 def rotation(node: object) -> Quaternion | None:

@@ -92,12 +92,10 @@ class Decoding:
             return f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
         schema = channel.schema
         found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
-        if found.deserialize is None:
+        if found.deserialize is None or found.definitions is None:
             return found.reason or "its definition cannot be used"
         if found.fieldless:
             return _fieldless(found.deserialize)
-        if found.definitions is None:
-            return found.deserialize
         return _bounded(found.deserialize, found.definitions, full_name(schema.name))
 
 
