@@ -130,8 +130,10 @@ class CatalogueDatabase:
         self._databases = 0
         self._closed = False
         self._tried_s = 0.0
-        self._trouble: str | None = None
-        self._failing = False
+        self.trouble: str | None = None
+        """What is wrong, as the end of a sentence about the catalogue, or None."""
+        self.is_failing = False
+        """Whether it failed, and has not been written since."""
         self.failures = 0
         """How often it could not be read: answers of meanwhile may lack something."""
 
@@ -141,16 +143,6 @@ class CatalogueDatabase:
         with self._lock:
             opened = self._ready()
         return None if opened is None else opened.path
-
-    @property
-    def trouble(self) -> str | None:
-        """What is wrong, as the end of a sentence about the catalogue, or None. Never blocks."""
-        return self._trouble
-
-    @property
-    def is_failing(self) -> bool:
-        """Whether it failed, and has not been written since."""
-        return self._failing
 
     @property
     def offset(self) -> int:
@@ -197,7 +189,7 @@ class CatalogueDatabase:
                 if opened is None:
                     return False
                 try:
-                    _transact(opened.connection, write, probing=self._failing)
+                    _transact(opened.connection, write, probing=self.is_failing)
                 except (sqlite3.Error, MemoryError) as error:
                     if not is_busy(error) or self._monotonic() >= give_up_s:
                         self._failed(error)
@@ -207,8 +199,8 @@ class CatalogueDatabase:
                     log.warning("catalogue_refused", reason=str(error))
                     return False
                 else:
-                    if self._failing:
-                        self._trouble, self._failing = None, False
+                    if self.is_failing:
+                        self.trouble, self.is_failing = None, False
                         log.info("catalogue_works_again")
                     return True
             # Outside the lock, so that readers do not wait for another program's writes.
@@ -253,9 +245,9 @@ class CatalogueDatabase:
             paths = self._candidate_paths()
             found = open_file(paths)
             self._opened = _in_memory() if isinstance(found, str) else found
-            self._trouble = None
+            self.trouble = None
             if isinstance(found, str) and paths:
-                self._trouble = f"is kept in memory: {found}"
+                self.trouble = f"is kept in memory: {found}"
         return self._opened
 
     def _move_to_preferred_path(self, before: OpenDatabase) -> None:
@@ -278,7 +270,7 @@ class CatalogueDatabase:
             before.connection.close()
             self._opened = found
             self._databases += 1
-            self._trouble, self._failing = None, False
+            self.trouble, self.is_failing = None, False
             if before.path is None:
                 log.info("catalogue_in_file_again", path=str(found.path))
             else:
@@ -291,10 +283,10 @@ class CatalogueDatabase:
             return
         self.failures += 1
         trouble = f"cannot be used: {error}"
-        if trouble != self._trouble:
+        if trouble != self.trouble:
             path = None if self._opened is None else self._opened.path
             log.warning("catalogue_failed", path=str(path), reason=str(error))
-        self._trouble, self._failing = trouble, True
+        self.trouble, self.is_failing = trouble, True
 
     def _lose(self, reason: str, *, aside: bool) -> None:
         """Gives the open database up; the next read or write opens or makes another."""
