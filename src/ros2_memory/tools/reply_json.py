@@ -64,7 +64,13 @@ def planar_pose(pose: Pose) -> JsonObject:
     return {**metres(pose.position), "yaw_deg": degrees(None if unit is None else yaw(unit))}
 
 
-def with_notes(reply: JsonObject, notes: Sequence[str], age: Ns | None = None) -> JsonObject:
-    """Returns a reply with its age and its notes, where there are any."""
-    aged: JsonObject = reply if age is None else {**reply, "age_s": seconds(age)}
-    return {**aged, "notes": [*notes]} if notes else aged
+def with_notes(
+    reply: JsonObject, notes: Sequence[str], age: Ns | None = None, **marks: bool
+) -> JsonObject:
+    """Returns a reply with the marks that are true, its age and its notes, where there are any."""
+    whole = reply | {name: True for name, is_so in marks.items() if is_so}
+    if age is not None:
+        whole["age_s"] = seconds(age)
+    if notes:
+        whole["notes"] = [*notes]
+    return whole

@@ -159,9 +159,7 @@ def _stored(stored: results.ListedMoment, now: Ns) -> JsonObject:
         "size_gb": round(stored.size / GB, 6),
         "complete": not (stored.pending or stored.missing),
     }
-    if stored.pending:
-        reply["pending"] = True
-    return with_notes(reply, stored.missing)
+    return with_notes(reply, stored.missing, pending=stored.pending)
 
 
 def _labelled_window(saved: results.RememberedMoment | results.ListedMoment) -> JsonObject:

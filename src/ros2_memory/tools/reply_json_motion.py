@@ -150,9 +150,7 @@ def _visits(answer: results.Visits) -> JsonObject:
         "visits": [_visit(each, answer.now) for each in answer.visits],
         "total": answer.total,
     }
-    if answer.more:
-        reply["more"] = True
-    return with_notes(reply, answer.notes)
+    return with_notes(reply, answer.notes, more=answer.more)
 
 
 def _visit(visit: results.Visit, now: Ns) -> JsonObject:

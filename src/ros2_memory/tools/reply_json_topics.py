@@ -78,9 +78,7 @@ def _topic_value(answer: results.TopicValue) -> JsonObject:
         "timestamp": unix_rounded_up(answer.sample.time),
         "value": answer.sample.value,
     }
-    if answer.latched:
-        reply["latched"] = True
-    return with_notes(reply, answer.notes, answer.age)
+    return with_notes(reply, answer.notes, answer.age, latched=answer.latched)
 
 
 @render.register(results.TopicRange)
@@ -183,9 +181,7 @@ def _sightings(answer: results.Sightings) -> JsonObject:
         "searched_from": moment(answer.start),
         "searched_to": moment(answer.end),
     }
-    if answer.more:
-        reply["more"] = True
-    return with_notes(reply, answer.notes)
+    return with_notes(reply, answer.notes, more=answer.more)
 
 
 def _sighting(sighting: results.Sighting, now: Ns) -> JsonObject:
@@ -204,9 +200,7 @@ def _sighting(sighting: results.Sighting, now: Ns) -> JsonObject:
     if sighting.thing is not None:
         spot = sighting.thing
         reply["place"] = {**metres(spot.position), "frame_id": spot.frame_id or None}
-    if not sighting.begun:
-        reply["began_earlier"] = True
-    return reply
+    return with_notes(reply, (), began_earlier=not sighting.begun)
 
 
 @render.register(results.Recap)
@@ -240,6 +234,4 @@ def _event(event: results.Event, now: Ns) -> JsonObject:
     }
     if event.end is not None:
         reply["duration_s"] = seconds(event.end - event.start)
-    if event.goes_on:
-        reply["goes_on"] = True
-    return reply
+    return with_notes(reply, (), goes_on=event.goes_on)
