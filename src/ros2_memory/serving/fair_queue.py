@@ -38,7 +38,7 @@ class FairQueue:
 
     def __init__(self, name: str, threads: int, most_waiting: int = MOST_WAITING) -> None:
         self._threads = ThreadPoolExecutor(threads, thread_name_prefix=name)
-        self._free = threads
+        self._at_once = threads
         self._most_waiting = most_waiting
         self._waiting: dict[Hashable, deque[_Turn]] = {}
         self._running: Counter[Hashable] = Counter()
@@ -82,8 +82,8 @@ class FairQueue:
 
     async def _wait_for_turn(self, client: Hashable) -> None:
         """Waits for a free thread, and takes it."""
-        if self._free and not self._waiting:
-            self._take(client)
+        if self.running < self._at_once and not self._waiting:
+            self._running[client] += 1
             return
         if self.waiting >= self._most_waiting:
             self._make_room(client)
@@ -125,24 +125,19 @@ class FairQueue:
             if not turns:
                 del self._waiting[client]
 
-    def _take(self, client: Hashable) -> None:
-        self._free -= 1
-        self._running[client] += 1
-
     def _release(self, client: Hashable) -> None:
         """Frees a thread, and begins the next query."""
-        self._free += 1
         self._running[client] -= 1
         if not self._running[client]:
             del self._running[client]
-        while self._free and self._waiting:
+        while self.running < self._at_once and self._waiting:
             following = min(self._waiting, key=self._running.__getitem__)
             turns = self._waiting.pop(following)
             turn = turns.popleft()
             if turns:  # behind the others: a dictionary keeps its order
                 self._waiting[following] = turns
             if not turn.done():
-                self._take(following)
+                self._running[following] += 1
                 turn.set_result(None)
 
 
