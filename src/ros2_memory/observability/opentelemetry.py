@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Final
 from opentelemetry import trace
 from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
 from opentelemetry.sdk.resources import SERVICE_NAME, Resource
-from opentelemetry.sdk.trace import ReadableSpan, SpanLimits, SpanProcessor, TracerProvider
+from opentelemetry.sdk.trace import (
+    ReadableSpan,
+    SpanLimits,
+    SpanProcessor,
+    SynchronousMultiSpanProcessor,
+    TracerProvider,
+)
 from opentelemetry.sdk.trace.export import BatchSpanProcessor
 from opentelemetry.trace import SpanKind, Status, StatusCode
 
@@ -24,9 +30,6 @@ from ros2_memory.core.telemetry import Observer
 from ros2_memory.core.timebase import ns_from_unix
 
 if TYPE_CHECKING:
-    from opentelemetry.context import Context
-    from opentelemetry.sdk.trace import Span
-
     from ros2_memory.core.telemetry import Answered
 
 SERVICE: Final = "ros2-memory-server"
@@ -72,24 +75,17 @@ class Traces(Observer):
         ending.join(_SHUTDOWN_S)
 
 
-class BoundedSpanProcessor(SpanProcessor):
+class BoundedSpanProcessor(SynchronousMultiSpanProcessor):
     """Passes spans on with names and descriptions of bounded length, as their attributes are.
 
     The MCP library repeats the names of tools and methods that a client sends, however long, in the
-    name and the status of a span.
-
-    Args:
-        processor: receives the bounded spans.
-        arguments: whether they may hold texts that a client chose, cut short.
+    name and the status of a span. `arguments`: whether spans may hold texts that a client chose,
+    cut short.
     """
 
-    def __init__(self, processor: SpanProcessor, *, arguments: bool) -> None:
-        self._processor = processor
+    def __init__(self, *, arguments: bool) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]  # has no types
         self._arguments = arguments
-
-    def on_start(self, span: Span, parent_context: Context | None = None) -> None:
-        """Passes a span on."""
-        self._processor.on_start(span, parent_context)
 
     def on_end(self, span: ReadableSpan) -> None:
         """Passes on what a span may show."""
@@ -101,7 +97,7 @@ class BoundedSpanProcessor(SpanProcessor):
             tool = attributes.get("gen_ai.tool.name")
             name = str(attributes.get("mcp.method.name", name)) + (f" {tool}" if tool else "")
             description, events = None, ()
-        self._processor.on_end(
+        super().on_end(
             ReadableSpan(
                 name=name if len(name) <= MAX_CHARS else f"{name[: MAX_CHARS - 3]}...",
                 context=span.context,
@@ -118,14 +114,6 @@ class BoundedSpanProcessor(SpanProcessor):
             )
         )
 
-    def shutdown(self) -> None:
-        """Shuts the processor down."""
-        self._processor.shutdown()
-
-    def force_flush(self, timeout_millis: int = 30000) -> bool:
-        """Flushes the processor."""
-        return self._processor.force_flush(timeout_millis)
-
 
 def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerProvider:
     """Returns a provider of spans of bounded size, with the environment's sampler and resource.
@@ -138,8 +126,13 @@ def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerPr
     if str(resource.attributes.get(SERVICE_NAME, _UNNAMED)).startswith(_UNNAMED):
         resource = resource.merge(Resource({SERVICE_NAME: SERVICE}))
     limits = SpanLimits(max_attribute_length=MAX_CHARS, max_span_attribute_length=MAX_CHARS)
-    provider = TracerProvider(resource=resource, span_limits=limits, shutdown_on_exit=False)
-    provider.add_span_processor(BoundedSpanProcessor(processor, arguments=arguments))
+    provider = TracerProvider(
+        resource=resource,
+        span_limits=limits,
+        shutdown_on_exit=False,
+        active_span_processor=BoundedSpanProcessor(arguments=arguments),
+    )
+    provider.add_span_processor(processor)
     return provider
 
 
