@@ -33,7 +33,12 @@ class Listening(Dispatcher):
         self.asked: list[Hashable] = []
 
     async def answer(
-        self, name: str, given: Mapping[str, object], client: Hashable = None
+        self,
+        name: str,
+        given: Mapping[str, object],
+        client: Hashable = None,
+        *,
+        for_resource: bool = False,
     ) -> Reply:
         self.asked.append(client)
         return Reply("{}")

@@ -99,25 +99,19 @@ class Dispatcher:
         self.blocking.stop()
 
     async def answer(
-        self, name: str, given: Mapping[str, object], client: Hashable = None
+        self,
+        name: str,
+        given: Mapping[str, object],
+        client: Hashable = None,
+        *,
+        for_resource: bool = False,
     ) -> Reply:
         """Returns the reply to a call, within `call_timeout_s`. Raises nothing but cancellation.
 
-        Where more calls wait than there are threads, `client`s take turns.
+        Where more calls wait than there are threads, `client`s take turns. `for_resource`: whether
+        the tools that only the resources use can be named, too.
         """
-        return await self._answer(self._tools, name, given, client)
-
-    async def read(self, name: str, given: Mapping[str, object], client: Hashable = None) -> Reply:
-        """Returns the reply of the tool behind a resource; otherwise as `answer`."""
-        return await self._answer(self._readable, name, given, client)
-
-    async def _answer(
-        self,
-        tools: Mapping[str, Tool],
-        name: str,
-        given: Mapping[str, object],
-        client: Hashable,
-    ) -> Reply:
+        tools = self._readable if for_resource else self._tools
         begun = time.perf_counter_ns()
         query_timeout_s = max(self._call_timeout_s - _QUERY_MARGIN_S, self._call_timeout_s * 0.9)
         over = threading.Event()

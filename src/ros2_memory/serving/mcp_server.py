@@ -130,7 +130,8 @@ class EpisodicServer(MCPServer[object]):
                 protocol has for it, -32602 (SEP-2164).
         """
         name, arguments = _resource_call(str(uri), self._resources)
-        reply = await self.dispatcher.read(name, arguments, _client(context))
+        client = _client(context)
+        reply = await self.dispatcher.answer(name, arguments, client, for_resource=True)
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
     async def list_prompts(self) -> list[Prompt]:
