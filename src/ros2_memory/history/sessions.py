@@ -14,7 +14,7 @@ are of one robot, so a reply that uses borrowed transforms has to say so.
 from __future__ import annotations
 
 from collections import defaultdict
-from itertools import combinations
+from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -26,7 +26,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile
@@ -47,32 +47,25 @@ class Sessions:
     """The sessions of a view that hold transforms.
 
     Args:
-        view: one call's view of the memory.
-        moving: the topics of moving transforms.
-        static: those of static ones.
-        poses: the topic of the robot's own poses: two sessions that hold it at once are two robots.
-        children: returns the child frames that a session has on some topics.
+        view: one call's view of the memory. Two sessions that hold the topic of the robot's own
+            poses (`data.pose_topic`) at once are two robots.
+        children: returns the child frames of all transforms of a session.
     """
 
-    def __init__(
-        self,
-        view: View,
-        moving: Sequence[str],
-        static: Sequence[str],
-        poses: str,
-        children: Callable[[Sequence[str], Session], set[str]],
-    ) -> None:
+    def __init__(self, view: View, children: Callable[[Session], set[str]]) -> None:
         self._view = view
-        self._topics = {"moving": tuple(moving), "static": tuple(static)}
+        limits = view.memory.limits
+        self._topics = (*limits.tf_topics, *limits.tf_static_topics, limits.pose_topic)
         self._children = children
         self._names = HardLinks(view.memory.index.bag_dir)
         self._root = str(view.memory.index.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
-        self._spans: dict[str, dict[str, tuple[Ns, Ns]]] = {
-            kind: self._spans_of(topics) for kind, topics in self._topics.items()
+        self._spans = {
+            "moving": self._spans_of(limits.tf_topics),
+            "static": self._spans_of(limits.tf_static_topics),
         }
-        self._joined = self._chains(poses)
-        self._poses = [*self._spans_of((poses,)).items()]
+        self._joined = self._chains()
+        self._poses = [*self._spans_of((limits.pose_topic,)).items()]
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
@@ -143,7 +136,7 @@ class Sessions:
     def _completed(self, own: Session, at: Ns) -> Session:
         """Returns a session with the one that lends to it; empty where it has no transforms."""
         kinds = self._kinds(own)
-        if len(kinds) == len(self._topics) or self._are_two_robots(at):
+        if len(kinds) == len(self._spans) or self._are_two_robots(at):
             return own if kinds else frozenset()
         beside = [each for each in self._around(at) if each != own and self._kinds(each)]
         if kinds:
@@ -168,8 +161,7 @@ class Sessions:
         """Whether one has moving transforms alone, the other static ones alone, of other frames."""
         if self._kinds(one) & self._kinds(other):
             return False
-        every = [topic for topics in self._topics.values() for topic in topics]
-        return not self._children(every, one) & self._children(every, other)
+        return not self._children(one) & self._children(other)
 
     def _kinds(self, session: Session) -> frozenset[str]:
         """Returns which kinds of transforms a session holds; carried ones count as its own."""
@@ -198,16 +190,15 @@ class Sessions:
                 spans[folder] = min(first, known[0]), max(last, known[1])
         return spans
 
-    def _chains(self, poses: str) -> Mapping[str, Session]:
+    def _chains(self) -> Mapping[str, Session]:
         """Returns, by folder, the recordings with transforms or poses joined by handovers."""
         timeline = self._view.snapshot.timeline
         known = _JOINED.get(timeline)
         if known is None:
-            every = [topic for topics in self._topics.values() for topic in topics]
-            recordings = [timeline.recordings(topic) for topic in (*every, poses)]
-            paths = {self.folder(path): path for some in recordings for path in some}
+            recordings = map(timeline.recordings, self._topics)
+            paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
             chains = _joined(paths) if len(paths) > 1 else {}
-            known = {folder: chain | {self._carried} for folder, chain in chains.items()}
+            known = {folder: joined | {self._carried} for folder, joined in chains.items()}
             _JOINED[timeline] = known
         return known
 
@@ -224,8 +215,8 @@ def _joined(paths: Mapping[str, Path]) -> dict[str, Session]:
     for folder in paths:
         if folder in joined:
             continue
-        chain = frozenset(reachable(folder, beside))
-        joined.update(dict.fromkeys(chain, chain))
+        session = frozenset(reachable(folder, beside))
+        joined.update(dict.fromkeys(session, session))
     return joined
 
 

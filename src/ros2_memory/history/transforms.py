@@ -159,7 +159,7 @@ def _transform_in(view: View, among: Session, frames: tuple[str, str], at: Ns) -
 
     for half_width in _HALF_WIDTHS:
         window = TimeWindow.around(at, half_width)
-        moving = list(_transforms(view, limits.tf_topics, window, among, static=False))
+        moving = list(_transforms(view, limits.tf_topics, window, among))
         try:
             return look_up(moving)._replace(reach=half_width)
         except NoDataError as error:
@@ -178,7 +178,7 @@ def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTra
     wider = TimeWindow(
         max(window.start - TF_CACHE_NS, MIN_NS), min(window.stop + TF_CACHE_NS, MAX_NS)
     )
-    return list(_transforms(view, view.memory.limits.tf_topics, wider, among, static=False))
+    return list(_transforms(view, view.memory.limits.tf_topics, wider, among))
 
 
 def graph_of(
@@ -196,7 +196,7 @@ def _clock(view: View, moving: Sequence[StampedTransform]) -> TfClock:
 def static_transforms(view: View, among: Session) -> list[StampedTransform]:
     """Returns every static transform of a session, in log-time order."""
     topics = view.memory.limits.tf_static_topics
-    return list(_transforms(view, topics, TimeWindow.everything(), among, static=True))
+    return list(_transforms(view, topics, TimeWindow.everything(), among))
 
 
 def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
@@ -217,14 +217,9 @@ def sessions_of(view: View) -> Sessions:
     """Returns the sessions of a view, made once."""
     if view.sessions is None:
         limits = view.memory.limits
+        topics = (*limits.tf_topics, *limits.tf_static_topics)
         view.sessions = Sessions(
-            view,
-            limits.tf_topics,
-            limits.tf_static_topics,
-            limits.pose_topic,
-            lambda topics, among: {
-                child for _, child in _pairs(view, topics, static=True, among=among)
-            },
+            view, lambda among: {child for _, child in _pairs(view, topics, among=among)}
         )
     return view.sessions
 
@@ -245,7 +240,7 @@ def session_bags(
 
 def children_moving(view: View, among: Session) -> set[str]:
     """Returns the child frames of a session's moving transforms."""
-    pairs = _pairs(view, view.memory.limits.tf_topics, static=False, among=among)
+    pairs = _pairs(view, view.memory.limits.tf_topics, among=among)
     return {child.lstrip("/") for _, child in pairs}
 
 
@@ -256,9 +251,8 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     name is none to tf2, and left out with a note.
     """
     limits = view.memory.limits
-    pairs: dict[tuple[str, str], bool] = {}
-    for topics, static in ((limits.tf_static_topics, True), (limits.tf_topics, False)):
-        pairs.update((pair, static) for pair in _pairs(view, topics, static=static))
+    pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)
+    pairs |= dict.fromkeys(_pairs(view, limits.tf_topics), False)
     refused = [pair for pair in pairs if not _is_edge(pair)]
     for pair in refused:
         del pairs[pair]
@@ -272,8 +266,6 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
 def _pairs(
     view: View,
     topics: Iterable[str],
-    *,
-    static: bool,
     window: TimeWindow | None = None,
     among: Session | None = None,
 ) -> set[tuple[str, str]]:
@@ -293,7 +285,7 @@ def _pairs(
             pairs |= known
             unknown += spans
     for span in united(unknown):
-        for each in _transforms(view, recorded, TimeWindow(*span), among, static=static):
+        for each in _transforms(view, recorded, TimeWindow(*span), among):
             pairs.add((each.parent, each.child))
     return pairs
 
@@ -374,8 +366,8 @@ def connected(
     """
     limits = view.memory.limits
     try:
-        pairs = _pairs(view, limits.tf_topics, static=False, window=window, among=among)
-        pairs |= _pairs(view, limits.tf_static_topics, static=True, among=among)
+        pairs = _pairs(view, limits.tf_topics, window, among)
+        pairs |= _pairs(view, limits.tf_static_topics, among=among)
     except QueryTimeoutError:
         return False
     beside: defaultdict[str, set[str]] = defaultdict(set)
@@ -418,7 +410,7 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
         ends = _stamps_at_ends(view, span.bag, topics)
         if ends and min(ends) - TF_CACHE_NS <= at <= max(ends) + TF_CACHE_NS:
             for found in view.bags.track_sources(view.bags.read(span.bag, topics, everything)):
-                yield from _decoded(view, found, static=False)
+                yield from _decoded(view, found)
 
 
 def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]:
@@ -434,7 +426,7 @@ def _stamps_at_ends(view: View, bag: BagFile, topics: Sequence[str]) -> list[Ns]
         for found in view.bags.track_sources(
             islice(view.bags.read(bag, topics, everything, newest_first=newest_first), 1)
         )
-        for transform in _decoded(view, found, static=False)
+        for transform in _decoded(view, found)
     ]
 
 
@@ -444,7 +436,7 @@ def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
 
 
 def _transforms(
-    view: View, topics: Iterable[str], window: TimeWindow, among: Session | None, *, static: bool
+    view: View, topics: Iterable[str], window: TimeWindow, among: Session | None
 ) -> Iterator[StampedTransform]:
     """Yields the transforms in a window, in order; with duplicates, where it is of one session."""
     recorded = _recorded(view, topics)
@@ -461,7 +453,7 @@ def _transforms(
         tracked = view.bags.track_sources(merged)
         found = (each for each in tracked if not several or sessions.has(among, each))
     for each in found:
-        yield from _decoded(view, each, static=static)
+        yield from _decoded(view, each)
 
 
 def _bags_of(
@@ -478,7 +470,8 @@ def _is_of(view: View, bag: BagFile, among: Session | None) -> bool:
     return among is None or sessions_of(view).folder(bag.recording) in among
 
 
-def _decoded(view: View, found: StoredMessage, *, static: bool) -> tuple[StampedTransform, ...]:
+def _decoded(view: View, found: StoredMessage) -> tuple[StampedTransform, ...]:
+    static = found.record.channel.topic in view.memory.limits.tf_static_topics
     begin = time.perf_counter_ns()
     try:
         message = view.memory.reader.decode(found.record)
