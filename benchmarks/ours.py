@@ -14,7 +14,7 @@ from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

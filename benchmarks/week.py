@@ -20,7 +20,7 @@ from benchmarks.timing import FLOOR, OURS
 from ros2_memory.bootstrap import build_backfill
 from ros2_memory.catalogue.store import BagKey, relative
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.status import memory_status

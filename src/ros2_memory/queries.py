@@ -53,14 +53,15 @@ from ros2_memory.history.no_data import (
 )
 from ros2_memory.history.reverse_search import ReverseSearch, not_covered
 from ros2_memory.history.robots import note_robots, note_robots_near
-from ros2_memory.history.time_arguments import (
+from ros2_memory.history.view import (
     AtTime,
     TimeRange,
+    View,
     ns_argument,
     open_moment,
     open_span,
+    open_view,
 )
-from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import absent_splits, describe_absent
 from ros2_memory.insights.field_extremes import (
@@ -215,8 +216,7 @@ def transform(
 
 def frames(memory: Memory, call: Call) -> results.Frames:
     """Returns every frame and parent-child pair that was recorded."""
-    view = View(memory, call, memory.clock.now())
-    require_bags(view)
+    view = open_view(memory, call, memory.clock.now())
     edges = frame_history.edges(view)
     note_unread(view, TimeWindow.everything(), nothing=True)
     return results.Frames(edges, view.notes.sentences())
@@ -244,7 +244,7 @@ def find_last_match(
     found = ReverseSearch(view, topic, condition).newest(until)
     if found is None:
         return results.Match(None, not_covered(view, TimeWindow(MIN_NS, until)))
-    _note_robots(view, found)
+    note_robots_near(view, found)
     note_unread(view, _searched(view, found, until, now), search=True)
     counted_from = now if memory.limits.now == "wall" else view.snapshot.latest
     if counted_from is not None and found.time > counted_from + FUTURE_NS:
@@ -278,7 +278,7 @@ def value_when(
     if found is None:
         return results.ValueWhen(None, notes=not_covered(view, TimeWindow(MIN_NS, until)))
     note_unread(view, _searched(view, found, until, now), search=True)
-    _note_robots(view, found)
+    note_robots_near(view, found)
     matched = _value(view, found, (), None)
     upto = TimeWindow.until(found.time)
     held = _newest_beside(view, name, upto, found)
@@ -333,8 +333,6 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     view = View(memory, call, now if memory.limits.now == "wall" else None)
     view.bags.track_all_sources()
     snapshot = view.snapshot
-    if memory.limits.now == "latest" and snapshot.latest is not None:
-        now = snapshot.latest
     if snapshot.problem:
         view.notes.add(snapshot.problem)
     if snapshot.dating.note:
@@ -346,7 +344,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     return results.DataTimeRange(
         earliest=snapshot.dating.earliest,
         latest=snapshot.dating.latest,
-        now=now,
+        now=memory.now(now, snapshot.latest),
         bags=len(snapshot.bags),
         gaps=tuple(results.Gap(*each) for each in recording_gaps(view)),
         incomplete=left_open(snapshot),
@@ -371,9 +369,7 @@ def _newest_beside(
     if newest is None or newest.bag.recording == match.bag.recording:
         return newest
     recording = match.bag.recording
-    own = frame_history.session_bags(view, topic, window, recording) or []
-    if newest.bag not in {each.bag for each in own}:
-        newest = view.stream.first([topic], window, newest_first=True, among=own) or newest
+    newest = frame_history.newest_in_session(view, topic, window, recording) or newest
     if not frame_history.sessions_of(view).are_joined(recording, newest.bag.recording):
         view.notes.add(
             f"the match is of recording {recording.name}, and the value of "
@@ -436,7 +432,7 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Stor
             found = None
     if found is None:
         raise no_data_at(view, (topic,), at, tolerance)
-    _note_robots(view, found)
+    note_robots_near(view, found)
     note_unread(view, TimeWindow(found.time, stop))
     return found
 
@@ -456,12 +452,6 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
     if view.memory.limits.latching.holds(view.snapshot, found):
         topic = found.record.channel.topic
         view.notes.add(f"{topic} is latched: its value of {seconds(at - found.time)} before holds")
-
-
-def _note_robots(view: View, found: StoredMessage) -> None:
-    """Notes recordings of several robots around a message; a single recording is of one."""
-    if len(view.snapshot.timeline.recordings(found.record.channel.topic)) > 1:
-        note_robots_near(view, found)
 
 
 def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:

@@ -16,7 +16,7 @@ from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.visits import visits

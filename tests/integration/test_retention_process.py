@@ -25,7 +25,7 @@ from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving

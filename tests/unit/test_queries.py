@@ -16,8 +16,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import AtTime, TimeRange
-from ros2_memory.history.view import View
+from ros2_memory.history.view import AtTime, TimeRange, View
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.bags import (
     McapLayout,

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Reader
 from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import typestore
 from tests.support.closed_form import (
     CAMERA,

@@ -56,8 +56,10 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> None:
 
 
 def note_robots_near(view: View, found: StoredMessage) -> None:
-    """Does as `note_robots`, around the time of a message."""
-    note_robots(view, found.record.channel.topic, TimeWindow.around(found.time, _NEAR_NS))
+    """Does as `note_robots`, around the time of a message; a single recording is of one robot."""
+    topic = found.record.channel.topic
+    if len(view.snapshot.timeline.recordings(topic)) > 1:
+        note_robots(view, topic, TimeWindow.around(found.time, _NEAR_NS))
 
 
 def _overlapping_pairs(

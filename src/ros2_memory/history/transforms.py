@@ -224,18 +224,22 @@ def sessions_of(view: View) -> Sessions:
     return view.sessions
 
 
-def session_bags(
+def newest_in_session(
     view: View, topic: str, window: TimeWindow, recording: Path
-) -> list[BagSpan] | None:
-    """Returns the bags with a topic, in a window, of a recording's session.
+) -> StoredMessage | None:
+    """Returns the newest message of a topic in a window, from the session of a recording.
 
-    None where that session has no message of the topic at all.
+    From any session where that one has no message of the topic at all.
     """
+    newest = view.stream.newest(topic, window)
     sessions = sessions_of(view)
     own = sessions.of(recording)
     if not any(sessions.folder(each) in own for each in view.snapshot.timeline.recordings(topic)):
-        return None
-    return _bags_of(view, (topic,), window, own)
+        return newest
+    bags = _bags_of(view, (topic,), window, own)
+    if newest is not None and newest.bag in {each.bag for each in bags}:
+        return newest
+    return view.stream.first((topic,), window, newest_first=True, among=bags)
 
 
 def children_moving(view: View, among: Session) -> set[str]:

@@ -50,7 +50,7 @@ from ros2_memory.history.coverage import note_edges, note_unread, recording_gaps
 from ros2_memory.history.driven_path import add_poses, driven_path, length_notes
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.time_arguments import open_span
+from ros2_memory.history.view import open_span
 from ros2_memory.results import Event, Recap
 
 if TYPE_CHECKING:
@@ -66,8 +66,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.time_arguments import TimeRange
-    from ros2_memory.history.view import View
+    from ros2_memory.history.view import TimeRange, View
 
 MOST_EVENTS: Final = 25
 

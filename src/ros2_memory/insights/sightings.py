@@ -30,11 +30,9 @@ from ros2_memory.core.timebase import (
     Ns,
 )
 from ros2_memory.history.coverage import note_unread, unix_text
-from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.reverse_search import ReverseSearch
-from ros2_memory.history.time_arguments import TimeRange, clamped, last_window, ns_argument
-from ros2_memory.history.transforms import session_bags, transform_at
-from ros2_memory.history.view import View
+from ros2_memory.history.transforms import newest_in_session, transform_at
+from ros2_memory.history.view import TimeRange, clamped, last_window, ns_argument, open_view
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.results import LabelledPlace, Sighting, Sightings
 
@@ -46,6 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import SearchWindow
+    from ros2_memory.history.view import View
     from ros2_memory.messages.detections import Detection
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
@@ -97,8 +96,7 @@ def find_matches(
     condition = parse_condition(condition_type, value, memory.limits.position_tolerance_m, field)
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
-    view = View(memory, call, min(_window(span, wall).stop, wall))
-    require_bags(view)
+    view = open_view(memory, call, min(_window(span, wall).stop, wall))
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     now = memory.now(wall, latest)
     window = clamped(view, _window(span, now))
@@ -329,14 +327,9 @@ def _robot(view: View, topic: str, seen: StoredMessage) -> Pose | None:
     Where the session of the match has poses, it is one of these.
     """
     window = TimeWindow(max(seen.time - NEWEST_POSE_NS, MIN_NS), seen.time + 1)
-    own = session_bags(view, topic, window, seen.bag.recording)
-    found = view.stream.newest(topic, window)
-    if own is not None and (found is None or found.bag not in {held.bag for held in own}):
-        found = view.stream.first([topic], window, newest_first=True, among=own)
-    if found is None:
-        return None
-    message = view.bags.decode(found)
-    if message is None:
+    found = newest_in_session(view, topic, window, seen.bag.recording)
+    message = None if found is None else view.bags.decode(found)
+    if found is None or message is None:
         return None
     pose = view.memory.extractor.pose(message, found.record.channel.type)
     return pose if pose is not None and all(map(math.isfinite, pose.position)) else None

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.no_data import require_bags
-from ros2_memory.history.view import View
+from ros2_memory.history.view import open_view
 from ros2_memory.results import TypeFields
 
 if TYPE_CHECKING:
@@ -26,8 +25,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     Raises:
         NoDataError: no topic was recorded under the type, or none of its messages can be decoded.
     """
-    view = View(memory, call, memory.clock.now())
-    require_bags(view)
+    view = open_view(memory, call, memory.clock.now())
     timeline = view.snapshot.timeline
     topics = [topic for topic, types in timeline.types.items() if type_name in types]
     if not topics:

@@ -36,9 +36,9 @@ from ros2_memory.history.driven_path import (
     positions_of,
 )
 from ros2_memory.history.duplicates import COPY_HORIZON_NS
-from ros2_memory.history.no_data import describe_lack, require_bags, resolve_pose_topic
+from ros2_memory.history.no_data import describe_lack, resolve_pose_topic
 from ros2_memory.history.reverse_search import CandidateBags
-from ros2_memory.history.view import View
+from ros2_memory.history.view import open_view
 from ros2_memory.insights.map_placement import map_placement
 from ros2_memory.results import Visit, Visits
 
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.history.view import View
     from ros2_memory.insights.map_placement import MapPlacement
 
 _COUNTING_S: Final = 5.0
@@ -87,8 +88,7 @@ def visits(
     if not (radius > 0 and math.isfinite(radius)):
         raise InvalidArgumentsError(f"radius_m must be more than 0, and was {radius_m}")
     wall = memory.clock.now()
-    view = View(memory, call, wall)
-    require_bags(view)
+    view = open_view(memory, call, wall)
     topic = resolve_pose_topic(view)
     place = map_placement(view, _pose_frame(view, topic), topic, frame_id)
     search = _VisitSearch(view, topic, place, (x, y, radius))

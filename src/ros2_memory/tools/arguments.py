@@ -24,7 +24,7 @@ from pydantic import (
 )
 
 from ros2_memory.bag_dir.moment_file import fault_of_label
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 
 LATEST_UNIX_S: Final = 9_223_372_036.0
 """The last second that int64 nanoseconds can represent; a larger number is in another unit."""

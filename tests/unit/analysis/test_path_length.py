@@ -24,7 +24,7 @@ from ros2_memory.core.geometry import simplify_to
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.tools.replies import Replies

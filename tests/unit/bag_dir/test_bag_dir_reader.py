@@ -18,7 +18,7 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.storage.base import CdrLayout, Closing, Record
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap

@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import list_recorded_topics, trajectory_summary
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of, recalling

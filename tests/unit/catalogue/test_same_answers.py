@@ -19,8 +19,7 @@ from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.time_arguments import AtTime, TimeRange
-from ros2_memory.history.view import View
+from ros2_memory.history.view import AtTime, TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader

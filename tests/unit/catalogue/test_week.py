@@ -15,7 +15,7 @@ from ros2_memory.catalogue.store import BagKey, Catalogue
 from ros2_memory.core.model import BagFile, BagState, BagSummary
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from tests.support.bags import detections, odom, tf, transform

@@ -14,7 +14,7 @@ from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.time_arguments import AtTime
+from ros2_memory.history.view import AtTime
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.insights.status import memory_status
 from ros2_memory.queries import position, topic_value, value_when

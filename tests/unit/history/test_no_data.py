@@ -14,7 +14,7 @@ from ros2_memory.core.model import Transform
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.no_data import seconds
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import render
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap

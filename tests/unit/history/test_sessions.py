@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.visits import visits

@@ -13,7 +13,7 @@ from mcap.writer import IndexType
 
 from ros2_memory.catalogue.codec import decode_schema, encode_schema
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import data_time_range, topic_range
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap

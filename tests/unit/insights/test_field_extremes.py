@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import field_extremes
 from ros2_memory.results import Extremes
 from ros2_memory.tools.replies import Replies

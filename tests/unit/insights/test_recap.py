@@ -21,7 +21,7 @@ from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import MOST_EVENTS, recap
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.results import Event, Recap

@@ -13,7 +13,7 @@ from ros2_memory import queries
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
 from ros2_memory.recorder.index_manager import IndexManager

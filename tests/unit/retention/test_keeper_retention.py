@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import (

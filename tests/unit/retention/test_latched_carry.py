@@ -11,7 +11,7 @@ from ros2_memory.core.errors import BagError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.time_arguments import AtTime
+from ros2_memory.history.view import AtTime
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap

@@ -15,7 +15,7 @@ from ros2_memory import queries
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.memories import memory_of
 from tests.support.shared_bags import REAL, needs_real
 

@@ -18,7 +18,7 @@ from ros2_memory.catalogue.digest import Digester
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.time_arguments import TimeRange
+from ros2_memory.history.view import TimeRange
 from ros2_memory.messages.to_json import MAX_EXACT_NUMBERS
 from ros2_memory.queries import topic_range
 from ros2_memory.storage.base import Channel, Record, Schema

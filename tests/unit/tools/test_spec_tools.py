@@ -11,7 +11,7 @@ import pytest
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.history.time_arguments import AtTime, TimeRange
+from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.tools import extra_tools, spec_tools
 from ros2_memory.tools.arguments import (
     At,
