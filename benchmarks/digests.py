@@ -156,12 +156,14 @@ def _moved_poses(poses: PoseDigest, by: int) -> PoseDigest:
     def leg(one: Leg | None) -> Leg | None:
         return one and replace(one, first=later(one.first), last=later(one.last))
 
+    totals = replace(
+        poses.totals,
+        head=leg(poses.totals.head),
+        tail=leg(poses.totals.tail),
+        resets=tuple(moment + by for moment in poses.totals.resets),
+    )
     return replace(
         poses,
-        first=poses.first and later(poses.first),
-        last=poses.last and later(poses.last),
-        head=leg(poses.head),
-        tail=leg(poses.tail),
-        resets=tuple(moment + by for moment in poses.resets),
+        totals=totals,
         vertices=tuple((moment + by, place, turn) for moment, place, turn in poses.vertices),
     )

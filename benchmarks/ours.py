@@ -87,7 +87,7 @@ def path_length(memory: Memory, topic: str, start: int, stop: int) -> float:
     """Metres driven in a window."""
     return queries.trajectory_summary(
         memory, Call(), _span(start, stop), topic=topic
-    ).trajectory.distance_m
+    ).trajectory.totals.distance_m
 
 
 def last_match(memory: Memory, topic: str, condition: str, value: JsonValue) -> int | None:

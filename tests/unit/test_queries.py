@@ -90,7 +90,7 @@ def test_a_pose_that_cannot_be_decoded_is_left_out_of_the_path_and_counted(tmp_p
     poses[5] = Msg("/odom", poses[5].type, T0 + 5 * S, b"\x00\x01\x00\x00")
     write_mcap(tmp_path / "a" / "a_0.mcap", poses)
     answer = queries.trajectory_summary(memory_of(tmp_path), Call(), span(0, 10))
-    assert (answer.trajectory.poses, answer.trajectory.distance_m) == (9, 9.0)
+    assert (answer.trajectory.poses, answer.trajectory.totals.distance_m) == (9, 9.0)
     assert any("cannot be decoded: 1 " in note for note in answer.notes)
 
 

@@ -138,7 +138,7 @@ def test_the_path_length_is_speed_times_time(memory: Memory, session: Session) -
     span = TimeRange(start_s=session.at(begin - 1), end_s=session.at(end + 1))
     answer = queries.trajectory_summary(memory, Call(), span)
     steps = round((end - begin) * 20)
-    assert answer.trajectory.distance_m == pytest.approx(SPEED * steps / 20, rel=1e-3)
+    assert answer.trajectory.totals.distance_m == pytest.approx(SPEED * steps / 20, rel=1e-3)
     assert answer.trajectory.max_speed == pytest.approx(SPEED, abs=1e-6)
     assert answer.trajectory.avg_speed == pytest.approx(SPEED, rel=0.01)
     for waypoint in answer.trajectory.waypoints:

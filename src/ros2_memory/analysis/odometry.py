@@ -281,17 +281,12 @@ def _step_m(before: End, after: End, steps: int, net_m: float, plain_m: float) -
     return math.sqrt(max(net_m**2 - variance, expected_m**2))
 
 
-@dataclass(frozen=True, slots=True)
-class PoseDigest:
-    """The poses of one bag, summed up; a pose is valid where its coordinates are a place.
+@dataclass(slots=True)
+class MotionTotals:
+    """What was driven, and what is left out of it: the legs of a path, summed up.
 
     Attributes:
-        poses: how many valid poses.
-        invalid: how many others.
-        first: the first valid pose; None without one, and then nothing below counts.
-        last: the last valid pose.
-        head: the first leg; None where there are few poses: then `vertices` are all of them, and
-            joining measures them anew.
+        head: the first leg; None without a pose.
         tail: the last leg; None where the first is the only one.
         length_m: of the legs between these.
         sum_m: the sum of the distances between poses, of the legs between these.
@@ -301,27 +296,68 @@ class PoseDigest:
         gap_m: the distance across them in straight lines.
         resets: the first pose after each reset of odometry; the earliest, of very many.
         speed_mps: the highest speed measured; None where the poses are too few.
+    """
+
+    head: Leg | None = None
+    tail: Leg | None = None
+    length_m: float = 0.0
+    sum_m: float = 0.0
+    jumps: int = 0
+    jumped_m: float = 0.0
+    gaps: int = 0
+    gap_m: float = 0.0
+    resets: tuple[Ns, ...] = ()
+    speed_mps: float | None = None
+
+    @property
+    def newest(self) -> Leg | None:
+        """The last leg, be it the only one."""
+        return self.tail or self.head
+
+    @property
+    def distance_m(self) -> float:
+        """The length of all that was driven: gaps, jumps and resets left out."""
+        return self.length_m + sum(leg.total_m for leg in self._ends())
+
+    @property
+    def path_sum_m(self) -> float:
+        """The sum of the distances between the poses of `distance_m`, noise included."""
+        return self.sum_m + sum(leg.sum_m for leg in self._ends())
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether noise may be much of the length of its first or last leg."""
+        return any(leg.in_doubt for leg in self._ends())
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first pose to the last."""
+        ends = self._ends()
+        return unix_from_ns(ends[-1].last.time - ends[0].first.time) if ends else 0.0
+
+    def _ends(self) -> list[Leg]:
+        return [leg for leg in (self.head, self.tail) if leg is not None]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseDigest:
+    """The poses of one bag, summed up; a pose is valid where its coordinates are a place.
+
+    Attributes:
+        poses: how many valid poses.
+        invalid: how many others.
+        totals: what was driven. Without legs where there are few poses: then `vertices` are all of
+            them, and joining measures them anew.
         twist: the highest speed (m/s) that a message states; None where none states one.
         frames: the frames of all poses, in order of appearance.
-        vertices: the drawn path, first and last pose among them, split where the robot jumped
+        vertices: the drawn path from the first valid pose to the last, split where the robot jumped
             (see `polyline.PARTED`).
         error_m: no valid pose is farther than this from the drawn path.
     """
 
     poses: int
     invalid: int
-    first: TimedPosition | None
-    last: TimedPosition | None
-    head: Leg | None
-    tail: Leg | None
-    length_m: float
-    sum_m: float
-    jumps: int
-    jumped_m: float
-    gaps: int
-    gap_m: float
-    resets: tuple[Ns, ...]
-    speed_mps: float | None
+    totals: MotionTotals
     twist: float | None
     frames: tuple[str, ...]
     vertices: tuple[Vertex, ...]
@@ -332,55 +368,15 @@ class Motion:
     """Measures poses that come in order, many at a time.
 
     Attributes:
-        first: the first pose; None without one.
-        last: the last pose.
-        head: the first leg; None without a pose.
-        tail: the last leg, if it is another one.
-        length_m: of the legs between these.
-        sum_m: of the legs between these.
-        jumps, jumped_m, gaps, gap_m, resets, speed_mps: see `PoseDigest`.
+        totals: of all poses so far.
         step_mps: the highest speed from one pose to the next where these were too few to measure
             a speed.
     """
 
     def __init__(self, max_plausible_speed_mps: float) -> None:
         self._fastest_mps = max_plausible_speed_mps
-        self.first: TimedPosition | None = None
-        self.last: TimedPosition | None = None
-        self.head: Leg | None = None
-        self.tail: Leg | None = None
-        self.length_m = 0.0
-        self.sum_m = 0.0
-        self.jumps = 0
-        self.jumped_m = 0.0
-        self.gaps = 0
-        self.gap_m = 0.0
-        self.resets: list[Ns] = []
-        self.speed_mps: float | None = None
+        self.totals = MotionTotals()
         self.step_mps = 0.0
-
-    @property
-    def distance_m(self) -> float:
-        """The length of all that was driven."""
-        legs = (self.head, self.tail)
-        return self.length_m + sum(leg.total_m for leg in legs if leg is not None)
-
-    @property
-    def path_sum_m(self) -> float:
-        """The sum of the distances between poses of all that was driven."""
-        return self.sum_m + sum(leg.sum_m for leg in (self.head, self.tail) if leg is not None)
-
-    @property
-    def in_doubt(self) -> bool:
-        """Whether noise may be much of the length of its first or last leg."""
-        return any(leg.in_doubt for leg in (self.head, self.tail) if leg is not None)
-
-    @property
-    def duration_s(self) -> float:
-        """Seconds from the first pose to the last."""
-        if self.first is None or self.last is None:
-            return 0.0
-        return unix_from_ns(self.last.time - self.first.time)
 
     def add(self, path: Sequence[TimedPosition]) -> list[int]:
         """Takes the poses that come next; returns the indices of those that a jump or reset led to.
@@ -393,7 +389,7 @@ class Motion:
         steps_m = np.sqrt((np.diff(positions, axis=0) ** 2).sum(axis=1))
         plausible_m = self._fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
         parted: list[int] = []
-        begin, before = 0, self.last
+        begin, newest = 0, self.totals.newest
         beside_m = np.maximum(
             np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
         )
@@ -407,97 +403,101 @@ class Motion:
             )
             known = sum(map(len, sides))
             near = _motion_of(sides[0]).or_more(_motion_of(sides[1]))
-            leg = self.tail or self.head
-            if index < begin + _NEARBY and before is not None and leg is not None:
-                known += leg.poses
-                near = near.or_more(leg.near_last)
+            if index < begin + _NEARBY and newest is not None:
+                known += newest.poses
+                near = near.or_more(newest.near_last)
             # Too few poses do not show what is usual.
             usual = near if known >= _NEARBY else None
             kind = link(here, there, usual_ns, self._fastest_mps, usual)
             if kind == "driven":
                 continue
-            if self._go_on(before, _leg(path[begin : index + 1])):
+            if self._go_on(newest, _leg(path[begin : index + 1])):
                 parted.append(begin)
             self._break(kind, here, there)
-            begin, before = index + 1, None
+            begin, newest = index + 1, None
             if kind != "gap":
                 parted.append(begin)
-        if self._go_on(before, _leg(path[begin:])):
+        if self._go_on(newest, _leg(path[begin:])):
             parted.append(begin)
         return parted
 
-    def join(self, whole: PoseDigest) -> bool:
+    def join(self, later: MotionTotals) -> bool:
         """Takes the legs of a digest that come next; returns whether a jump or reset led there."""
-        if whole.head is None:
+        if later.head is None:
             return False
-        parted = self._go_on(self.last, (whole.head, whole.speed_mps, 0.0))
-        self.jumps += whole.jumps
-        self.jumped_m += whole.jumped_m
-        self.gaps += whole.gaps
-        self.gap_m += whole.gap_m
-        self.resets += whole.resets[: _MAX_RESETS - len(self.resets)]
-        if whole.tail is not None:
+        totals = self.totals
+        parted = self._go_on(totals.newest, (later.head, later.speed_mps, 0.0))
+        totals.jumps += later.jumps
+        totals.jumped_m += later.jumped_m
+        totals.gaps += later.gaps
+        totals.gap_m += later.gap_m
+        totals.resets = (*totals.resets, *later.resets)[:_MAX_RESETS]
+        if later.tail is not None:
             self._end_leg()
-            self.length_m += whole.length_m
-            self.sum_m += whole.sum_m
-            self.tail = whole.tail
-            self.last = whole.tail.last
+            totals.length_m += later.length_m
+            totals.sum_m += later.sum_m
+            totals.tail = later.tail
         return parted
 
     @property
     def _period_ns(self) -> Ns | None:
-        leg = self.tail or self.head
+        leg = self.totals.newest
         return None if leg is None else leg.period_ns
 
-    def _go_on(self, before: TimedPosition | None, measured_leg: _MeasuredLeg) -> bool:
-        """Takes the leg that comes next; returns whether a jump or reset led to it."""
+    def _go_on(self, before: Leg | None, measured_leg: _MeasuredLeg) -> bool:
+        """Takes the leg that comes next; returns whether a jump or reset led to it.
+
+        `before` is the one before it, unless what ended that is counted already.
+        """
         leg, speed_mps, step_mps = measured_leg
+        totals = self.totals
         if speed_mps is not None:
-            self.speed_mps = max(self.speed_mps or 0.0, speed_mps)
+            totals.speed_mps = max(totals.speed_mps or 0.0, speed_mps)
         self.step_mps = max(self.step_mps, step_mps)
         kind: Link | None = None
         if before is not None:
-            periods = [each for each in (self._period_ns, leg.period_ns) if each is not None]
-            last = self.tail or self.head
+            periods = [each for each in (before.period_ns, leg.period_ns) if each is not None]
             near = None
-            if last is not None and last.poses + leg.poses >= _NEARBY:
-                near = last.near_last.or_more(leg.near_first)
-            kind = link(before, leg.first, max(periods, default=None), self._fastest_mps, near)
-        self.last = leg.last
-        if kind == "driven":
-            if self.tail is not None:
-                self.tail = self.tail.joined(leg)
-            elif self.head is not None:
-                self.head = self.head.joined(leg)
-            return False
-        if before is not None and kind is not None:
-            self._break(kind, before, leg.first)
-        if self.head is None:
-            self.head, self.first = leg, leg.first
+            if before.poses + leg.poses >= _NEARBY:
+                near = before.near_last.or_more(leg.near_first)
+            usual_ns = max(periods, default=None)
+            kind = link(before.last, leg.first, usual_ns, self._fastest_mps, near)
+            if kind != "driven":
+                self._break(kind, before.last, leg.first)
+            elif totals.tail is not None:
+                totals.tail = before.joined(leg)
+                return False
+            else:
+                totals.head = before.joined(leg)
+                return False
+        if totals.head is None:
+            totals.head = leg
         else:
             self._end_leg()
-            self.tail = leg
+            totals.tail = leg
         return kind in ("jump", "reset")
 
     def _end_leg(self) -> None:
         """Adds the last leg to those between."""
-        if self.tail is not None:
-            self.length_m += self.tail.total_m
-            self.sum_m += self.tail.sum_m
-            self.tail = None
+        totals = self.totals
+        if totals.tail is not None:
+            totals.length_m += totals.tail.total_m
+            totals.sum_m += totals.tail.sum_m
+            totals.tail = None
 
     def _break(self, kind: Link, before: TimedPosition, after: TimedPosition) -> None:
         """Counts what ends a leg."""
+        totals = self.totals
         step_m = distance(before.position, after.position)
         if kind == "gap":
-            self.gaps += 1
-            self.gap_m += step_m
+            totals.gaps += 1
+            totals.gap_m += step_m
             return
         if _is_jump(before, after, self._fastest_mps):
-            self.jumps += 1
-            self.jumped_m += step_m
-        if kind == "reset" and len(self.resets) < _MAX_RESETS:
-            self.resets.append(after.time)
+            totals.jumps += 1
+            totals.jumped_m += step_m
+        if kind == "reset":
+            totals.resets = (*totals.resets, after.time)[:_MAX_RESETS]
 
 
 _MeasuredLeg: TypeAlias = "tuple[Leg, float | None, float]"

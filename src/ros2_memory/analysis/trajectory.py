@@ -7,11 +7,12 @@ limit on the count of vertices widens it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from ros2_memory.analysis.odometry import (
     Motion,
+    MotionTotals,
     PoseDigest,
     TimedPosition,
     Vertex,
@@ -57,9 +58,8 @@ class Trajectory:
     """The measurements of a driven path.
 
     Attributes:
-        distance_m: path length in 3D in log-time order, as far as its noise allows (see
-            `path_length`); gaps, jumps and resets left out.
-        duration_s: from the first to the last valid pose.
+        totals: path length in 3D in log-time order, as far as its noise allows (see
+            `path_length`), and what is left out of it.
         avg_speed: `distance_m / duration_s` (m/s); 0 where there is no duration.
         max_speed: the highest speed (m/s), from `max_speed_from`.
         max_speed_from: `twist`: the messages' own; `positions`: over a second and eight poses.
@@ -68,17 +68,9 @@ class Trajectory:
         waypoint_error_m: no pose is farther than this from the drawn path.
         poses: how many valid poses.
         invalid: poses left out, since a coordinate is NaN, infinite or beyond any place.
-        jumps: steps faster than plausible, left out of distance and speed.
-        jumped_m: their total length.
-        path_sum_m: the sum of the distances between the poses of `distance_m`, noise included.
-        gaps: times in which nothing was recorded.
-        gap_m: the distance across them in straight lines, left out of the distance.
-        resets: the first pose after each reset of odometry; the step to it is left out.
-        in_doubt: whether noise may be much of the length, where poses are too rare to tell.
     """
 
-    distance_m: float
-    duration_s: float
+    totals: MotionTotals
     avg_speed: float
     max_speed: float
     max_speed_from: Literal["twist", "positions"]
@@ -86,13 +78,6 @@ class Trajectory:
     waypoint_error_m: float
     poses: int
     invalid: int
-    jumps: int
-    jumped_m: float
-    path_sum_m: float = 0.0
-    gaps: int = 0
-    gap_m: float = 0.0
-    resets: tuple[Ns, ...] = ()
-    in_doubt: bool = False
 
     @property
     def is_known(self) -> bool:
@@ -102,8 +87,9 @@ class Trajectory:
     @property
     def is_noisy(self) -> bool:
         """Whether the plain sum is longer by more than 2 %, and by a millimetre."""
-        more_m = self.path_sum_m - self.distance_m
-        return more_m > max(_NOISY_SHARE * self.distance_m, _NOISY_M)
+        distance_m = self.totals.distance_m
+        more_m = self.totals.path_sum_m - distance_m
+        return more_m > max(_NOISY_SHARE * distance_m, _NOISY_M)
 
 
 class _Poses:
@@ -181,29 +167,29 @@ class TrajectoryBuilder(_Poses):
         self._frames.update(dict.fromkeys(whole.frames))
         self._invalid += whole.invalid
         self._twist = faster(self._twist, whole.twist)
-        if whole.head is None:
+        if whole.totals.head is None:
             for vertex in whole.vertices:
                 self._add(vertex)
             return
         self._measure()
         self._poses += whole.poses
-        if self._motion.join(whole):
+        if self._motion.join(whole.totals):
             self._path.part()
         self._path.extend(whole.vertices, whole.error_m)
 
     def result(self) -> Trajectory:
         """Returns the trajectory so far; more poses may be added after."""
         self._measure()
-        motion = self._motion
-        duration_s = motion.duration_s
-        avg_speed = motion.distance_m / duration_s if duration_s > 0 else 0.0
+        totals = replace(self._motion.totals)
+        distance_m, duration_s = totals.distance_m, totals.duration_s
+        avg_speed = distance_m / duration_s if duration_s > 0 else 0.0
         # Drivers without a twist leave it zero, which is wrong where the robot moved.
-        stated = self._twist if self._twist or not motion.distance_m else None
-        measured = motion.speed_mps or (motion.step_mps if self._poses <= SPEED_STEPS else 0.0)
+        stated = self._twist if self._twist or not distance_m else None
+        step_mps = self._motion.step_mps if self._poses <= SPEED_STEPS else 0.0
+        measured = totals.speed_mps or step_mps
         drawn = self._path.drawn(self._max_waypoints)
         return Trajectory(
-            distance_m=motion.distance_m,
-            duration_s=duration_s,
+            totals=totals,
             avg_speed=avg_speed,
             max_speed=max(measured, avg_speed) if stated is None else stated,
             max_speed_from="positions" if stated is None else "twist",
@@ -215,13 +201,6 @@ class TrajectoryBuilder(_Poses):
             waypoint_error_m=drawn.error_m,
             poses=self._poses,
             invalid=self._invalid,
-            jumps=motion.jumps,
-            jumped_m=motion.jumped_m,
-            path_sum_m=motion.path_sum_m,
-            gaps=motion.gaps,
-            gap_m=motion.gap_m,
-            resets=tuple(motion.resets),
-            in_doubt=motion.in_doubt,
         )
 
 
@@ -238,24 +217,13 @@ class PoseCollector(_Poses):
         """Returns the digest."""
         few = self._waiting if self._poses <= _BAG_VERTICES else None
         self._measure()
-        motion = self._motion
         drawn = self._path.drawn(_BAG_VERTICES)
         vertices = drawn.row() if few is None else few
+        totals = self._motion.totals
         return PoseDigest(
             poses=self._poses,
             invalid=self._invalid,
-            first=motion.first,
-            last=motion.last,
-            head=motion.head if few is None else None,
-            tail=motion.tail if few is None else None,
-            length_m=motion.length_m,
-            sum_m=motion.sum_m,
-            jumps=motion.jumps,
-            jumped_m=motion.jumped_m,
-            gaps=motion.gaps,
-            gap_m=motion.gap_m,
-            resets=tuple(motion.resets),
-            speed_mps=motion.speed_mps,
+            totals=replace(totals) if few is None else replace(totals, head=None, tail=None),
             twist=self._twist,
             frames=tuple(self._frames),
             vertices=tuple((time, position, _heading(turn)) for time, position, turn in vertices),

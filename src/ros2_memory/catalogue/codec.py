@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.intervals import IntervalTable
-from ros2_memory.analysis.odometry import Leg, NearbyMotion, PoseDigest, TimedPosition
+from ros2_memory.analysis.odometry import Leg, MotionTotals, NearbyMotion, PoseDigest, TimedPosition
 from ros2_memory.analysis.path_length import Creep, End
 from ros2_memory.analysis.standstills import ChainDigest, StandstillDigest
 from ros2_memory.analysis.topic_events import KnownFlag, ReportedError, Toggle, TopicEvents
@@ -33,38 +33,36 @@ _VERTEX: Final = struct.Struct("<qdddd")
 _EVENTS: Final = struct.Struct("<qqqqqI")
 _MIN_COMPRESSED_BYTES: Final = 256
 """A shorter text is not worth compressing."""
-_NOWHERE: Final = TimedPosition(0, (math.nan, math.nan, math.nan))
+_NOWHERE: Final[Vertex] = (0, (math.nan, math.nan, math.nan), None)
 
 
 def encode_poses(poses: PoseDigest) -> bytes:
     """Encodes a digest of poses."""
-    legs = [leg for leg in (poses.head, poses.tail) if leg is not None]
-    first, last = (_NOWHERE if each is None else each for each in (poses.first, poses.last))
+    totals = poses.totals
+    legs = [leg for leg in (totals.head, totals.tail) if leg is not None]
+    ends = (poses.vertices[0], poses.vertices[-1]) if poses.vertices else (_NOWHERE, _NOWHERE)
     head = _HEAD.pack(
         poses.poses,
         poses.invalid,
-        poses.jumps,
-        poses.gaps,
-        len(poses.resets),
+        totals.jumps,
+        totals.gaps,
+        len(totals.resets),
         len(poses.vertices),
         len(legs),
-        poses.length_m,
-        poses.sum_m,
-        poses.jumped_m,
-        poses.gap_m,
-        math.nan if poses.speed_mps is None else poses.speed_mps,
+        totals.length_m,
+        totals.sum_m,
+        totals.jumped_m,
+        totals.gap_m,
+        math.nan if totals.speed_mps is None else totals.speed_mps,
         math.nan if poses.twist is None else poses.twist,
         poses.error_m,
-        first.time,
-        *first.position,
-        last.time,
-        *last.position,
+        *(number for time, position, _ in ends for number in (time, *position)),
     )
     vertices = b"".join(
         _VERTEX.pack(time, *position, turn if isinstance(turn, float) else math.nan)
         for time, position, turn in poses.vertices
     )
-    resets = struct.pack(f"<{len(poses.resets)}q", *poses.resets)
+    resets = struct.pack(f"<{len(totals.resets)}q", *totals.resets)
     frames = json.dumps(poses.frames).encode()
     return b"".join((head, *map(_encode_leg, legs), resets, vertices, frames))
 
@@ -214,8 +212,7 @@ def _decode_text(
 
 def _decode_poses(packed: bytes) -> PoseDigest:
     poses, invalid, jumps, gaps, reset, count, legs, *numbers = _HEAD.unpack_from(packed)
-    length_m, sum_m, jumped_m, gap_m, speed_mps, twist, error_m, *ends_of_all = numbers
-    first, last = _ends(ends_of_all)
+    length_m, sum_m, jumped_m, gap_m, speed_mps, twist, error_m, *_ = numbers
     begin = _HEAD.size
     ends: list[Leg] = []
     for _ in range(legs):
@@ -228,11 +225,7 @@ def _decode_poses(packed: bytes) -> PoseDigest:
         (time, (x, y, z), None if math.isnan(heading) else heading)
         for time, x, y, z, heading in _VERTEX.iter_unpack(packed[begin:end])
     ]
-    return PoseDigest(
-        poses=poses,
-        invalid=invalid,
-        first=first if poses else None,
-        last=last if poses else None,
+    totals = MotionTotals(
         head=ends[0] if ends else None,
         tail=ends[1] if len(ends) > 1 else None,
         length_m=length_m,
@@ -243,6 +236,11 @@ def _decode_poses(packed: bytes) -> PoseDigest:
         gap_m=gap_m,
         resets=resets,
         speed_mps=None if math.isnan(speed_mps) else speed_mps,
+    )
+    return PoseDigest(
+        poses=poses,
+        invalid=invalid,
+        totals=totals,
         twist=None if math.isnan(twist) else twist,
         frames=_frames(packed[end:]),
         vertices=tuple(vertices),

@@ -90,33 +90,34 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> DrivenPath | None
 
 def length_notes(path: Trajectory) -> Iterator[str]:
     """Yields what is left out of the length of a path, and why it is not the sum of all steps."""
+    totals = path.totals
     if path.invalid:
         poses = counted(path.invalid, "pose")
         yield f"{poses} left out: the coordinates are no place (NaN or beyond)"
     if path.is_noisy:
         yield (
-            f"the positions are noisy: step by step they sum up to {path.path_sum_m:.2f} m; "
+            f"the positions are noisy: step by step they sum up to {totals.path_sum_m:.2f} m; "
             "distance_m is without what the noise adds"
         )
-    if path.in_doubt:
+    if totals.in_doubt:
         yield (
             "the positions come more than 0.25 s apart, and noise or sharp turns are much of the "
             "steps between them: distance_m may be too long, since noise cannot be taken off"
         )
-    if path.gaps:
+    if totals.gaps:
         without = "without a valid pose" if path.invalid else "in which nothing was recorded"
         yield (
-            f"{counted(path.gaps, 'gap')} {without}, {path.gap_m:.2f} m across in straight lines "
-            "(gap_m): left out of distance_m"
+            f"{counted(totals.gaps, 'gap')} {without}, {totals.gap_m:.2f} m across in straight "
+            "lines (gap_m): left out of distance_m"
         )
-    if path.jumps:
+    if totals.jumps:
         yield (
-            f"{counted(path.jumps, 'jump')} of {path.jumped_m:.2f} m in all, faster than is "
+            f"{counted(totals.jumps, 'jump')} of {totals.jumped_m:.2f} m in all, faster than is "
             "plausible, left out of distance and speed"
         )
-    if path.resets:
+    if totals.resets:
         yield (
-            f"odometry began anew {counted(len(path.resets), 'time')}: "
+            f"odometry began anew {counted(len(totals.resets), 'time')}: "
             "what led back to its origin is left out of distance and speed"
         )
 

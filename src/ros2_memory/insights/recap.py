@@ -108,11 +108,16 @@ class _Drive:
         if known is None or not known.is_known:
             return stood or None
         if not stood:
-            is_hidden = length >= SHORTEST_NS and known.distance_m <= CREEP_MPS * known.duration_s
+            is_hidden = (
+                length >= SHORTEST_NS
+                and known.totals.distance_m <= CREEP_MPS * known.totals.duration_s
+            )
             return None if is_hidden else 0
-        else_s = known.duration_s - unix_from_ns(stood)
-        is_hidden = else_s > known.duration_s / 2 and known.distance_m < CREEP_MPS * else_s
-        if is_hidden and not known.gaps and ns_from_unix(else_s) > SHORTEST_NS:
+        else_s = known.totals.duration_s - unix_from_ns(stood)
+        is_hidden = (
+            else_s > known.totals.duration_s / 2 and known.totals.distance_m < CREEP_MPS * else_s
+        )
+        if is_hidden and not known.totals.gaps and ns_from_unix(else_s) > SHORTEST_NS:
             return None
         return stood
 
@@ -151,7 +156,7 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
         start=start,
         end=end,
         now=memory.now(memory.clock.now(), view.snapshot.latest),
-        distance_m=None if known is None else known.distance_m,
+        distance_m=None if known is None else known.totals.distance_m,
         max_speed=None if known is None else known.max_speed,
         stood=stood,
         shortest_stop=SHORTEST_NS,
@@ -160,8 +165,10 @@ def recap(memory: Memory, call: Call, span: TimeRange) -> Recap:
         throughout=tuple(sorted(throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
         notes=view.notes.sentences(),
-        path_sum_m=None if trajectory is None or not trajectory.is_noisy else trajectory.path_sum_m,
-        gap_m=None if trajectory is None or not trajectory.gaps else trajectory.gap_m,
+        path_sum_m=None
+        if trajectory is None or not trajectory.is_noisy
+        else trajectory.totals.path_sum_m,
+        gap_m=None if trajectory is None or not trajectory.totals.gaps else trajectory.totals.gap_m,
     )
 
 

@@ -146,7 +146,7 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
         view.notes.complete = False
         view.notes.add("the time was over before it was known whether odometry began anew since")
         return ()
-    return () if path is None else path.trajectory.resets
+    return () if path is None else path.trajectory.totals.resets
 
 
 def _pose_frame(view: View, topic: str) -> str:
@@ -314,20 +314,21 @@ class _VisitSearch:
         here: tuple[float, float],
     ) -> bool:
         """Adds a whole group by the digest of its poses; False where that is not enough to know."""
-        if digest.invalid or digest.first is None or digest.last is None:
+        if digest.invalid or not digest.vertices:
             return False
         path = [vertex[1] for vertex in digest.vertices]
+        first, last = digest.vertices[0][0], digest.vertices[-1][0]
         error_m = digest.error_m + _ROUNDING_M
         bound_m = _off_path(path, here) - error_m
         if bound_m > self._radius:
-            visits.away(digest.first.time)
+            visits.away(first)
             return True
         near = all(_away(position, here) + error_m <= self._radius for position in path)
         if not near or not self._unbroken(group, digest, span):
             return False
         if digest.error_m == 0 and len({*path}) == 1:
             # The robot stood still: the digest has the exact position of all poses.
-            visits.near(Approach(_away(path[0], here), digest.first.time), digest.last.time)
+            visits.near(Approach(_away(path[0], here), first), last)
             return True
         bound = Approach(max(bound_m, 0.0), span[0])
         visits.near_throughout(*span, Unread(bound, TimeWindow(span[0], span[1] + 1), here))

@@ -96,10 +96,10 @@ def _trajectory(answer: results.TrajectorySummary) -> JsonObject:
     path = answer.trajectory
     known = path.is_known
     reply: JsonObject = {
-        "distance_m": rounded(path.distance_m, 4) if known else None,
+        "distance_m": rounded(path.totals.distance_m, 4) if known else None,
         "avg_speed": rounded(path.avg_speed, 4) if known else None,
         "max_speed": rounded(path.max_speed, 4) if known else None,
-        "duration_s": rounded(path.duration_s, 3) if known else None,
+        "duration_s": rounded(path.totals.duration_s, 3) if known else None,
         "waypoints": [
             {
                 "timestamp": unix_rounded_up(point.time),
@@ -114,18 +114,18 @@ def _trajectory(answer: results.TrajectorySummary) -> JsonObject:
         "start": unix_rounded_up(answer.start),
         "end": unix_rounded_up(answer.end),
         "poses": path.poses,
-        **({"path_sum_m": rounded(path.path_sum_m, 4)} if path.is_noisy else {}),
-        **({"gap_m": rounded(path.gap_m, 4)} if path.gaps else {}),
+        **({"path_sum_m": rounded(path.totals.path_sum_m, 4)} if path.is_noisy else {}),
+        **({"gap_m": rounded(path.totals.gap_m, 4)} if path.totals.gaps else {}),
     }
     return with_notes(reply, (*answer.notes, *_path_notes(path)))
 
 
 def _path_notes(path: Trajectory) -> Iterator[str]:
     yield from length_notes(path)
-    if path.jumps:
+    if path.totals.jumps:
         drawn = sum(point.jump for point in path.waypoints)
         if drawn:
-            longest = "the longest lead" if drawn < path.jumps else "each leads"
+            longest = "the longest lead" if drawn < path.totals.jumps else "each leads"
             yield f"of the jumps {longest} to a waypoint with jump: true; no way was driven there"
     if path.poses and path.max_speed_from == "positions":
         yield "max_speed is measured from positions: the messages state no speed"

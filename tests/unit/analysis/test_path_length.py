@@ -108,17 +108,17 @@ def test_an_hour_of_standing_with_10_mm_of_noise_is_no_way(hertz: int, axes: int
     poses = noisy(np.zeros((HOUR_S * hertz, 3)), 0.010, axes=axes)
     assert plain_sum(poses) > 50
     whole, in_bags = summarise(poses, hertz), summarise(poses, hertz, range(0, len(poses), 500))
-    assert whole.distance_m < 0.1
-    assert in_bags.distance_m < 0.1
+    assert whole.totals.distance_m < 0.1
+    assert in_bags.totals.distance_m < 0.1
     assert whole.is_noisy
-    assert whole.path_sum_m == pytest.approx(plain_sum(poses), rel=1e-9)
+    assert whole.totals.path_sum_m == pytest.approx(plain_sum(poses), rel=1e-9)
     assert whole.max_speed < 0.01
 
 
 def test_a_robot_that_creeps_in_its_noise_gets_where_it_gets() -> None:
     poses = noisy(line(0.001, 50, HOUR_S), 0.005)
     for found in (summarise(poses, 50), summarise(poses, 50, range(0, len(poses), 500))):
-        assert found.distance_m == pytest.approx(3.6, rel=0.05)
+        assert found.totals.distance_m == pytest.approx(3.6, rel=0.05)
 
 
 # Driving
@@ -129,8 +129,8 @@ def test_a_robot_that_creeps_in_its_noise_gets_where_it_gets() -> None:
 def test_without_noise_lines_and_arcs_have_their_length(speed: float, hertz: int) -> None:
     for poses in (line(speed, hertz, 60), arc(speed, hertz, 60)):
         found = summarise(poses, hertz)
-        assert found.distance_m == pytest.approx(60 * speed, rel=0.002)
-        assert found.distance_m == pytest.approx(found.path_sum_m, rel=1e-9)
+        assert found.totals.distance_m == pytest.approx(60 * speed, rel=0.002)
+        assert found.totals.distance_m == pytest.approx(found.totals.path_sum_m, rel=1e-9)
         assert not found.is_noisy
         assert found.max_speed == pytest.approx(speed, rel=0.002)
 
@@ -150,7 +150,7 @@ def test_with_5_mm_of_noise_a_way_is_within_3_percent(speed: float, hertz: int) 
         for axes in (2, 3):
             found = summarise(noisy(poses, 0.005, seed, axes), hertz)
             truth = plain_sum(poses) if seed != 1 else 100 * speed
-            assert found.distance_m == pytest.approx(truth, rel=0.03)
+            assert found.totals.distance_m == pytest.approx(truth, rel=0.03)
             assert found.max_speed == pytest.approx(speed, rel=0.2)
 
 
@@ -160,8 +160,10 @@ def test_a_robot_that_stands_and_goes_is_within_3_percent_too() -> None:
     for top in (0.1, 0.5, 2.0):
         x = np.cumsum(speeds * top / 50)
         poses = np.column_stack([x, 0 * x, 0 * x])
-        assert summarise(poses, 50).distance_m == pytest.approx(x[-1] - x[0], rel=1e-6)
-        assert summarise(noisy(poses, 0.005), 50).distance_m == pytest.approx(x[-1], rel=0.03)
+        assert summarise(poses, 50).totals.distance_m == pytest.approx(x[-1] - x[0], rel=1e-6)
+        assert summarise(noisy(poses, 0.005), 50).totals.distance_m == pytest.approx(
+            x[-1], rel=0.03
+        )
 
 
 @pytest.mark.parametrize(
@@ -174,7 +176,7 @@ def test_short_legs_come_out_as_much_too_short_as_the_docs_say(
     poses = through([(0, 0, 0), (leg_m, 0, 0)] * round(60 * speed / leg_m), speed, 50)
     for seed in range(5):
         found = summarise(noisy(poses, 0.005, seed, axes=2), 50)
-        assert least < found.distance_m / plain_sum(poses) - 1 < most
+        assert least < found.totals.distance_m / plain_sum(poses) - 1 < most
 
 
 def test_short_stops_and_goes_come_out_as_much_too_long_as_the_docs_say() -> None:
@@ -182,30 +184,30 @@ def test_short_stops_and_goes_come_out_as_much_too_long_as_the_docs_say() -> Non
     poses = np.column_stack([x, 0 * x, 0 * x])
     for seed in range(5):
         found = summarise(noisy(poses, 0.005, seed, axes=2), 50)
-        assert 0 < found.distance_m / x[-1] - 1 < 0.04
+        assert 0 < found.totals.distance_m / x[-1] - 1 < 0.04
 
 
 def test_turning_on_the_spot_is_no_way() -> None:
     # The pose is that of the middle of the axle: it turns and stays where it is.
-    assert summarise(noisy(np.zeros((1500, 3)), 0.003, axes=2), 50).distance_m < 0.01
+    assert summarise(noisy(np.zeros((1500, 3)), 0.003, axes=2), 50).totals.distance_m < 0.01
 
 
 def test_poses_at_one_hertz_keep_the_turns_between_them() -> None:
     corners = [(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (2.0, 2.0, 0.0), (0.0, 2.0, 0.0)] * 5
     poses = through(corners, 0.5, 1)
-    assert summarise(poses, 1).distance_m == pytest.approx(plain_sum(poses), rel=1e-9)
+    assert summarise(poses, 1).totals.distance_m == pytest.approx(plain_sum(poses), rel=1e-9)
     circle = arc(0.5, 1, 300)
-    assert summarise(circle, 1).distance_m == pytest.approx(plain_sum(circle), rel=1e-9)
+    assert summarise(circle, 1).totals.distance_m == pytest.approx(plain_sum(circle), rel=1e-9)
     shuttle = np.array([(10.0 * (nth % 2), 0.0, 0.0) for nth in range(40)])
-    assert summarise(shuttle, 1).distance_m == 390.0
+    assert summarise(shuttle, 1).totals.distance_m == 390.0
 
 
 def test_slow_noise_counts_as_the_way_that_it_looks_like() -> None:
     # Reported beside the acceptance figures: what moves over seconds may be the robot.
     poses = slowly_off(line(0.5, 50, 120), 0.005, 50)
     found = summarise(poses, 50)
-    assert found.distance_m == pytest.approx(60, rel=0.03)
-    assert found.distance_m < found.path_sum_m
+    assert found.totals.distance_m == pytest.approx(60, rel=0.03)
+    assert found.totals.distance_m < found.totals.path_sum_m
 
 
 # Parts
@@ -227,8 +229,8 @@ def test_other_cuts_of_a_history_differ_by_half_a_percent_at_most(
     hertz: int, speed: float, count: int, seed: int, curved: bool
 ) -> None:
     poses = noisy((arc if curved else line)(speed, hertz, 120), 0.005, seed)
-    whole = summarise(poses, hertz).distance_m
-    assert summarise(poses, hertz, cuts_of(poses, count, seed)).distance_m == pytest.approx(
+    whole = summarise(poses, hertz).totals.distance_m
+    assert summarise(poses, hertz, cuts_of(poses, count, seed)).totals.distance_m == pytest.approx(
         whole, rel=0.005
     )
 
@@ -238,7 +240,7 @@ def test_other_cuts_of_a_history_differ_by_half_a_percent_at_most(
 def test_without_noise_any_cuts_give_the_same_length(seed: int, count: int) -> None:
     poses = arc(0.5, 20, 60)
     found = summarise(poses, 20, cuts_of(poses, count, seed))
-    assert found.distance_m == pytest.approx(plain_sum(poses), rel=1e-9)
+    assert found.totals.distance_m == pytest.approx(plain_sum(poses), rel=1e-9)
 
 
 def test_a_digest_outlives_its_bytes() -> None:
@@ -303,9 +305,9 @@ def test_slow_poses_follow_each_other_up_to_five_usual_periods() -> None:
         for place in x:
             builder.add(BEGIN + round(place * 2 * S), Pose((place + 5, 0.0, 0.0), None))
         found = builder.result()
-        assert found.gaps == gaps
-        assert found.distance_m + found.gap_m == pytest.approx(29.0)
-        assert found.gap_m == (missing + 1 if gaps else 0)
+        assert found.totals.gaps == gaps
+        assert found.totals.distance_m + found.totals.gap_m == pytest.approx(29.0)
+        assert found.totals.gap_m == (missing + 1 if gaps else 0)
 
 
 each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
@@ -433,17 +435,17 @@ def test_driving_through_the_origin_and_stopping_there_is_no_reset(hertz: float)
     ):
         for cuts in (None, range(0, len(poses), 7), range(0, len(poses), 40)):
             found = summarise(poses, hertz, cuts)
-            assert found.resets == ()
-            assert found.distance_m == pytest.approx(plain_sum(poses), rel=1e-6)
+            assert found.totals.resets == ()
+            assert found.totals.distance_m == pytest.approx(plain_sum(poses), rel=1e-6)
 
 
 def test_a_spike_that_comes_back_to_the_origin_is_no_reset() -> None:
     poses = np.zeros((3000, 3))
     poses[250::500, 0] = 0.5
-    assert summarise(poses, 50).resets == ()
+    assert summarise(poses, 50).totals.resets == ()
     at_zero = np.column_stack([np.full(3000, 0.6), np.zeros((3000, 2))])
     at_zero[250::500] = 0.0
-    assert summarise(at_zero, 50).resets == ()
+    assert summarise(at_zero, 50).totals.resets == ()
 
 
 @pytest.mark.parametrize("lost", [5, 10, 45])
@@ -455,8 +457,8 @@ def test_messages_lost_on_the_way_home_are_no_reset(lost: int) -> None:
         if not last < nth < 250:
             builder.add(BEGIN + nth * S // 50, Pose((float(x), float(y), float(z)), None))
     found = builder.result()
-    assert found.resets == ()
-    assert found.distance_m == pytest.approx(5.0)
+    assert found.totals.resets == ()
+    assert found.totals.distance_m == pytest.approx(5.0)
 
 
 @each_way

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.analysis.odometry import MotionTotals
 from ros2_memory.analysis.trajectory import (
     TOLERANCE_M,
     PoseCollector,
@@ -91,7 +92,7 @@ def farthest_off(positions: Iterable[Vector3], found: Trajectory) -> float:
 def test_a_known_path_has_its_length_duration_and_mean_speed() -> None:
     square: list[Vector3] = [(0, 0, 0), (3, 0, 0), (3, 4, 0), (0, 4, 0), (0, 0, 0)]
     found = summarise(driven(square, 2 * S), LIMIT_MPS)
-    assert (found.distance_m, found.duration_s, found.poses) == (14.0, 8.0, 5)
+    assert (found.totals.distance_m, found.totals.duration_s, found.poses) == (14.0, 8.0, 5)
     assert found.avg_speed == 14.0 / 8.0
     assert found.max_speed == 2.0
     assert found.max_speed_from == "positions"
@@ -103,7 +104,7 @@ def test_poses_at_ten_hertz_each_tell_a_speed() -> None:
 
 
 def test_height_counts_in_the_length() -> None:
-    assert summarise(driven([(0, 0, 0), (0, 3, 4)]), LIMIT_MPS).distance_m == 5.0
+    assert summarise(driven([(0, 0, 0), (0, 3, 4)]), LIMIT_MPS).totals.distance_m == 5.0
 
 
 # Of these none is at the origin, where odometry may have begun anew.
@@ -115,8 +116,8 @@ def test_of_few_poses_the_distance_is_the_plain_length(
     positions: list[Vector3],
 ) -> None:
     found = summarise(driven(positions), 1e9)
-    assert found.distance_m == pytest.approx(path_length(positions), rel=1e-12)
-    assert found.jumps == 0
+    assert found.totals.distance_m == pytest.approx(path_length(positions), rel=1e-12)
+    assert found.totals.jumps == 0
     assert found.max_speed >= found.avg_speed
 
 
@@ -124,20 +125,22 @@ def test_of_few_poses_the_distance_is_the_plain_length(
 def test_distances_of_two_parts_that_share_a_pose_add_up(
     before: list[Vector3], after: list[Vector3]
 ) -> None:
-    whole = summarise(driven([*before, *after]), 1e9).distance_m
-    parts = [summarise(driven(part), 1e9).distance_m for part in (before, [before[-1], *after])]
+    whole = summarise(driven([*before, *after]), 1e9).totals.distance_m
+    parts = [
+        summarise(driven(part), 1e9).totals.distance_m for part in (before, [before[-1], *after])
+    ]
     assert whole == pytest.approx(sum(parts), rel=1e-9, abs=1e-9)
 
 
 def test_no_pose_makes_an_empty_trajectory() -> None:
     assert summarise([], LIMIT_MPS) == Trajectory(
-        0.0, 0.0, 0.0, 0.0, "positions", (), 0.0, 0, 0, 0, 0.0
+        MotionTotals(), 0.0, 0.0, "positions", (), 0.0, 0, 0
     )
 
 
 def test_one_pose_is_a_place_without_a_way() -> None:
     found = summarise(driven(along_x(2.0)), LIMIT_MPS)
-    assert (found.distance_m, found.duration_s, found.avg_speed) == (0.0, 0.0, 0.0)
+    assert (found.totals.distance_m, found.totals.duration_s, found.avg_speed) == (0.0, 0.0, 0.0)
     assert [waypoint.position for waypoint in found.waypoints] == [(2.0, 0.0, 0.0)]
 
 
@@ -167,15 +170,15 @@ def test_poses_that_arrive_in_a_burst_do_not_make_the_robot_fast() -> None:
         for i, (time, position) in enumerate(even)
     ]
     found = summarise([(time, Pose(position, None), None) for time, position in burst], LIMIT_MPS)
-    assert found.jumps == 0
-    assert found.distance_m == pytest.approx(199 * 0.02)
+    assert found.totals.jumps == 0
+    assert found.totals.distance_m == pytest.approx(199 * 0.02)
     assert found.max_speed < 6.0
 
 
 def test_poses_of_one_moment_are_a_way_and_no_division_by_zero() -> None:
     found = summarise(driven(along_x(0.0, 0.3, 0.6), 0), LIMIT_MPS)
-    assert (found.distance_m, found.duration_s, found.avg_speed) == (0.6, 0.0, 0.0)
-    assert (found.jumps, found.max_speed) == (0, 0.0)
+    assert (found.totals.distance_m, found.totals.duration_s, found.avg_speed) == (0.6, 0.0, 0.0)
+    assert (found.totals.jumps, found.max_speed) == (0, 0.0)
 
 
 # Jumps and invalid poses
@@ -183,10 +186,10 @@ def test_poses_of_one_moment_are_a_way_and_no_division_by_zero() -> None:
 
 def test_a_jump_is_left_out_of_distance_and_speed_and_is_counted() -> None:
     found = summarise(driven(along_x(0, 1, 101, 102, 2, 3)), LIMIT_MPS)
-    assert (found.jumps, found.jumped_m) == (2, 200.0)
-    assert found.distance_m == 3.0
+    assert (found.totals.jumps, found.totals.jumped_m) == (2, 200.0)
+    assert found.totals.distance_m == 3.0
     assert found.max_speed == 1.0
-    assert found.duration_s == 5.0
+    assert found.totals.duration_s == 5.0
 
 
 def test_both_ends_of_a_jump_are_drawn_and_nothing_between_them() -> None:
@@ -215,7 +218,7 @@ def test_a_robot_that_stands_before_and_after_a_jump_is_drawn_until_it_jumps() -
 def test_of_more_jumps_than_can_be_drawn_the_longest_are() -> None:
     jumping = [100.0 * (n % 2) + n * (n == 31) for n in range(60)]
     found = summarise(driven(along_x(*jumping)), LIMIT_MPS, 12)
-    assert found.jumps == 59
+    assert found.totals.jumps == 59
     assert len(found.waypoints) <= 12
     assert sum(point.jump for point in found.waypoints) == 5
     assert 131.0 in [point.position[0] for point in found.waypoints if point.jump]
@@ -236,7 +239,7 @@ def test_jumps_are_drawn_alike_pose_by_pose_and_from_parts(steps: list[float], c
     for digest in digests:
         builder.join(digest)
     whole, joined = summarise(poses, LIMIT_MPS, 200), builder.result()
-    drawable = all(digest.jumps <= 15 for digest in digests)
+    drawable = all(digest.totals.jumps <= 15 for digest in digests)
     assert [point.position for point in joined.waypoints if point.jump] == [
         point.position for point in whole.waypoints if point.jump
     ] or not drawable
@@ -248,17 +251,17 @@ def test_a_path_in_very_many_pieces_is_held_in_bounded_memory() -> None:
         builder.add(n * S, Pose((100.0 * (n % 3), 0.0, 0.0), None))
     assert held_by(builder) < 25_000
     found = builder.result()
-    assert (found.jumps, len(found.waypoints) <= 50) == (5999, True)
+    assert (found.totals.jumps, len(found.waypoints) <= 50) == (5999, True)
 
 
 def test_exactly_the_plausible_speed_is_no_jump() -> None:
     found = summarise(driven(along_x(*(0.1 * i for i in range(50))), 10 * MS * 10), 1.0)
-    assert found.jumps == 0
+    assert found.totals.jumps == 0
 
 
 @pytest.mark.parametrize(("step_m", "jumps"), [(0.99, 0), (1.01, 1)])
 def test_a_step_is_granted_the_jitter_of_its_arrival(step_m: float, jumps: int) -> None:
-    assert summarise(driven(along_x(0.0, step_m), MS), LIMIT_MPS).jumps == jumps
+    assert summarise(driven(along_x(0.0, step_m), MS), LIMIT_MPS).totals.jumps == jumps
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
@@ -268,7 +271,7 @@ def test_a_pose_that_is_no_place_is_left_out_and_counted(bad: float, axis: int) 
     position[axis] = bad
     poses = driven([(0.0, 0.0, 0.0), (position[0], position[1], position[2]), (2.0, 0.0, 0.0)])
     found = summarise(poses, LIMIT_MPS)
-    assert (found.poses, found.invalid, found.distance_m) == (2, 1, 2.0)
+    assert (found.poses, found.invalid, found.totals.distance_m) == (2, 1, 2.0)
     assert all(math.isfinite(part) for point in found.waypoints for part in point.position)
 
 
@@ -287,7 +290,7 @@ def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     found = summarise(driven(positions), LIMIT_MPS, at_most)
     assert farthest_off(positions, found) <= found.waypoint_error_m + 1e-7
     assert len(found.waypoints) <= at_most
-    assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most or found.jumps
+    assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most or found.totals.jumps
 
 
 @given(st.lists(points, min_size=1, max_size=60), st.floats(0.01, 100.0))
@@ -356,7 +359,7 @@ def test_a_long_way_is_drawn_in_bounded_memory(noise_m: float, count: int) -> No
         held = max(held, held_by(builder))
     found = builder.result()
     assert held <= 25_000
-    assert found.path_sum_m == pytest.approx(path_length(positions), rel=1e-9)
+    assert found.totals.path_sum_m == pytest.approx(path_length(positions), rel=1e-9)
     assert farthest_off(positions[::37], found) <= found.waypoint_error_m + 1e-9
     assert found.waypoint_error_m < (0.05 if noise_m == 0 else 1.0)
 
@@ -414,8 +417,8 @@ def test_ways_of_public_robots_are_as_long_as_independent_tools_say(name: str, t
     poses = _recorded(name, topic)
     found = summarise(poses, LIMIT_MPS, 1000)
     assert found.poses == expected[topic]["n"]
-    assert found.jumps == 0
-    assert found.distance_m == pytest.approx(
+    assert found.totals.jumps == 0
+    assert found.totals.distance_m == pytest.approx(
         expected[topic]["path_length_3d_m_log_order"], abs=1e-6
     )
     assert farthest_off([pose.position for _, pose, _ in poses], found) <= 0.05
@@ -429,4 +432,4 @@ def test_the_nan_positions_of_a_public_robot_are_counted_and_make_no_way() -> No
         for p in (message.pose.pose.position,)
     ]
     found = summarise(poses, LIMIT_MPS)
-    assert (found.invalid, found.poses, found.distance_m) == (3, 0, 0.0)
+    assert (found.invalid, found.poses, found.totals.distance_m) == (3, 0, 0.0)

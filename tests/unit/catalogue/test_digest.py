@@ -134,14 +134,17 @@ def test_digests_of_bags_joined_give_what_all_their_poses_give(
         joined.join(decode_poses(encode_poses(collector.digest())))
     told, expected = joined.result(), whole.result()
     assert joined.frames == whole.frames
-    assert told.distance_m == pytest.approx(expected.distance_m, rel=1e-12, abs=1e-12)
-    assert told.jumped_m == pytest.approx(expected.jumped_m, rel=1e-12)
-    assert (told.poses, told.invalid, told.jumps) == (
+    assert told.totals.distance_m == pytest.approx(expected.totals.distance_m, rel=1e-12, abs=1e-12)
+    assert told.totals.jumped_m == pytest.approx(expected.totals.jumped_m, rel=1e-12)
+    assert (told.poses, told.invalid, told.totals.jumps) == (
         expected.poses,
         expected.invalid,
-        expected.jumps,
+        expected.totals.jumps,
     )
-    assert (told.duration_s, told.max_speed_from) == (expected.duration_s, expected.max_speed_from)
+    assert (told.totals.duration_s, told.max_speed_from) == (
+        expected.totals.duration_s,
+        expected.max_speed_from,
+    )
     assert told.max_speed == pytest.approx(expected.max_speed, rel=1e-12)
     assert [told.waypoints[:1], told.waypoints[-1:]] == [
         expected.waypoints[:1],

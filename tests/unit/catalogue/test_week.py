@@ -24,7 +24,7 @@ from tests.support.fakes import FakeReader
 from tests.support.memories import extractor
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.odometry import PoseDigest, TimedPosition
+    from ros2_memory.analysis.odometry import PoseDigest
     from ros2_memory.recorder.index_manager import IndexManager
 
 BAGS = 60_480
@@ -68,16 +68,8 @@ def later(digest: Digest, by: int) -> Digest:
 
 
 def moved(poses: PoseDigest, by: int) -> PoseDigest:
-    def stop(at: TimedPosition | None) -> TimedPosition | None:
-        if at is None:
-            return None
-        x, y, z = at.position
-        return at._replace(time=at.time + by, position=(x + by / SPLIT, y, z))
-
     return replace(
         poses,
-        first=stop(poses.first),
-        last=stop(poses.last),
         vertices=tuple(
             (time + by, (x + by / SPLIT, y, z), turn) for time, (x, y, z), turn in poses.vertices
         ),
@@ -128,5 +120,5 @@ def test_the_way_of_an_hour_is_summed_without_reading_a_bag(
     hour = TimeRange(start_s=float(T0_S + 360 * 100), end_s=float(T0_S + 360 * 100 + 3599))
     told = queries.trajectory_summary(memory, Call(), hour)
     assert told.trajectory.poses == 3600
-    assert told.trajectory.distance_m == pytest.approx(3599 * 0.1, rel=1e-6)
+    assert told.trajectory.totals.distance_m == pytest.approx(3599 * 0.1, rel=1e-6)
     assert reader.opened == []

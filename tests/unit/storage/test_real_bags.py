@@ -146,15 +146,19 @@ def test_path_lengths_equal_those_of_independent_tools(name: str, topic: str) ->
     limits = QuerySettings(max_plausible_speed_mps=1e9)
     answer = queries.trajectory_summary(memory(name, limits), Call(), span, topic=topic)
     assert answer.trajectory.poses == truth["n"]
-    assert answer.trajectory.path_sum_m == pytest.approx(
+    assert answer.trajectory.totals.path_sum_m == pytest.approx(
         truth["path_length_3d_m_log_order"], abs=2e-6
     )
     if (name, topic) in NOISY:
         straight_m = truth["straight_line_first_last_m"]
-        assert straight_m - 1e-3 < answer.trajectory.distance_m < answer.trajectory.path_sum_m
+        assert (
+            straight_m - 1e-3
+            < answer.trajectory.totals.distance_m
+            < answer.trajectory.totals.path_sum_m
+        )
         assert answer.trajectory.is_noisy
     else:
-        assert answer.trajectory.distance_m == pytest.approx(
+        assert answer.trajectory.totals.distance_m == pytest.approx(
             truth["path_length_3d_m_log_order"], abs=2e-6
         )
 
@@ -217,7 +221,7 @@ def test_positions_that_are_not_numbers_are_reported() -> None:
     summary = queries.trajectory_summary(
         asked, Call(), TimeRange(start_s=0.0, end_s=4e9), topic="/coug2/odom"
     )
-    assert (summary.trajectory.invalid, summary.trajectory.distance_m) == (3, 0.0)
+    assert (summary.trajectory.invalid, summary.trajectory.totals.distance_m) == (3, 0.0)
 
 
 @pytest.mark.parametrize(

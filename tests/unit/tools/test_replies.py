@@ -11,6 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory import results
+from ros2_memory.analysis.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
+from ros2_memory.analysis.path_length import End
 from ros2_memory.analysis.trajectory import Trajectory, Waypoint
 from ros2_memory.analysis.transform_tree import FrameEdge
 from ros2_memory.core.errors import (
@@ -63,10 +65,18 @@ def of_samples(values: list[Any], notes: tuple[str, ...] = ()) -> results.TopicR
     return results.TopicRange("/odom", "nav_msgs/msg/Odometry", 5000, samples, notes)
 
 
+def driven(jumps: int = 0, jumped_m: float = 0.0) -> MotionTotals:
+    end, near = End(0.0, 0.0, plain=True, creep=None), NearbyMotion(0.0, 0.0)
+    first = TimedPosition(T0, (0.0, 0.0, 0.0))
+    last = first._replace(time=T0 + 60_000_490_000)
+    length_m = 12.34567
+    leg = Leg(first, last, 3000, None, length_m, length_m, end, end, False, near, near)
+    return MotionTotals(leg, jumps=jumps, jumped_m=jumped_m)
+
+
 def trajectory(**other: Any) -> results.TrajectorySummary:
     way: dict[str, Any] = {
-        "distance_m": 12.34567,
-        "duration_s": 60.00049,
+        "totals": driven(),
         "avg_speed": 0.205761,
         "max_speed": 0.5,
         "max_speed_from": "twist",
@@ -77,8 +87,6 @@ def trajectory(**other: Any) -> results.TrajectorySummary:
         "waypoint_error_m": 0.05,
         "poses": 3000,
         "invalid": 0,
-        "jumps": 0,
-        "jumped_m": 0.0,
     }
     return results.TrajectorySummary("/odom", "odom", T0, T0 + 1, Trajectory(**way | other))
 
@@ -377,7 +385,7 @@ def test_a_trajectory_is_rounded_to_sense() -> None:
 def test_a_trajectory_says_what_was_left_out_and_how_it_was_measured() -> None:
     notes = said(
         trajectory(
-            invalid=3, jumps=2, jumped_m=41.5, max_speed_from="positions", waypoint_error_m=0.31
+            invalid=3, totals=driven(2, 41.5), max_speed_from="positions", waypoint_error_m=0.31
         )
     )["notes"]
     assert [note.split(" ")[0] for note in notes] == ["3", "2", "max_speed", "the"]
@@ -387,13 +395,13 @@ def test_a_trajectory_says_what_was_left_out_and_how_it_was_measured() -> None:
 
 def test_a_jump_is_marked_at_the_waypoint_it_led_to() -> None:
     waypoints = (Waypoint(T0, (0, 0, 0), None), Waypoint(T0 + 1, (90, 0, 0), None, jump=True))
-    shown = said(trajectory(waypoints=waypoints, jumps=1, jumped_m=90.0))
+    shown = said(trajectory(waypoints=waypoints, totals=driven(1, 90.0)))
     assert [point.get("jump") for point in shown["waypoints"]] == [None, True]
     assert shown["notes"] == [
         ("1 jump of 90.00 m in all, faster than is plausible, left out of distance and speed"),
         "of the jumps each leads to a waypoint with jump: true; no way was driven there",
     ]
-    shown = said(trajectory(waypoints=waypoints, jumps=9, jumped_m=99.0))
+    shown = said(trajectory(waypoints=waypoints, totals=driven(9, 99.0)))
     assert shown["notes"][1].startswith("of the jumps the longest lead to a waypoint")
 
 
@@ -403,7 +411,7 @@ def test_without_a_single_valid_pose_nothing_is_said_of_the_way() -> None:
             poses=0,
             invalid=1,
             waypoints=(),
-            distance_m=0.0,
+            totals=MotionTotals(),
             avg_speed=0.0,
             max_speed=0.0,
             max_speed_from="positions",
