@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Annotated
@@ -29,6 +28,7 @@ from ros2_memory.core.errors import (
     RecorderError,
 )
 from ros2_memory.core.text import counted
+from ros2_memory.retention.delete import size_of
 
 _MAX_LINKS_NAMED = 5
 _INSTEAD = "move or mount the bags into the bag directory"
@@ -140,11 +140,5 @@ def _identity(path: Path) -> Identity:
 
 def _count_bags(folder: Path) -> tuple[int, int]:
     """Returns the number of bag files in a directory, and their bytes."""
-    files = size = 0
-    for path in folder.iterdir():
-        if bag_kind(path.name):
-            with suppress(OSError):
-                if is_regular(path):
-                    size += path.lstat().st_size
-                    files += 1
-    return files, size
+    bags = [path for path in folder.iterdir() if bag_kind(path.name) and is_regular(path)]
+    return len(bags), sum(map(size_of, bags))

@@ -25,6 +25,7 @@ from ros2_memory.core.errors import BagError, BagVanishedError, RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, WallClock, unix_from_ns
 from ros2_memory.index.scan import Tree
+from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.repair import Repairer, open_files
 
 RECENT_NS: Final[Ns] = 30 * NS_PER_S
@@ -96,7 +97,7 @@ def recover_files(
     """
     clock = clock or WallClock()
     files, others = _files_below(path, clock)
-    sizes = [_size(file) for file in files]
+    sizes = [size_of(file) for file in files]
     recovery = _Recovery(clock, force, build_repairer())
     with progress_bar(console) as bar:
         task = bar.add_task("", total=max(sum(sizes), 1))
@@ -116,7 +117,7 @@ def recover_files(
         recovery.correct_metadata(folder, report)
     for folder in sorted(recovery.changed):
         # A recording whose metadata.yaml was never written: only its recorder knew all of it.
-        if any(folder.glob(f"*{_MCAP}")) and not _size(folder / METADATA_FILE):
+        if any(folder.glob(f"*{_MCAP}")) and not size_of(folder / METADATA_FILE):
             report(f"{folder} has no {METADATA_FILE}: `ros2 bag reindex {folder}` makes one")
     if others:
         left = counted(others, "bag file of another kind was", "bag files of other kinds were")
@@ -237,10 +238,3 @@ def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
     bags = sorted(Path(each) for each in walked.stamps if not links.is_saved(each))
     files = [bag for bag in bags if bag.suffix == _MCAP]
     return files, len(bags) - len(files)
-
-
-def _size(file: Path) -> int:
-    try:
-        return file.stat().st_size
-    except OSError:
-        return 0
